@@ -1,0 +1,74 @@
+"""`python -m client`: one simulated UAV as a process."""
+
+import secrets
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from client.plant import FirstOrderPlant
+from client.vehicle import Client
+from shared import command
+from shared.chance import stream
+from shared.command import CommandError, ScenarioFlags, ScenarioName
+from shared.config import Scenario
+from shared.record import Recorder, client_columns, parse
+from shared.shell import ANYWHERE
+from shared.summary import summarise
+
+
+@dataclass(frozen=True)
+class Options:
+    """Of `skytether client`."""
+
+    scenario: ScenarioName = "demo"
+    """A scenario's name (see `skytether scenarios`) or a .toml file; the server's."""
+    server: str = "127.0.0.1:47000"
+    """HOST:PORT where the server is to be met: netem's, or its own."""
+    number: Annotated[int, tyro.conf.arg(name="id")] = 1
+    """Number of this vehicle, unlike any other of the server's (0 to 65535)."""
+    record: Path | None = None
+    """File for the client's part of the record."""
+    json: Path | None = None
+    """File for the summary of the flight, as far as the vehicle knows it."""
+    config: ScenarioFlags = Scenario()
+
+
+def fly(argv: Sequence[str]) -> None:
+    """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM."""
+    options = command.parse(Options(), argv, "skytether client", fly.__doc__)
+    scenario, server = options.config, command.address(options.server)
+    if not 0 <= options.number < 2**16:
+        raise CommandError(f"--id: got {options.number}, expected 0 to 65535", 2)
+    with (
+        command.open_record(options.record) if options.record else tempfile.TemporaryFile()
+    ) as sink:
+        endpoint = Client(
+            scenario,
+            FirstOrderPlant(scenario, stream(scenario.seed, "wind", options.number)),
+            server=server,
+            vehicle=options.number,
+            boot_id=secrets.randbits(64),
+            recorder=Recorder(client_columns(scenario.model.axes), sink),
+        )
+        command.drive("client", endpoint, ANYWHERE, [server], f"the server at {options.server}")
+        sink.flush()
+        sink.seek(0)
+        rows = parse(sink.read())
+    if endpoint.failure:
+        raise CommandError(endpoint.failure)
+    if len(rows):
+        command.finish(summarise(scenario, options.scenario, rows), "client", options.json)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; the exit code."""
+    return command.main(fly, argv, "client")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

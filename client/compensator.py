@@ -1,0 +1,64 @@
+"""Uplink delay compensator, eq. (11): which input to fly now, from a horizon made earlier.
+
+    u* = u(min(k, k_h + H - 1) | k_h)        k_h: the step that the horizon was made for
+
+The horizon of the newest generation wins, in whatever order they arrive (E11).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.config import Scenario
+from shared.model import Array
+from shared.protocol import NO_HORIZON, Horizon, ProtocolError
+
+
+class Compensator:
+    """Holds the newest horizon and reads the input of any step from it."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._H = scenario.control.horizon
+        self._compensate = scenario.control.scheme == "paper"
+        self._brakes = scenario.vehicle.exhausted == "brake"
+        self._brake_per_step = scenario.vehicle.brake_mps2 * scenario.control.dt
+        self._u_max = scenario.u_max
+        self._inputs: Array = np.zeros((scenario.model.axes, self._H))
+        self.in_force = NO_HORIZON
+        """k_h, or NO_HORIZON: then the vehicle hovers."""
+        self.observed_ns = -1
+        """Stamp of the observation that the horizon was computed from [client clock]."""
+        self.stale = 0
+        """Horizons that came after a newer one."""
+
+    def offer(self, horizon: Horizon, step: int) -> None:
+        """A horizon arrived during `step`.
+
+        Raises:
+            ProtocolError: it is made for a time so far ahead that nothing later could replace it.
+        """
+        if horizon.step > step + self._H:
+            raise ProtocolError("from the future")
+        if horizon.step <= self.in_force:
+            self.stale += 1
+            return
+        self.in_force = horizon.step
+        self.observed_ns = horizon.observed_ns
+        self._inputs = np.clip(horizon.inputs, -self._u_max[:, None], self._u_max[:, None])
+
+    def choose(self, step: int) -> Array:
+        """u* for `step` [m/s]; shape (axes,)."""
+        if self.in_force == NO_HORIZON:
+            return np.zeros(len(self._u_max))
+        if not self._compensate:
+            return self._inputs[:, 0].copy()
+        stage = step - self.in_force
+        if stage >= self._H and self._brakes:
+            return self._braked(stage - self._H + 1)
+        return self._inputs[:, min(max(stage, 0), self._H - 1)].copy()
+
+    def _braked(self, steps: int) -> Array:
+        """The last input, slowed down for `steps` at a constant rate, straight ahead."""
+        last: NDArray[np.float64] = self._inputs[:, -1]
+        speed = float(np.linalg.norm(last))
+        left = max(0.0, speed - steps * self._brake_per_step)
+        return last * (left / speed) if speed > 0.0 else last.copy()

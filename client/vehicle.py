@@ -1,0 +1,203 @@
+"""The client: at every step, fly the chosen input, report the state, and stay in touch.
+
+Its clock is the flight's clock: the epoch is the moment its session opened, step k begins at
+epoch + k Δt, and every stamp that control uses is read here. A lost server changes nothing in that:
+the vehicle flies on along its horizon, then as `vehicle.exhausted` says, and says HELLO meanwhile.
+"""
+
+from collections import Counter
+
+from client.compensator import Compensator
+from client.plant import Plant
+from shared.config import Scenario
+from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
+from shared.protocol import (
+    Heartbeat,
+    Hello,
+    Horizon,
+    Observation,
+    ProtocolError,
+    Welcome,
+    decode,
+    encode,
+)
+from shared.record import Recorder, client_columns
+
+HELLO_NS = SECOND_NS
+"""Between two HELLOs while nobody answers."""
+
+
+class Client(Endpoint):
+    """One vehicle.
+
+    Args:
+        scenario: must be the server's, as far as it makes the terms of a flight.
+        plant: what flies.
+        server: where the server is to be met, directly or through netem.
+        vehicle: its number, unlike that of any other vehicle of the server.
+        boot_id: a number that no other life of this vehicle has had.
+        recorder: takes one row a step.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        plant: Plant,
+        *,
+        server: Address,
+        vehicle: int,
+        boot_id: int,
+        recorder: Recorder | None = None,
+    ) -> None:
+        super().__init__()
+        self._terms = scenario.terms()
+        self._dt_ns = scenario.dt_ns
+        self._steps = scenario.steps
+        self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
+        self._connect_ns = seconds_to_ns(scenario.link.connect_s)
+        self._plant = plant
+        self._compensator = Compensator(scenario)
+        self._server = server
+        self._vehicle = vehicle
+        self._boot_id = boot_id
+        self._recorder = recorder or Recorder(client_columns(scenario.model.axes))
+
+        self._hello_due_ns: int | None = 0
+        """When to say HELLO next; None while the server is heard."""
+        self._began_ns: int | None = None
+        self._session: int | None = None
+        self._server_boot_id: int | None = None
+        self._echo = (0, 0)
+        """Newest `server_ns`, and when it came."""
+        self._epoch_ns: int | None = None
+        self._step = 0
+        """The step that comes next,"""
+        self._flown = 0
+        """and the one whose state the plant is in."""
+        self._input = self._compensator.choose(0)
+        """Desired velocity flown now [m/s]; shape (axes,)."""
+        self.failure: str | None = None
+        """Why there can be no flight."""
+        self.missed = 0
+        self.counts: Counter[str] = Counter()
+
+    @property
+    def finished(self) -> bool:
+        """Flown to the end, or never."""
+        return self.failure is not None or self._step >= self._steps
+
+    # -- datagrams ---------------------------------------------------------------------------
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """WELCOME, HORIZON and HEARTBEAT of this session; anything else is dropped and counted."""
+        try:
+            match decode(datagram.payload, self._terms):
+                case Welcome() as welcome:
+                    self._welcome(welcome, now_ns)
+                case Horizon() as horizon:
+                    self._heard(horizon, now_ns)
+                    self._compensator.offer(horizon, self._step)
+                    self.counts["horizons"] += 1
+                case Heartbeat() as heartbeat:
+                    self._heard(heartbeat, now_ns)
+                case _:
+                    raise ProtocolError("not for a client")
+        except ProtocolError as error:
+            self.counts[f"dropped: {error.reason}"] += 1
+
+    def _welcome(self, welcome: Welcome, now_ns: int) -> None:
+        if (welcome.vehicle, welcome.boot_id) != (self._vehicle, self._boot_id):
+            raise ProtocolError("for another life")
+        if welcome.terms != self._terms:
+            if self._session is None:
+                difference = welcome.terms.against(self._terms)
+                self.failure = f"the server flies another scenario: {difference}"
+            raise ProtocolError("other terms")
+        if self._server_boot_id not in (None, welcome.server_boot_id):
+            self._news.append("the server has restarted")
+        self._session, self._server_boot_id = welcome.session, welcome.server_boot_id
+        self._heard(welcome, now_ns)
+        if self._epoch_ns is None:
+            self._epoch_ns = now_ns
+            self._news.append("session open, flying")
+
+    def _heard(self, message: Welcome | Horizon | Heartbeat, now_ns: int) -> None:
+        if (message.vehicle, message.session) != (self._vehicle, self._session):
+            raise ProtocolError("unknown session")
+        if self._hello_due_ns is not None and self._epoch_ns is not None:
+            self._news.append("the server is heard again")
+        self._hello_due_ns = None
+        self._echo = (message.server_ns, now_ns)
+
+    # -- time --------------------------------------------------------------------------------
+
+    def next_wake_ns(self) -> int | None:
+        """The next step or the next HELLO, whichever comes first."""
+        if self.finished:
+            return None
+        if self._epoch_ns is None:
+            return self._hello_due_ns
+        return self._epoch_ns + self._step * self._dt_ns
+
+    def wake(self, *, now_ns: int) -> None:
+        """Steps that are due, and HELLO where nobody is heard."""
+        if self._began_ns is None:
+            self._began_ns = now_ns
+        if self._epoch_ns is None:
+            if now_ns - self._began_ns > self._connect_ns:
+                host, port = self._server
+                waited_s = (now_ns - self._began_ns) / SECOND_NS
+                self.failure = f"no answer from {host}:{port} in {waited_s:.0f} s"
+                return
+        elif now_ns < self._epoch_ns + self._step * self._dt_ns:
+            return
+        else:
+            self._fly(now_ns, self._epoch_ns)
+            if self._hello_due_ns is None and now_ns - self._echo[1] > self._timeout_ns:
+                self._news.append("the server is silent")
+                self._hello_due_ns = now_ns
+        if self._hello_due_ns is not None and now_ns >= self._hello_due_ns:
+            self._hello_due_ns = now_ns + HELLO_NS
+            self._send(Hello(self._vehicle, self._boot_id, self._terms))
+
+    def _fly(self, now_ns: int, epoch_ns: int) -> None:
+        """Advance to the present step; one that was slept through was flown with the old input."""
+        present = min((now_ns - epoch_ns) // self._dt_ns, self._steps - 1)
+        self.missed += present - self._step
+        for _ in range(self._flown, present):
+            self._plant.advance(self._input)
+        self._flown, self._step = present, present + 1
+        self._input = self._compensator.choose(present)
+        state, stamp_ns = self._plant.state(), epoch_ns + present * self._dt_ns
+        assert self._session is not None
+        self._send(
+            Observation(
+                self._vehicle,
+                self._session,
+                present,
+                stamp_ns,
+                self._compensator.in_force,
+                *self._echo,
+                state,
+            )
+        )
+        observed_ns = self._compensator.observed_ns
+        self._recorder.append(
+            1,
+            vehicle=self._vehicle,
+            step=present,
+            state=state,
+            input=self._input,
+            in_force=self._compensator.in_force,
+            age_ns=-1 if observed_ns < 0 else stamp_ns - observed_ns,
+            stale=self._compensator.stale,
+            missed=self.missed,
+        )
+
+    def _send(self, message: Hello | Observation) -> None:
+        self._out.append(Datagram(encode(message), self._server))
+
+    def report(self) -> str:
+        """See `Endpoint`."""
+        counts = ", ".join(f"{value} {name}" for name, value in sorted(self.counts.items()))
+        return f"step {self._step} of {self._steps}, {self.missed} missed, {counts or 'no packets'}"

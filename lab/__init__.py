@@ -1,0 +1,1 @@
+"""What is made of flights: figures and comparisons."""

@@ -1,0 +1,58 @@
+"""Pictures of flights."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from shared.command import CommandError
+from shared.config import Scenario
+from sim.flight import Flight
+
+FORMATS = (".png", ".pdf", ".svg")
+
+
+def check(path: Path) -> None:
+    """Refuse a file that no picture can be written to, before anything is flown.
+
+    Raises:
+        CommandError: with what would do.
+    """
+    if path.suffix not in FORMATS:
+        raise CommandError(f"{path}: expected a file in {', '.join(FORMATS)}", 2)
+    if not path.absolute().parent.is_dir():
+        raise CommandError(f"{path}: there is no folder {path.parent}", 2)
+
+
+def flight(path: Path, scenario: Scenario, flights: Mapping[str, Flight]) -> None:
+    """Draw flights of one scenario side by side: the path over the reference, events beneath.
+
+    Args:
+        flights: by title.
+    """
+    from matplotlib.figure import Figure  # takes half a second to import
+
+    figure = Figure(figsize=(4.8 * len(flights), 6.0), layout="constrained")
+    grid = figure.subplots(
+        2, len(flights), squeeze=False, sharex="row", sharey="row", height_ratios=(5, 1)
+    )
+    for (title, flown), (plane, events) in zip(flights.items(), grid.T, strict=True):
+        time_s = flown.client["step"] * scenario.control.dt
+        desired = scenario.make_reference()(time_s)[..., 0]
+        position = flown.client["state"][..., 0]
+        plane.plot(desired[:, 0], desired[:, 1], "r--", label="reference")
+        plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
+        plane.plot(position[0, 0], position[0, 1], "ko", markersize=4, label="start")
+        plane.set_title(title, fontsize=10)
+        plane.set_xlabel("x [m]")
+        plane.set_aspect("equal", adjustable="datalim")
+        plane.grid(alpha=0.3)
+        sent_s = flown.server["step"][flown.server["event"]] * scenario.control.dt
+        events.vlines(sent_s, 0.0, 1.0, color="k", linewidth=0.6)
+        ratio = float(np.mean(flown.server["event"])) if len(flown.server) else 0.0
+        events.set_xlabel(f"time [s]; horizons sent at {ratio:.0%} of the steps")
+        events.set_yticks([])
+    grid[0, 0].set_ylabel("y [m]")
+    grid[0, 0].legend(loc="upper right", fontsize=8)
+    grid[1, 0].set_ylabel("sent")
+    figure.savefig(path, dpi=150)

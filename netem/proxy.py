@@ -1,0 +1,130 @@
+"""netem: a UDP proxy that stands for the network and never decodes what it carries.
+
+Clients send to its bound socket. Each client address is a flow with a socket of its own towards the
+server, so that the server's answers find their way back. Uplink is server to client, downlink
+client to server, as in the paper.
+"""
+
+from dataclasses import dataclass
+
+from netem.fate import fates
+from netem.link import Counts, Lane, Link
+from shared.config import Scenario
+from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
+from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Recorder
+
+FLOWS_MAX = 1024
+"""Clients at once; a packet of a further one is dropped, and counted."""
+IDLE_NS = 60 * SECOND_NS
+"""A flow without a packet for so long gives its place, and its socket, to a new client."""
+
+
+@dataclass(slots=True)
+class Flow:
+    """One client address."""
+
+    client: Address
+    socket: int
+    uplink: Lane
+    downlink: Lane
+    used_ns: int
+
+
+class Proxy(Endpoint):
+    """Delays, reorders and loses datagrams between clients and one server.
+
+    Args:
+        scenario: its `network` and `seed`.
+        server: where the server is.
+        recorder: takes one row a packet.
+    """
+
+    def __init__(
+        self, scenario: Scenario, *, server: Address, recorder: Recorder | None = None
+    ) -> None:
+        super().__init__()
+        recorder = recorder or Recorder(PACKET_COLUMNS)
+        self._scenario = scenario
+        self._server = server
+        self.uplink = Link(UPLINK, recorder)
+        self.downlink = Link(DOWNLINK, recorder)
+        self._by_client: dict[Address, Flow] = {}
+        self._by_socket: dict[int, Flow] = {}
+        self._opened = 0
+        self.refused = 0
+        """Packets of clients beyond FLOWS_MAX, and of strangers at a flow's socket."""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """A packet enters the network."""
+        if datagram.socket == 0:
+            flow = self._by_client.get(datagram.peer) or self._open(datagram.peer, now_ns)
+            if flow is None:
+                self.refused += 1
+                return
+            onward = Datagram(datagram.payload, self._server, flow.socket)
+            self.downlink.take(onward, flow.downlink, now_ns=now_ns)
+        else:
+            flow = self._by_socket.get(datagram.socket)
+            if flow is None or datagram.peer != self._server:
+                self.refused += 1
+                return
+            self.uplink.take(Datagram(datagram.payload, flow.client), flow.uplink, now_ns=now_ns)
+        flow.used_ns = now_ns
+        self._forward(now_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        """Packets that are due leave it."""
+        self._forward(now_ns)
+
+    def _forward(self, now_ns: int) -> None:
+        for link in (self.uplink, self.downlink):
+            self._out += link.give(now_ns=now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """When the next packet is due."""
+        dues = (self.uplink.next_due_ns(), self.downlink.next_due_ns())
+        return min((due for due in dues if due is not None), default=None)
+
+    def _open(self, client: Address, now_ns: int) -> Flow | None:
+        socket = len(self._by_socket) + 1
+        if socket > FLOWS_MAX:
+            idle = min(self._by_socket.values(), key=lambda flow: flow.used_ns)
+            if now_ns - idle.used_ns < IDLE_NS:
+                return None
+            del self._by_client[idle.client]
+            socket = idle.socket
+        number = self._opened
+        self._opened += 1
+        network, seed = self._scenario.network, self._scenario.seed
+        flow = Flow(
+            client,
+            socket,
+            Lane(number, fates(network.uplink, seed, "uplink", number)),
+            Lane(number, fates(network.downlink, seed, "downlink", number)),
+            now_ns,
+        )
+        self._by_client[client] = self._by_socket[socket] = flow
+        self._news.append(f"flow {number} for {client[0]}:{client[1]}")
+        return flow
+
+    def report(self) -> str:
+        """See `Endpoint`."""
+        return "\n".join(
+            [
+                f"{len(self._by_socket)} flows, {self.refused} packets refused",
+                _describe("uplink", self.uplink.counts, self.uplink.depth()),
+                _describe("downlink", self.downlink.counts, self.downlink.depth()),
+            ]
+        )
+
+
+def _describe(name: str, counts: Counts, depth: int) -> str:
+    error = counts.error
+    return (
+        f"{name}: {counts.packets} packets, {counts.forwarded} forwarded, {counts.lost} lost, "
+        f"{counts.reordered} reordered, {counts.overflowed} overflowed, "
+        f"queue {depth} (at most {counts.depth_max})\n"
+        f"  delay: {counts.delay}\n"
+        f"  added-delay error: p50 {error.quantile_ms(0.5):.2f} ms, "
+        f"p99 {error.quantile_ms(0.99):.2f} ms, largest {error.largest_ns / 1e6:.2f} ms"
+    )

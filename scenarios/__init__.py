@@ -1,0 +1,1 @@
+"""The scenarios that come with Skytether, one TOML file each."""

@@ -1,0 +1,11 @@
+"""Named streams of chance: the same seed and names give the same numbers, in any process."""
+
+import zlib
+
+import numpy as np
+
+
+def stream(seed: int, *names: str | int) -> np.random.Generator:
+    """An independent generator for one purpose, as in `stream(3, "uplink", "delay", flow)`."""
+    numbers = [zlib.crc32(name.encode()) if isinstance(name, str) else name for name in names]
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, *numbers])))

@@ -1,0 +1,180 @@
+"""What every Skytether command has in common: its arguments, its one line for a mistake, its table.
+
+A command's options are a dataclass with a field `scenario` for the name and a field `config` for
+the scenario itself, whose every key is a flag: the file comes first, flags lie over it.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from inspect import cleandoc
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO, Protocol, TypeVar
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from shared import config
+from shared.config import ConfigError, Scenario
+from shared.endpoint import Address, Endpoint
+from shared.shell import AddressError, Shell, run
+from shared.summary import Summary
+
+CONFIGURATION, RUN = 2, 1
+"""Exit codes: the command asked for something impossible, or it went wrong on the way."""
+
+ScenarioName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
+ScenarioFlags = Annotated[Scenario, tyro.conf.arg(name="")]
+
+
+class CommandError(Exception):
+    """What ends a command: one line for the user, and the exit code."""
+
+    def __init__(self, message: str, code: int = RUN) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class Options(Protocol):
+    """The options of a command that is about a scenario."""
+
+    @property
+    def scenario(self) -> str: ...
+    @property
+    def config(self) -> Scenario: ...
+
+
+O = TypeVar("O", bound=Options)  # noqa: E741 - the options of one command
+
+
+def parse(defaults: O, argv: Sequence[str], prog: str, help_: str | None) -> O:
+    """The options of a command line, laid over the scenario it names.
+
+    Raises:
+        CommandError: the scenario cannot be flown.
+        SystemExit: tyro has shown the help, or what is wrong with a flag.
+    """
+    name = argv[0] if argv and not argv[0].startswith("-") else defaults.scenario
+    try:
+        while True:
+            options = replace(defaults, scenario=name, config=config.load(name))  # type: ignore[type-var]
+            options = tyro.cli(
+                type(defaults), args=argv, default=options, prog=prog, description=cleandoc(help_ or "")
+            )
+            if options.scenario == name:
+                break
+            name = options.scenario
+        checked = config.check(config.to_table(options.config), f"{name} and the command line")
+    except ConfigError as error:
+        raise CommandError(str(error), CONFIGURATION) from None
+    return replace(options, config=checked)  # type: ignore[type-var]
+
+
+def address(text: str) -> Address:
+    """HOST:PORT as an address.
+
+    Raises:
+        CommandError: it is none.
+    """
+    host, colon, port = text.rpartition(":")
+    if not (host and colon and port.isascii() and port.isdigit() and int(port) < 65536):
+        raise CommandError(f"got the address {text!r}, expected HOST:PORT", CONFIGURATION)
+    return host, int(port)
+
+
+def open_record(path: Path) -> BinaryIO:
+    """A file for a part of the record.
+
+    Raises:
+        CommandError: it cannot be written.
+    """
+    try:
+        return path.open("w+b")
+    except OSError as error:
+        raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None
+
+
+def drive(
+    prog: str, endpoint: Endpoint, bind: Address, peers: Sequence[Address], waiting_for: str
+) -> None:
+    """Run one endpoint as a process until it has finished or is told to stop.
+
+    Raises:
+        CommandError: it cannot start.
+    """
+
+    def say(text: str) -> None:
+        for line in text.splitlines():
+            print(f"{prog}: {line}", flush=True)
+
+    try:
+        shell = Shell(endpoint, bind, peers)
+    except AddressError as error:
+        raise CommandError(str(error)) from None
+    host, port = shell.address
+    say(f"listening on {host}:{port}, waiting for {waiting_for}")
+    if any(not address[0].startswith("127.") for address in (bind, *peers)):
+        say("plaintext and unauthenticated: only for a network that you trust")
+
+    def report() -> None:
+        say(endpoint.report())
+        if shell.kernel_drops() or shell.send_errors:
+            say(f"{shell.kernel_drops()} datagrams dropped by the kernel, {shell.send_errors} unsent")
+
+    run([shell], on_news=say, on_report=report)
+    report()
+
+
+def main(command: Any, argv: Sequence[str] | None, prog: str) -> int:
+    """Run a command; its exit code. What went wrong is one line on stderr."""
+    try:
+        command(sys.argv[1:] if argv is None else argv)
+    except CommandError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return error.code
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return RUN
+    return 0
+
+
+def finish(summary: Summary, title: str, json: Path | None) -> None:
+    """Print a summary as a table, and write it to a file.
+
+    Raises:
+        CommandError: the file cannot be written.
+    """
+    table = Table(title=title, title_justify="left", show_header=False)
+    for row in _rows(summary):
+        table.add_row(*map(Text, row))  # as text: "[m]" would be markup
+    Console().print(table)
+    if json is not None:
+        try:
+            json.write_bytes(summary.to_json())
+        except OSError as error:
+            raise CommandError(f"{json}: cannot be written: {error.strerror}") from None
+
+
+def _rows(summary: Summary) -> list[tuple[str, str]]:
+    s = summary
+    height = [("RMSE z [m]", _number(s.rmse_z, ".4f"))] if s.rmse_z is not None else []
+    return [
+        ("steps", f"{s.steps} in {s.duration_s:g} s"),
+        ("RMSE x, y, xy [m]", ", ".join(_number(v, ".4f") for v in (s.rmse_x, s.rmse_y, s.rmse_xy))),
+        *height,
+        ("event ratio", _number(s.event_ratio, ".3f")),
+        ("uplink", f"{_number(s.uplink_packets)} packets, {_number(s.uplink_bytes)} bytes"),
+        ("downlink", f"{_number(s.downlink_packets)} packets, {_number(s.downlink_bytes)} bytes"),
+        ("lost, reordered", f"{_number(s.lost)}, {_number(s.reordered)} packets"),
+        ("discarded as stale", f"{s.stale} packets"),
+        ("age p50, p99 [ms]", f"{_number(s.age_ms_p50, '.0f')}, {_number(s.age_ms_p99, '.0f')}"),
+        ("solve p50, p99 [ms]", f"{_number(s.solve_ms_p50, '.2f')}, {_number(s.solve_ms_p99, '.2f')}"),
+        ("deadline misses", str(s.deadline_misses)),
+    ]
+
+
+def _number(value: float | None, spec: str = "d") -> str:
+    return "–" if value is None else format(value, spec)

@@ -1,0 +1,415 @@
+"""One scenario: everything about a flight, from one TOML file, typed, frozen and checked once.
+
+A scenario may say `extends = "other"` (a scenario's name, or a file beside it) and then holds only
+what differs. `skytether scenarios` lists those that come with Skytether.
+"""
+
+import difflib
+import re
+import tomllib
+import typing
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from shared import reference as shapes
+from shared.endpoint import seconds_to_ns
+from shared.protocol import INPUTS_MAX, Terms
+
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+
+
+class ConfigError(Exception):
+    """The user's scenario cannot be flown; the message names file, key, given and expected."""
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the scenario."""
+
+
+class ModelConfig(Section):
+    """The UAV as both ends know it, eq. (1)-(6)."""
+
+    axes: Literal[2, 3] = 2
+    """Fly in the plane or in space."""
+    tau_s: tuple[Positive, ...] = (0.81,)
+    """Time constant of the velocity loop [s]: one for all axes, or one each."""
+    u_max: tuple[Positive, ...] = (1.8,)
+    """Largest desired velocity [m/s]: one for all axes, or one each."""
+
+
+class ControlConfig(Section):
+    """The server's planning, eq. (5)-(16)."""
+
+    dt: Annotated[float, Meta(ge=0.001, le=1)] = 0.05
+    """Length of a step, Δt [s]."""
+    horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
+    """Steps planned ahead, H."""
+    scheme: Literal["paper", "none"] = "paper"
+    """Delay compensation at both ends: eq. (11) and (13), or none."""
+    trigger: Literal["paper", "always"] = "paper"
+    """When a horizon is sent: eq. (16), or at every step."""
+    epsilon: NonNegative = 3.6
+    """Tolerance ε of eq. (16)."""
+    decay_rate: NonNegative = 1.5
+    """Decay rate λ of eq. (16) [1/s]."""
+    state_weight: tuple[NonNegative, NonNegative] = (10.0, 19.7)
+    """Q of eq. (5), on the position and the velocity of every axis."""
+    terminal_weight: tuple[NonNegative, NonNegative] = (55.9, 828.0)
+    """P of eq. (5) and (16), on position and velocity."""
+    input_weight: Positive = 2.71
+    """R of eq. (5)."""
+    change_weight: NonNegative = 0.033
+    """S of eq. (9), on the change against the horizon before."""
+    input_reference: bool = False
+    """Let R weigh u - v_ref instead of u, so that it does not ask for standing still."""
+
+
+class ReferenceConfig(Section):
+    """The desired trajectory."""
+
+    shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
+    """What to fly."""
+    radius_m: Positive = 1.5
+    """Half the width of circle, figure-eight and square [m]."""
+    period_s: Positive = 14.2
+    """Time for one round of them [s]."""
+    altitude_m: float = 0.0
+    """Their height in 3-D [m]."""
+    points_m: tuple[tuple[float, ...], ...] = ()
+    """Waypoints [m], at least two, or the one point to hover at."""
+    speed_mps: Positive = 1.0
+    """Speed between waypoints [m/s]."""
+    loop: bool = False
+    """Fly the waypoints round and round."""
+    file: str = ""
+    """CSV file with the columns t, x, y (and z), relative to the scenario's own folder."""
+
+
+class VehicleConfig(Section):
+    """The simulated UAV and what it does without fresh orders."""
+
+    exhausted: Literal["hold", "brake"] = "brake"
+    """Once a horizon has run out: hold its last input for ever (the paper), or brake and hover."""
+    brake_mps2: Positive = 2.0
+    """How fast `brake` takes the desired velocity to zero [m/s²]."""
+    tau_s: tuple[Positive, ...] = ()
+    """True time constant [s], where it differs from the model's; one for all axes, or one each."""
+    start_m: tuple[float, ...] = ()
+    """Where the flight starts, at rest [m]; left out: at the reference's start."""
+    wind: NonNegative = 0.0
+    """White acceleration [m/s² per √s]."""
+    gust_mps2: NonNegative = 0.0
+    """Strength of gusts [m/s²]; 0 for none."""
+    gust_every_s: Positive = 10.0
+    """Mean time from the end of one gust to the next [s]."""
+    gust_s: Positive = 1.0
+    """Length of a gust [s]."""
+
+
+class DirectionConfig(Section):
+    """One direction of the network."""
+
+    delay: Literal["paper", "constant", "none"] = "paper"
+    """Delay of a packet: minimum_s + slot_s · Poisson(slots_mean) (17), minimum_s, or none."""
+    minimum_s: NonNegative = 0.4
+    """The smallest delay [s]."""
+    slot_s: NonNegative = 0.02
+    """Lattice of the paper's delay [s]."""
+    slots_mean: NonNegative = 2.0
+    """Mean number of slots on top."""
+    loss: Annotated[float, Meta(ge=0, le=1)] = 0.1
+    """Share of packets lost."""
+
+    @property
+    def mean_s(self) -> float:
+        """Mean delay [s]."""
+        jitter_s = self.slot_s * self.slots_mean if self.delay == "paper" else 0.0
+        return 0.0 if self.delay == "none" else self.minimum_s + jitter_s
+
+
+class NetworkConfig(Section):
+    """What netem does to packets."""
+
+    uplink: DirectionConfig = DirectionConfig()
+    """Server to vehicle."""
+    downlink: DirectionConfig = DirectionConfig()
+    """Vehicle to server."""
+
+
+class LinkConfig(Section):
+    """How a session is kept."""
+
+    heartbeat_s: Positive = 0.1
+    """The server lets no longer pass without a packet [s]."""
+    timeout_s: Positive = 1.0
+    """Silence after which the vehicle says HELLO again [s]."""
+    connect_s: Positive = 15.0
+    """How long the vehicle waits for its first session before it gives up [s]."""
+
+
+class SimulationConfig(Section):
+    """What only virtual time has to be told."""
+
+    compute_s: NonNegative = 0.001
+    """Time the server takes for a step [s]."""
+    clock_offset_s: float = 0.0
+    """The vehicle's clock minus the server's, at the start [s]."""
+    clock_drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
+    """How much faster the vehicle's clock runs [ppm]."""
+
+
+class Scenario(Section):
+    """Everything about a flight."""
+
+    title: str = ""
+    """What it shows, in a line."""
+    duration: Annotated[float, Meta(gt=0, le=86400)] = 60.0
+    """Length of the flight [s]."""
+    settle: NonNegative = 0.0
+    """Start of the flight that RMSE leaves out [s]."""
+    seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 1
+    """Of everything random: delays, losses, wind."""
+    model: ModelConfig = ModelConfig()
+    control: ControlConfig = ControlConfig()
+    reference: ReferenceConfig = ReferenceConfig()
+    vehicle: VehicleConfig = VehicleConfig()
+    network: NetworkConfig = NetworkConfig()
+    link: LinkConfig = LinkConfig()
+    simulation: SimulationConfig = SimulationConfig()
+
+    @property
+    def dt_ns(self) -> int:
+        """Length of a step [ns]."""
+        return seconds_to_ns(self.control.dt)
+
+    @property
+    def steps(self) -> int:
+        """Steps in the whole flight."""
+        return max(1, round(self.duration / self.control.dt))
+
+    @property
+    def tau_s(self) -> NDArray[np.float64]:
+        """The model's time constants [s]; shape (axes,)."""
+        return self._per_axis(self.model.tau_s)
+
+    @property
+    def true_tau_s(self) -> NDArray[np.float64]:
+        """The vehicle's time constants [s]; shape (axes,)."""
+        return self._per_axis(self.vehicle.tau_s or self.model.tau_s)
+
+    @property
+    def u_max(self) -> NDArray[np.float64]:
+        """Bounds of the input [m/s]; shape (axes,)."""
+        return self._per_axis(self.model.u_max)
+
+    def _per_axis(self, values: tuple[float, ...]) -> NDArray[np.float64]:
+        return np.array(np.broadcast_to(values, self.model.axes), dtype=np.float64)
+
+    def terms(self) -> Terms:
+        """What both ends must agree on."""
+        return Terms(
+            self.dt_ns,
+            self.control.horizon,
+            self.model.axes,
+            tuple(self.tau_s.tolist()),
+            tuple(self.u_max.tolist()),
+        )
+
+    def make_reference(self) -> shapes.Reference:
+        """The desired trajectory."""
+        config, axes = self.reference, self.model.axes
+        points = np.array(config.points_m, dtype=np.float64)
+        match config.shape:
+            case "circle":
+                return shapes.circle(
+                    config.radius_m, config.period_s, axes, config.altitude_m
+                )
+            case "figure-eight":
+                return shapes.figure_eight(
+                    config.radius_m, config.period_s, axes, config.altitude_m
+                )
+            case "square":
+                return shapes.square(config.radius_m, config.period_s, axes, config.altitude_m)
+            case "waypoints":
+                return shapes.waypoints(points, config.speed_mps, loop=config.loop)
+            case "hover":
+                return shapes.hover(points[0])
+            case "csv":
+                return shapes.from_csv(Path(config.file), axes)
+
+
+def names() -> list[str]:
+    """The scenarios that come with Skytether."""
+    return sorted(
+        file.name.removesuffix(".toml")
+        for file in resources.files("scenarios").iterdir()
+        if file.name.endswith(".toml")
+    )
+
+
+def load(name: str) -> Scenario:
+    """A scenario by its name, or from a file by its path (anything that ends in .toml).
+
+    Raises:
+        ConfigError: it does not exist, or something in it is wrong.
+    """
+    return check(_read(name), name)
+
+
+def check(raw: Mapping[str, Any], source: str) -> Scenario:
+    """The scenario in a table of plain values, every one of them checked.
+
+    Args:
+        source: the file or command line they come from, for the message.
+
+    Raises:
+        ConfigError: the first thing that is wrong.
+    """
+    try:
+        scenario = msgspec.convert(raw, Scenario)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {_explain(str(error), raw)}") from None
+    for key, given, expected in _contradictions(scenario):
+        raise ConfigError(f"{source}: {key}: got {given}, expected {expected}")
+    return scenario
+
+
+def to_table(scenario: Scenario) -> dict[str, Any]:
+    """The plain values of a scenario; `check` makes it of them again."""
+    table: dict[str, Any] = msgspec.to_builtins(scenario)
+    return table
+
+
+def to_toml(scenario: Scenario) -> bytes:
+    """The scenario as a file that `load` reads."""
+    return msgspec.toml.encode(scenario)
+
+
+def _read(name: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The raw table of a scenario, laid over those that it extends."""
+    if name in seen:
+        raise ConfigError(f"{seen[0]}: extends: got a circle of {' → '.join((*seen, name))}")
+    if name.endswith(".toml"):
+        path = Path(name)
+    elif name in names():
+        path = Path(str(resources.files("scenarios") / f"{name}.toml"))
+    else:
+        raise ConfigError(f"{name}: no such scenario{_hint(name, names())}")
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{name}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{name}: no valid TOML: {error}") from None
+    table = raw.get("reference")
+    if isinstance(table, dict) and isinstance(table.get("file"), str):
+        table["file"] = str((path.parent / table["file"]).absolute())
+    base = raw.pop("extends", None)
+    if base is None:
+        return raw
+    if not isinstance(base, str):
+        raise ConfigError(f"{name}: extends: got {base!r}, expected the name of a scenario")
+    if base.endswith(".toml"):
+        base = str(path.parent / base)
+    return _overlay(_read(base, (*seen, name)), raw)
+
+
+def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        both = isinstance(old, dict) and isinstance(value, dict)
+        merged[key] = _overlay(old, value) if both else value  # type: ignore[arg-type]
+    return merged
+
+
+def _hint(given: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(given, known, n=1)
+    return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known)}"
+
+
+_ERROR = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>[^`]*)`)?", re.DOTALL)
+
+
+def _explain(message: str, raw: Mapping[str, Any]) -> str:
+    """msgspec's message as `key: got …, expected …`."""
+    found = _ERROR.fullmatch(message)
+    assert found is not None
+    what, path = found["what"], found["path"] or ""
+    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what)
+    section, given = Scenario, raw
+    for part in filter(None, path.split(".")):
+        key, *index = part.replace("]", "").split("[")
+        given = given[key] if isinstance(given, Mapping) else given
+        for digits in index:
+            given = given[int(digits)] if digits.isdigit() else given
+        section = typing.get_type_hints(section).get(key, section)
+    if unknown:
+        prefix = f"{path}." if path else ""
+        return f"{prefix}{unknown[1]}: no such key{_hint(unknown[1], list(section.__struct_fields__))}"
+    if what.startswith("Invalid enum value"):
+        choices = " or ".join(repr(choice) for choice in typing.get_args(section))
+        return f"{path}: got {given!r}, expected {choices}"
+    expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
+    return f"{path or 'the scenario'}: got {given!r}, expected {expected}"
+
+
+def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
+    """Values that are right one by one and impossible together: key, given, expected."""
+    model, control, ref = scenario.model, scenario.control, scenario.reference
+    axes = model.axes
+    for key, values in (
+        ("model.tau_s", model.tau_s),
+        ("model.u_max", model.u_max),
+        ("vehicle.tau_s", scenario.vehicle.tau_s or (1.0,)),
+    ):
+        if len(values) not in (1, axes):
+            yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
+    start = scenario.vehicle.start_m
+    if start and len(start) != axes:
+        yield "vehicle.start_m", list(start), f"{axes} numbers with model.axes = {axes}"
+    if control.horizon * axes > INPUTS_MAX:
+        yield (
+            "control.horizon",
+            control.horizon,
+            f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram",
+        )
+    covered_s, delay_s = control.horizon * control.dt, scenario.network.uplink.mean_s
+    if covered_s < delay_s:
+        yield (
+            "control.horizon",
+            control.horizon,
+            f"horizon · dt (now {covered_s:g} s) to cover the uplink's mean delay of {delay_s:g} s",
+        )
+    if scenario.settle >= scenario.duration:
+        yield "settle", scenario.settle, f"less than the duration of {scenario.duration:g} s"
+    if scenario.link.timeout_s <= scenario.link.heartbeat_s:
+        yield (
+            "link.timeout_s",
+            scenario.link.timeout_s,
+            f"more than link.heartbeat_s = {scenario.link.heartbeat_s:g}",
+        )
+    wanted = {"waypoints": 2, "hover": 1}.get(ref.shape, 0)
+    if len(ref.points_m) < wanted:
+        yield "reference.points_m", list(ref.points_m), f"at least {wanted} with shape {ref.shape!r}"
+    for point in ref.points_m:
+        if len(point) != axes:
+            yield "reference.points_m", list(point), f"{axes} numbers a point"
+    route = ref.points_m + ref.points_m[:1] * ref.loop
+    if ref.shape == "waypoints" and any(a == b for a, b in zip(route, route[1:], strict=False)):
+        yield "reference.points_m", [list(p) for p in route], "no point twice in a row"
+    if ref.shape == "csv":
+        try:
+            scenario.make_reference()
+        except OSError as error:
+            yield "reference.file", repr(ref.file), f"a readable file ({error.strerror})"
+        except ValueError as error:
+            yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"

@@ -1,0 +1,106 @@
+"""What a process writes down about a flight: rows of one numpy structured type.
+
+Each process keeps its own part: the client what flew, the server what it thought, netem the fate of
+every packet. A part is a line of JSON that names the columns, then the rows as they are in memory.
+So a writer that is killed loses no more than its last row, and nothing is held in memory.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+Rows = NDArray[np.void]
+
+
+def client_columns(axes: int) -> np.dtype[np.void]:
+    """One row a step of the client."""
+    return np.dtype(
+        [
+            ("vehicle", "<u2"),
+            ("step", "<i8"),
+            ("state", "<f8", (axes, 2)),  # true position [m] and velocity [m/s]
+            ("input", "<f8", (axes,)),  # desired velocity that is flown from here on [m/s]
+            ("in_force", "<i8"),  # step that its horizon was made for, -1 for none
+            ("age_ns", "<i8"),  # since the observation behind that horizon, -1 for none
+            ("stale", "<i8"),  # horizons older than the one held, so far
+            ("missed", "<i8"),  # steps slept through, so far
+        ]
+    )
+
+
+def server_columns(axes: int) -> np.dtype[np.void]:
+    """One row a tick and vehicle of the server."""
+    return np.dtype(
+        [
+            ("vehicle", "<u2"),
+            ("step", "<i8"),
+            ("estimate", "<f8", (axes, 2)),  # x̂(k)
+            ("planned", "<f8", (axes, 2)),  # x_p(k|k-1)
+            ("input", "<f8", (axes,)),  # û(k)
+            ("observed_step", "<i8"),  # of the observation behind x̂
+            ("error", "<f8"),  # V(k)
+            ("threshold", "<f8"),  # S(k)
+            ("event", "?"),
+            ("solved", "?"),
+            ("solve_ns", "<i8"),  # both MPCs, all vehicles of the tick; -1 where not measured
+            ("stale", "<i8"),  # observations older than the newest, so far
+            ("missed", "<i8"),  # ticks slept through, so far
+        ]
+    )
+
+
+UPLINK, DOWNLINK = 0, 1
+
+PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
+    [
+        ("direction", "<u1"),  # UPLINK or DOWNLINK
+        ("flow", "<u4"),  # which client
+        ("number", "<u4"),  # of the packet in its flow and direction
+        ("bytes", "<u2"),  # UDP payload
+        ("arrived_ns", "<i8"),  # [netem's clock]
+        ("delay_ns", "<i8"),  # as drawn, also when lost
+        ("lost", "?"),
+        ("overtaken", "?"),  # by a later packet of the same flow
+    ]
+)
+"""One row a packet of netem."""
+
+
+class Recorder:
+    """Appends rows to a binary file, or to nothing."""
+
+    def __init__(self, columns: np.dtype[np.void], sink: BinaryIO | None = None) -> None:
+        self.columns = columns
+        self._sink = sink
+        if sink is not None:
+            sink.write(json.dumps(columns.descr).encode() + b"\n")
+
+    def append(self, count: int, **values: Any) -> None:
+        """`count` rows; each value is one for all of them, or an array with the rows first."""
+        if self._sink is None:
+            return
+        rows = np.zeros(count, self.columns)
+        for name, value in values.items():
+            rows[name] = value
+        self._sink.write(rows.tobytes())
+
+
+def parse(part: bytes) -> Rows:
+    """The rows of a part; half a row at its end (a killed writer's) is left out."""
+    header, _, body = part.partition(b"\n")
+    descr = [(name, kind, *map(tuple, shape)) for name, kind, *shape in json.loads(header)]
+    columns = np.dtype(descr)
+    return np.frombuffer(body[: len(body) - len(body) % columns.itemsize], columns)
+
+
+def read(path: Path) -> Rows:
+    """The rows of a part in a file.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no part.
+    """
+    return parse(path.read_bytes())

@@ -1,0 +1,140 @@
+"""Desired trajectories x_d(t): position and velocity at any time (E6: the paper names only position).
+
+A reference is a function of time since the epoch [s; any shape] that gives the desired state
+[m, m/s; that shape + (axes, 2)] in the world frame, metres, third axis up.
+"""
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Reference = Callable[[Array], Array]
+
+
+def _planar(
+    x: Callable[[Array], tuple[Array, Array]],
+    y: Callable[[Array], tuple[Array, Array]],
+    axes: int,
+    altitude_m: float,
+) -> Reference:
+    """A plane curve from (position, velocity) of x and of y; in 3-D at constant altitude."""
+
+    def sample(t: Array) -> Array:
+        t = np.asarray(t, dtype=np.float64)
+        state = np.zeros((*t.shape, axes, 2))
+        for axis, curve in zip(range(axes), (x, y), strict=False):
+            state[..., axis, 0], state[..., axis, 1] = curve(t)
+        if axes == 3:
+            state[..., 2, 0] = altitude_m
+        return state
+
+    return sample
+
+
+def circle(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
+    """Around the origin, counter-clockwise, from (radius, 0)."""
+    w = 2.0 * np.pi / period_s
+    return _planar(
+        lambda t: (radius_m * np.cos(w * t), -radius_m * w * np.sin(w * t)),
+        lambda t: (radius_m * np.sin(w * t), radius_m * w * np.cos(w * t)),
+        axes,
+        altitude_m,
+    )
+
+
+def figure_eight(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
+    """Gerono's lemniscate: 2 radii wide, 1 radius high, from the crossing."""
+    w = 2.0 * np.pi / period_s
+    return _planar(
+        lambda t: (radius_m * np.sin(w * t), radius_m * w * np.cos(w * t)),
+        lambda t: (
+            0.5 * radius_m * np.sin(2.0 * w * t),
+            radius_m * w * np.cos(2.0 * w * t),
+        ),
+        axes,
+        altitude_m,
+    )
+
+
+def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Reference:
+    """Straight lines between points reached at given times.
+
+    Args:
+        times_s: rising, from 0; shape (n,).
+        points_m: shape (n, axes).
+        loop: start again at the end; otherwise stop at the last point and stay.
+    """
+    times_s, points_m = np.asarray(times_s, float), np.asarray(points_m, float)
+    slopes = np.diff(points_m, axis=0) / np.diff(times_s)[:, None]
+
+    def sample(t: Array) -> Array:
+        t = np.asarray(t, dtype=np.float64)
+        t = np.mod(t, times_s[-1]) if loop else t
+        leg = np.clip(np.searchsorted(times_s, t, side="right") - 1, 0, len(slopes) - 1)
+        moving = (t >= times_s[0]) & (t < times_s[-1])
+        velocity = np.where(moving[..., None], slopes[leg], 0.0)
+        held = np.clip(t, times_s[0], times_s[-1])
+        position = points_m[leg] + slopes[leg] * (held - times_s[leg])[..., None]
+        return np.stack([position, velocity], axis=-1)
+
+    return sample
+
+
+def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Reference:
+    """Through the points at constant speed; `loop` flies back to the first, and on."""
+    points = np.asarray(points_m, dtype=np.float64)
+    if loop:
+        points = np.concatenate([points, points[:1]])
+    lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return timed_path(np.concatenate([[0.0], np.cumsum(lengths_m) / speed_mps]), points, loop=loop)
+
+
+def square(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
+    """Corners at (±radius, ±radius), one round a period, from (radius, -radius)."""
+    corners = np.zeros((4, axes))
+    corners[:, :2] = radius_m * np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]])
+    corners[:, 2:] = altitude_m
+    return waypoints(corners, 8.0 * radius_m / period_s, loop=True)
+
+
+def hover(point_m: Array) -> Reference:
+    """At one point, for ever; shape (axes,)."""
+    point = np.asarray(point_m, dtype=np.float64)
+
+    def sample(t: Array) -> Array:
+        t = np.asarray(t, dtype=np.float64)
+        state = np.zeros((*t.shape, len(point), 2))
+        state[..., 0] = point
+        return state
+
+    return sample
+
+
+def from_csv(path: Path, axes: int) -> Reference:
+    """From a table with the columns t [s], x, y, z [m] (as many as there are axes).
+
+    Raises:
+        ValueError: with what is wrong, and in which line.
+    """
+    names = ["t", "x", "y", "z"][: axes + 1]
+    with path.open(newline="") as file:
+        table = csv.DictReader(file)
+        missing = [name for name in names if name not in (table.fieldnames or ())]
+        if missing:
+            raise ValueError(f"line 1: expected the columns {', '.join(names)}")
+        rows = []
+        for line, row in enumerate(table, start=2):
+            try:
+                rows.append([float(row[name]) for name in names])
+            except (TypeError, ValueError):
+                raise ValueError(f"line {line}: expected {len(names)} numbers") from None
+    data = np.array(rows).reshape(-1, axes + 1)
+    if len(data) < 2 or not np.isfinite(data).all():
+        raise ValueError("expected at least two lines of finite numbers")
+    if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
+        raise ValueError("column t must start at 0 and rise from line to line")
+    return timed_path(data[:, 0], data[:, 1:])

@@ -1,0 +1,126 @@
+"""The figures of a flight, from the parts of its record. Their names are the product's vocabulary."""
+
+import msgspec
+import numpy as np
+
+from shared.config import Scenario
+from shared.model import Array
+from shared.record import DOWNLINK, UPLINK, Rows
+
+
+class Summary(msgspec.Struct, frozen=True, kw_only=True):
+    """One vehicle's flight; None is what was not measured or whose part of the record is absent."""
+
+    scenario: str
+    seed: int
+    duration_s: float
+    steps: int
+    """Flown by the client."""
+    rmse_x: float | None
+    """Position against the reference, from `settle` on [m]."""
+    rmse_y: float | None
+    rmse_z: float | None
+    """Only in 3-D."""
+    rmse_xy: float | None
+    event_ratio: float | None
+    """Share of the server's steps that sent a horizon."""
+    uplink_packets: int | None
+    """All that entered the network from the server, those it lost too."""
+    uplink_bytes: int | None
+    """Their UDP payload."""
+    downlink_packets: int | None
+    downlink_bytes: int | None
+    lost: int | None
+    """By the network, both ways."""
+    reordered: int | None
+    """Overtaken by a later packet, both ways."""
+    stale: int
+    """Discarded at either end because something newer had come before."""
+    age_ms_p50: float | None
+    """Age of the observation behind the input being flown, at each step."""
+    age_ms_p99: float | None
+    solve_ms_p50: float | None
+    """Both MPCs of a step, on the wall clock; never of a virtual flight."""
+    solve_ms_p99: float | None
+    deadline_misses: int
+    """Steps that the server or the client slept through."""
+    secure: bool = False
+    """Whether the link was authenticated and encrypted."""
+
+    def to_json(self) -> bytes:
+        """As one indented JSON object."""
+        return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
+
+
+def summarise(
+    scenario: Scenario,
+    name: str,
+    client: Rows,
+    server: Rows | None = None,
+    netem: Rows | None = None,
+) -> Summary:
+    """The summary of one vehicle's flight.
+
+    Args:
+        name: of the scenario.
+        client: its rows, of one vehicle.
+        server: rows of the server, of any vehicles.
+        netem: rows of netem; all flows count.
+    """
+    error = position_error(scenario, client)
+    squares = (error[client["step"] * scenario.control.dt >= scenario.settle] ** 2).mean(axis=0)
+    rmse = [float(value) for value in np.sqrt(squares)] if np.isfinite(squares).all() else []
+    age_ms = client["age_ns"][client["age_ns"] >= 0] / 1e6
+    stale, missed = _last(client, "stale"), _last(client, "missed")
+    event_ratio, solve_ms = None, np.empty(0)
+    if server is not None:
+        rows = server[np.isin(server["vehicle"], client["vehicle"])]
+        event_ratio = float(rows["event"].mean()) if len(rows) else None
+        solve_ms = rows["solve_ns"][rows["solve_ns"] >= 0] / 1e6
+        stale, missed = stale + _last(rows, "stale"), missed + _last(rows, "missed")
+    return Summary(
+        scenario=name,
+        seed=scenario.seed,
+        duration_s=len(client) * scenario.control.dt,
+        steps=len(client),
+        rmse_x=rmse[0] if rmse else None,
+        rmse_y=rmse[1] if rmse else None,
+        rmse_z=rmse[2] if len(rmse) == 3 else None,
+        rmse_xy=float(np.hypot(*rmse[:2])) if rmse else None,
+        event_ratio=event_ratio,
+        uplink_packets=_count(netem, UPLINK),
+        uplink_bytes=_bytes(netem, UPLINK),
+        downlink_packets=_count(netem, DOWNLINK),
+        downlink_bytes=_bytes(netem, DOWNLINK),
+        lost=None if netem is None else int(netem["lost"].sum()),
+        reordered=None if netem is None else int(netem["overtaken"].sum()),
+        stale=stale,
+        age_ms_p50=_quantile(age_ms, 0.5),
+        age_ms_p99=_quantile(age_ms, 0.99),
+        solve_ms_p50=_quantile(solve_ms, 0.5),
+        solve_ms_p99=_quantile(solve_ms, 0.99),
+        deadline_misses=missed,
+    )
+
+
+def position_error(scenario: Scenario, client: Rows) -> Array:
+    """Position minus reference at every step [m]; shape (steps, axes)."""
+    desired = scenario.make_reference()(client["step"] * scenario.control.dt)
+    error: Array = client["state"][..., 0] - desired[..., 0]
+    return error
+
+
+def _last(rows: Rows, name: str) -> int:
+    return int(rows[name][-1]) if len(rows) else 0
+
+
+def _count(netem: Rows | None, direction: int) -> int | None:
+    return None if netem is None else int((netem["direction"] == direction).sum())
+
+
+def _bytes(netem: Rows | None, direction: int) -> int | None:
+    return None if netem is None else int(netem["bytes"][netem["direction"] == direction].sum())
+
+
+def _quantile(values: Array, share: float) -> float | None:
+    return float(np.quantile(values, share)) if len(values) else None

@@ -1,0 +1,1 @@
+"""The same endpoints in virtual time."""

@@ -1,0 +1,127 @@
+"""Virtual time: any number of endpoints on one clock that jumps from event to event.
+
+Between endpoints a datagram takes no time (delays are netem's business, and netem is an endpoint
+here as well). Every host has a clock of its own, with offset and drift, and may take time to
+compute: it then hears nothing and sends nothing until it is done. Time is integer nanoseconds, so
+the same inputs give the same events in the same order, everywhere.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from heapq import heappop, heappush
+
+from shared.endpoint import Address, Datagram, Endpoint
+
+BILLION = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """A host's monotonic clock, as a function of the world's time."""
+
+    offset_ns: int = 0
+    drift_ppb: int = 0
+    """How much faster it runs than the world's [10⁻⁹]."""
+
+    def local(self, time_ns: int) -> int:
+        """What it shows at a time of the world."""
+        return self.offset_ns + time_ns * (BILLION + self.drift_ppb) // BILLION
+
+    def world(self, local_ns: int) -> int:
+        """The first time of the world at which it shows at least this."""
+        return -((self.offset_ns - local_ns) * BILLION // (BILLION + self.drift_ppb))
+
+
+@dataclass(slots=True)
+class Host:
+    """One endpoint in the world; its socket s has the address (name, s)."""
+
+    name: str
+    endpoint: Endpoint
+    clock: Clock
+    compute_ns: int
+    busy_until_ns: int = 0
+    armed_ns: int | None = None
+
+
+Event = Callable[[], None]
+
+ARRIVAL, WAKE = 0, 1
+"""At one instant, what has arrived is heard before anybody acts on the time."""
+
+
+class World:
+    """Hosts, and what happens to them."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+        self._hosts: dict[str, Host] = {}
+        self._events: list[tuple[int, int, int, Event]] = []
+        self._scheduled = 0
+
+    def add(
+        self, name: str, endpoint: Endpoint, *, clock: Clock = Clock(), compute_ns: int = 0
+    ) -> Address:
+        """A new host.
+
+        Args:
+            compute_ns: how long it works whenever it is woken.
+
+        Returns:
+            its address.
+        """
+        host = self._hosts[name] = Host(name, endpoint, clock, compute_ns)
+        self._arm(host)
+        return (name, 0)
+
+    def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
+        """Let time pass until a condition holds, or until a time of the world."""
+        while self._events and not until():
+            time_ns, _, _, event = heappop(self._events)
+            if time_ns > limit_ns:
+                return
+            self.now_ns = time_ns
+            event()
+
+    def _at(self, time_ns: int, order: int, event: Event) -> None:
+        self._scheduled += 1
+        heappush(self._events, (time_ns, order, self._scheduled, event))
+
+    def _arm(self, host: Host) -> None:
+        due_ns = host.endpoint.next_wake_ns()
+        if due_ns is None:
+            host.armed_ns = None
+            return
+        time_ns = max(self.now_ns, host.busy_until_ns, host.clock.world(due_ns))
+        if time_ns != host.armed_ns:
+            host.armed_ns = time_ns
+            self._at(time_ns, WAKE, lambda: self._wake(host, time_ns))
+
+    def _wake(self, host: Host, armed_ns: int) -> None:
+        if host.armed_ns != armed_ns:
+            return  # it has changed its mind since
+        host.armed_ns = None
+        host.endpoint.wake(now_ns=host.clock.local(self.now_ns))
+        host.busy_until_ns = self.now_ns + host.compute_ns
+        self._after(host)
+
+    def _receive(self, host: Host, datagram: Datagram) -> None:
+        if self.now_ns < host.busy_until_ns:
+            self._at(host.busy_until_ns, ARRIVAL, lambda: self._receive(host, datagram))
+            return
+        host.endpoint.receive(datagram, now_ns=host.clock.local(self.now_ns))
+        self._after(host)
+
+    def _after(self, host: Host) -> None:
+        """Its datagrams leave once it is done computing; then it waits again."""
+        leaves_ns = max(self.now_ns, host.busy_until_ns)
+        for payload, (name, socket), source in host.endpoint.outbox():
+            receiver = self._hosts.get(name)
+            if receiver is not None:
+                arrived = Datagram(payload, (host.name, source), socket)
+                self._at(leaves_ns, ARRIVAL, _delivery(self, receiver, arrived))
+        self._arm(host)
+
+
+def _delivery(world: World, receiver: Host, datagram: Datagram) -> Event:
+    return lambda: world._receive(receiver, datagram)

@@ -1,0 +1,66 @@
+"""The front door: the `skytether` command."""
+
+import difflib
+import sys
+from collections.abc import Callable, Sequence
+from importlib import metadata
+
+import client.__main__
+import netem.__main__
+import server.__main__
+from shared import command, config
+from skytether.fly import fly
+
+USAGE = """usage: skytether COMMAND ...
+
+Flies a UAV over a bad network: a server plans, a client flies, and netem, between them, delays,
+reorders and loses their packets.
+
+  fly [SCENARIO]        one flight, with everything it needs; the place to start
+  scenarios             what can be flown
+  server [SCENARIO]     one process by hand: plan for vehicles
+  netem [SCENARIO]      one process by hand: be the network
+  client [SCENARIO]     one process by hand: be a vehicle
+
+Each has a --help of its own. `skytether fly demo` flies a demonstration."""
+
+
+def list_scenarios(argv: Sequence[str]) -> None:
+    """Print the scenarios that come with Skytether, a line each."""
+    if argv:
+        raise command.CommandError(f"scenarios: got {argv[0]!r}, expected nothing", 2)
+    names = config.names()
+    width = max(map(len, names))
+    for name in names:
+        print(f"{name:{width}}  {config.load(name).title}")
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
+    "fly": lambda argv: command.main(fly, argv, "fly"),
+    "scenarios": lambda argv: command.main(list_scenarios, argv, "skytether"),
+    "server": server.__main__.main,
+    "netem": netem.__main__.main,
+    "client": client.__main__.main,
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    if not argv or argv[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0
+    name, *rest = argv
+    if name == "--version":
+        print(f"skytether {metadata.version('skytether')}")
+        return 0
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
+        print(f"skytether: no command {name!r}; {hint}", file=sys.stderr)
+        return command.CONFIGURATION
+    return COMMANDS[name](rest)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,103 @@
+"""`skytether fly`: one flight, over real UDP or in virtual time, and what came of it."""
+
+import asyncio
+import signal
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from lab import figures
+from shared import command, record
+from shared.command import CommandError, ScenarioFlags, ScenarioName
+from shared.config import Scenario, to_toml
+from shared.shell import new_event_loop
+from shared.summary import summarise
+from sim import flight
+from skytether import processes
+
+GRACE_S = 30.0
+"""How much longer than planned a flight may take, beside the time to connect."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Of `skytether fly`."""
+
+    scenario: ScenarioName = "demo"
+    """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    virtual: bool = False
+    """Fly in virtual time: the same endpoints, reproducible, many times faster."""
+    json: Path | None = None
+    """File for the summary of the flight."""
+    figure: Path | None = None
+    """File for a picture of it (.png, .pdf or .svg)."""
+    config: ScenarioFlags = Scenario()
+
+
+def fly(argv: Sequence[str]) -> None:
+    """Fly a scenario: server, netem and client as processes on loopback, or in virtual time.
+
+    Every key of the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight
+    and still shows what was flown.
+    """
+    options = command.parse(Options(), argv, "skytether fly", fly.__doc__)
+    scenario = options.config
+    if options.figure:
+        figures.check(options.figure)
+    where = "in virtual time" if options.virtual else "over UDP on loopback"
+    title = f"{options.scenario}, {where}, seed {scenario.seed}"
+    with Progress(
+        TextColumn(f"flying {title}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f} of {task.total:.0f} s"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    ) as progress:
+        task = progress.add_task("", total=scenario.duration)
+
+        def on_second(flown_s: float) -> None:
+            progress.update(task, completed=min(flown_s, scenario.duration))
+
+        flown = (_virtually if options.virtual else _really)(scenario, on_second)
+    if flown.failure:
+        raise CommandError(flown.failure)
+    if not len(flown.client):
+        raise CommandError("ended before the first step")
+    summary = summarise(scenario, options.scenario, flown.client, flown.server, flown.netem)
+    command.finish(summary, title, options.json)
+    if options.figure:
+        figures.flight(options.figure, scenario, {title: flown})
+
+
+def _virtually(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
+    return flight.fly(scenario, on_second=on_second)
+
+
+def _really(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
+    with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
+        parts = Path(folder)
+        file = parts / "scenario.toml"
+        file.write_bytes(to_toml(scenario))
+        timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
+
+        async def main() -> None:
+            task = asyncio.current_task()
+            assert task is not None
+            loop = asyncio.get_running_loop()
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.add_signal_handler(number, task.cancel)
+            try:
+                await processes.fly(file, parts, timeout_s=timeout_s, on_second=on_second)
+            except asyncio.CancelledError:
+                pass  # what was flown until now is there
+
+        with asyncio.Runner(loop_factory=new_event_loop) as runner:
+            runner.run(main())
+        return flight.Flight(
+            *(record.read(parts / part) for part in ("client", "server", "netem"))
+        )
