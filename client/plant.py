@@ -71,7 +71,7 @@ class FirstOrderPlant:
 
 
 def white_acceleration(tau_s: Array, dt_s: float) -> Array:
-    """Square root L of a step's covariance under unit white acceleration: L Lᵀ = ∫ e^{As}GGᵀe^{Aᵀs}.
+    """Square root L of a step's covariance under white acceleration, L Lᵀ = ∫ e^{As} G Gᵀ e^{Aᵀs}.
 
     With G = [0, 1], e^{As}G = [τ(1 - e^{-s/τ}), e^{-s/τ}], and the integrals over [0, Δt] follow.
 
@@ -87,4 +87,5 @@ def white_acceleration(tau_s: Array, dt_s: float) -> Array:
     positions = tau**2 * (dt_s - 2.0 * one + two)
     both = tau * (one - two)
     covariance = np.stack([np.stack([positions, both], -1), np.stack([both, two], -1)], -2)
-    return np.linalg.cholesky(covariance)
+    root: Array = np.linalg.cholesky(covariance).astype(np.float64)
+    return root

@@ -27,8 +27,7 @@ class Histogram:
     def add(self, value_ns: int) -> None:
         """Count one."""
         self.counts[min(value_ns // self.bin_ns, BINS - 1)] += 1
-        if value_ns > self.largest_ns:
-            self.largest_ns = value_ns
+        self.largest_ns = max(self.largest_ns, value_ns)
 
     def quantile_ms(self, share: float) -> float:
         """Upper edge of the bin in which this share of all lies below [ms]; 0 without any."""

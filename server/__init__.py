@@ -1,1 +1,1 @@
-"""The ground side: estimate the vehicle's state, plan, decide whether a horizon is worth a packet."""
+"""The ground side: estimate the vehicle's state, plan, decide when a horizon is worth a packet."""

@@ -147,9 +147,7 @@ class Server(Endpoint):
         return VEHICLES_MAX - len(self._sessions) - len(waiting)
 
     def _welcome(self, hello: Hello, session: int, address: Address, now_ns: int) -> None:
-        welcome = Welcome(
-            hello.vehicle, session, hello.boot_id, self._boot_id, now_ns, self._terms
-        )
+        welcome = Welcome(hello.vehicle, session, hello.boot_id, self._boot_id, now_ns, self._terms)
         self._out.append(Datagram(encode(welcome), address))
 
     def _observe(self, observation: Observation, address: Address, now_ns: int) -> None:
@@ -235,9 +233,7 @@ class Server(Endpoint):
             if now_ns - session.sent_ns >= self._heartbeat_ns:
                 self._send(session, Heartbeat(session.vehicle, session.session, now_ns), now_ns)
 
-    def _control(
-        self, sessions: list[Session], rows: Indices, step: Indices, now_ns: int
-    ) -> None:
+    def _control(self, sessions: list[Session], rows: Indices, step: Indices, now_ns: int) -> None:
         """Algorithms 1 and 2 of the paper, for the vehicles in `rows` at their steps k."""
         self._last_step[rows] = step
         estimate = self._estimator.estimate(rows, step)  # (13)

@@ -30,9 +30,7 @@ class Successive:
         self.states = np.zeros((capacity, axes, H, 2))
         """X(k-1), the states predicted with it."""
 
-    def solve(
-        self, rows: Indices, gap: Indices, fresh: Flags, x: Array, target: Array
-    ) -> Flags:
+    def solve(self, rows: Indices, gap: Indices, fresh: Flags, x: Array, target: Array) -> Flags:
         """{X(k), U(k)} ← MPC, eq. (10), into `states` and `inputs`.
 
         Args:

@@ -49,7 +49,8 @@ class OsqpSolver:
     """OSQP, set up once per axis; only vectors change afterwards."""
 
     def __init__(self, hessian: Array, u_max: Array) -> None:
-        """
+        """Set up.
+
         Args:
             hessian: shape (axes, H, H).
             u_max: bound of every input [m/s]; shape (axes,).

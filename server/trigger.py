@@ -33,7 +33,8 @@ class Trigger(Protocol):
     def test(
         self, rows: Indices, step: Indices, estimate: Array, planned: Array, fresh: Flags
     ) -> Verdict:
-        """
+        """The verdict on each.
+
         Args:
             rows: the vehicles; shape (n,).
             step: k of each; shape (n,).
@@ -58,7 +59,12 @@ class Always:
         self._P = control.terminal_weight
 
     def test(
-        self, rows: Indices, step: Indices, estimate: Array, planned: Array, fresh: Flags
+        self,
+        rows: Indices,
+        step: Indices,  # noqa: ARG002 - a `Trigger`'s, but it sends without looking
+        estimate: Array,
+        planned: Array,
+        fresh: Flags,  # noqa: ARG002
     ) -> Verdict:
         """See `Trigger`."""
         error = planning_error(estimate, planned, self._P)

@@ -42,9 +42,12 @@ class Options(Protocol):
     """The options of a command that is about a scenario."""
 
     @property
-    def scenario(self) -> str: ...
+    def scenario(self) -> str:
+        """Name or file of the scenario."""
+
     @property
-    def config(self) -> Scenario: ...
+    def config(self) -> Scenario:
+        """The scenario."""
 
 
 O = TypeVar("O", bound=Options)  # noqa: E741 - the options of one command
@@ -60,9 +63,13 @@ def parse(defaults: O, argv: Sequence[str], prog: str, help_: str | None) -> O:
     name = argv[0] if argv and not argv[0].startswith("-") else defaults.scenario
     try:
         while True:
-            options = replace(defaults, scenario=name, config=config.load(name))  # type: ignore[type-var]
+            default = replace(defaults, scenario=name, config=config.load(name))  # type: ignore[type-var]
             options = tyro.cli(
-                type(defaults), args=argv, default=options, prog=prog, description=cleandoc(help_ or "")
+                type(defaults),
+                args=argv,
+                default=default,
+                prog=prog,
+                description=cleandoc(help_ or ""),
             )
             if options.scenario == name:
                 break
@@ -121,8 +128,10 @@ def drive(
 
     def report() -> None:
         say(endpoint.report())
-        if shell.kernel_drops() or shell.send_errors:
-            say(f"{shell.kernel_drops()} datagrams dropped by the kernel, {shell.send_errors} unsent")
+        if drops := shell.kernel_drops():
+            say(f"{drops} datagrams dropped by the kernel: its receive buffer was full")
+        if shell.send_errors:
+            say(f"{shell.send_errors} datagrams could not be sent")
 
     run([shell], on_news=say, on_report=report)
     report()
@@ -160,10 +169,12 @@ def finish(summary: Summary, title: str, json: Path | None) -> None:
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
     s = summary
+    rmse_m = ", ".join(_number(value, ".4f") for value in (s.rmse_x, s.rmse_y, s.rmse_xy))
+    solve_ms = ", ".join(_number(value, ".2f") for value in (s.solve_ms_p50, s.solve_ms_p99))
     height = [("RMSE z [m]", _number(s.rmse_z, ".4f"))] if s.rmse_z is not None else []
     return [
         ("steps", f"{s.steps} in {s.duration_s:g} s"),
-        ("RMSE x, y, xy [m]", ", ".join(_number(v, ".4f") for v in (s.rmse_x, s.rmse_y, s.rmse_xy))),
+        ("RMSE x, y, xy [m]", rmse_m),
         *height,
         ("event ratio", _number(s.event_ratio, ".3f")),
         ("uplink", f"{_number(s.uplink_packets)} packets, {_number(s.uplink_bytes)} bytes"),
@@ -171,7 +182,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ("lost, reordered", f"{_number(s.lost)}, {_number(s.reordered)} packets"),
         ("discarded as stale", f"{s.stale} packets"),
         ("age p50, p99 [ms]", f"{_number(s.age_ms_p50, '.0f')}, {_number(s.age_ms_p99, '.0f')}"),
-        ("solve p50, p99 [ms]", f"{_number(s.solve_ms_p50, '.2f')}, {_number(s.solve_ms_p99, '.2f')}"),
+        ("solve p50, p99 [ms]", solve_ms),
         ("deadline misses", str(s.deadline_misses)),
     ]
 

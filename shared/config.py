@@ -10,6 +10,7 @@ import tomllib
 import typing
 from collections.abc import Mapping
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -34,7 +35,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """A table of the scenario."""
 
 
-class ModelConfig(Section):
+class ModelConfig(Section, frozen=True):
     """The UAV as both ends know it, eq. (1)-(6)."""
 
     axes: Literal[2, 3] = 2
@@ -45,7 +46,7 @@ class ModelConfig(Section):
     """Largest desired velocity [m/s]: one for all axes, or one each."""
 
 
-class ControlConfig(Section):
+class ControlConfig(Section, frozen=True):
     """The server's planning, eq. (5)-(16)."""
 
     dt: Annotated[float, Meta(ge=0.001, le=1)] = 0.05
@@ -72,7 +73,7 @@ class ControlConfig(Section):
     """Let R weigh u - v_ref instead of u, so that it does not ask for standing still."""
 
 
-class ReferenceConfig(Section):
+class ReferenceConfig(Section, frozen=True):
     """The desired trajectory."""
 
     shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
@@ -93,7 +94,7 @@ class ReferenceConfig(Section):
     """CSV file with the columns t, x, y (and z), relative to the scenario's own folder."""
 
 
-class VehicleConfig(Section):
+class VehicleConfig(Section, frozen=True):
     """The simulated UAV and what it does without fresh orders."""
 
     exhausted: Literal["hold", "brake"] = "brake"
@@ -114,7 +115,7 @@ class VehicleConfig(Section):
     """Length of a gust [s]."""
 
 
-class DirectionConfig(Section):
+class DirectionConfig(Section, frozen=True):
     """One direction of the network."""
 
     delay: Literal["paper", "constant", "none"] = "paper"
@@ -135,7 +136,7 @@ class DirectionConfig(Section):
         return 0.0 if self.delay == "none" else self.minimum_s + jitter_s
 
 
-class NetworkConfig(Section):
+class NetworkConfig(Section, frozen=True):
     """What netem does to packets."""
 
     uplink: DirectionConfig = DirectionConfig()
@@ -144,7 +145,7 @@ class NetworkConfig(Section):
     """Vehicle to server."""
 
 
-class LinkConfig(Section):
+class LinkConfig(Section, frozen=True):
     """How a session is kept."""
 
     heartbeat_s: Positive = 0.1
@@ -155,7 +156,7 @@ class LinkConfig(Section):
     """How long the vehicle waits for its first session before it gives up [s]."""
 
 
-class SimulationConfig(Section):
+class SimulationConfig(Section, frozen=True):
     """What only virtual time has to be told."""
 
     compute_s: NonNegative = 0.001
@@ -166,7 +167,7 @@ class SimulationConfig(Section):
     """How much faster the vehicle's clock runs [ppm]."""
 
 
-class Scenario(Section):
+class Scenario(Section, frozen=True):
     """Everything about a flight."""
 
     title: str = ""
@@ -229,9 +230,7 @@ class Scenario(Section):
         points = np.array(config.points_m, dtype=np.float64)
         match config.shape:
             case "circle":
-                return shapes.circle(
-                    config.radius_m, config.period_s, axes, config.altitude_m
-                )
+                return shapes.circle(config.radius_m, config.period_s, axes, config.altitude_m)
             case "figure-eight":
                 return shapes.figure_eight(
                     config.radius_m, config.period_s, axes, config.altitude_m
@@ -336,6 +335,16 @@ def _hint(given: str, known: list[str]) -> str:
     return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known)}"
 
 
+_PLAIN = {
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "str": "a text",
+    "array": "a list",
+    "object": "a table",
+}
+"""msgspec's words in a scenario's."""
+
 _ERROR = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>[^`]*)`)?", re.DOTALL)
 
 
@@ -354,58 +363,59 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
         section = typing.get_type_hints(section).get(key, section)
     if unknown:
         prefix = f"{path}." if path else ""
-        return f"{prefix}{unknown[1]}: no such key{_hint(unknown[1], list(section.__struct_fields__))}"
+        hint = _hint(unknown[1], list(section.__struct_fields__))
+        return f"{prefix}{unknown[1]}: no such key{hint}"
     if what.startswith("Invalid enum value"):
         choices = " or ".join(repr(choice) for choice in typing.get_args(section))
         return f"{path}: got {given!r}, expected {choices}"
     expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
+    for theirs, ours in _PLAIN.items():
+        expected = re.sub(rf"^{theirs}\b", ours, expected)
     return f"{path or 'the scenario'}: got {given!r}, expected {expected}"
 
 
 def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
     """Values that are right one by one and impossible together: key, given, expected."""
-    model, control, ref = scenario.model, scenario.control, scenario.reference
+    model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
     axes = model.axes
     for key, values in (
         ("model.tau_s", model.tau_s),
         ("model.u_max", model.u_max),
-        ("vehicle.tau_s", scenario.vehicle.tau_s or (1.0,)),
+        ("vehicle.tau_s", vehicle.tau_s or (1.0,)),
     ):
         if len(values) not in (1, axes):
             yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
-    start = scenario.vehicle.start_m
-    if start and len(start) != axes:
-        yield "vehicle.start_m", list(start), f"{axes} numbers with model.axes = {axes}"
+    if len(vehicle.start_m) not in (0, axes):
+        yield "vehicle.start_m", list(vehicle.start_m), f"{axes} numbers with model.axes = {axes}"
     if control.horizon * axes > INPUTS_MAX:
-        yield (
-            "control.horizon",
-            control.horizon,
-            f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram",
-        )
+        most = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
+        yield "control.horizon", control.horizon, most
     covered_s, delay_s = control.horizon * control.dt, scenario.network.uplink.mean_s
     if covered_s < delay_s:
-        yield (
-            "control.horizon",
-            control.horizon,
-            f"horizon · dt (now {covered_s:g} s) to cover the uplink's mean delay of {delay_s:g} s",
+        cover = (
+            f"horizon · dt (now {covered_s:g} s) to cover the uplink's mean delay, {delay_s:g} s"
         )
+        yield "control.horizon", control.horizon, cover
     if scenario.settle >= scenario.duration:
         yield "settle", scenario.settle, f"less than the duration of {scenario.duration:g} s"
-    if scenario.link.timeout_s <= scenario.link.heartbeat_s:
-        yield (
-            "link.timeout_s",
-            scenario.link.timeout_s,
-            f"more than link.heartbeat_s = {scenario.link.heartbeat_s:g}",
-        )
-    wanted = {"waypoints": 2, "hover": 1}.get(ref.shape, 0)
-    if len(ref.points_m) < wanted:
-        yield "reference.points_m", list(ref.points_m), f"at least {wanted} with shape {ref.shape!r}"
+    link = scenario.link
+    if link.timeout_s <= link.heartbeat_s:
+        yield "link.timeout_s", link.timeout_s, f"more than link.heartbeat_s = {link.heartbeat_s:g}"
+    yield from _no_reference(scenario)
+
+
+def _no_reference(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
+    """Why the desired trajectory cannot be made: key, given, expected."""
+    ref, axes = scenario.reference, scenario.model.axes
+    least = {"waypoints": 2, "hover": 1}.get(ref.shape, 0)
+    if len(ref.points_m) < least:
+        yield "reference.points_m", list(ref.points_m), f"at least {least} with shape {ref.shape!r}"
     for point in ref.points_m:
         if len(point) != axes:
             yield "reference.points_m", list(point), f"{axes} numbers a point"
     route = ref.points_m + ref.points_m[:1] * ref.loop
-    if ref.shape == "waypoints" and any(a == b for a, b in zip(route, route[1:], strict=False)):
-        yield "reference.points_m", [list(p) for p in route], "no point twice in a row"
+    if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
+        yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
     if ref.shape == "csv":
         try:
             scenario.make_reference()

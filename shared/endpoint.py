@@ -29,7 +29,7 @@ class Datagram(NamedTuple):
     peer: Address
     """Who sent it, or for whom it is."""
     socket: int = 0
-    """Which of the endpoint's own sockets it came in by or leaves by; 0 is the one that is bound."""
+    """Which of the endpoint's own sockets it uses; 0 is the one that is bound."""
 
 
 class Endpoint(ABC):

@@ -33,7 +33,7 @@ INPUTS_MAX = 288
 """Inputs of all axes in one horizon: what fits beside the other fields."""
 
 INPUT_TOLERANCE = 1.001
-"""How far over its bound an input may be (float32 rounds): beyond it the whole packet is refused."""
+"""How far over its bound an input may be (float32 rounds) before the packet is refused."""
 
 NO_HORIZON = -1
 """`Observation.in_force` while no horizon has arrived yet."""

@@ -1,4 +1,4 @@
-"""Desired trajectories x_d(t): position and velocity at any time (E6: the paper names only position).
+"""Desired trajectories x_d(t): position and velocity at any time (E6: the paper has positions).
 
 A reference is a function of time since the epoch [s; any shape] that gives the desired state
 [m, m/s; that shape + (axes, 2)] in the world frame, metres, third axis up.
@@ -7,12 +7,13 @@ A reference is a function of time since the epoch [s; any shape] that gives the 
 import csv
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Reference = Callable[[Array], Array]
+Reference = Callable[[NDArray[Any]], Array]
 
 
 def _planar(

@@ -113,8 +113,9 @@ class Shell:
                 break
             except OSError:  # an earlier packet of ours found the peer's port closed
                 continue
-            peer = self._named.get(peer, peer)
-            endpoint.receive(Datagram(payload, peer, number), now_ns=time.monotonic_ns())
+            sender: Address = self._named.get(peer, peer)
+            datagram = Datagram(payload, sender, number)
+            endpoint.receive(datagram, now_ns=time.monotonic_ns())
         self._after()
 
     def _wake(self) -> None:

@@ -1,4 +1,6 @@
-"""The figures of a flight, from the parts of its record. Their names are the product's vocabulary."""
+"""The figures of a flight, from the parts of its record; their names are used everywhere."""
+
+import math
 
 import msgspec
 import numpy as np
@@ -86,7 +88,7 @@ def summarise(
         rmse_x=rmse[0] if rmse else None,
         rmse_y=rmse[1] if rmse else None,
         rmse_z=rmse[2] if len(rmse) == 3 else None,
-        rmse_xy=float(np.hypot(*rmse[:2])) if rmse else None,
+        rmse_xy=math.hypot(*rmse[:2]) if rmse else None,
         event_ratio=event_ratio,
         uplink_packets=_count(netem, UPLINK),
         uplink_bytes=_bytes(netem, UPLINK),

@@ -65,12 +65,14 @@ class KernelTimer:
         self._callback()
 
     def set(self, due_ns: int | None) -> None:
+        """See `Timer`."""
         # An absolute time of zero would disarm; one nanosecond is as long past as any other.
         due_ns = 0 if due_ns is None else max(due_ns, 1)
         self._spec.value_s, self._spec.value_ns = divmod(due_ns, SECOND_NS)
         self._settime(self._fd, _TFD_TIMER_ABSTIME, ctypes.byref(self._spec), None)
 
     def close(self) -> None:
+        """See `Timer`."""
         self._loop.remove_reader(self._fd)
         os.close(self._fd)
 
@@ -84,12 +86,14 @@ class LoopTimer:
         self._handle: asyncio.TimerHandle | None = None
 
     def set(self, due_ns: int | None) -> None:
+        """See `Timer`."""
         self.close()
         if due_ns is not None:
             delay_s = max(0, due_ns - time.monotonic_ns()) / SECOND_NS
             self._handle = self._loop.call_later(delay_s, self._callback)
 
     def close(self) -> None:
+        """See `Timer`."""
         if self._handle is not None:
             self._handle.cancel()
             self._handle = None

@@ -97,4 +97,5 @@ def fly(
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
     world.run(over, limit_ns=seconds_to_ns(longest_s))
     failure = next((client.failure for client in clients if client.failure), None)
-    return Flight(*(parse(sink.getvalue()) for sink in sinks), failure=failure)
+    client_rows, server_rows, netem_rows = (parse(sink.getvalue()) for sink in sinks)
+    return Flight(client_rows, server_rows, netem_rows, failure)

@@ -1,6 +1,7 @@
 """`skytether fly`: one flight, over real UDP or in virtual time, and what came of it."""
 
 import asyncio
+import contextlib
 import signal
 import tempfile
 from collections.abc import Callable, Sequence
@@ -91,13 +92,10 @@ def _really(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Fl
             loop = asyncio.get_running_loop()
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.add_signal_handler(number, task.cancel)
-            try:
+            with contextlib.suppress(asyncio.CancelledError):  # what was flown until now is there
                 await processes.fly(file, parts, timeout_s=timeout_s, on_second=on_second)
-            except asyncio.CancelledError:
-                pass  # what was flown until now is there
 
         with asyncio.Runner(loop_factory=new_event_loop) as runner:
             runner.run(main())
-        return flight.Flight(
-            *(record.read(parts / part) for part in ("client", "server", "netem"))
-        )
+        client, server, netem = (record.read(parts / part) for part in processes.NAMES)
+        return flight.Flight(client, server, netem)

@@ -13,6 +13,9 @@ from pathlib import Path
 from shared.command import CommandError
 from shared.endpoint import Address
 
+NAMES = ("client", "server", "netem")
+"""Of the processes, and of their parts of the record."""
+
 START_S = 30.0
 """How long a process may take to say what it listens on."""
 STOP_S = 5.0

@@ -1,0 +1,50 @@
+# Everything runs in .venv, made from requirements.lock; only python3 with venv, make and a compiler
+# need to be there.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.ready
+COMPILE := $(BIN)/pip-compile --quiet --strip-extras --generate-hashes --allow-unsafe --no-header \
+	--no-emit-index-url --no-emit-trusted-host --no-emit-find-links
+
+.PHONY: setup demo test check format lock docker-test bench clean
+
+setup: $(STAMP)  ## the environment alone
+
+$(STAMP): requirements.lock requirements-dev.lock pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes \
+		-r requirements.lock -r requirements-dev.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $@
+
+demo: setup  ## fly the demonstration
+	$(BIN)/skytether fly demo --figure demo.png
+	@echo "The flight is drawn in demo.png."
+
+test: setup  ## everything but Docker, in under five minutes
+	$(BIN)/pytest -q -m "not docker"
+
+check: setup  ## style, types, and who imports whom
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: setup  ## as `check` wants it
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+docker-test: setup  ## the three containers, and what they survive; needs a Docker engine
+	$(BIN)/pytest -q -rs -m docker
+
+bench: setup  ## netem's accuracy beside the machine's own
+	$(BIN)/python benchmarks/netem.py
+
+lock:  ## pin what pyproject.toml asks for
+	$(BIN)/pip install --quiet pip-tools
+	$(COMPILE) --upgrade --output-file requirements.lock pyproject.toml
+	$(COMPILE) --upgrade --extra dev --constraint requirements.lock \
+		--output-file requirements-dev.lock pyproject.toml
+
+clean:
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
