@@ -113,7 +113,7 @@ class Shell:
                 break
             except OSError:  # an earlier packet of ours found the peer's port closed
                 continue
-            sender: Address = self._named.get(peer, peer)
+            sender: Address = self._named.get(peer) or peer
             datagram = Datagram(payload, sender, number)
             endpoint.receive(datagram, now_ns=time.monotonic_ns())
         self._after()
