@@ -132,8 +132,11 @@ class Server(Endpoint):
             if session is not None and session.boot_id == hello.boot_id:
                 self._welcome(hello, session.session, address, now_ns)
                 return
-        if hello.vehicle not in self._sessions and self._room() == 0:
-            raise ProtocolError("no room for another vehicle")
+        taken = self._sessions.keys() | self._welcomed.keys()
+        if hello.vehicle not in taken and len(taken) >= VEHICLES_MAX:
+            if not self._welcomed:
+                raise ProtocolError("no room for another vehicle")
+            del self._welcomed[next(iter(self._welcomed))]  # the oldest that never came
         # The session of an earlier life goes on until this one proves to be heard.
         self._opened += 1
         number = (self._boot_id + self._opened) % 2**32
@@ -141,10 +144,6 @@ class Server(Endpoint):
             hello.vehicle, number, hello.boot_id, -1, address, now_ns, now_ns
         )
         self._welcome(hello, number, address, now_ns)
-
-    def _room(self) -> int:
-        waiting = self._welcomed.keys() - self._sessions.keys()
-        return VEHICLES_MAX - len(self._sessions) - len(waiting)
 
     def _welcome(self, hello: Hello, session: int, address: Address, now_ns: int) -> None:
         welcome = Welcome(hello.vehicle, session, hello.boot_id, self._boot_id, now_ns, self._terms)
@@ -210,15 +209,14 @@ class Server(Endpoint):
         self._expire(now_ns)
         if self._sessions:
             self._tick(tick_ns, now_ns)
-        elif not self._welcomed:
+        else:
             self._due_ns = None
 
     def _expire(self, now_ns: int) -> None:
-        for known in (self._sessions, self._welcomed):
-            for session in list(known.values()):
-                if now_ns - session.heard_ns > SESSION_NS:
-                    del known[session.vehicle]
-                    self._news.append(f"vehicle {session.vehicle} is gone")
+        for session in list(self._sessions.values()):
+            if now_ns - session.heard_ns > SESSION_NS:
+                del self._sessions[session.vehicle]
+                self._news.append(f"vehicle {session.vehicle} is gone")
 
     def _tick(self, tick_ns: int, now_ns: int) -> None:
         sessions = list(self._sessions.values())

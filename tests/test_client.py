@@ -1,0 +1,263 @@
+"""The client as an endpoint: session, steps on its own grid, and flying on alone."""
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+
+from client.plant import FirstOrderPlant
+from client.vehicle import HELLO_NS, Client
+from shared import config
+from shared.chance import stream
+from shared.config import Scenario
+from shared.endpoint import SECOND_NS, Address, Datagram
+from shared.protocol import (
+    NO_HORIZON,
+    Heartbeat,
+    Hello,
+    Horizon,
+    Message,
+    Observation,
+    Terms,
+    Welcome,
+    decode,
+    encode,
+)
+from shared.record import Recorder, Rows, client_columns, parse
+
+SERVER: Address = ("server", 0)
+
+
+def scenario(**changes: Any) -> Scenario:
+    """A short flight of the paper's, with some keys changed."""
+    table = config.to_table(config.load("paper-every-step")) | {"duration": 10.0}
+    for section, values in changes.items():
+        table[section] |= values
+    return config.check(table, "test")
+
+
+class Server:
+    """A client, and a server that says to it exactly what a test wants it to."""
+
+    def __init__(self, flown: Scenario) -> None:
+        self.terms = flown.terms()
+        self.dt_ns = flown.dt_ns
+        self.sink = io.BytesIO()
+        self.client = Client(
+            flown,
+            FirstOrderPlant(flown, stream(1, "wind")),
+            server=SERVER,
+            vehicle=4,
+            boot_id=99,
+            recorder=Recorder(client_columns(flown.model.axes), self.sink),
+        )
+        self.now_ns = 5 * SECOND_NS
+        self.session = 7
+
+    def wake(self) -> list[Message]:
+        """Time passes until the client wants to be woken; what it then says."""
+        due_ns = self.client.next_wake_ns()
+        assert due_ns is not None
+        self.now_ns = max(self.now_ns, due_ns)
+        self.client.wake(now_ns=self.now_ns)
+        said = self.client.outbox()
+        assert {datagram.peer for datagram in said} <= {SERVER}
+        return [decode(datagram.payload, self.terms) for datagram in said]
+
+    def say(self, message: Message) -> None:
+        """One datagram to the client."""
+        self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
+
+    def welcome(
+        self, *, boot_id: int = 99, server_boot_id: int = 1, terms: Terms | None = None
+    ) -> None:
+        """Open a session."""
+        self.say(Welcome(4, self.session, boot_id, server_boot_id, 1234, terms or self.terms))
+
+    def horizon(self, step: int, value: float, *, observed_ns: int = 0) -> None:
+        """A horizon of one constant input."""
+        inputs = np.full((self.terms.axes, self.terms.horizon), value, np.float32)
+        self.say(Horizon(4, self.session, step, 5678, observed_ns, inputs))
+
+    def rows(self) -> Rows:
+        """The record so far."""
+        return parse(self.sink.getvalue())
+
+
+def flying(**changes: Any) -> Server:
+    """A server that has just welcomed its client."""
+    server = Server(scenario(**changes))
+    assert [type(message) for message in server.wake()] == [Hello]
+    server.welcome()
+    return server
+
+
+def test_hello_is_repeated_until_somebody_answers() -> None:
+    """Once a second, with the terms of the scenario."""
+    server = Server(scenario())
+    said = []
+    for second in range(4):
+        assert server.client.next_wake_ns() == (0 if second == 0 else server.now_ns + HELLO_NS)
+        said += server.wake()
+    assert said == [Hello(4, 99, server.terms)] * 4
+
+
+def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
+    """After `link.connect_s`, before it has flown at all."""
+    server = Server(scenario())
+    for _ in range(30):
+        if server.client.finished:
+            break
+        server.wake()
+    assert server.client.failure == "no answer from server:0 in 16 s"
+    assert server.client.next_wake_ns() is None
+
+
+def test_another_scenario_at_the_server_ends_the_client_with_the_difference() -> None:
+    """Flying with other terms than the server's would be flying blind."""
+    server = Server(scenario())
+    server.wake()
+    server.welcome(terms=server.terms._replace(dt_ns=20_000_000))
+    assert server.client.finished
+    expected = "the server flies another scenario: dt_ns 20000000 against 50000000"
+    assert server.client.failure == expected
+
+
+def test_the_epoch_is_the_moment_the_session_opens() -> None:
+    """Step k is observed at epoch + k Δt exactly, however late the timer is."""
+    server = flying()
+    epoch_ns = server.now_ns
+    (first,) = server.wake()
+    server.now_ns += server.dt_ns + 3_000_000
+    (second,) = server.wake()
+    assert isinstance(first, Observation)
+    assert isinstance(second, Observation)
+    assert (first.step, first.stamp_ns, first.in_force) == (0, epoch_ns, NO_HORIZON)
+    assert (second.step, second.stamp_ns) == (1, epoch_ns + server.dt_ns)
+    assert server.client.next_wake_ns() == epoch_ns + 2 * server.dt_ns
+
+
+def test_every_observation_echoes_the_newest_word_of_the_server() -> None:
+    """Its stamp, and when it came: the server's only way to know our clock."""
+    server = flying()
+    welcomed_ns = server.now_ns
+    (first,) = server.wake()
+    server.now_ns += 7_000_000
+    server.say(Heartbeat(4, 7, 4321))
+    heard_ns = server.now_ns
+    (second,) = server.wake()
+    assert isinstance(first, Observation)
+    assert isinstance(second, Observation)
+    assert (first.server_ns, first.received_ns) == (1234, welcomed_ns)
+    assert (second.server_ns, second.received_ns) == (4321, heard_ns)
+
+
+def test_the_vehicle_hovers_until_its_first_horizon() -> None:
+    """Zero desired velocity, and an observation at every step all the same."""
+    server = flying()
+    for step in range(5):
+        (said,) = server.wake()
+        assert isinstance(said, Observation)
+        assert said.step == step
+    assert np.abs(server.rows()["input"]).max() == 0.0
+    assert np.ptp(server.rows()["state"], axis=0).max() == 0.0
+
+
+def test_an_input_is_flown_from_the_step_after_it_came() -> None:
+    """Applied at the next step, felt in the state one step later."""
+    server = flying()
+    server.wake()
+    server.horizon(0, 1.0, observed_ns=server.now_ns)
+    for _ in range(3):
+        server.wake()
+    rows = server.rows()
+    assert rows["input"][:, 0].tolist() == [0.0, 1.0, 1.0, 1.0]
+    assert rows["in_force"].tolist() == [NO_HORIZON, 0, 0, 0]
+    velocity = rows["state"][:, 0, 1]
+    assert velocity[:2].tolist() == [0.0, 0.0]
+    assert velocity[2] == pytest.approx(1 - np.exp(-0.05 / 0.81), abs=1e-12)
+    assert rows["age_ns"].tolist() == [-1, *(n * server.dt_ns for n in (1, 2, 3))]
+
+
+def test_steps_slept_through_are_flown_with_the_old_input_and_counted() -> None:
+    """The actuator holds what it was told last; only the present step is observed."""
+    server = flying()
+    server.wake()
+    server.horizon(0, 1.0)
+    server.wake()
+    server.now_ns += 4 * server.dt_ns
+    (late,) = server.wake()
+    assert isinstance(late, Observation)
+    assert late.step == 5
+    assert server.client.missed == 3
+    tau, held_s = 0.81, 4 * 0.05
+    assert late.state[0, 1] == pytest.approx(1 - np.exp(-held_s / tau), abs=1e-12)
+
+
+def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
+    """HELLO beside the observations; a heartbeat ends the calling, the epoch stays."""
+    server = flying(link={"heartbeat_s": 0.1, "timeout_s": 1.0})
+    epoch_ns = server.now_ns
+    said = [message for _ in range(65) for message in server.wake()]
+    hellos = [message for message in said if isinstance(message, Hello)]
+    assert len(said) - len(hellos) == 65
+    assert len(hellos) == 3
+    assert server.client.news()[-1] == "the server is silent"
+    server.say(Heartbeat(4, 7, 1))
+    assert server.client.news() == ["the server is heard again"]
+    (only,) = server.wake()
+    assert isinstance(only, Observation)
+    assert only.stamp_ns == epoch_ns + 65 * server.dt_ns
+
+
+def test_a_restarted_server_is_flown_with_in_its_new_session() -> None:
+    """What the old session still sends is dropped; steps go on."""
+    server = flying()
+    server.wake()
+    server.session = 8
+    server.welcome(server_boot_id=2)
+    (said,) = server.wake()
+    assert isinstance(said, Observation)
+    assert (said.session, said.step) == (8, 1)
+    assert "the server has restarted" in server.client.news()
+    server.session = 7
+    server.horizon(1, 1.0)
+    assert server.client.counts == {"dropped: unknown session": 1}
+
+
+def test_an_answer_to_another_life_is_dropped() -> None:
+    """The boot id tells them apart."""
+    server = Server(scenario())
+    server.wake()
+    server.welcome(boot_id=98)
+    assert server.client.counts == {"dropped: for another life": 1}
+    assert [type(message) for message in server.wake()] == [Hello]
+
+
+def test_the_flight_ends_after_its_duration() -> None:
+    """As many steps as fit, then no more wakes."""
+    server = flying()
+    for _ in range(200):
+        assert not server.client.finished
+        server.wake()
+    assert server.client.finished
+    assert server.client.next_wake_ns() is None
+    assert server.rows()["step"].tolist() == list(range(200))
+
+
+def test_an_exhausted_horizon_brakes_or_holds() -> None:
+    """As the scenario says: the paper's flies on for ever, others come to hover."""
+    speeds = {}
+    for exhausted in ("hold", "brake"):
+        server = flying(vehicle={"exhausted": exhausted})
+        server.wake()
+        server.horizon(0, 1.0)
+        for _ in range(100):
+            server.wake()
+        speeds[exhausted] = server.rows()["input"][:, 0]
+    assert speeds["hold"][-1] == 1.0
+    # H = 40 inputs of 1 m/s on two axes, then 2 m/s² against a speed of √2 m/s.
+    expected = np.maximum(0.0, 1.0 - np.arange(1, 61) * 2.0 * 0.05 / np.sqrt(2.0))
+    np.testing.assert_allclose(speeds["brake"][40:100], expected, atol=1e-9)
+    assert speeds["brake"][-1] == 0.0

@@ -1,0 +1,198 @@
+"""Whole flights in virtual time: reproducible, and as good as they are said to be."""
+
+import os
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shared import config
+from shared.config import Scenario
+from shared.record import DOWNLINK, UPLINK
+from shared.summary import Summary, summarise
+from sim.flight import Flight, fly
+
+
+def scenario(name: str, **changes: Any) -> Scenario:
+    """A packaged scenario with some keys changed."""
+    table = config.to_table(config.load(name))
+    for key, value in changes.items():
+        table[key] = table[key] | value if isinstance(value, dict) else value
+    return config.check(table, "test")
+
+
+def summary(flown: Scenario, flight: Flight) -> Summary:
+    """Of a flight's three parts."""
+    return summarise(flown, "test", flight.client, flight.server, flight.netem)
+
+
+QUIET = {
+    "uplink": {"delay": "none", "loss": 0.0},
+    "downlink": {"delay": "none", "loss": 0.0},
+}
+"""A network that does nothing."""
+
+HASH = """
+from shared import config
+from sim.flight import fly
+import msgspec
+flown = msgspec.structs.replace(config.load("paper"), duration=8.0, seed=5)
+print(fly(flown).trace_hash())
+"""
+
+
+def test_the_same_seed_flies_the_same_in_other_processes_and_hash_seeds() -> None:
+    """To the last bit of the record."""
+    hashes = set()
+    for hash_seed in ("0", "1"):
+        environment = os.environ | {"PYTHONHASHSEED": hash_seed}
+        run = subprocess.run(
+            [sys.executable, "-c", HASH], env=environment, capture_output=True, check=True
+        )
+        hashes.add(run.stdout.decode().strip())
+    hashes.add(fly(scenario("paper", duration=8.0, seed=5)).trace_hash())
+    assert len(hashes) == 1
+    assert fly(scenario("paper", duration=8.0, seed=6)).trace_hash() not in hashes
+
+
+def test_compensation_is_worth_a_factor_of_two_and_a_half() -> None:
+    """The paper's claim, over ten seeds: without compensation the error is 2.5 times as large."""
+    error = {}
+    for name in ("paper-no-compensation", "paper-every-step"):
+        flights = [scenario(name, seed=seed, duration=33.0) for seed in range(1, 11)]
+        error[name] = np.mean([summary(flown, fly(flown)).rmse_xy or 0.0 for flown in flights])
+    assert error["paper-no-compensation"] >= 2.5 * error["paper-every-step"]
+
+
+def test_the_event_trigger_saves_four_packets_in_five() -> None:
+    """For an error that grows, but stays under what no compensation costs."""
+    every_step, triggered = (
+        summary(flown, fly(flown)) for flown in (scenario("paper-every-step"), scenario("paper"))
+    )
+    assert every_step.event_ratio == 1.0
+    assert triggered.event_ratio is not None
+    assert triggered.event_ratio < 0.2
+    assert triggered.uplink_packets is not None
+    assert every_step.uplink_packets is not None
+    assert triggered.uplink_packets < 0.25 * every_step.uplink_packets
+    assert triggered.rmse_xy is not None
+    assert every_step.rmse_xy is not None
+    assert every_step.rmse_xy < triggered.rmse_xy < 2.5 * every_step.rmse_xy
+
+
+def test_without_network_the_estimate_is_the_state() -> None:
+    """Zero delay, no loss: x̂(k) = x(k) to the last bit, at every step."""
+    flown = scenario("paper-every-step", duration=10.0, network=QUIET)
+    flight = fly(flown)
+    # The flight is over with step 199, before the server has ticked for it.
+    assert flight.server["step"].tolist() == list(range(199))
+    np.testing.assert_array_equal(flight.server["estimate"], flight.client["state"][:199])
+
+
+def test_the_summary_counts_what_the_network_saw() -> None:
+    """Every packet once, lost ones with them."""
+    flown = scenario("paper", duration=20.0)
+    flight = fly(flown)
+    result = summary(flown, flight)
+    up = flight.netem[flight.netem["direction"] == UPLINK]
+    down = flight.netem[flight.netem["direction"] == DOWNLINK]
+    assert result.steps == 400
+    assert result.duration_s == 20.0
+    # HELLO, an observation a step; the last half second of them is still on its way at the end.
+    assert result.downlink_packets == len(down) >= 390
+    assert result.downlink_bytes == down["bytes"].sum()
+    assert result.uplink_packets == len(up)
+    assert result.event_ratio is not None
+    assert result.event_ratio * len(flight.server) == pytest.approx(flight.server["event"].sum())
+    assert result.lost == flight.netem["lost"].sum() > 0
+    assert result.reordered == flight.netem["overtaken"].sum() > 0
+    assert result.solve_ms_p50 is None
+    assert result.secure is False
+    assert result.rmse_xy == pytest.approx(np.hypot(result.rmse_x or 0, result.rmse_y or 0))
+
+
+def test_age_is_a_round_trip_and_the_wait_for_the_next_step() -> None:
+    """At least 0.8 s of delay, at most 0.25 s of waiting and jitter at the median."""
+    flown = scenario("paper-every-step", duration=20.0)
+    result = summary(flown, fly(flown))
+    assert result.age_ms_p50 is not None
+    assert 850 <= result.age_ms_p50 <= 1050
+
+
+@pytest.mark.parametrize("offset_s", [-3600.0, 0.5, 86000.0])
+def test_unsynchronised_clocks_change_nothing(offset_s: float) -> None:
+    """The vehicle's clock may be hours off: only the round trip enters."""
+    flown = scenario("paper-every-step", duration=15.0)
+    plain = fly(flown)
+    clocks = {"clock_offset_s": offset_s}
+    offset = fly(scenario("paper-every-step", duration=15.0, simulation=clocks))
+    np.testing.assert_array_equal(plain.client["state"], offset.client["state"])
+
+
+def test_a_drifting_clock_is_followed() -> None:
+    """200 ppm for a minute are 12 ms: the flight is as good as without."""
+    flown = scenario("paper-every-step", seed=3)
+    drifting = scenario("paper-every-step", seed=3, simulation={"clock_drift_ppm": 200.0})
+    plain, drifted = summary(flown, fly(flown)), summary(drifting, fly(drifting))
+    assert drifted.rmse_xy == pytest.approx(plain.rmse_xy, rel=0.05)
+
+
+def test_a_server_too_slow_for_its_steps_misses_deadlines_and_says_so() -> None:
+    """80 ms of computing in steps of 50 ms: three ticks in eight are skipped."""
+    flown = scenario("paper-every-step", duration=10.0, simulation={"compute_s": 0.08})
+    result = summary(flown, fly(flown))
+    assert 65 <= result.deadline_misses <= 75
+
+
+def test_it_flies_in_space_with_a_time_constant_for_each_axis() -> None:
+    """3-D: the third axis holds its altitude, all axes are controlled."""
+    flown = scenario(
+        "paper-every-step",
+        duration=20.0,
+        model={"axes": 3, "tau_s": [0.81, 0.6, 1.0]},
+        reference={"altitude_m": 5.0},
+        vehicle={"start_m": [1.5, 0.0, 4.0]},
+    )
+    flight = fly(flown)
+    result = summary(flown, flight)
+    assert flight.client["state"].shape == (400, 3, 2)
+    assert result.rmse_z is not None
+    assert result.rmse_z < 0.2
+    assert flight.client["state"][-1, 2, 0] == pytest.approx(5.0, abs=0.05)
+
+
+def test_two_vehicles_share_one_server() -> None:
+    """Each through a flow of its own, both as well as one alone."""
+    flown = scenario("paper-every-step", duration=20.0)
+    flight = fly(flown, vehicles=2)
+    for vehicle in (1, 2):
+        rows = flight.client[flight.client["vehicle"] == vehicle]
+        result = summarise(flown, "test", rows, flight.server, flight.netem)
+        assert result.steps == 400
+        assert result.rmse_xy is not None
+        assert result.rmse_xy < 0.4
+    assert set(flight.netem["flow"]) == {0, 1}
+
+
+def test_a_network_that_loses_everything_is_no_flight() -> None:
+    """The client gives up, and says why."""
+    lost = QUIET | {"uplink": {"delay": "none", "loss": 1.0}}
+    flight = fly(scenario("paper", settle=0.0, network=lost))
+    assert flight.failure == "no answer from netem:0 in 16 s"
+    assert len(flight.client) == 0
+
+
+def test_wind_and_gusts_push_but_do_not_break() -> None:
+    """Tracking gets worse, and stays bounded."""
+    calm = scenario("paper-every-step", duration=30.0)
+    windy = scenario(
+        "paper-every-step",
+        duration=30.0,
+        vehicle={"wind": 0.3, "gust_mps2": 0.5, "gust_every_s": 5.0},
+    )
+    calm_m, windy_m = (summary(flown, fly(flown)).rmse_xy for flown in (calm, windy))
+    assert calm_m is not None
+    assert windy_m is not None
+    assert calm_m < windy_m < 2.0

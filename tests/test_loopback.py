@@ -1,0 +1,314 @@
+"""Real sockets on loopback: the shell, and the three endpoints through it."""
+
+import asyncio
+import io
+import socket
+import sys
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from client.plant import FirstOrderPlant
+from client.vehicle import Client
+from netem.proxy import Proxy
+from server.controller import Server
+from shared import config, shell, timer
+from shared.chance import stream
+from shared.config import Scenario
+from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
+from shared.record import PACKET_COLUMNS, Recorder, client_columns, parse, server_columns
+from shared.shell import AddressError, Shell
+from sim.flight import Flight
+from sim.flight import fly as fly_virtually
+
+LOOPBACK: Address = ("127.0.0.1", 0)
+LATE_NS = SECOND_NS // 4
+"""How late anything may come on a busy machine before a test gives up on it."""
+
+
+class Echo(Endpoint):
+    """Sends back what it hears, by its sockets in turn; wakes at given times."""
+
+    def __init__(
+        self, wakes_ns: list[int] | None = None, *, last: int = 10**9, sockets: int = 1
+    ) -> None:
+        super().__init__()
+        self.sockets = sockets
+        self.wakes_ns = wakes_ns or []
+        self.woken_ns: list[int] = []
+        self.heard: list[bytes] = []
+        self.last = last
+
+    @property
+    def finished(self) -> bool:
+        """After so many datagrams or wakes."""
+        return len(self.heard) + len(self.woken_ns) >= self.last
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Answer."""
+        assert now_ns > 0
+        self.heard.append(datagram.payload)
+        self._news.append("heard")
+        self._out.append(Datagram(datagram.payload, datagram.peer, len(self.heard) % self.sockets))
+
+    def wake(self, *, now_ns: int) -> None:
+        """Note the time."""
+        self.woken_ns.append(now_ns - self.wakes_ns.pop(0))
+
+    def next_wake_ns(self) -> int | None:
+        """The next of the list."""
+        return self.wakes_ns[0] if self.wakes_ns else None
+
+    def report(self) -> str:
+        """Nothing to say."""
+        return ""
+
+
+@asynccontextmanager
+async def driven(*shells: Shell) -> AsyncIterator[None]:
+    """Shells running in this loop, as many as there are."""
+    tasks = [asyncio.create_task(each.run()) for each in shells]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_datagrams_come_and_go_through_several_sockets() -> None:
+    """Every second answer leaves by a socket that was opened for it."""
+    echo = Echo(last=4, sockets=2)
+    news: list[str] = []
+    driver = Shell(echo, LOOPBACK)
+    loop = asyncio.get_running_loop()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.setblocking(False)
+        peer.bind(LOOPBACK)
+        task = asyncio.create_task(driver.run(news.append))
+        answers = []
+        for number in range(4):
+            await loop.sock_sendto(peer, b"%d" % number, driver.address)
+            answers.append(await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 5))
+        await asyncio.wait_for(task, 5)
+    assert [payload for payload, _ in answers] == [b"0", b"1", b"2", b"3"]
+    ports = [port for _, (_, port) in answers]
+    assert ports[1] == ports[3] == driver.address[1]
+    assert ports[0] == ports[2] != driver.address[1]
+    assert news == ["heard"] * 4
+
+
+@pytest.mark.parametrize("kernel", [True, False], ids=["timerfd", "the loop's timer"])
+async def test_wakes_come_in_time_and_never_early(
+    kernel: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both timers, twenty wakes: some already past when asked for, some in the future."""
+    if not kernel:
+        monkeypatch.setattr(shell, "make_timer", timer.LoopTimer)
+    now_ns = time.monotonic_ns()
+    wakes_ns = [now_ns + step * 2_000_000 for step in range(-5, 15)]
+    echo = Echo(wakes_ns, last=20)
+    await asyncio.wait_for(Shell(echo, LOOPBACK).run(), 5)
+    assert len(echo.woken_ns) == 20
+    assert min(echo.woken_ns) >= 0
+
+
+async def test_a_closed_port_and_an_unknown_network_are_lost_packets() -> None:
+    """Nothing that a peer's absence does to a socket reaches the endpoint."""
+    echo = Echo()
+    driver = Shell(echo, LOOPBACK)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(LOOPBACK)
+        closed = gone.getsockname()
+    async with driven(driver):
+        for peer in (closed, closed, ("255.255.255.255", 9)):
+            echo._out.append(Datagram(b"x", peer))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+            peer.setblocking(False)
+            peer.bind(LOOPBACK)
+            loop = asyncio.get_running_loop()
+            for _ in range(2):
+                await loop.sock_sendto(peer, b"still there?", driver.address)
+                answer, _ = await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 5)
+    assert answer == b"still there?"
+    assert driver.send_errors >= 1
+
+
+async def test_names_are_looked_up_and_seen_by_the_endpoint_as_names() -> None:
+    """What it sends to ("localhost", port) is answered by ("localhost", port)."""
+    seen: list[Address] = []
+
+    class Asker(Echo):
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            seen.append(datagram.peer)
+            super().receive(datagram, now_ns=now_ns)
+
+    answerer, asker = Shell(Echo(), LOOPBACK), Asker(last=1)
+    peer = ("localhost", answerer.address[1])
+    asker._out.append(Datagram(b"who?", peer))
+    async with driven(answerer):
+        await asyncio.wait_for(Shell(asker, LOOPBACK, [peer]).run(), 5)
+    assert seen == [peer]
+
+
+async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names are looked up all along, and the old address stands for the name no more."""
+    addresses = {"first": ("127.0.0.1", 1), "then": ("127.0.0.2", 1)}
+    looked_up: list[Address] = []
+
+    def look_up(peer: Address) -> Address:
+        looked_up.append(peer)
+        return addresses["first" if len(looked_up) == 1 else "then"]
+
+    monkeypatch.setattr(shell, "_look_up", look_up)
+    monkeypatch.setattr(shell, "RESOLVE_EVERY_S", 0.001)
+    driver = Shell(Echo(), LOOPBACK, [("moving", 1)])
+    assert driver._named == {addresses["first"]: ("moving", 1)}
+    async with driven(driver):
+        while len(looked_up) < 3:
+            await asyncio.sleep(0.001)
+    assert driver._named == {addresses["then"]: ("moving", 1)}
+
+
+def test_addresses_of_no_use_are_named() -> None:
+    """A port in use, and a name that nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(LOOPBACK)
+        host, port = taken.getsockname()
+        with pytest.raises(AddressError, match=f"cannot listen on {host}:{port}: Address already"):
+            Shell(Echo(), (host, port))
+    with pytest.raises(AddressError, match="cannot find no-such-host.invalid: "):
+        Shell(Echo(), LOOPBACK, [("no-such-host.invalid", 1)])
+
+
+def scenario(name: str, **changes: Any) -> Scenario:
+    """A packaged scenario with some keys changed."""
+    table = config.to_table(config.load(name)) | {"settle": 0.0}
+    for key, value in changes.items():
+        table[key] = table[key] | value if isinstance(value, dict) else value
+    return config.check(table, "test")
+
+
+async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = None) -> Flight:
+    """The three endpoints in this process, over real UDP.
+
+    Args:
+        at_phase: start when the server's clock is so far into one of its steps.
+    """
+    axes = flown.model.axes
+    sinks = [io.BytesIO() for _ in range(3)]
+    columns = (client_columns(axes), server_columns(axes), PACKET_COLUMNS)
+    recorders = [Recorder(column, sink) for column, sink in zip(columns, sinks, strict=True)]
+    server = Shell(Server(flown, boot_id=1, recorder=recorders[1]), LOOPBACK)
+    netem = Shell(Proxy(flown, server=server.address, recorder=recorders[2]), LOOPBACK)
+    clients = [
+        Shell(
+            Client(
+                flown,
+                FirstOrderPlant(flown, stream(flown.seed, "wind", number)),
+                server=netem.address,
+                vehicle=number,
+                boot_id=1,
+                recorder=recorders[0],
+            ),
+            LOOPBACK,
+        )
+        for number in range(1, vehicles + 1)
+    ]
+    async with driven(server, netem):
+        if at_phase is not None:
+            into_ns = time.monotonic_ns() % flown.dt_ns
+            await asyncio.sleep((at_phase * flown.dt_ns - into_ns) % flown.dt_ns / SECOND_NS)
+        flights = asyncio.gather(*(each.run() for each in clients))
+        await asyncio.wait_for(flights, flown.duration + 20.0)
+    client_rows, server_rows, netem_rows = (parse(sink.getvalue()) for sink in sinks)
+    return Flight(client_rows, server_rows, netem_rows)
+
+
+FAST = {
+    "uplink": {"delay": "constant", "minimum_s": 0.02, "loss": 0.0},
+    "downlink": {"delay": "constant", "minimum_s": 0.02, "loss": 0.0},
+}
+
+
+async def test_a_flight_over_real_sockets() -> None:
+    """Delays of 20 ms, an observation and a horizon a step, and the circle is flown."""
+    flown = scenario("paper-every-step", duration=4.0, network=FAST)
+    flight = await fly(flown)
+    assert flight.client["step"][-1] == 79
+    assert len(flight.client) + flight.client["missed"][-1] == 80
+    assert flight.server["solved"].all()
+    assert flight.server["event"].all()
+    assert not flight.netem["lost"].any()
+    # Each observation takes 20 ms down, waits for a tick, and takes 20 ms up: at most 3 steps.
+    flown_on = flight.client["step"][5:] - flight.client["in_force"][5:]
+    assert np.median(flown_on) in (1, 2)
+
+
+async def test_two_vehicles_in_space_on_one_server() -> None:
+    """3-D, two flows through netem, two sessions that tick together."""
+    flown = scenario("paper-every-step", duration=3.0, network=FAST, model={"axes": 3})
+    flight = await fly(flown, vehicles=2)
+    for vehicle in (1, 2):
+        rows = flight.client[flight.client["vehicle"] == vehicle]
+        assert rows["step"][-1] == 59
+        assert rows["in_force"][-1] > 50
+        assert rows["state"].shape[1:] == (3, 2)
+    assert set(flight.netem["flow"]) == {0, 1}
+
+
+async def test_both_worlds_decide_the_same_on_a_network_without_delay() -> None:
+    """The same scenario over loopback and in virtual time: same events, same inputs, same order.
+
+    Steps are 0.2 s, and the server ticks in the middle of the vehicle's: a pause of this machine
+    would have to take 0.1 s to change a decision, and then shows as a missed or repeated step.
+    """
+    none = {"delay": "none", "loss": 0.0}
+    changes = {
+        "duration": 5.0,
+        "network": {"uplink": none, "downlink": none},
+        "control": {"dt": 0.2, "horizon": 10, "epsilon": 0.05},
+        "seed": 4,
+    }
+    flown = scenario("paper", **changes)
+    real = await fly(flown, at_phase=0.5)
+    virtual = fly_virtually(flown)
+    steps = min(len(real.server), len(virtual.server))
+    assert steps >= 24
+    for column in ("step", "observed_step", "event", "solved"):
+        assert real.server[column][:steps].tolist() == virtual.server[column][:steps].tolist()
+    for column in ("estimate", "planned", "input", "error", "threshold"):
+        np.testing.assert_array_equal(real.server[column][:steps], virtual.server[column][:steps])
+    assert 2 <= real.server["event"].sum() < steps
+    for column in ("step", "state", "input", "in_force"):
+        np.testing.assert_array_equal(real.client[column], virtual.client[column])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="SO_MEMINFO is Linux's")
+async def test_datagrams_dropped_by_the_kernel_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They would look like losses of the network."""
+    monkeypatch.setattr(shell, "BUFFER_BYTES", 4096)
+    driver = Shell(Echo(), LOOPBACK)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        for _ in range(200):
+            peer.sendto(bytes(1000), driver.address)
+    assert driver.kernel_drops() > 100
+    drops = driver.kernel_drops()
+    async with driven(driver):
+        await asyncio.sleep(0)
+    assert driver.kernel_drops() == drops
+
+
+def test_uvloop_is_used_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And asyncio's own loop where it does not."""
+    for module in ("uvloop", "asyncio"):
+        loop = shell.new_event_loop()
+        loop.close()
+        assert type(loop).__module__.startswith(module)
+        monkeypatch.setitem(sys.modules, "uvloop", None)

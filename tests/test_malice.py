@@ -1,0 +1,106 @@
+"""Anybody can send anything: it is dropped, counted, and changes nothing."""
+
+import random
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from client.plant import FirstOrderPlant
+from client.vehicle import Client
+from server.controller import VEHICLES_MAX, Server
+from shared import config
+from shared.chance import stream
+from shared.endpoint import NEWS_MAX, SECOND_NS, Datagram, Endpoint
+from shared.protocol import Heartbeat, Hello, Horizon, Observation, Welcome, encode
+
+SCENARIO = config.load("paper")
+TERMS = SCENARIO.terms()
+STRANGER = ("stranger", 6)
+DATAGRAMS = 10_000
+
+
+def hostile(rng: random.Random) -> Iterator[bytes]:
+    """Random bytes, and real messages with bytes changed, cut off, put in or doubled."""
+    inputs = np.zeros((2, 40), np.float32)
+    real = [
+        encode(message)
+        for message in (
+            Welcome(1, 7, 5, 3, 10, TERMS),
+            Observation(1, 7, 5, 10, 4, 8, 9, np.zeros((2, 2))),
+            Horizon(1, 7, 5, 10, 9, inputs),
+            Heartbeat(1, 7, 10),
+        )
+    ]
+    while True:
+        if rng.random() < 0.3:
+            yield rng.randbytes(rng.randrange(1500))
+            continue
+        payload = bytearray(rng.choice(real))
+        for _ in range(rng.randrange(1, 4)):
+            at = rng.randrange(len(payload) + 1)
+            match rng.randrange(4):
+                case 0 if at < len(payload):
+                    payload[at] = rng.randrange(256)
+                case 1:
+                    payload = payload[:at]
+                case 2:
+                    payload[at:at] = rng.randbytes(rng.randrange(1, 9))
+                case _:
+                    payload += payload[at:]
+        yield bytes(payload)
+
+
+def endpoints() -> list[Endpoint]:
+    """A server and a client, as they are before any session."""
+    plant = FirstOrderPlant(SCENARIO, stream(1, "wind"))
+    return [
+        Server(SCENARIO, boot_id=2**40),
+        Client(SCENARIO, plant, server=("server", 0), vehicle=1, boot_id=2**50),
+    ]
+
+
+@pytest.mark.parametrize("endpoint", endpoints(), ids=["server", "client"])
+def test_ten_thousand_hostile_datagrams_are_counted_and_change_nothing(
+    endpoint: Server | Client,
+) -> None:
+    """No exception, no answer, no session, no wake; a bounded set of reasons."""
+    asleep_until = endpoint.next_wake_ns()
+    datagrams = hostile(random.Random(1))
+    for _ in range(DATAGRAMS):
+        endpoint.receive(Datagram(next(datagrams), STRANGER), now_ns=SECOND_NS)
+    assert endpoint.outbox() == []
+    assert endpoint.next_wake_ns() == asleep_until
+    assert not endpoint.finished
+    assert sum(endpoint.counts.values()) == DATAGRAMS
+    assert set(endpoint.counts) <= {
+        f"dropped: {reason}"
+        for reason in (
+            *("too long", "not msgpack", "not a message", "version", "type", "field", "shape"),
+            *("not finite", "input out of range", "unknown session", "for another life"),
+            *("not for a server", "not for a client"),
+        )
+    }
+
+
+def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
+    """Many vehicles with many lives each: one answer each, and no more kept than there is room."""
+    server = Server(SCENARIO, boot_id=1)
+    answers = 0
+    for boot_id in range(3):
+        for vehicle in range(2000):
+            hello = encode(Hello(vehicle, boot_id, TERMS))
+            server.receive(Datagram(hello, STRANGER), now_ns=SECOND_NS)
+            answers += len(server.outbox())
+    assert answers == 6000
+    assert len(server._welcomed) == VEHICLES_MAX
+    assert len(server.news()) <= NEWS_MAX
+
+
+def test_an_answer_is_no_longer_than_its_question() -> None:
+    """HELLO and WELCOME: nobody can use the server to flood somebody else tenfold."""
+    hello = encode(Hello(1, 2**63, TERMS))
+    server = Server(SCENARIO, boot_id=2**63)
+    server.receive(Datagram(hello, STRANGER), now_ns=3 * 10**14)
+    ((answer, _, _),) = server.outbox()
+    assert len(answer) < 1.5 * len(hello)

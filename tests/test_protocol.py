@@ -1,0 +1,208 @@
+"""The wire: what is written is read again, and nothing else is."""
+
+import math
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from shared import protocol
+from shared.protocol import (
+    INPUTS_MAX,
+    NO_HORIZON,
+    PAYLOAD_BYTES_MAX,
+    Heartbeat,
+    Hello,
+    Horizon,
+    Message,
+    Observation,
+    ProtocolError,
+    Terms,
+    Welcome,
+    decode,
+    encode,
+)
+
+TERMS = Terms(50_000_000, 40, 2, (0.81, 0.7), (1.8, 2.5))
+
+u16 = st.integers(0, 2**16 - 1)
+u32 = st.integers(0, 2**32 - 1)
+u64 = st.integers(0, 2**64 - 1)
+stamp = st.integers(0, 2**63 - 1)
+step = st.integers(0, 2**40)
+positive = st.floats(1e-3, 1e3)
+
+
+@st.composite
+def terms(draw: st.DrawFn) -> Terms:
+    """Any terms that make sense."""
+    axes = draw(st.integers(1, 3))
+    several = st.tuples(*[positive] * axes)
+    horizon = draw(st.integers(1, INPUTS_MAX))
+    return Terms(draw(stamp), horizon, axes, draw(several), draw(several))
+
+
+messages: st.SearchStrategy[Message] = st.one_of(
+    st.builds(Hello, u16, u64, terms()),
+    st.builds(Welcome, u16, u32, u64, u64, stamp, terms()),
+    st.builds(
+        Observation,
+        *(u16, u32, step, stamp, st.integers(NO_HORIZON, 2**40), stamp, stamp),
+        arrays("<f8", (2, 2), elements=st.floats(allow_nan=False, allow_infinity=False)),
+    ),
+    st.builds(
+        Horizon,
+        *(u16, u32, step, stamp, stamp),
+        arrays("<f4", (2, 40), elements=st.floats(-1.75, 1.75, width=32)),
+    ),
+    st.builds(Heartbeat, u16, u32, stamp),
+)
+
+
+def same(one: Message, other: Message) -> bool:
+    """Equal type and equal fields, arrays to the bit."""
+    return type(one) is type(other) and all(
+        np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+@given(messages)
+def test_every_message_is_read_as_it_was_written(message: Message) -> None:
+    """Round trip of all five."""
+    assert same(decode(encode(message), TERMS), message)
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_the_longest_horizon_fits_one_datagram(axes: int) -> None:
+    """All numbers at their largest, and as many inputs as the limit allows."""
+    longest = INPUTS_MAX // axes
+    horizon = Horizon(
+        2**16 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**63 - 1, np.ones((axes, longest), np.float32)
+    )
+    assert len(encode(horizon)) <= PAYLOAD_BYTES_MAX
+
+
+def test_documented_sizes_are_the_real_ones() -> None:
+    """The example of docs/protocol.md: 40 inputs on two axes."""
+    inputs = np.zeros((2, 40), np.float32)
+    state = np.zeros((2, 2))
+    stamp_ns, session = 3 * 10**14, 2**31
+    assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs))) == 353
+    observation = Observation(1, session, 500, stamp_ns, 480, stamp_ns, stamp_ns, state)
+    assert len(encode(observation)) == 76
+    assert len(encode(Heartbeat(1, session, stamp_ns))) == 18
+
+
+def body(message: Message) -> list[object]:
+    """The message as the list that is packed."""
+    fields: list[object] = msgpack.unpackb(encode(message))
+    return fields
+
+
+OBSERVATION = Observation(1, 7, 5, 10, 4, 8, 9, np.array([[1.0, 2.0], [3.0, 4.0]]))
+HORIZON = Horizon(1, 7, 5, 10, 9, np.full((2, 40), 0.5, np.float32))
+HELLO = Hello(1, 99, TERMS)
+
+
+@pytest.mark.parametrize(
+    ("message", "field", "value", "reason"),
+    [
+        (OBSERVATION, 0, 2, "version"),
+        (OBSERVATION, 0, True, "version"),
+        (OBSERVATION, 1, 0, "type"),
+        (OBSERVATION, 1, 6, "type"),
+        (OBSERVATION, 1, "3", "type"),
+        (OBSERVATION, 2, 2**16, "field"),
+        (OBSERVATION, 2, True, "field"),
+        (OBSERVATION, 3, -1, "field"),
+        (OBSERVATION, 4, 1.0, "field"),
+        (OBSERVATION, 4, 2**40 + 1, "field"),
+        (OBSERVATION, 5, -1, "field"),
+        (OBSERVATION, 5, 2**63, "field"),
+        (OBSERVATION, 6, -2, "field"),
+        (OBSERVATION, 9, b"", "shape"),
+        (OBSERVATION, 9, [1.0, 2.0, 3.0, 4.0], "shape"),
+        (OBSERVATION, 9, np.array([1, 2, 3, math.nan]).tobytes(), "not finite"),
+        (OBSERVATION, 9, np.array([1, 2, 3, math.inf]).tobytes(), "not finite"),
+        (HORIZON, 7, np.zeros(79, np.float32).tobytes(), "shape"),
+        (HORIZON, 7, np.zeros(80, np.float64).tobytes(), "shape"),
+        (HORIZON, 7, np.full(80, np.nan, np.float32).tobytes(), "not finite"),
+        (HORIZON, 7, np.full(80, 1.81, np.float32).tobytes(), "input out of range"),
+        (HELLO, 4, [0, 40, 2, [0.8, 0.7], [1.8, -1.0]], "field"),
+        (HELLO, 4, [0, 40, 2, [0.8, 0.7], [1.8, math.nan]], "field"),
+        (HELLO, 4, [0, 40, 2, [0.8, 0.7], [1.8]], "field"),
+        (HELLO, 4, [0, 40, 2, [0.8, 0.7], [1, 1]], "field"),
+        (HELLO, 4, [0, 40, 4, [0.8] * 4, [1.8] * 4], "field"),
+        (HELLO, 4, [0, 0, 2, [0.8, 0.7], [1.8, 1.8]], "field"),
+        (HELLO, 4, [0, 40, 2, [0.8, 0.7]], "field"),
+        (HELLO, 4, None, "field"),
+    ],
+)
+def test_a_wrong_field_is_the_peers_mistake(
+    message: Message, field: int, value: object, reason: str
+) -> None:
+    """Each check of each field, with its reason."""
+    fields = body(message)
+    fields[field] = value
+    with pytest.raises(ProtocolError) as error:
+        decode(msgpack.packb(fields), TERMS)
+    assert error.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", "not msgpack"),
+        (b"\xc1", "not msgpack"),
+        (encode(HELLO) + b"\x00", "not msgpack"),
+        (encode(HELLO)[:-1], "not msgpack"),
+        (b"\x80", "not a message"),
+        (b"\x81\x01\x02", "not msgpack"),
+        (msgpack.packb(7), "not a message"),
+        (msgpack.packb([1]), "not a message"),
+        (msgpack.packb([1, 5, 1, 7]), "not a message"),
+        (msgpack.packb([1, 5, 1, 7, 8, 9]), "not a message"),
+        (msgpack.packb([[[[[[]]]]]]), "not a message"),
+        (b"\xdd\xff\xff\xff\xff", "not msgpack"),
+        (b"\x91" * 1200, "not msgpack"),
+        (bytes(PAYLOAD_BYTES_MAX + 1), "too long"),
+    ],
+)
+def test_what_is_no_message_is_refused(payload: bytes, reason: str) -> None:
+    """Truncated, overlong, nested, huge by its own word, or something else altogether."""
+    with pytest.raises(ProtocolError) as error:
+        decode(payload, TERMS)
+    assert error.value.reason == reason
+
+
+def test_no_field_of_any_message_goes_unchecked() -> None:
+    """Each field in turn made a string: never accepted."""
+    welcome = Welcome(1, 7, 99, 98, 10, TERMS)
+    for message in (HELLO, welcome, OBSERVATION, HORIZON, Heartbeat(1, 7, 10)):
+        for field in range(len(message) + 2):
+            fields = body(message)
+            fields[field] = "x"
+            with pytest.raises(ProtocolError):
+                decode(msgpack.packb(fields), TERMS)
+
+
+@settings(max_examples=300)
+@given(st.binary(max_size=1300))
+def test_random_bytes_are_refused_or_are_a_message(payload: bytes) -> None:
+    """Nothing but a ProtocolError ever comes out of decoding."""
+    try:
+        message = decode(payload, TERMS)
+    except ProtocolError:
+        return
+    assert same(decode(encode(message), TERMS), message)
+
+
+def test_the_table_of_messages_is_complete() -> None:
+    """As many checks as fields, for every message."""
+    assert [len(checks) for _, checks in protocol._TYPES] == [
+        len(message._fields) for message, _ in protocol._TYPES
+    ]

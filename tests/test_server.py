@@ -1,0 +1,329 @@
+"""The server as an endpoint: sessions, ticks, and what it sends to whom."""
+
+import io
+import math
+from typing import Any
+
+import numpy as np
+
+from server import controller
+from server.controller import Server
+from shared import config
+from shared.config import Scenario
+from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
+from shared.protocol import (
+    NO_HORIZON,
+    Heartbeat,
+    Hello,
+    Horizon,
+    Message,
+    Observation,
+    Welcome,
+    decode,
+    encode,
+)
+from shared.record import Recorder, Rows, parse, server_columns
+
+HERE: Address = ("vehicle", 1)
+DAY_NS = 86_400 * SECOND_NS
+"""What the vehicle's clock is ahead of the server's, in all of these tests."""
+
+
+def scenario(**control: Any) -> Scenario:
+    """The paper's, with some keys of `control` changed."""
+    table = config.to_table(config.load("paper-every-step"))
+    table["control"] |= control
+    return config.check(table, "test")
+
+
+class Vehicles:
+    """A server, and vehicles that say to it exactly what a test wants them to."""
+
+    def __init__(self, flown: Scenario, boot_id: int = 77) -> None:
+        self.terms = flown.terms()
+        self.dt_ns = flown.dt_ns
+        self.sink = io.BytesIO()
+        recorder = Recorder(server_columns(flown.model.axes), self.sink)
+        self.server = Server(flown, boot_id=boot_id, recorder=recorder)
+        # Ticks lie on multiples of 50 ms: the first comes 30 ms after what is said first.
+        self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
+
+    def say(self, message: Message, sender: Address = HERE) -> list[tuple[Message, Address]]:
+        """One datagram, and the answers to it."""
+        self.server.receive(Datagram(encode(message), sender), now_ns=self.now_ns)
+        return self.answers()
+
+    def answers(self) -> list[tuple[Message, Address]]:
+        """What is in the outbox, decoded."""
+        return [(decode(out.payload, self.terms), out.peer) for out in self.server.outbox()]
+
+    def open(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
+        """A session, welcomed but not yet live."""
+        ((welcome, peer),) = self.say(Hello(vehicle, boot_id, self.terms), sender)
+        assert isinstance(welcome, Welcome)
+        assert peer == sender
+        return welcome
+
+    def observe(
+        self,
+        welcome: Welcome,
+        step: int,
+        state: object = ((1.0, 0.0), (0.0, 0.0)),
+        sender: Address = HERE,
+    ) -> None:
+        """An observation that took no time: both clocks run alike, a day apart."""
+        stamp_ns = self.now_ns + DAY_NS
+        observation = Observation(
+            *(welcome.vehicle, welcome.session, step, stamp_ns, NO_HORIZON),
+            *(self.now_ns, stamp_ns, np.array(state)),
+        )
+        assert self.say(observation, sender) == []
+
+    def tick(self) -> list[tuple[Message, Address]]:
+        """Time passes until the next tick; what is sent at it."""
+        due_ns = self.server.next_wake_ns()
+        assert due_ns is not None
+        self.now_ns = due_ns
+        self.server.wake(now_ns=due_ns)
+        return self.answers()
+
+    def rows(self) -> Rows:
+        """The record so far."""
+        return parse(self.sink.getvalue())
+
+
+def test_hello_is_welcomed_with_the_servers_terms() -> None:
+    """The answer echoes the vehicle's boot id and carries the server's."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open(vehicle=3, boot_id=42)
+    assert (welcome.vehicle, welcome.boot_id, welcome.server_boot_id) == (3, 42, 77)
+    assert welcome.terms == vehicles.terms
+    assert welcome.server_ns == vehicles.now_ns
+
+
+def test_a_repeated_hello_gets_the_same_session() -> None:
+    """A WELCOME that was lost costs nothing but time, before and after the first observation."""
+    vehicles = Vehicles(scenario())
+    first = vehicles.open()
+    assert vehicles.open().session == first.session
+    vehicles.observe(first, 0)
+    assert vehicles.open().session == first.session
+
+
+def test_other_terms_open_no_session() -> None:
+    """The server says what it flies, and the operator hears what differs."""
+    vehicles = Vehicles(scenario())
+    other = vehicles.terms._replace(horizon=20)
+    ((welcome, _),) = vehicles.say(Hello(1, 5, other))
+    assert isinstance(welcome, Welcome)
+    assert welcome.terms == vehicles.terms
+    assert vehicles.server.news() == ["vehicle 1 flies another scenario: horizon 40 against 20"]
+    vehicles.observe(welcome, 0)
+    assert vehicles.server.counts["dropped: unknown session"] == 1
+
+
+def test_an_idle_server_asks_for_no_wake() -> None:
+    """No vehicle, no ticks; they begin with the first observation."""
+    vehicles = Vehicles(scenario())
+    assert vehicles.server.next_wake_ns() is None
+    welcome = vehicles.open()
+    assert vehicles.server.next_wake_ns() is None
+    vehicles.observe(welcome, 0)
+    due_ns = vehicles.server.next_wake_ns()
+    assert due_ns is not None
+    assert due_ns % vehicles.dt_ns == 0
+    assert 0 < due_ns - vehicles.now_ns <= vehicles.dt_ns
+
+
+def test_the_first_tick_sends_a_horizon_for_the_step_it_is_aboard() -> None:
+    """Stamped with k on the vehicle's grid and with the observation behind it."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 100)
+    observed_ns = vehicles.now_ns + DAY_NS
+    ((horizon, peer),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert peer == HERE
+    assert (horizon.vehicle, horizon.session) == (1, welcome.session)
+    # 30 ms have passed since the start of step 100, a step is 50 ms.
+    assert horizon.step == 100
+    assert horizon.observed_ns == observed_ns
+    ((later, _),) = vehicles.tick()
+    assert isinstance(later, Horizon)
+    assert later.step == 101
+
+
+def test_the_newest_observation_wins_after_reordering() -> None:
+    """An older one is counted as stale, and neither state nor address follow it."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 5)
+    vehicles.observe(welcome, 4, state=((9.0, 0.0), (9.0, 0.0)), sender=("old", 2))
+    ((_, peer),) = vehicles.tick()
+    assert peer == HERE
+    row = vehicles.rows()[-1]
+    assert (row["observed_step"], row["stale"]) == (5, 1)
+    assert row["estimate"][:, 0].tolist() == [1.0, 0.0]
+
+
+def test_answers_follow_the_vehicle_to_its_new_address() -> None:
+    """A restarted netem has other ports: the newest observation says where the vehicle is."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    vehicles.observe(welcome, 1, sender=("elsewhere", 9))
+    ((_, peer),) = vehicles.tick()
+    assert peer == ("elsewhere", 9)
+
+
+def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None:
+    """Until then the old session flies on; after it, the old one is a stranger."""
+    vehicles = Vehicles(scenario())
+    old = vehicles.open(boot_id=5)
+    vehicles.observe(old, 50)
+    new = vehicles.open(boot_id=6)
+    assert new.session != old.session
+    ((horizon, _),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert horizon.session == old.session
+    vehicles.observe(new, 0)
+    ((horizon, _),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert (horizon.session, horizon.step) == (new.session, 1)
+    vehicles.observe(old, 51)
+    assert vehicles.server.counts["dropped: unknown session"] == 1
+
+
+def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None:
+    """Two lives of the server share no session."""
+    welcome = Vehicles(scenario(), boot_id=1).open()
+    vehicles = Vehicles(scenario(), boot_id=2**63)
+    vehicles.observe(welcome, 3)
+    assert vehicles.server.counts == {"dropped: unknown session": 1}
+
+
+def test_ticks_slept_through_are_counted_and_skipped() -> None:
+    """One horizon, for the step it is now; the grid does not move."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    vehicles.tick()
+    due_ns = vehicles.server.next_wake_ns()
+    assert due_ns is not None
+    vehicles.now_ns = due_ns + 3 * vehicles.dt_ns + 1
+    vehicles.server.wake(now_ns=vehicles.now_ns)
+    ((horizon, _),) = vehicles.answers()
+    assert isinstance(horizon, Horizon)
+    assert horizon.step == 4
+    assert vehicles.server.missed == 3
+    assert vehicles.server.next_wake_ns() == due_ns + 4 * vehicles.dt_ns
+
+
+def test_a_wake_before_its_time_does_nothing() -> None:
+    """A timer that fires early must not tick twice."""
+    vehicles = Vehicles(scenario())
+    vehicles.observe(vehicles.open(), 0)
+    due_ns = vehicles.server.next_wake_ns()
+    assert due_ns is not None
+    vehicles.server.wake(now_ns=due_ns - 1)
+    assert vehicles.answers() == []
+    assert vehicles.server.next_wake_ns() == due_ns
+
+
+def test_a_silent_server_sends_heartbeats() -> None:
+    """Where no event sends a horizon, a heartbeat keeps the session alive."""
+    vehicles = Vehicles(scenario(trigger="paper", epsilon=1e9))
+    welcome = vehicles.open()
+    sent = []
+    for step in range(61):
+        vehicles.observe(welcome, step)
+        sent += [message for message, _ in vehicles.tick()]
+    assert isinstance(sent[0], Horizon)
+    heartbeats = sent[1:]
+    # The paper's scenario asks for one a second, and a step is 50 ms.
+    assert [type(message) for message in heartbeats] == [Heartbeat] * 3
+    assert {message.session for message in heartbeats} == {welcome.session}
+
+
+def test_no_estimate_without_a_recent_observation() -> None:
+    """Two seconds after the last one the server plans no more, but stays in touch."""
+    vehicles = Vehicles(scenario())
+    vehicles.observe(vehicles.open(), 0)
+    kinds = [[type(message) for message, _ in vehicles.tick()] for _ in range(62)]
+    assert kinds[:41] == [[Horizon]] * 41
+    assert [kind for kind in kinds[41:] if kind] == [[Heartbeat]]
+
+
+def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
+    """Its row is free again, and the server comes to rest."""
+    vehicles = Vehicles(scenario())
+    vehicles.observe(vehicles.open(), 0)
+    vehicles.now_ns += controller.SESSION_NS + vehicles.dt_ns
+    vehicles.server.wake(now_ns=vehicles.now_ns)
+    assert vehicles.server.next_wake_ns() is None
+    assert vehicles.server.news()[-1] == "vehicle 1 is gone"
+
+
+def test_no_more_vehicles_than_there_is_room_for() -> None:
+    """The one too many gets no answer; one that is known always does."""
+    vehicles = Vehicles(scenario())
+    for number in range(controller.VEHICLES_MAX):
+        vehicles.observe(vehicles.open(vehicle=number), 0)
+    assert vehicles.say(Hello(1000, 1, vehicles.terms)) == []
+    assert vehicles.server.counts["dropped: no room for another vehicle"] == 1
+    assert vehicles.open(vehicle=7).vehicle == 7
+
+
+def test_vehicles_that_never_came_give_their_place_to_new_ones() -> None:
+    """A welcome is a promise that expires: HELLOs alone cannot fill the server."""
+    vehicles = Vehicles(scenario())
+    for number in range(controller.VEHICLES_MAX):
+        vehicles.open(vehicle=number)
+    vehicles.observe(vehicles.open(vehicle=1000), 0)
+    assert [type(message) for message, _ in vehicles.tick()] == [Horizon]
+
+
+def test_two_vehicles_fly_as_each_would_alone() -> None:
+    """One batch equals its singles, to the last bit of every horizon."""
+
+    def horizons(numbers: tuple[int, ...]) -> dict[int, list[bytes]]:
+        vehicles = Vehicles(scenario())
+        sent: dict[int, list[bytes]] = {number: [] for number in numbers}
+        welcomes = {number: vehicles.open(vehicle=number, sender=("v", number)) for number in sent}
+        for step in range(20):
+            for number, welcome in welcomes.items():
+                angle = 0.1 * step + number
+                state = ((math.cos(angle), 0.2), (math.sin(angle), number))
+                vehicles.observe(welcome, 10 * number + step, state, ("v", number))
+            for message, (_, number) in vehicles.tick():
+                assert isinstance(message, Horizon)
+                sent[number].append(message.inputs.tobytes())
+        return sent
+
+    together = horizons((1, 2))
+    assert together[1] == horizons((1,))[1]
+    assert together[2] == horizons((2,))[2]
+    assert together[1] != together[2]
+    assert [len(sent) for sent in together.values()] == [20, 20]
+
+
+def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
+    """One vehicle reports a position at which its QP overflows; the other flies on."""
+    vehicles = Vehicles(scenario())
+    good = vehicles.open(vehicle=1, sender=("v", 1))
+    bad = vehicles.open(vehicle=2, sender=("v", 2))
+    vehicles.observe(good, 0, sender=("v", 1))
+    vehicles.observe(bad, 0, state=((1e308, 1e308), (0.0, 0.0)), sender=("v", 2))
+    with np.errstate(all="ignore"):
+        sent = vehicles.tick()
+    assert [peer for _, peer in sent] == [("v", 1)]
+    assert vehicles.server.counts["unsolved"] == 1
+
+
+def test_report_tells_what_was_counted() -> None:
+    """One line for the operator."""
+    vehicles = Vehicles(scenario())
+    vehicles.observe(vehicles.open(), 0)
+    vehicles.tick()
+    report = vehicles.server.report()
+    assert report == "1 vehicles, 0 ticks missed, 1 events, 1 steps, 0 unsolved"

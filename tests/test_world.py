@@ -1,0 +1,137 @@
+"""Virtual time itself: clocks, order, computing time."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
+from sim.world import Clock, World
+
+offsets = st.integers(-(10**15), 10**15)
+drifts = st.integers(-1_000_000, 1_000_000)
+times = st.integers(0, 10**15)
+
+
+class Probe(Endpoint):
+    """Writes down what happens to it, answers once, and wakes as it was told to."""
+
+    def __init__(self, wakes_ns: list[int], answer_to: Address | None = None) -> None:
+        super().__init__()
+        self.wakes_ns = wakes_ns
+        self.answer_to = answer_to
+        self.log: list[tuple[str, int]] = []
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Note it."""
+        name, socket = datagram.peer
+        self.log.append((f"{datagram.payload.decode()} from {name} {socket}", now_ns))
+
+    def wake(self, *, now_ns: int) -> None:
+        """Note it, and send one datagram."""
+        self.wakes_ns.pop(0)
+        self.log.append(("wake", now_ns))
+        if self.answer_to is not None:
+            self._out.append(Datagram(b"hi", self.answer_to, 2))
+
+    def next_wake_ns(self) -> int | None:
+        """The next of the list."""
+        return self.wakes_ns[0] if self.wakes_ns else None
+
+    def report(self) -> str:
+        """Nothing to say."""
+        return ""
+
+
+def never() -> bool:
+    """Until nothing is left to happen."""
+    return False
+
+
+@given(offsets, drifts, times)
+def test_a_clock_finds_its_own_time_again(offset_ns: int, drift_ppb: int, time_ns: int) -> None:
+    """world() is the first moment at which the clock shows at least the local time."""
+    clock = Clock(offset_ns, drift_ppb)
+    local_ns = clock.local(time_ns)
+    found = clock.world(local_ns)
+    assert found <= time_ns
+    assert clock.local(found) >= local_ns
+    assert clock.local(found - 1) < local_ns
+
+
+def test_a_drifting_clock_gains_what_it_should() -> None:
+    """100 ppm are 8.64 s a day."""
+    day_ns = 86_400 * SECOND_NS
+    assert Clock(5, 100_000).local(day_ns) == 5 + day_ns + 8_640_000_000
+
+
+def test_hosts_wake_in_the_order_of_the_worlds_time() -> None:
+    """Each by its own clock: a clock that is ahead wakes earlier."""
+    world, ahead, behind = World(), Probe([1000]), Probe([1000])
+    world.add("behind", behind, clock=Clock(offset_ns=100))
+    world.add("ahead", ahead, clock=Clock(offset_ns=400))
+    order: list[int] = []
+    world.run(lambda: bool(order.append(world.now_ns)), limit_ns=SECOND_NS)
+    assert order[1:] == [600]
+    assert (ahead.log, behind.log) == ([("wake", 1000)], [("wake", 1000)])
+
+
+def test_a_datagram_arrives_at_once_with_the_senders_address() -> None:
+    """Socket 2 of the sender is (name, 2), as a UDP source port would tell."""
+    world, receiver = World(), Probe([])
+    there = world.add("there", receiver, clock=Clock(offset_ns=7))
+    world.add("here", Probe([50], answer_to=there))
+    world.run(never, limit_ns=SECOND_NS)
+    assert receiver.log == [("hi from here 2", 57)]
+
+
+def test_a_datagram_to_nobody_is_lost() -> None:
+    """As UDP would have it."""
+    world = World()
+    world.add("here", Probe([50], answer_to=("nobody", 0)))
+    world.run(never, limit_ns=SECOND_NS)
+    assert world.now_ns == 50
+
+
+def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
+    """Ties are the rule on a lattice of delays."""
+    world = World()
+    receiver = Probe([50])
+    there = world.add("there", receiver)
+    world.add("here", Probe([50], answer_to=there))
+    world.run(never, limit_ns=SECOND_NS)
+    # Both wake at 50; the sender was asked second, but what it sends still comes at 50.
+    assert receiver.log == [("wake", 50), ("hi from here 2", 50)]
+    later = Probe([50, 60])
+    world = World()
+    there = world.add("there", later)
+    world.add("here", Probe([60], answer_to=there), clock=Clock())
+    world.run(never, limit_ns=SECOND_NS)
+    assert later.log[0] == ("wake", 50)
+
+
+def test_a_computing_host_sends_late_and_hears_late() -> None:
+    """It is busy for 30 ns after its wake at 50: its word leaves at 80, and it listens from 80."""
+    world, busy, other = World(), Probe([50]), Probe([60])
+    busy_address = world.add("busy", busy, compute_ns=30)
+    other_address = world.add("other", other)
+    busy.answer_to, other.answer_to = other_address, busy_address
+    world.run(never, limit_ns=SECOND_NS)
+    assert other.log == [("wake", 60), ("hi from busy 2", 80)]
+    assert busy.log == [("wake", 50), ("hi from other 2", 80)]
+
+
+def test_a_wake_during_computing_comes_late() -> None:
+    """How a deadline is missed in virtual time."""
+    world, busy = World(), Probe([50, 60])
+    world.add("busy", busy, compute_ns=30)
+    world.run(never, limit_ns=SECOND_NS)
+    assert busy.log == [("wake", 50), ("wake", 80)]
+
+
+@pytest.mark.parametrize("limit_ns", [49, 50])
+def test_time_stops_at_its_limit(limit_ns: int) -> None:
+    """Nothing later than the limit happens."""
+    world, probe = World(), Probe([50])
+    world.add("host", probe)
+    world.run(never, limit_ns=limit_ns)
+    assert len(probe.log) == (limit_ns == 50)
