@@ -121,10 +121,12 @@ def drive(
         shell = Shell(endpoint, bind, peers)
     except AddressError as error:
         raise CommandError(str(error)) from None
-    host, port = shell.address
-    say(f"listening on {host}:{port}, waiting for {waiting_for}")
-    if any(not address[0].startswith("127.") for address in (bind, *peers)):
-        say("plaintext and unauthenticated: only for a network that you trust")
+
+    def start() -> None:
+        host, port = shell.address
+        say(f"listening on {host}:{port}, waiting for {waiting_for}")
+        if any(not address[0].startswith("127.") for address in (bind, *peers)):
+            say("plaintext and unauthenticated: only for a network that you trust")
 
     def report() -> None:
         say(endpoint.report())
@@ -133,7 +135,7 @@ def drive(
         if shell.send_errors:
             say(f"{shell.send_errors} datagrams could not be sent")
 
-    run([shell], on_news=say, on_report=report)
+    run([shell], on_start=start, on_news=say, on_report=report)
     report()
 
 

@@ -40,7 +40,7 @@ class ModelConfig(Section, frozen=True):
 
     axes: Literal[2, 3] = 2
     """Fly in the plane or in space."""
-    tau_s: tuple[Positive, ...] = (0.81,)
+    tau_s: tuple[Positive, ...] = (0.855,)
     """Time constant of the velocity loop [s]: one for all axes, or one each."""
     u_max: tuple[Positive, ...] = (1.8,)
     """Largest desired velocity [m/s]: one for all axes, or one each."""
@@ -61,11 +61,11 @@ class ControlConfig(Section, frozen=True):
     """Tolerance ε of eq. (16)."""
     decay_rate: NonNegative = 1.5
     """Decay rate λ of eq. (16) [1/s]."""
-    state_weight: tuple[NonNegative, NonNegative] = (10.0, 19.7)
+    state_weight: tuple[NonNegative, NonNegative] = (6.2, 11.65)
     """Q of eq. (5), on the position and the velocity of every axis."""
-    terminal_weight: tuple[NonNegative, NonNegative] = (55.9, 828.0)
+    terminal_weight: tuple[NonNegative, NonNegative] = (73.9, 594.0)
     """P of eq. (5) and (16), on position and velocity."""
-    input_weight: Positive = 2.71
+    input_weight: Positive = 1.93
     """R of eq. (5)."""
     change_weight: NonNegative = 0.033
     """S of eq. (9), on the change against the horizon before."""
@@ -78,9 +78,9 @@ class ReferenceConfig(Section, frozen=True):
 
     shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
     """What to fly."""
-    radius_m: Positive = 1.5
+    radius_m: Positive = 1.42
     """Half the width of circle, figure-eight and square [m]."""
-    period_s: Positive = 14.2
+    period_s: Positive = 27.5
     """Time for one round of them [s]."""
     altitude_m: float = 0.0
     """Their height in 3-D [m]."""

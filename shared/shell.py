@@ -164,12 +164,14 @@ class Shell:
 def run(
     shells: list[Shell],
     *,
+    on_start: Callable[[], None] = lambda: None,
     on_news: Callable[[str], None] = lambda _: None,
     on_report: Callable[[], None] = lambda: None,
 ) -> None:
     """Drive several endpoints in this process until all have finished, or SIGINT or SIGTERM comes.
 
     Args:
+        on_start: called once signals are heeded and the endpoints are about to be driven.
         on_news: called with each line of news.
         on_report: called at SIGUSR1.
     """
@@ -183,6 +185,7 @@ def run(
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
         loop.add_signal_handler(signal.SIGUSR1, on_report)
+        on_start()
         with contextlib.suppress(asyncio.CancelledError):
             await task
 

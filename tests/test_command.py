@@ -1,0 +1,357 @@
+"""The commands as a user runs them: real processes, real sockets, and one line for a mistake."""
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+import skytether.__main__
+from shared import config
+
+PATIENCE_S = 30.0
+"""How long a test waits for something before it gives up."""
+
+QUICK = [
+    *("--network.uplink.delay", "constant", "--network.downlink.delay", "constant"),
+    *("--network.uplink.minimum-s", "0.03", "--network.downlink.minimum-s", "0.03"),
+    *("--network.uplink.loss", "0", "--network.downlink.loss", "0", "--settle", "0"),
+    *("--link.heartbeat-s", "0.1", "--link.timeout-s", "0.5"),
+]
+"""A short link without losses, and a session that notices silence soon."""
+
+
+def skytether_(*argv: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """One command to its end."""
+    return subprocess.run(
+        [sys.executable, "-P", "-m", "skytether", *argv],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
+
+
+class Process:
+    """A command that goes on, and what it has said."""
+
+    def __init__(self, stack: ExitStack, *argv: str) -> None:
+        self.popen = stack.enter_context(
+            subprocess.Popen(
+                [sys.executable, "-P", "-u", "-m", *argv],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+        )
+        stack.callback(self.popen.kill)
+        assert self.popen.stdout is not None
+        self._stdout = self.popen.stdout
+        self.said: list[str] = []
+
+    def wait_for(self, pattern: str) -> re.Match[str]:
+        """The first line from here on that has the pattern; pytest's own time limit is the test's."""
+        for line in self._stdout:
+            self.said.append(line.rstrip())
+            found = re.search(pattern, line)
+            if found:
+                return found
+        raise AssertionError(f"{pattern!r} was never said; this was: {self.said}")
+
+    def address(self) -> str:
+        """What it listens on."""
+        return self.wait_for(r"listening on (\S+:\d+), waiting for")[1]
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        """Its exit code after a signal."""
+        self.popen.send_signal(number)
+        self.said += self._stdout.read().splitlines()
+        return self.popen.wait(PATIENCE_S)
+
+    def ended(self) -> int:
+        """Its exit code, once it has ended by itself."""
+        self.said += self._stdout.read().splitlines()
+        return self.popen.wait(PATIENCE_S)
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Process]]:
+    """Starts processes; what is still running at the end of the test is killed."""
+    with ExitStack() as stack:
+        yield lambda *argv: Process(stack, *argv)
+
+
+# -- mistakes ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("argv", "code", "line"),
+    [
+        (["fly", "papr"], 2, "fly: papr: no such scenario; did you mean paper?"),
+        (["flyy"], 2, "skytether: no command 'flyy'; did you mean fly?"),
+        (
+            ["fly", "demo", "--control.dt", "0"],
+            2,
+            "fly: demo and the command line: control.dt: got 0.0, expected a number >= 0.001",
+        ),
+        (
+            ["fly", "demo", "--control.horizon", "5"],
+            2,
+            "fly: demo and the command line: control.horizon: got 5, expected horizon · dt "
+            "(now 0.25 s) to cover the uplink's mean delay, 0.44 s",
+        ),
+        (
+            ["fly", "--figure", "flight.gif"],
+            2,
+            "fly: flight.gif: expected a file in .png, .pdf, .svg",
+        ),
+        (["server", "--bind", "47001"], 2, "server: got the address '47001', expected HOST:PORT"),
+        (["client", "--id", "-1"], 2, "client: --id: got -1, expected 0 to 65535"),
+        (
+            ["netem", "--server", "nobody.invalid:1"],
+            1,
+            "netem: cannot find nobody.invalid: Name or service not known",
+        ),
+        (["scenarios", "paper"], 2, "skytether: scenarios: got 'paper', expected nothing"),
+    ],
+)
+def test_a_mistake_is_one_clear_line(
+    argv: list[str], code: int, line: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """On stderr, with the exit code of its kind; no traceback."""
+    assert skytether.__main__.main(argv) == code
+    said = capfd.readouterr()
+    assert said.err.splitlines() == [line]
+
+
+@pytest.mark.parametrize(
+    "argv", [["fly", "--control.dt", "soon"], ["fly", "--control.triger", "always"], ["fly", "a", "b"]]
+)
+def test_a_wrong_flag_is_explained(argv: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    """Exit code 2, the flag named, and where to read more."""
+    argv = [argv[0], "demo", *argv[1:]] if argv[1].startswith("-") else ["fly", "demo", "b"]
+    with pytest.raises(SystemExit) as exit_:
+        skytether.__main__.main(argv)
+    assert exit_.value.code == 2
+    said = capfd.readouterr().err
+    assert argv[2] in said
+    assert "skytether fly --help" in said
+
+
+def test_a_broken_scenario_file_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """File, key, what was given and what was expected."""
+    file = tmp_path / "mine.toml"
+    file.write_text('extends = "paper"\n[network.uplink]\nlos = 0.3\n')
+    assert skytether.__main__.main(["fly", str(file)]) == 2
+    said = capfd.readouterr().err
+    assert said == f"fly: {file}: network.uplink.los: no such key; did you mean loss?\n"
+
+
+def test_a_port_in_use_is_named(capfd: pytest.CaptureFixture[str]) -> None:
+    """A run that cannot start: exit code 1."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        assert skytether.__main__.main(["server", "--bind", f"127.0.0.1:{port}"]) == 1
+    assert capfd.readouterr().err == (
+        f"server: cannot listen on 127.0.0.1:{port}: Address already in use\n"
+    )
+
+
+def test_an_unreachable_server_is_named() -> None:
+    """The client waits as long as the scenario says, then ends with exit code 1."""
+    run = skytether_("client", "demo", "--server", "127.0.0.1:9", "--link.connect-s", "0.5")
+    assert run.returncode == 1
+    assert run.stderr == "client: no answer from 127.0.0.1:9 in 1 s\n"
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    """`skytether scenarios | head -1` says nothing of broken pipes."""
+    command = f"{sys.executable} -P -m skytether scenarios | head -c 1"
+    run = subprocess.run(command, shell=True, capture_output=True, check=False)
+    assert run.stderr == b""
+
+
+# -- help ----------------------------------------------------------------------------------------
+
+
+def test_the_front_door_names_every_command(capfd: pytest.CaptureFixture[str]) -> None:
+    """Without arguments, and with --help."""
+    for argv in ([], ["--help"]):
+        assert skytether.__main__.main(argv) == 0
+        said = capfd.readouterr().out
+        for name in skytether.__main__.COMMANDS:
+            assert re.search(rf"^  {name}\b", said, re.MULTILINE)
+
+
+def test_scenarios_are_listed_with_a_line_each(capfd: pytest.CaptureFixture[str]) -> None:
+    """All that come with Skytether."""
+    assert skytether.__main__.main(["scenarios"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == config.names()
+    assert {"paper", "paper-no-compensation", "paper-every-step", "demo"} <= set(config.names())
+    assert all(len(line.split()) > 3 for line in lines)
+
+
+@pytest.mark.parametrize("name", ["fly", "server", "netem", "client"])
+def test_help_shows_the_scenario_that_was_named(
+    name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Every key is a flag, its default is the scenario's value."""
+    with pytest.raises(SystemExit) as exit_:
+        skytether.__main__.main([name, "paper", "--help"])
+    assert exit_.value.code == 0
+    said = " ".join(re.sub(r"[│\n]", " ", capfd.readouterr().out).split())
+    assert f"usage: skytether {name}" in said
+    assert "--control.decay-rate FLOAT" in said
+    assert "(default: 60.0)" in said
+
+
+# -- flights -------------------------------------------------------------------------------------
+
+
+def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
+    """The same seed, the same file; measured times stay out of it."""
+    files = [tmp_path / "one.json", tmp_path / "two.json"]
+    for file in files:
+        run = skytether_(
+            *("fly", "paper", "--virtual", "--duration", "12", "--seed", "3"),
+            *("--json", str(file), "--figure", str(tmp_path / "flight.png")),
+        )
+        assert run.returncode == 0, run.stderr
+    assert files[0].read_bytes() == files[1].read_bytes()
+    summary = json.loads(files[0].read_text())
+    assert list(summary) == [
+        *("scenario", "seed", "duration_s", "steps", "rmse_x", "rmse_y", "rmse_z", "rmse_xy"),
+        *("event_ratio", "uplink_packets", "uplink_bytes", "downlink_packets", "downlink_bytes"),
+        *("lost", "reordered", "stale", "age_ms_p50", "age_ms_p99", "solve_ms_p50"),
+        *("solve_ms_p99", "deadline_misses", "secure"),
+    ]
+    assert (summary["scenario"], summary["seed"], summary["steps"]) == ("paper", 3, 240)
+    assert summary["solve_ms_p50"] is None
+    assert (tmp_path / "flight.png").read_bytes().startswith(b"\x89PNG")
+    assert "RMSE x, y, xy [m]" in run.stdout
+
+
+def test_flags_lie_over_the_scenario(tmp_path: Path) -> None:
+    """An override changes what is flown; the scenario may be named first or last."""
+    ratios = []
+    for trigger in ("always", "paper"):
+        file = tmp_path / f"{trigger}.json"
+        flags = ["--virtual", "--duration", "8", "--control.trigger", trigger, "--json", str(file)]
+        assert skytether_("fly", *flags, "paper").returncode == 0
+        ratios.append(json.loads(file.read_text())["event_ratio"])
+    assert ratios[0] == 1.0
+    assert ratios[1] < 0.8
+
+
+def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
+    """Three processes on loopback; every figure of the summary is there."""
+    file = tmp_path / "real.json"
+    run = skytether_("fly", "demo", *QUICK, "--duration", "3", "--json", str(file))
+    assert run.returncode == 0, run.stderr
+    summary = json.loads(file.read_text())
+    assert summary["steps"] + summary["deadline_misses"] >= 60
+    absent = {key for key, value in summary.items() if value is None}
+    assert absent == {"rmse_z"}
+    assert summary["solve_ms_p50"] > 0.0
+    assert summary["lost"] == 0
+
+
+def test_ctrl_c_ends_the_flight_and_still_shows_it() -> None:
+    """What was flown until then; nothing is left running."""
+    command = [sys.executable, "-P", "-m", "skytether", "fly", "demo", *QUICK]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as fly:
+        children = []
+        deadline = time.monotonic() + PATIENCE_S
+        while len(children) < 3 and time.monotonic() < deadline:
+            listed = Path(f"/proc/{fly.pid}/task/{fly.pid}/children").read_text().split()
+            children = [int(pid) for pid in listed]
+            time.sleep(0.05)
+        assert len(children) == 3
+        time.sleep(2.0)  # of flight: this is about what is in the table afterwards
+        fly.send_signal(signal.SIGINT)
+        out, err = fly.communicate(timeout=PATIENCE_S)
+    assert fly.returncode == 0, err
+    steps = re.search(r"steps +│ (\d+) in", out)
+    assert steps is not None
+    assert int(steps[1]) > 5
+    assert not any(Path(f"/proc/{pid}").exists() for pid in children)
+
+
+def test_three_processes_by_hand(start: Callable[..., Process], tmp_path: Path) -> None:
+    """`python -m server`, `netem` and `client` say what they listen on, report, and end cleanly."""
+    file = tmp_path / "summary.json"
+    server = start("server", "demo", "--bind", "127.0.0.1:0", *QUICK)
+    address = server.address()
+    netem = start("netem", "demo", "--bind", "127.0.0.1:0", "--server", address, *QUICK)
+    address = netem.address()
+    client = start(
+        *("client", "demo", "--server", address, "--duration", "3", "--json", str(file), *QUICK)
+    )
+    client.wait_for(r"waiting for the server at 127\.0\.0\.1:\d+")
+    client.wait_for("session open, flying")
+    server.wait_for("vehicle 1 flies, from 127.0.0.1:")
+    netem.popen.send_signal(signal.SIGUSR1)
+    netem.wait_for(r"uplink: \d+ packets, \d+ forwarded, 0 lost, 0 reordered, 0 overflowed, queue")
+    netem.wait_for(r"delay: 20 ms: \d+")
+    netem.wait_for("added-delay error: p50")
+    assert client.ended() == 0
+    assert netem.end() == 0
+    assert server.end(signal.SIGINT) == 0
+    assert any("added-delay error" in line for line in netem.said[-2:])
+    summary = json.loads(file.read_text())
+    assert summary["steps"] + summary["deadline_misses"] == 60
+    assert summary["event_ratio"] is None
+
+
+@pytest.mark.parametrize("victim", ["server", "netem", "client"])
+def test_the_other_two_survive_a_kill_and_restart(
+    victim: str, start: Callable[..., Process]
+) -> None:
+    """Killed outright, started again on the same port: horizons flow again."""
+    flags = [*QUICK, "--control.trigger", "always", "--duration", "60"]
+    argv = {"server": ["server", "demo", "--bind", "127.0.0.1:0", *flags]}
+    running = {"server": start(*argv["server"])}
+    address = running["server"].address()
+    argv["server"] = ["server", "demo", "--bind", address, *flags]
+    argv["netem"] = ["netem", "demo", "--bind", "127.0.0.1:0", "--server", address, *flags]
+    running["netem"] = start(*argv["netem"])
+    address = running["netem"].address()
+    argv["netem"] = ["netem", "demo", "--bind", address, *argv["netem"][4:]]
+    argv["client"] = ["client", "demo", "--server", address, *flags]
+    running["client"] = start(*argv["client"])
+    running["client"].wait_for("session open, flying")
+
+    assert running[victim].end(signal.SIGKILL) == -signal.SIGKILL
+    if victim != "client":
+        running["client"].wait_for("the server is silent")
+    running[victim] = start(*argv[victim])
+    if victim == "client":
+        running["client"].wait_for("session open, flying")
+    else:
+        running["client"].wait_for("the server is heard again|the server has restarted")
+
+    def horizons() -> int:
+        running["client"].popen.send_signal(signal.SIGUSR1)
+        return int(running["client"].wait_for(r"(\d+) horizons|missed, no packets")[1] or 0)
+
+    before = horizons()
+    deadline = time.monotonic() + PATIENCE_S
+    while horizons() < before + 10:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    for name in ("client", "netem", "server"):
+        assert running[name].end() == 0
+        assert not any("Traceback" in line for line in running[name].said)
