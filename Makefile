@@ -18,7 +18,7 @@ $(STAMP): requirements.lock requirements-dev.lock pyproject.toml
 	touch $@
 
 demo: setup  ## fly the demonstration
-	$(BIN)/skytether fly demo --figure demo.png
+	$(BIN)/skytether fly demo --beside demo-no-compensation --figure demo.png
 	@echo "The flight is drawn in demo.png."
 
 test: setup  ## everything but Docker, in under five minutes

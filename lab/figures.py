@@ -24,35 +24,36 @@ def check(path: Path) -> None:
         raise CommandError(f"{path}: there is no folder {path.parent}", 2)
 
 
-def flight(path: Path, scenario: Scenario, flights: Mapping[str, Flight]) -> None:
-    """Draw flights of one scenario side by side: the path over the reference, events beneath.
+def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
+    """Draw flights side by side: the path over the reference, and beneath it when packets went up.
 
     Args:
-        flights: by title.
+        path: of a file in one of FORMATS.
+        flown: scenario and record of each, by title.
     """
     from matplotlib.figure import Figure  # takes half a second to import
 
-    figure = Figure(figsize=(4.8 * len(flights), 6.0), layout="constrained")
+    figure = Figure(figsize=(5.2 * len(flown), 5.2), layout="constrained")
     grid = figure.subplots(
-        2, len(flights), squeeze=False, sharex="row", sharey="row", height_ratios=(5, 1)
+        2, len(flown), squeeze=False, sharex="row", sharey="row", height_ratios=(6, 1)
     )
-    for (title, flown), (plane, events) in zip(flights.items(), grid.T, strict=True):
-        time_s = flown.client["step"] * scenario.control.dt
-        desired = scenario.make_reference()(time_s)[..., 0]
-        position = flown.client["state"][..., 0]
+    for (title, (scenario, flight)), (plane, events) in zip(flown.items(), grid.T, strict=True):
+        dt = scenario.control.dt
+        desired = scenario.make_reference()(flight.client["step"] * dt)[..., 0]
+        position = flight.client["state"][..., 0]
         plane.plot(desired[:, 0], desired[:, 1], "r--", label="reference")
         plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
         plane.plot(position[0, 0], position[0, 1], "ko", markersize=4, label="start")
         plane.set_title(title, fontsize=10)
         plane.set_xlabel("x [m]")
-        plane.set_aspect("equal", adjustable="datalim")
+        plane.set_aspect("equal", adjustable="box")
         plane.grid(alpha=0.3)
-        sent_s = flown.server["step"][flown.server["event"]] * scenario.control.dt
-        events.vlines(sent_s, 0.0, 1.0, color="k", linewidth=0.6)
-        ratio = float(np.mean(flown.server["event"])) if len(flown.server) else 0.0
-        events.set_xlabel(f"time [s]; horizons sent at {ratio:.0%} of the steps")
+        sent = flight.server["event"]
+        ratio = float(np.mean(sent)) if len(sent) else 0.0
+        events.vlines(flight.server["step"][sent] * dt, 0.0, 1.0, color="k", linewidth=0.6)
+        events.set_xlabel(f"time [s]; a horizon sent at {ratio:.0%} of the steps")
         events.set_yticks([])
     grid[0, 0].set_ylabel("y [m]")
     grid[0, 0].legend(loc="upper right", fontsize=8)
     grid[1, 0].set_ylabel("sent")
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=130)

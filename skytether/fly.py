@@ -8,15 +8,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lab import figures
-from shared import command, record
+from shared import command, config, record
 from shared.command import CommandError, ScenarioFlags, ScenarioName
-from shared.config import Scenario, to_toml
+from shared.config import ConfigError, Scenario, to_toml
 from shared.shell import new_event_loop
-from shared.summary import summarise
+from shared.summary import Summary, summarise
 from sim import flight
 from skytether import processes
 
@@ -36,6 +37,8 @@ class Options:
     """File for the summary of the flight."""
     figure: Path | None = None
     """File for a picture of it (.png, .pdf or .svg)."""
+    beside: str | None = None
+    """Another scenario, flown in virtual time for as long and with the same seed, to compare."""
     config: ScenarioFlags = Scenario()
 
 
@@ -49,6 +52,7 @@ def fly(argv: Sequence[str]) -> None:
     scenario = options.config
     if options.figure:
         figures.check(options.figure)
+    beside = _beside(options)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{options.scenario}, {where}, seed {scenario.seed}"
     with Progress(
@@ -69,10 +73,29 @@ def fly(argv: Sequence[str]) -> None:
         raise CommandError(flown.failure)
     if not len(flown.client):
         raise CommandError("ended before the first step")
-    summary = summarise(scenario, options.scenario, flown.client, flown.server, flown.netem)
-    command.finish(summary, title, options.json)
+    flights = {title: (scenario, flown)}
+    if beside:
+        other = flight.fly(beside)
+        other_title = f"{options.beside}, in virtual time, seed {beside.seed}"
+        flights[other_title] = beside, other
+        command.finish(_summarise(beside, str(options.beside), other), other_title)
+    command.finish(_summarise(scenario, options.scenario, flown), title, options.json)
     if options.figure:
-        figures.flight(options.figure, scenario, {title: flown})
+        figures.flights(options.figure, flights)
+
+
+def _beside(options: Options) -> Scenario | None:
+    if options.beside is None:
+        return None
+    same = {key: getattr(options.config, key) for key in ("duration", "seed", "settle")}
+    try:
+        return msgspec.structs.replace(config.load(options.beside), **same)
+    except ConfigError as error:
+        raise CommandError(str(error), command.CONFIGURATION) from None
+
+
+def _summarise(scenario: Scenario, name: str, flown: flight.Flight) -> Summary:
+    return summarise(scenario, name, flown.client, flown.server, flown.netem)
 
 
 def _virtually(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:

@@ -57,7 +57,7 @@ class Process:
         self.said: list[str] = []
 
     def wait_for(self, pattern: str) -> re.Match[str]:
-        """The first line from here on that has the pattern; pytest's own time limit is the test's."""
+        """The first line from here on that has the pattern; the test's time limit bounds it."""
         for line in self._stdout:
             self.said.append(line.rstrip())
             found = re.search(pattern, line)
@@ -104,8 +104,10 @@ def start() -> Iterator[Callable[..., Process]]:
         (
             ["fly", "demo", "--control.horizon", "5"],
             2,
-            "fly: demo and the command line: control.horizon: got 5, expected horizon · dt "
-            "(now 0.25 s) to cover the uplink's mean delay, 0.44 s",
+            (
+                "fly: demo and the command line: control.horizon: got 5, expected horizon · dt "
+                "(now 0.25 s) to cover the uplink's mean delay, 0.44 s"
+            ),
         ),
         (
             ["fly", "--figure", "flight.gif"],
@@ -131,23 +133,18 @@ def test_a_mistake_is_one_clear_line(
     assert said.err.splitlines() == [line]
 
 
-@pytest.mark.parametrize(
-    "argv", [["fly", "--control.dt", "soon"], ["fly", "--control.triger", "always"], ["fly", "a", "b"]]
-)
+@pytest.mark.parametrize("argv", [["--control.dt", "soon"], ["--control.triger", "x"], ["more"]])
 def test_a_wrong_flag_is_explained(argv: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     """Exit code 2, the flag named, and where to read more."""
-    argv = [argv[0], "demo", *argv[1:]] if argv[1].startswith("-") else ["fly", "demo", "b"]
     with pytest.raises(SystemExit) as exit_:
-        skytether.__main__.main(argv)
+        skytether.__main__.main(["fly", "demo", *argv])
     assert exit_.value.code == 2
     said = capfd.readouterr().err
-    assert argv[2] in said
+    assert argv[0] in said
     assert "skytether fly --help" in said
 
 
-def test_a_broken_scenario_file_is_named(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_broken_scenario_file_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """File, key, what was given and what was expected."""
     file = tmp_path / "mine.toml"
     file.write_text('extends = "paper"\n[network.uplink]\nlos = 0.3\n')

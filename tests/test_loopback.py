@@ -181,7 +181,7 @@ def test_addresses_of_no_use_are_named() -> None:
         host, port = taken.getsockname()
         with pytest.raises(AddressError, match=f"cannot listen on {host}:{port}: Address already"):
             Shell(Echo(), (host, port))
-    with pytest.raises(AddressError, match="cannot find no-such-host.invalid: "):
+    with pytest.raises(AddressError, match=r"cannot find no-such-host\.invalid: "):
         Shell(Echo(), LOOPBACK, [("no-such-host.invalid", 1)])
 
 
