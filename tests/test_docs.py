@@ -1,0 +1,115 @@
+"""The documents: their commands run, their links lead somewhere, their names exist."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared.protocol import PAYLOAD_BYTES_MAX
+from shared.summary import Summary
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
+
+
+def blocks(document: Path) -> list[list[str]]:
+    """The commands in each shell block of a document, without comments."""
+    found = re.findall(r"```sh\n(.*?)```", document.read_text(), re.DOTALL)
+    return [
+        [line for line in (raw.split("#")[0].strip() for raw in block.splitlines()) if line]
+        for block in found
+    ]
+
+
+COMMANDS = [line for document in DOCUMENTS for block in blocks(document) for line in block]
+
+
+def skytether(line: str) -> list[str]:
+    """A documented command as this environment runs it."""
+    name, *argv = shlex.split(line)
+    assert name == "skytether"
+    return [sys.executable, "-P", "-m", "skytether", *argv]
+
+
+@pytest.mark.parametrize(
+    "line", [line for line in COMMANDS if line.startswith(("skytether fly", "skytether scen"))]
+)
+def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
+    """As written; over UDP a tenth as long."""
+    if "--duration 20" in line:
+        line += " --settle 0 --duration 2"
+    run = subprocess.run(skytether(line), cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip()
+
+
+def test_the_three_documented_terminals_fly_together() -> None:
+    """The block of README with server, netem and client, each line in a process of its own."""
+    (lines,) = [
+        block
+        for block in blocks(ROOT / "README.md")
+        if any(line.startswith("skytether client") for line in block)
+    ]
+    server, netem, client = (skytether(line) for line in lines)
+    client += ["--settle", "0", "--duration", "2"]
+    with (
+        subprocess.Popen(server, stdout=subprocess.DEVNULL) as one,
+        subprocess.Popen(netem, stdout=subprocess.DEVNULL) as two,
+    ):
+        try:
+            run = subprocess.run(client, capture_output=True, text=True, timeout=60, check=False)
+        finally:
+            time.sleep(0.1)
+            one.terminate()
+            two.terminate()
+    assert run.returncode == 0, run.stderr
+    assert "session open, flying" in run.stdout
+    assert (one.returncode, two.returncode) == (0, 0)
+
+
+@pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
+def test_documented_targets_exist(line: str) -> None:
+    """`make -n` knows each."""
+    run = subprocess.run(
+        ["make", "-n", *shlex.split(line)[1:]], cwd=ROOT, capture_output=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+
+
+def test_every_documented_command_is_tested() -> None:
+    """Here, or by make docker-test."""
+    known = ("make ", "skytether fly ", "skytether scenarios", "docker compose up")
+    by_hand = ("skytether server ", "skytether netem ", "skytether client ")
+    for line in COMMANDS:
+        assert line.startswith((*known, *by_hand)), line
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(document: Path) -> None:
+    """Every relative link of every document."""
+    for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text()):
+        assert (document.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_named_places_in_the_code_exist(document: Path) -> None:
+    """`path/file.py` and, behind it, the names it is said to hold."""
+    text = document.read_text()
+    for path, names in re.findall(r"`((?:\w+/)+\w+\.py)`?(?::((?:,? ?`?\.?[\w.]+`?)+))?", text):
+        code = (ROOT / path).read_text()
+        for name in re.findall(
+            r"`\.?([A-Za-z_][\w.]*)`", f"`{names}`" if "`" not in names else names
+        ):
+            assert name.split(".")[-1] in code, f"{path} has no {name}"
+
+
+def test_the_protocols_table_states_the_limits() -> None:
+    """The numbers in prose are the numbers in code."""
+    text = (ROOT / "docs" / "protocol.md").read_text()
+    assert f"at most {PAYLOAD_BYTES_MAX} bytes" in text
+    assert "has 353 bytes, an\nOBSERVATION 76, a HEARTBEAT 18" in text
+    assert "rmse_xy" in Summary.__struct_fields__
