@@ -152,7 +152,7 @@ def main(command: Any, argv: Sequence[str] | None, prog: str) -> int:
     return 0
 
 
-def finish(summary: Summary, title: str, json: Path | None) -> None:
+def finish(summary: Summary, title: str, json: Path | None = None) -> None:
     """Print a summary as a table, and write it to a file.
 
     Raises:

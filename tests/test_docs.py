@@ -63,7 +63,6 @@ def test_the_three_documented_terminals_fly_together() -> None:
         try:
             run = subprocess.run(client, capture_output=True, text=True, timeout=60, check=False)
         finally:
-            time.sleep(0.1)
             one.terminate()
             two.terminate()
     assert run.returncode == 0, run.stderr
