@@ -17,8 +17,8 @@ from shared.chance import stream
 from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import Scenario
 from shared.record import Recorder, client_columns, parse
-from shared.shell import ANYWHERE
 from shared.summary import summarise
+from shared.udp import ANYWHERE
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
 from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Recorder
 
-FLOWS_MAX = 1024
-"""Clients at once; a packet of a further one is dropped, and counted."""
+FLOWS_MAX = 512
+"""Clients at once, a socket each; a packet of a further one is dropped, and counted."""
 IDLE_NS = 60 * SECOND_NS
 """A flow without a packet for so long gives its place, and its socket, to a new client."""
 

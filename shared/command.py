@@ -5,12 +5,13 @@ the scenario itself, whose every key is a flag: the file comes first, flags lie 
 """
 
 import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from inspect import cleandoc
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Protocol, TypeVar
+from typing import Annotated, BinaryIO, Protocol, TypeVar
 
 import tyro
 from rich.console import Console
@@ -20,8 +21,9 @@ from rich.text import Text
 from shared import config
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint
-from shared.shell import AddressError, Shell, run
+from shared.shell import Shell, run
 from shared.summary import Summary
+from shared.udp import AddressError
 
 CONFIGURATION, RUN = 2, 1
 """Exit codes: the command asked for something impossible, or it went wrong on the way."""
@@ -139,13 +141,15 @@ def drive(
     report()
 
 
-def main(command: Any, argv: Sequence[str] | None, prog: str) -> int:
+def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, prog: str) -> int:
     """Run a command; its exit code. What went wrong is one line on stderr."""
     try:
         command(sys.argv[1:] if argv is None else argv)
     except CommandError as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return error.code
+    except KeyboardInterrupt:  # before there was anything to end in order
+        return 128 + signal.SIGINT
     except BrokenPipeError:  # whoever read our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return RUN

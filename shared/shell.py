@@ -1,33 +1,25 @@
 """The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
 
-All of asyncio, sockets and signals is in here and in `shared.timer`. It knows nothing of control or
-of the protocol: datagrams and time go in, datagrams and lines of news come out.
+All of asyncio and signals is in here and in `shared.timer`, all of sockets in `shared.udp`. It
+knows nothing of control or of the protocol: datagrams and time go in, datagrams and news come out.
 """
 
 import asyncio
 import contextlib
 import gc
-import ipaddress
 import signal
-import socket
-import struct
 import time
 from collections.abc import Callable, Iterable
 
 from shared.endpoint import Address, Datagram, Endpoint
 from shared.timer import make_timer
+from shared.udp import ANYWHERE, Names, kernel_drops, open_socket
 
-BUFFER_BYTES = 4 * 1024 * 1024
-"""The default receive buffer holds 166 datagrams of 600 B."""
 BURST_MAX = 128
 """Datagrams read from one socket before timers and other sockets have their turn."""
 DATAGRAM_BYTES_MAX = 65535
-ANYWHERE: Address = ("0.0.0.0", 0)
-"""A free port on every interface: what an endpoint's further sockets are bound to."""
 RESOLVE_EVERY_S = 2.0
 """Names are looked up again so often, off the loop: a restarted host may have a new address."""
-
-_SO_MEMINFO, _MEMINFO_DROPS = 55, 8
 
 
 def new_event_loop() -> asyncio.AbstractEventLoop:
@@ -37,10 +29,6 @@ def new_event_loop() -> asyncio.AbstractEventLoop:
     except ImportError:
         return asyncio.new_event_loop()
     return uvloop.new_event_loop()
-
-
-class AddressError(Exception):
-    """An address that the user gave is of no use; the message says which and why."""
 
 
 class Shell:
@@ -60,19 +48,8 @@ class Shell:
         self.endpoint = endpoint
         self.send_errors = 0
         self._drops = 0
-        self._names = [peer for peer in peers if not _is_numeric(peer[0])]
-        self._numeric: dict[Address, Address] = {}
-        self._named: dict[Address, Address] = {}
-        for peer in self._names:
-            try:
-                self._learn(peer, _look_up(peer))
-            except OSError as error:
-                raise AddressError(f"cannot find {peer[0]}: {error.strerror}") from None
-        try:
-            self._sockets = {0: _open(bind)}
-        except OSError as error:
-            reason = f"cannot listen on {bind[0]}:{bind[1]}: {error.strerror}"
-            raise AddressError(reason) from None
+        self._names = Names(peers)
+        self._sockets = {0: open_socket(bind)}
         self.address: Address = self._sockets[0].getsockname()
 
     async def run(self, on_news: Callable[[str], None] = lambda _: None) -> None:
@@ -99,7 +76,7 @@ class Shell:
 
     def kernel_drops(self) -> int:
         """Datagrams the kernel dropped because a receive buffer was full (0 where it won't say)."""
-        return self._drops + sum(map(_drops, self._sockets.values()))
+        return self._drops + sum(map(kernel_drops, self._sockets.values()))
 
     def _listen(self, number: int) -> None:
         self._loop.add_reader(self._sockets[number], self._read, number)
@@ -113,8 +90,7 @@ class Shell:
                 break
             except OSError:  # an earlier packet of ours found the peer's port closed
                 continue
-            sender: Address = self._named.get(peer) or peer
-            datagram = Datagram(payload, sender, number)
+            datagram = Datagram(payload, self._names.name(peer), number)
             endpoint.receive(datagram, now_ns=time.monotonic_ns())
         self._after()
 
@@ -140,25 +116,19 @@ class Shell:
             self._done.set_result(None)
 
     def _send(self, datagram: Datagram) -> None:
-        if datagram.socket not in self._sockets:
-            self._sockets[datagram.socket] = _open(ANYWHERE)
-            self._listen(datagram.socket)
-        peer = self._numeric.get(datagram.peer, datagram.peer)
+        to = self._names.number(datagram.peer)
         try:
-            self._sockets[datagram.socket].sendto(datagram.payload, peer)
+            if datagram.socket not in self._sockets:
+                self._sockets[datagram.socket] = open_socket(ANYWHERE)
+                self._listen(datagram.socket)
+            self._sockets[datagram.socket].sendto(datagram.payload, to)
         except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet
             self.send_errors += 1
 
     async def _keep_resolving(self) -> None:
         while self._names:
             await asyncio.sleep(RESOLVE_EVERY_S)
-            for peer in self._names:
-                with contextlib.suppress(OSError):  # the name server may be as lost as the peer
-                    self._learn(peer, await self._loop.run_in_executor(None, _look_up, peer))
-
-    def _learn(self, name: Address, numeric: Address) -> None:
-        self._named.pop(self._numeric.get(name, name), None)
-        self._numeric[name], self._named[numeric] = numeric, name
+            self._names.learn(await self._loop.run_in_executor(None, self._names.look_up))
 
 
 def run(
@@ -191,41 +161,3 @@ def run(
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(main())
-
-
-def _open(address: Address) -> socket.socket:
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        sock.setblocking(False)
-        for option, forced in ((socket.SO_RCVBUF, 33), (socket.SO_SNDBUF, 32)):
-            sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
-            # SO_…BUFFORCE goes over the system's limit, for those who may.
-            with contextlib.suppress(OSError):
-                sock.setsockopt(socket.SOL_SOCKET, forced, BUFFER_BYTES)
-        sock.bind(address)
-    except OSError:
-        sock.close()
-        raise
-    return sock
-
-
-def _drops(sock: socket.socket) -> int:
-    try:
-        info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
-    except OSError:
-        return 0
-    return int(struct.unpack("=9I", info)[_MEMINFO_DROPS])
-
-
-def _is_numeric(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
-
-
-def _look_up(peer: Address) -> Address:
-    found = socket.getaddrinfo(*peer, socket.AF_INET, socket.SOCK_DGRAM)
-    host, port = found[0][4][:2]
-    return str(host), int(port)

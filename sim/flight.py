@@ -45,7 +45,8 @@ def fly(
     scenario: Scenario,
     *,
     vehicles: int = 1,
-    on_second: Callable[[int], None] | None = None,
+    on_second: Callable[[int], None] = lambda _: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Flight:
     """Fly a scenario in virtual time.
 
@@ -55,6 +56,7 @@ def fly(
     Args:
         vehicles: how many, numbered from 1, all with the same plan and winds of their own.
         on_second: called with the time flown [s], once a second of it.
+        stopped: asked often; once it says so, the flight is broken off.
     """
     axes, simulation = scenario.model.axes, scenario.simulation
     sinks = [io.BytesIO() for _ in range(3)]
@@ -89,10 +91,10 @@ def fly(
 
     def over() -> bool:
         nonlocal flown_s
-        if on_second is not None and world.now_ns // SECOND_NS != flown_s:
+        if world.now_ns // SECOND_NS != flown_s:
             flown_s = world.now_ns // SECOND_NS
             on_second(flown_s)
-        return all(client.finished for client in clients)
+        return stopped() or all(client.finished for client in clients)
 
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
     world.run(over, limit_ns=seconds_to_ns(longest_s))

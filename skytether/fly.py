@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import signal
 import tempfile
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,7 +100,12 @@ def _summarise(scenario: Scenario, name: str, flown: flight.Flight) -> Summary:
 
 
 def _virtually(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
-    return flight.fly(scenario, on_second=on_second)
+    stop = threading.Event()
+    before = signal.signal(signal.SIGINT, lambda *_: stop.set())
+    try:
+        return flight.fly(scenario, on_second=on_second, stopped=stop.is_set)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _really(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:

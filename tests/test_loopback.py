@@ -16,12 +16,13 @@ from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
 from server.controller import Server
-from shared import config, shell, timer
+from shared import config, shell, timer, udp
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
 from shared.record import PACKET_COLUMNS, Recorder, client_columns, parse, server_columns
-from shared.shell import AddressError, Shell
+from shared.shell import Shell
+from shared.udp import AddressError
 from sim.flight import Flight
 from sim.flight import fly as fly_virtually
 
@@ -164,14 +165,16 @@ async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.Monk
         looked_up.append(peer)
         return addresses["first" if len(looked_up) == 1 else "then"]
 
-    monkeypatch.setattr(shell, "_look_up", look_up)
+    monkeypatch.setattr(udp, "look_up", look_up)
     monkeypatch.setattr(shell, "RESOLVE_EVERY_S", 0.001)
     driver = Shell(Echo(), LOOPBACK, [("moving", 1)])
-    assert driver._named == {addresses["first"]: ("moving", 1)}
+    assert driver._names.name(addresses["first"]) == ("moving", 1)
     async with driven(driver):
         while len(looked_up) < 3:
             await asyncio.sleep(0.001)
-    assert driver._named == {addresses["then"]: ("moving", 1)}
+    assert driver._names.number(("moving", 1)) == addresses["then"]
+    assert driver._names.name(addresses["then"]) == ("moving", 1)
+    assert driver._names.name(addresses["first"]) == addresses["first"]
 
 
 def test_addresses_of_no_use_are_named() -> None:
@@ -293,7 +296,7 @@ async def test_datagrams_dropped_by_the_kernel_are_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """They would look like losses of the network."""
-    monkeypatch.setattr(shell, "BUFFER_BYTES", 4096)
+    monkeypatch.setattr(udp, "BUFFER_BYTES", 4096)
     driver = Shell(Echo(), LOOPBACK)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         for _ in range(200):

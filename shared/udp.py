@@ -1,0 +1,114 @@
+"""Sockets and names, as the shell needs them; all blocking calls about addresses are in here."""
+
+import contextlib
+import ipaddress
+import socket
+import struct
+from collections.abc import Iterable
+
+from shared.endpoint import Address
+
+ANYWHERE: Address = ("0.0.0.0", 0)
+"""A free port on every interface: what an endpoint's further sockets are bound to."""
+BUFFER_BYTES = 4 * 1024 * 1024
+"""The default receive buffer holds 166 datagrams of 600 B."""
+
+_SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
+
+
+class AddressError(OSError):
+    """An address that the user gave is of no use; the message says which and why."""
+
+
+def open_socket(address: Address) -> socket.socket:
+    """A non-blocking UDP socket with large buffers.
+
+    Raises:
+        AddressError: the address cannot be bound.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.setblocking(False)
+        for plain, forced in (
+            (socket.SO_RCVBUF, _SO_RCVBUFFORCE),
+            (socket.SO_SNDBUF, _SO_SNDBUFFORCE),
+        ):
+            sock.setsockopt(socket.SOL_SOCKET, plain, BUFFER_BYTES)
+            with contextlib.suppress(OSError):  # over the system's limit, for those who may
+                sock.setsockopt(socket.SOL_SOCKET, forced, BUFFER_BYTES)
+        sock.bind(address)
+    except OSError as error:
+        sock.close()
+        reason = f"cannot listen on {address[0]}:{address[1]}: {error.strerror}"
+        raise AddressError(reason) from None
+    return sock
+
+
+def kernel_drops(sock: socket.socket) -> int:
+    """Datagrams dropped because the receive buffer was full; 0 where the system won't say."""
+    try:
+        info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
+    except OSError:
+        return 0
+    return int(struct.unpack("=9I", info)[_MEMINFO_DROPS])
+
+
+class Names:
+    """Which numbers stand for the names of peers, as far as is known now.
+
+    Raises:
+        AddressError: one of them cannot be found.
+    """
+
+    def __init__(self, peers: Iterable[Address]) -> None:
+        self._names = [peer for peer in peers if not _is_numeric(peer[0])]
+        self._numbers: dict[Address, Address] = {}
+        self._by_number: dict[Address, Address] = {}
+        for name in self._names:
+            try:
+                self.learn({name: look_up(name)})
+            except OSError as error:
+                raise AddressError(f"cannot find {name[0]}: {error.strerror}") from None
+
+    def __bool__(self) -> bool:
+        return bool(self._names)
+
+    def number(self, peer: Address) -> Address:
+        """Where to send to."""
+        return self._numbers.get(peer, peer)
+
+    def name(self, number: Address) -> Address:
+        """Who has sent: the peer by its name, where it has one."""
+        return self._by_number.get(number, number)
+
+    def look_up(self) -> dict[Address, Address]:
+        """All names looked up anew, without those that cannot be found just now; blocks."""
+        found = {}
+        for name in self._names:
+            with contextlib.suppress(OSError):
+                found[name] = look_up(name)
+        return found
+
+    def learn(self, found: dict[Address, Address]) -> None:
+        """From now on these numbers stand for these names."""
+        self._numbers |= found
+        self._by_number = {number: name for name, number in self._numbers.items()}
+
+
+def look_up(peer: Address) -> Address:
+    """The numeric address of a named one; blocks.
+
+    Raises:
+        OSError: it cannot be found.
+    """
+    found = socket.getaddrinfo(*peer, socket.AF_INET, socket.SOCK_DGRAM)
+    host, port = found[0][4][:2]
+    return str(host), int(port)
+
+
+def _is_numeric(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
