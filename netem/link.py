@@ -34,9 +34,9 @@ class Histogram:
         wanted, seen = share * sum(self.counts), 0
         for index, count in enumerate(self.counts):
             seen += count
-            if count and seen >= wanted:
+            if count and seen >= wanted and index < BINS - 1:
                 return min((index + 1) * self.bin_ns, self.largest_ns) / MILLISECOND_NS
-        return 0.0
+        return self.largest_ns / MILLISECOND_NS
 
     def __str__(self) -> str:
         bins = [

@@ -64,6 +64,7 @@ class Estimator:
         observed = self._state[rows]
         if not self._compensate:
             return observed.copy()
+        self._hold(rows, step)
         age = self.age(rows, step)
         i = np.arange(1, self._reach + 1)
         ring = (step[:, None] - i) % self._reach
@@ -73,16 +74,17 @@ class Estimator:
         return free + np.einsum("aip,nai->nap", self._responses, past)
 
     def remember(self, rows: Indices, step: Indices, inputs: Array) -> None:
-        """û(k) ← u(k|k), eq. (12).
-
-        Steps between this one and the last remembered, at which nothing was computed, get û(k) too.
-
-        Args:
-            inputs: shape (n, axes).
-        """
-        last = self._last_step[rows]
-        missed = np.where(last < 0, 1, np.minimum(step - last, self._reach))
-        for back in range(int(missed.max(initial=0))):
-            some = missed > back
-            self._inputs[rows[some], :, (step[some] - back) % self._reach] = inputs[some]
+        """û(k) ← u(k|k), eq. (12); inputs of shape (n, axes)."""
+        self._hold(rows, step)
+        self._inputs[rows, :, step % self._reach] = inputs
         self._last_step[rows] = step
+
+    def _hold(self, rows: Indices, step: Indices) -> None:
+        """Steps before this one at which nothing was computed: û is what it was before them."""
+        last = self._last_step[rows]
+        held = np.take_along_axis(self._inputs[rows], (last % self._reach)[:, None, None], axis=2)
+        missed = np.where(last < 0, 0, np.minimum(step - 1 - last, self._reach))
+        for back in range(1, int(missed.max(initial=0)) + 1):
+            some = missed >= back
+            self._inputs[rows[some], :, (step[some] - back) % self._reach] = held[some, :, 0]
+        self._last_step[rows] = np.where(missed > 0, step - 1, last)

@@ -110,10 +110,12 @@ class Planner:
             planned: x_p(k|k-1), and `fresh`: from `planned`.
         """
         gap = np.where(fresh, 0, step - self._step[rows])
-        self._step[rows] = step
         stages = np.arange(self._H + 1)
         desired = self._reference((step[:, None] + stages) * self._dt).transpose(0, 2, 1, 3)
         led = self._generator.solve(rows, gap, fresh, planned, desired)
         trajectory = np.concatenate([planned[:, :, None], self._generator.states[rows]], axis=2)
         tracked = self._tracker.solve(rows, gap, fresh, estimate, trajectory)
-        return Plan(self._tracker.inputs[rows], led & tracked)
+        solved = led & tracked
+        # A first plan that failed is no plan to go on from.
+        self._step[rows] = np.where(fresh & ~solved, -1, step)
+        return Plan(self._tracker.inputs[rows], solved)

@@ -88,10 +88,10 @@ class Paper:
         self, rows: Indices, step: Indices, estimate: Array, planned: Array, fresh: Flags
     ) -> Verdict:
         """See `Trigger`."""
+        self.sent(rows[fresh], step[fresh], np.zeros(int(fresh.sum())))  # V(k_0) = 0
         error = planning_error(estimate, planned, self._P)
         since = step - self._event_step[rows]
-        decayed = np.where(fresh, 0.0, self._event_error[rows] * np.exp(-self._decay * since))
-        threshold = decayed + self._epsilon
+        threshold = self._event_error[rows] * np.exp(-self._decay * since) + self._epsilon
         return Verdict(fresh | (error > threshold), error, threshold)
 
     def sent(self, rows: Indices, step: Indices, error: Array) -> None:

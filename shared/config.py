@@ -5,13 +5,15 @@ what differs. `skytether scenarios` lists those that come with Skytether.
 """
 
 import difflib
+import math
 import re
 import tomllib
 import typing
 from collections.abc import Mapping
 from importlib import resources
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -25,6 +27,8 @@ from shared.protocol import INPUTS_MAX, Terms
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
+Duration = Annotated[float, Meta(ge=0, le=3600)]
+"""A time that may be nothing, and is no longer than an hour [s]."""
 
 
 class ConfigError(Exception):
@@ -120,11 +124,11 @@ class DirectionConfig(Section, frozen=True):
 
     delay: Literal["paper", "constant", "none"] = "paper"
     """Delay of a packet: minimum_s + slot_s · Poisson(slots_mean) (17), minimum_s, or none."""
-    minimum_s: NonNegative = 0.4
+    minimum_s: Duration = 0.4
     """The smallest delay [s]."""
-    slot_s: NonNegative = 0.02
+    slot_s: Duration = 0.02
     """Lattice of the paper's delay [s]."""
-    slots_mean: NonNegative = 2.0
+    slots_mean: Annotated[float, Meta(ge=0, le=1e6)] = 2.0
     """Mean number of slots on top."""
     loss: Annotated[float, Meta(ge=0, le=1)] = 0.1
     """Share of packets lost."""
@@ -159,7 +163,7 @@ class LinkConfig(Section, frozen=True):
 class SimulationConfig(Section, frozen=True):
     """What only virtual time has to be told."""
 
-    compute_s: NonNegative = 0.001
+    compute_s: Duration = 0.001
     """Time the server takes for a step [s]."""
     clock_offset_s: float = 0.0
     """The vehicle's clock minus the server's, at the start [s]."""
@@ -276,7 +280,7 @@ def check(raw: Mapping[str, Any], source: str) -> Scenario:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {_explain(str(error), raw)}") from None
-    for key, given, expected in _contradictions(scenario):
+    for key, given, expected in chain(_infinite(to_table(scenario)), _contradictions(scenario)):
         raise ConfigError(f"{source}: {key}: got {given}, expected {expected}")
     return scenario
 
@@ -292,10 +296,8 @@ def to_toml(scenario: Scenario) -> bytes:
     return msgspec.toml.encode(scenario)
 
 
-def _read(name: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The raw table of a scenario, laid over those that it extends."""
-    if name in seen:
-        raise ConfigError(f"{seen[0]}: extends: got a circle of {' → '.join((*seen, name))}")
+def _read(name: str, seen: Mapping[Path, str] = MappingProxyType({})) -> dict[str, Any]:
+    """The raw table of a scenario, laid over those that it extends; `seen` extend it in turn."""
     if name.endswith(".toml"):
         path = Path(name)
     elif name in names():
@@ -303,13 +305,22 @@ def _read(name: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     else:
         raise ConfigError(f"{name}: no such scenario{_hint(name, names())}")
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        path = path.resolve()
+        content = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{name}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
+        raise ConfigError(f"{name}: cannot be read: {error}") from None
+    if path in seen:
+        raise ConfigError(
+            f"{seen[path]}: extends: got a circle of {' → '.join([*seen.values(), name])}"
+        )
+    try:
+        raw = tomllib.loads(content.decode())
+    except ValueError as error:
         raise ConfigError(f"{name}: no valid TOML: {error}") from None
     table = raw.get("reference")
-    if isinstance(table, dict) and isinstance(table.get("file"), str):
+    if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
         table["file"] = str((path.parent / table["file"]).absolute())
     base = raw.pop("extends", None)
     if base is None:
@@ -318,7 +329,7 @@ def _read(name: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
         raise ConfigError(f"{name}: extends: got {base!r}, expected the name of a scenario")
     if base.endswith(".toml"):
         base = str(path.parent / base)
-    return _overlay(_read(base, (*seen, name)), raw)
+    return _overlay(_read(base, {**seen, path: name}), raw)
 
 
 def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
@@ -374,6 +385,18 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
     return f"{path or 'the scenario'}: got {given!r}, expected {expected}"
 
 
+def _infinite(value: object, key: str = "") -> typing.Iterator[tuple[str, object, str]]:
+    """Numbers that TOML knows and no flight has a use for: key, given, expected."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield key, value, "a finite number"
+    elif isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _infinite(inner, f"{key}.{name}" if key else name)
+    elif isinstance(value, list | tuple):
+        for index, inner in enumerate(value):
+            yield from _infinite(inner, f"{key}[{index}]")
+
+
 def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
     """Values that are right one by one and impossible together: key, given, expected."""
     model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
@@ -391,7 +414,7 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
         most = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
         yield "control.horizon", control.horizon, most
     covered_s, delay_s = control.horizon * control.dt, scenario.network.uplink.mean_s
-    if covered_s < delay_s:
+    if covered_s < delay_s - 1e-9:  # as much as floating point may make of 40 · 0.011
         cover = (
             f"horizon · dt (now {covered_s:g} s) to cover the uplink's mean delay, {delay_s:g} s"
         )

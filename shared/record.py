@@ -89,10 +89,19 @@ class Recorder:
 
 
 def parse(part: bytes) -> Rows:
-    """The rows of a part; half a row at its end (a killed writer's) is left out."""
+    """The rows of a part; half a row at its end (a killed writer's) is left out.
+
+    Raises:
+        ValueError: it is no part.
+    """
     header, _, body = part.partition(b"\n")
-    descr = [(name, kind, *map(tuple, shape)) for name, kind, *shape in json.loads(header)]
-    columns = np.dtype(descr)
+    try:
+        descr = [(name, kind, *map(tuple, shape)) for name, kind, *shape in json.loads(header)]
+        columns = np.dtype(descr)
+    except TypeError:
+        raise ValueError("not a part of a record") from None
+    if columns.itemsize == 0:
+        raise ValueError("not a part of a record: no columns")
     return np.frombuffer(body[: len(body) - len(body) % columns.itemsize], columns)
 
 

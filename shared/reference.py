@@ -127,12 +127,12 @@ def from_csv(path: Path, axes: int) -> Reference:
         missing = [name for name in names if name not in (table.fieldnames or ())]
         if missing:
             raise ValueError(f"line 1: expected the columns {', '.join(names)}")
-        rows = []
-        for line, row in enumerate(table, start=2):
-            try:
-                rows.append([float(row[name]) for name in names])
-            except (TypeError, ValueError):
-                raise ValueError(f"line {line}: expected {len(names)} numbers") from None
+        try:
+            rows = [[float(row[name]) for name in names] for row in table]
+        except (TypeError, ValueError):
+            raise ValueError(f"line {table.line_num}: expected {len(names)} numbers") from None
+        except csv.Error as error:
+            raise ValueError(f"line {table.line_num}: {error}") from None
     data = np.array(rows).reshape(-1, axes + 1)
     if len(data) < 2 or not np.isfinite(data).all():
         raise ValueError("expected at least two lines of finite numbers")

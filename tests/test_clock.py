@@ -1,0 +1,248 @@
+"""The server's clock mapped to the vehicle's: exact where it can be, honest where it cannot."""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from server.clock import ClockMap
+from shared.endpoint import MILLISECOND_NS as MS
+from shared.endpoint import SECOND_NS as S
+
+quick = settings(max_examples=60, deadline=None)
+
+DT_NS = 50 * MS
+HOUR = 3600 * S
+ROW = np.array([0])
+
+
+def observe(
+    clock: ClockMap, now_ns: int, offset_ns: int, *, down_ns: int, up_ns: int, row: int = 0
+) -> int:
+    """One observation and its echo, over a network of these delays; the offset adopted then."""
+    clock.observe(row, down_ns - offset_ns, up_ns + offset_ns, now_ns=now_ns)
+    return int(clock.offset_ns(np.array([row]))[0])
+
+
+def listen(
+    clock: ClockMap,
+    times_ns: Iterable[int],
+    offset_ns: Callable[[int], int],
+    *,
+    down_ns: int = 400 * MS,
+    up_ns: int = 400 * MS,
+) -> list[int]:
+    """How far the adopted offset is off at each time, delays being constant."""
+    return [
+        observe(clock, now, offset_ns(now), down_ns=down_ns, up_ns=up_ns) - offset_ns(now)
+        for now in times_ns
+    ]
+
+
+def times(start_s: float, end_s: float) -> range:
+    """20 observations a second."""
+    return range(round(start_s * S), round(end_s * S), DT_NS)
+
+
+@quick
+@given(st.integers(-(2**55), 2**55), st.integers(0, S))
+def test_equal_delays_give_the_offset_exactly(offset_ns: int, delay_ns: int) -> None:
+    """To the nanosecond, from the first observation on, whatever the clocks show."""
+    clock = ClockMap(1, DT_NS)
+    assert observe(clock, 5 * S, offset_ns, down_ns=delay_ns, up_ns=delay_ns) == offset_ns
+    assert clock.bound_ns(ROW).tolist() == [delay_ns]
+
+
+@quick
+@given(st.integers(0, S), st.integers(0, S))
+def test_unequal_delays_err_by_half_their_difference(down_ns: int, up_ns: int) -> None:
+    """Nobody can know better; and the error stays within the bound that is published."""
+    clock = ClockMap(1, DT_NS)
+    error = observe(clock, 5 * S, HOUR, down_ns=down_ns, up_ns=up_ns) - HOUR
+    assert error == (up_ns - down_ns) // 2
+    assert clock.bound_ns(ROW).tolist() == [(up_ns + down_ns) // 2]
+    assert abs(error) <= (up_ns + down_ns + 1) // 2
+
+
+def test_smallest_delay_of_each_direction_counts() -> None:
+    """They need not belong to the same round trip."""
+    clock = ClockMap(1, DT_NS)
+    observe(clock, 0, HOUR, down_ns=400 * MS, up_ns=900 * MS)
+    observe(clock, 1 * S, HOUR, down_ns=800 * MS, up_ns=400 * MS)
+    assert clock.offset_ns(ROW).tolist() == [HOUR]
+    assert clock.bound_ns(ROW).tolist() == [400 * MS]
+
+
+def test_small_movements_do_not_change_the_offset() -> None:
+    """Up to half a step, 25 ms, it stays as adopted; beyond, it follows all the way."""
+    clock = ClockMap(1, DT_NS)
+    observe(clock, 0, 0, down_ns=400 * MS, up_ns=400 * MS)
+    adopted = [
+        observe(clock, 1 * S, 0, down_ns=down_ns, up_ns=400 * MS)
+        for down_ns in (390 * MS, 360 * MS, 350 * MS, 349 * MS)
+    ]
+    assert adopted == [0, 0, 0, 25 * MS + MS // 2]
+
+
+def test_old_minima_are_forgotten_after_twenty_seconds() -> None:
+    """One lucky packet shapes the bound for so long, and no longer."""
+    clock = ClockMap(1, DT_NS)
+    observe(clock, 0, HOUR, down_ns=100 * MS, up_ns=300 * MS)
+    listen(clock, times(0.5, 20), lambda _: HOUR)
+    assert clock.bound_ns(ROW).tolist() == [200 * MS]
+    listen(clock, times(20, 20.5), lambda _: HOUR)
+    assert clock.bound_ns(ROW).tolist() == [400 * MS]
+    assert clock.offset_ns(ROW).tolist() == [HOUR]
+
+
+@pytest.mark.parametrize("silence_s", [20, 25, 40, 1000])
+def test_nothing_is_left_of_before_a_long_silence(silence_s: int) -> None:
+    """Also if not a single observation came meanwhile."""
+    clock = ClockMap(1, DT_NS)
+    listen(clock, times(100, 110), lambda _: 0)
+    listen(clock, times(110 + silence_s, 111 + silence_s), lambda _: HOUR)
+    assert clock.offset_ns(ROW).tolist() == [HOUR]
+
+
+@pytest.mark.parametrize("jump_ns", [HOUR, -HOUR, 100 * MS, -100 * MS])
+def test_offset_follows_a_stepped_clock_within_a_second_and_a_half(jump_ns: int) -> None:
+    """Either clock, either way, once three half seconds in a row know nothing older."""
+    clock = ClockMap(1, DT_NS)
+    assert set(listen(clock, times(0, 10), lambda _: 0)) == {0}
+    errors = listen(clock, times(10, 30), lambda _: jump_ns)
+    assert 0 not in errors[:20]
+    assert set(errors[20:]) == {0}
+
+
+def test_clock_may_step_at_any_moment_of_a_half_second() -> None:
+    """Then it takes up to half a second more."""
+    clock = ClockMap(1, DT_NS)
+    listen(clock, times(0, 10.1), lambda _: 0)
+    errors = listen(clock, times(10.1, 20), lambda _: HOUR)
+    assert 0 not in errors[:20]
+    assert set(errors[30:]) == {0}
+
+
+@pytest.mark.parametrize("jump_ns", [HOUR, -HOUR])
+def test_without_the_step_rule_the_offset_does_not_follow(
+    jump_ns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ablation: half of the jump is missing until the window of 20 s has passed."""
+    monkeypatch.setattr(ClockMap, "_drop_stepped", lambda *_: None)
+    clock = ClockMap(1, DT_NS)
+    listen(clock, times(0, 10), lambda _: 0)
+    errors = listen(clock, times(10, 31), lambda _: jump_ns)
+    assert set(errors[20 * 2 : 20 * 19]) == {-jump_ns // 2}
+    assert errors[-1] == 0
+
+
+@quick
+@given(st.integers(0, 300), st.integers(0, 300))
+def test_slower_network_is_no_stepped_clock(down_ms: int, up_ms: int) -> None:
+    """However much either direction slows down, the minima of before stay in force."""
+    clock = ClockMap(1, DT_NS)
+    listen(clock, times(0, 10), lambda _: 0)
+    slower = {"down_ns": (400 + down_ms) * MS, "up_ns": (400 + up_ms) * MS}
+    assert set(listen(clock, times(10, 14), lambda _: 0, **slower)) == {0}
+    assert clock.bound_ns(ROW).tolist() == [400 * MS]
+
+
+def after_change(down_ns: int, up_ns: int, *, before: range, since: int) -> int:
+    """The bound [ns] once both delays changed after 400 ms each, and `since` packets came."""
+    clock = ClockMap(1, DT_NS)
+    listen(clock, before, lambda _: 0)
+    start_s = 4 + before[-1] / S
+    listen(
+        clock,
+        list(times(start_s, start_s + 1.2))[-since:],
+        lambda _: 0,
+        down_ns=down_ns,
+        up_ns=up_ns,
+    )
+    return int(clock.bound_ns(ROW)[0])
+
+
+@pytest.mark.parametrize(("jump_ms", "bound_ms"), [(40, 380), (41, 400)])
+def test_step_is_a_change_by_more_than_40_ms(jump_ms: int, bound_ms: int) -> None:
+    """What is smaller waits for the window; here both delays stay and the clock jumps."""
+    clock = ClockMap(1, DT_NS)
+    listen(clock, times(0, 10), lambda _: 0)
+    listen(clock, times(10, 13), lambda _: jump_ms * MS)
+    assert clock.bound_ns(ROW).tolist() == [bound_ms * MS]
+
+
+def test_change_that_differs_between_directions_is_no_stepped_clock() -> None:
+    """A step moves both by as much, to within 40 ms or a fifth; here 200, 10 and 50 of 300 ms."""
+    before = times(0, 10)
+    assert after_change(300 * MS, 700 * MS, before=before, since=20) == 350 * MS
+    assert after_change(300 * MS, 510 * MS, before=before, since=20) == 405 * MS
+    assert after_change(100 * MS, 750 * MS, before=before, since=20) == 425 * MS
+
+
+@pytest.mark.parametrize("before_s", [10, 30])
+def test_four_packets_are_too_few_to_tell_a_stepped_clock(before_s: int) -> None:
+    """Five are enough, also where the ring has come round."""
+    before = times(0, before_s)
+    assert after_change(200 * MS, 600 * MS, before=before, since=4) == 300 * MS
+    assert after_change(200 * MS, 600 * MS, before=before, since=5) == 400 * MS
+
+
+def test_four_packets_of_before_are_too_few_as_well() -> None:
+    """Their minimum may have been a bad one."""
+    four, five = (range(0, count * DT_NS, DT_NS) for count in (4, 5))
+    assert after_change(200 * MS, 600 * MS, before=four, since=20) == 300 * MS
+    assert after_change(200 * MS, 600 * MS, before=five, since=20) == 400 * MS
+
+
+def test_drifting_clock_is_followed() -> None:
+    """At 200 ppm the window adds 2 ms, and hysteresis half a step."""
+    clock = ClockMap(1, DT_NS)
+    errors = listen(clock, times(0, 300), lambda now: HOUR + now * 200 // 1_000_000)
+    assert max(np.abs(errors)) <= DT_NS // 2 + 2 * MS + 1
+
+
+def test_forgotten_vehicle_is_measured_anew() -> None:
+    """A new life of the vehicle owes nothing to the clock of the old one."""
+    clock = ClockMap(1, DT_NS)
+    listen(clock, times(0, 10), lambda _: HOUR, down_ns=10 * MS, up_ns=10 * MS)
+    clock.forget(0)
+    assert observe(clock, 10 * S, -HOUR, down_ns=300 * MS, up_ns=300 * MS) == -HOUR
+    assert clock.bound_ns(ROW).tolist() == [300 * MS]
+
+
+def test_forgotten_vehicle_adopts_even_a_near_offset() -> None:
+    """No hysteresis against an offset of the life before."""
+    clock = ClockMap(1, DT_NS)
+    observe(clock, 0, 0, down_ns=0, up_ns=0)
+    clock.forget(0)
+    assert observe(clock, S, 10 * MS, down_ns=0, up_ns=0) == 10 * MS
+
+
+def test_vehicles_have_clocks_of_their_own() -> None:
+    """One steps, one drifts away, one is forgotten; each is seen as if it were alone."""
+    clock, rows = ClockMap(4, DT_NS), np.array([3, 0, 2])
+    for now in times(0, 20):
+        stepped = HOUR if now >= 10 * S else 0
+        for row, offset_ns in ((3, stepped), (0, -7 * HOUR), (2, 5 * MS)):
+            delay_ns = (100 + 50 * row) * MS
+            clock.observe(row, delay_ns - offset_ns, delay_ns + offset_ns, now_ns=now)
+        together = clock.offset_ns(rows)
+    clock.forget(1)
+    assert together.tolist() == [HOUR, -7 * HOUR, 5 * MS]
+    assert clock.bound_ns(rows).tolist() == [250 * MS, 100 * MS, 200 * MS]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_offset_is_right_to_half_a_step_on_the_papers_network(seed: int) -> None:
+    """(17) each way, one packet in ten lost, for a minute: below 25 ms once a second has passed."""
+    rng, clock = np.random.default_rng(seed), ClockMap(1, DT_NS)
+    errors = []
+    for now in times(0, 60):
+        down_ns, up_ns = 400 * MS + 20 * MS * rng.poisson(2.0, size=2)
+        if rng.random() > 0.1:
+            adopted = observe(clock, now, HOUR, down_ns=int(down_ns), up_ns=int(up_ns))
+            errors.append(adopted - HOUR)
+            assert clock.bound_ns(ROW)[0] >= 400 * MS
+    assert max(np.abs(errors[20:])) < 25 * MS

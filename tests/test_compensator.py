@@ -1,0 +1,163 @@
+"""Uplink delay compensator, eq. (11): the one place that chooses which input is flown."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from client.compensator import Compensator
+from shared.config import Scenario, check
+from shared.model import Array
+from shared.protocol import NO_HORIZON, Horizon, ProtocolError
+
+quick = settings(max_examples=60, deadline=None)
+
+H = 10
+INPUTS = np.array([np.linspace(0.1, 1.0, H), np.linspace(-0.5, 0.5, H)])
+"""Every stage unlike every other."""
+
+
+def scenario(*, scheme: str = "paper", exhausted: str = "hold") -> Scenario:
+    """Ten stages of 0.1 s, on a network of no delay."""
+    direction = {"delay": "none"}
+    return check(
+        {
+            "model": {"u_max": [1.8, 0.9]},
+            "control": {"dt": 0.1, "horizon": H, "scheme": scheme},
+            "vehicle": {"exhausted": exhausted, "brake_mps2": 2.0},
+            "network": {"uplink": direction, "downlink": direction},
+        },
+        "test",
+    )
+
+
+def horizon(step: int, inputs: Array = INPUTS, *, observed_ns: int = 0) -> Horizon:
+    """What the server made for `step`."""
+    return Horizon(1, 1, step, 0, observed_ns, inputs.astype(np.float32))
+
+
+def holding(step: int, inputs: Array = INPUTS, **keys: str) -> Compensator:
+    """A compensator that has been given one horizon."""
+    compensator = Compensator(scenario(**keys))
+    compensator.offer(horizon(step, inputs), step)
+    return compensator
+
+
+def test_vehicle_hovers_before_its_first_horizon() -> None:
+    """There is nothing to fly yet."""
+    compensator = Compensator(scenario())
+    assert compensator.in_force == NO_HORIZON
+    assert compensator.choose(0).tolist() == [0.0, 0.0]
+    assert compensator.choose(1000).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("step", range(100, 100 + H))
+def test_stage_is_the_step_since_the_horizon_was_made(step: int) -> None:
+    """u(k|k_h): a packet under way for five steps is entered at its fifth stage."""
+    np.testing.assert_allclose(holding(100).choose(step), INPUTS[:, step - 100], rtol=1e-7)
+
+
+@pytest.mark.parametrize("step", [100 + H, 101 + H, 100_000])
+def test_held_horizon_flies_its_last_input_for_ever(step: int) -> None:
+    """E10: the paper's min(k, k_h + H - 1)."""
+    np.testing.assert_allclose(holding(100).choose(step), INPUTS[:, -1], rtol=1e-7)
+
+
+@pytest.mark.parametrize("exhausted", ["hold", "brake"])
+def test_horizon_for_a_later_step_begins_at_once(exhausted: str) -> None:
+    """The server's idea of the step may be ahead: its first input is the nearest there is."""
+    compensator = Compensator(scenario(exhausted=exhausted))
+    compensator.offer(horizon(105), 100)
+    np.testing.assert_allclose(compensator.choose(101), INPUTS[:, 0], rtol=1e-7)
+
+
+def test_braking_begins_only_after_the_last_stage() -> None:
+    """The last input is flown for its own step in full."""
+    np.testing.assert_allclose(
+        holding(100, exhausted="brake").choose(99 + H), INPUTS[:, -1], rtol=1e-7
+    )
+
+
+def test_brake_takes_the_speed_away_at_its_rate() -> None:
+    """1.0 m/s at 2 m/s² in steps of 0.1 s: 0.8, 0.6 … 0, then hovering."""
+    compensator = holding(0, np.tile([[0.6], [0.8]], H), exhausted="brake")
+    speeds = [float(np.linalg.norm(compensator.choose(H + i))) for i in range(8)]
+    assert speeds == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0, 0.0, 0.0, 0.0], abs=1e-7)
+
+
+@quick
+@given(st.floats(-1.8, 1.8), st.floats(-0.9, 0.9), st.integers(0, 40))
+def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> None:
+    """Whatever was flown last, its direction stays and its speed only falls."""
+    compensator = holding(0, np.tile([[x], [y]], H), exhausted="brake")
+    last, now, then = (compensator.choose(H - 1 + i) for i in (0, later, later + 1))
+    assert last[0] * now[1] == pytest.approx(last[1] * now[0], abs=1e-12)
+    assert float(last @ now) >= 0.0
+    lost = np.linalg.norm(now) - np.linalg.norm(then)
+    assert -1e-12 <= lost <= 0.2 + 1e-12
+    assert compensator.choose(H + 10).tolist() == [0.0, 0.0]
+
+
+def test_brake_from_a_standstill_stays() -> None:
+    """There is no direction to brake in."""
+    assert holding(0, np.zeros((2, H)), exhausted="brake").choose(H + 3).tolist() == [0.0, 0.0]
+
+
+def test_stale_horizon_is_ignored_after_reordering() -> None:
+    """E11: the newest generation wins; what comes after it is counted."""
+    compensator = Compensator(scenario())
+    for made in (10, 12, 11, 12, 10):
+        compensator.offer(horizon(made, INPUTS + 0.01 * (made - 10), observed_ns=made), 14)
+    assert (compensator.in_force, compensator.observed_ns, compensator.stale) == (12, 12, 3)
+    np.testing.assert_allclose(compensator.choose(14), INPUTS[:, 2] + 0.02, rtol=1e-6)
+
+
+@quick
+@given(st.permutations(range(5)), st.integers(4, 12))
+def test_order_of_arrival_does_not_matter(order: list[int], step: int) -> None:
+    """Once all have arrived, the newest is in force."""
+    compensator = Compensator(scenario())
+    for made in order:
+        compensator.offer(horizon(made, INPUTS * 0.1 * (made + 1)), 4)
+    expected = INPUTS[:, min(step - 4, H - 1)] * 0.5
+    np.testing.assert_allclose(compensator.choose(step), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("exhausted", ["hold", "brake"])
+@pytest.mark.parametrize("step", [7, 12, 1000])
+def test_without_compensation_the_newest_first_input_is_flown(step: int, exhausted: str) -> None:
+    """Whatever its age: the rest of the horizon is not looked at."""
+    compensator = holding(5, scheme="none", exhausted=exhausted)
+    compensator.offer(horizon(7, INPUTS + 0.2), 9)
+    compensator.offer(horizon(6, INPUTS + 0.3), 9)
+    np.testing.assert_allclose(compensator.choose(step), INPUTS[:, 0] + 0.2, rtol=1e-6)
+
+
+def test_horizon_from_the_future_is_refused() -> None:
+    """One more than H steps ahead could not be replaced for long; it changes nothing."""
+    compensator = holding(100)
+    with pytest.raises(ProtocolError, match=r"^from the future$"):
+        compensator.offer(horizon(111 + H, INPUTS + 0.2), 110)
+    assert (compensator.in_force, compensator.stale) == (100, 0)
+    np.testing.assert_allclose(compensator.choose(103), INPUTS[:, 3], rtol=1e-7)
+
+
+def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
+    """The limit itself is not beyond it."""
+    compensator = holding(100)
+    compensator.offer(horizon(110 + H), 110)
+    assert compensator.in_force == 110 + H
+
+
+def test_inputs_are_held_within_the_bounds() -> None:
+    """The last clamp, apart from the parser's: each axis its own, on both sides."""
+    compensator = holding(0, np.tile([[1.8015, -5.0], [-0.9005, 3.0]], H // 2))
+    assert compensator.choose(0).tolist() == [1.8, -0.9]
+    assert compensator.choose(1).tolist() == [-1.8, 0.9]
+
+
+def test_chosen_input_is_the_caller_s_own() -> None:
+    """Writing to it does not write to the horizon."""
+    for compensator in (holding(0), holding(0, scheme="none"), holding(0, exhausted="brake")):
+        compensator.choose(0)[:] = 9.0
+        np.testing.assert_allclose(compensator.choose(0), INPUTS[:, 0], rtol=1e-7)

@@ -1,0 +1,421 @@
+"""shared.config: a scenario is right, or it is refused in one line that says what is wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared import config
+from shared.config import ConfigError, Scenario
+
+WRONG = {
+    # Not the form of a scenario.
+    "a key misspelt": ("sead = 3", "sead: no such key; did you mean seed?"),
+    "a key misspelt in a table": (
+        "control.horzon = 9",
+        "control.horzon: no such key; did you mean horizon?",
+    ),
+    "a key misspelt two tables down": (
+        "network.uplink.los = 0.1",
+        "network.uplink.los: no such key; did you mean loss?",
+    ),
+    "a key like no other": (
+        "model.colour = 1",
+        "model.colour: no such key; there are axes, tau_s, u_max",
+    ),
+    "a text for a number": ('control.dt = "fast"', "control.dt: got 'fast', expected a number"),
+    "a fraction for a whole number": (
+        "control.horizon = 2.5",
+        "control.horizon: got 2.5, expected a whole number",
+    ),
+    "yes or no for a whole number": ("seed = true", "seed: got True, expected a whole number"),
+    "a number for yes or no": (
+        "reference.loop = 1",
+        "reference.loop: got 1, expected true or false",
+    ),
+    "a number for a text": ("title = 3", "title: got 3, expected a text"),
+    "a number for a list": ("model.tau_s = 0.8", "model.tau_s: got 0.8, expected a list"),
+    "a number for a table": ("model = 3", "model: got 3, expected a table"),
+    "a text within a list": (
+        'control.state_weight = [1.0, "a"]',
+        "control.state_weight[1]: got 'a', expected a number",
+    ),
+    "a text within a list of lists": (
+        'reference.points_m = [[0.0, 0.0], [1.0, "a"]]',
+        "reference.points_m[1][1]: got 'a', expected a number",
+    ),
+    "a weight too many": (
+        "control.terminal_weight = [1.0, 2.0, 3.0]",
+        "control.terminal_weight: got [1.0, 2.0, 3.0], expected a list of length 2",
+    ),
+    # Out of range.
+    "no time step": ("control.dt = 0.0", "control.dt: got 0.0, expected a number >= 0.001"),
+    "a negative time step": (
+        "control.dt = -0.1",
+        "control.dt: got -0.1, expected a number >= 0.001",
+    ),
+    "a time step too long": ("control.dt = 2", "control.dt: got 2, expected a number <= 1.0"),
+    "no horizon": ("control.horizon = 0", "control.horizon: got 0, expected a whole number >= 1"),
+    "a horizon beyond any datagram": (
+        "control.horizon = 289",
+        "control.horizon: got 289, expected a whole number <= 288",
+    ),
+    "a negative weight": (
+        "control.state_weight = [1.0, -2.0]",
+        "control.state_weight[1]: got -2.0, expected a number >= 0.0",
+    ),
+    "no input weight": (
+        "control.input_weight = 0.0",
+        "control.input_weight: got 0.0, expected a number > 0.0",
+    ),
+    "a negative tolerance": (
+        "control.epsilon = -1.0",
+        "control.epsilon: got -1.0, expected a number >= 0.0",
+    ),
+    "more lost than sent": (
+        "network.downlink.loss = 2",
+        "network.downlink.loss: got 2, expected a number <= 1.0",
+    ),
+    "a negative delay": (
+        "network.uplink.minimum_s = -0.1",
+        "network.uplink.minimum_s: got -0.1, expected a number >= 0.0",
+    ),
+    "no duration": ("duration = 0.0", "duration: got 0.0, expected a number > 0.0"),
+    "a negative seed": ("seed = -1", "seed: got -1, expected a whole number >= 0"),
+    "a seed of more than 32 bits": (
+        "seed = 4294967296",
+        "seed: got 4294967296, expected a whole number <= 4294967295",
+    ),
+    "no bound": ("model.u_max = [0.0]", "model.u_max[0]: got 0.0, expected a number > 0.0"),
+    "no number": ("control.epsilon = nan", "control.epsilon: got nan, expected a number >= 0.0"),
+    # Not one of the choices.
+    "a scheme that is none": (
+        'control.scheme = "papr"',
+        "control.scheme: got 'papr', expected 'paper' or 'none'",
+    ),
+    "a shape that is none": (
+        'reference.shape = "ring"',
+        (
+            "reference.shape: got 'ring', expected 'circle' or 'figure-eight' or 'square' "
+            "or 'waypoints' or 'hover' or 'csv'"
+        ),
+    ),
+    "a fourth dimension": ("model.axes = 4", "model.axes: got 4, expected 2 or 3"),
+    # Right one by one, and impossible together.
+    "three time constants in the plane": (
+        "model.tau_s = [0.8, 0.8, 0.8]",
+        "model.tau_s: got [0.8, 0.8, 0.8], expected 1 or 2 numbers with model.axes = 2",
+    ),
+    "two bounds in space": (
+        "model.axes = 3\nmodel.u_max = [1.0, 2.0]",
+        "model.u_max: got [1.0, 2.0], expected 1 or 3 numbers with model.axes = 3",
+    ),
+    "no time constant": (
+        "model.tau_s = []",
+        "model.tau_s: got [], expected 1 or 2 numbers with model.axes = 2",
+    ),
+    "two true time constants in space": (
+        "model.axes = 3\nvehicle.tau_s = [1.0, 2.0]",
+        "vehicle.tau_s: got [1.0, 2.0], expected 1 or 3 numbers with model.axes = 3",
+    ),
+    "a start in space for a flight in the plane": (
+        "vehicle.start_m = [0.0, 0.0, 1.0]",
+        "vehicle.start_m: got [0.0, 0.0, 1.0], expected 2 numbers with model.axes = 2",
+    ),
+    "a horizon shorter than the uplink's delay": (
+        "control.horizon = 4\ncontrol.dt = 0.1",
+        (
+            "control.horizon: got 4, expected horizon · dt (now 0.4 s) to cover "
+            "the uplink's mean delay, 0.44 s"
+        ),
+    ),
+    "a horizon in space that fits no datagram": (
+        "model.axes = 3\ncontrol.horizon = 97",
+        "control.horizon: got 97, expected at most 96 with 3 axes, to fit one datagram",
+    ),
+    "nothing left after settling": (
+        "duration = 5.0\nsettle = 5.0",
+        "settle: got 5.0, expected less than the duration of 5 s",
+    ),
+    "a time-out within a heartbeat": (
+        "link.heartbeat_s = 1.0",
+        "link.timeout_s: got 1.0, expected more than link.heartbeat_s = 1",
+    ),
+    # No trajectory.
+    "a single waypoint": (
+        'reference.shape = "waypoints"\nreference.points_m = [[1.0, 2.0]]',
+        "reference.points_m: got [(1.0, 2.0)], expected at least 2 with shape 'waypoints'",
+    ),
+    "nowhere to hover": (
+        'reference.shape = "hover"',
+        "reference.points_m: got [], expected at least 1 with shape 'hover'",
+    ),
+    "a waypoint twice in a row": (
+        'reference.shape = "waypoints"\nreference.points_m = [[1, 2], [1, 2]]',
+        "reference.points_m: got [[1.0, 2.0], [1.0, 2.0]], expected no point twice in a row",
+    ),
+    "a loop that ends where it starts": (
+        (
+            'reference.shape = "waypoints"\nreference.loop = true\n'
+            "reference.points_m = [[0, 0], [1, 2], [0, 0]]"
+        ),
+        (
+            "reference.points_m: got [[0.0, 0.0], [1.0, 2.0], [0.0, 0.0], [0.0, 0.0]], "
+            "expected no point twice in a row"
+        ),
+    ),
+    "a waypoint in space for a flight in the plane": (
+        'reference.shape = "waypoints"\nreference.points_m = [[1, 2], [1, 2, 3]]',
+        "reference.points_m: got [1.0, 2.0, 3.0], expected 2 numbers a point",
+    ),
+}
+"""What is wrong: a scenario, and what is said of it after the name of the file."""
+
+
+def refusal(path: Path | str) -> str:
+    """What is said of a scenario that cannot be flown."""
+    with pytest.raises(ConfigError) as caught:
+        config.load(str(path))
+    return str(caught.value)
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    """A file in a folder."""
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(("text", "said"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_is_said_with_file_key_given_and_expected(
+    text: str, said: str, tmp_path: Path
+) -> None:
+    """In one line."""
+    path = write(tmp_path, "mine.toml", text)
+    assert refusal(path) == f"{path}: {said}"
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("reference.radius_m", "inf"),
+        ("reference.altitude_m", "nan"),
+        ("reference.points_m", "[[nan, 0.0]]"),
+        ("model.tau_s", "[inf]"),
+        ("vehicle.start_m", "[-inf, 0.0]"),
+        ("network.downlink.minimum_s", "inf"),
+        ("network.downlink.slots_mean", "inf"),
+        ("simulation.clock_offset_s", "nan"),
+        ("simulation.compute_s", "inf"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused(key: str, value: str, tmp_path: Path) -> None:
+    """TOML knows inf and nan; no flight has a use for them."""
+    path = write(tmp_path, "mine.toml", f"{key} = {value}")
+    assert refusal(path).startswith(f"{path}: {key}")
+
+
+@pytest.mark.parametrize("key", ["minimum_s", "slot_s", "slots_mean"])
+def test_a_delay_that_no_clock_can_count_is_refused(key: str, tmp_path: Path) -> None:
+    """Drawing it would end the flight with an overflow."""
+    path = write(tmp_path, "mine.toml", f"network.downlink.{key} = 1e19")
+    assert refusal(path).startswith(f"{path}: network.downlink.{key}: got 1e+19")
+
+
+@pytest.mark.parametrize(("horizon", "dt"), [(40, 0.011), (44, 0.01), (22, 0.02)])
+def test_a_horizon_that_just_covers_the_delay_is_right(horizon: int, dt: float) -> None:
+    """Whatever floating point makes of 40 · 0.011 s = 0.44 s."""
+    table = {"control": {"horizon": horizon, "dt": dt}}
+    assert config.check(table, "mine.toml").control.horizon == horizon
+
+
+def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:
+    """Or with all names, where none is near."""
+    assert refusal("papr") == "papr: no such scenario; did you mean paper?"
+    assert refusal("xyz") == f"xyz: no such scenario; there are {', '.join(config.names())}"
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    """With the system's reason."""
+    path = tmp_path / "none.toml"
+    assert refusal(path) == f"{path}: cannot be read: No such file or directory"
+
+
+@pytest.mark.parametrize("content", [b"dt = ", b"= 3", b"seed = 1\nseed = 2", b'title = "\xff"'])
+def test_a_file_that_is_no_toml_is_refused(content: bytes, tmp_path: Path) -> None:
+    """With the parser's reason."""
+    path = tmp_path / "mine.toml"
+    path.write_bytes(content)
+    assert refusal(path).startswith(f"{path}: no valid TOML: ")
+
+
+def test_extends_needs_the_name_of_a_scenario(tmp_path: Path) -> None:
+    """Not a number, and not a name that nobody has."""
+    number = write(tmp_path, "number.toml", "extends = 3")
+    assert refusal(number) == f"{number}: extends: got 3, expected the name of a scenario"
+    unknown = write(tmp_path, "unknown.toml", 'extends = "papr"')
+    assert refusal(unknown) == "papr: no such scenario; did you mean paper?"
+
+
+@pytest.mark.parametrize("name", ["a.toml", "../{folder}/a.toml"])
+def test_scenarios_that_extend_each_other_are_refused(name: str, tmp_path: Path) -> None:
+    """By whatever path they name each other."""
+    path = write(tmp_path, "a.toml", 'extends = "b.toml"')
+    write(tmp_path, "b.toml", f'extends = "{name.format(folder=tmp_path.name)}"')
+    said = refusal(path)
+    assert said.startswith(f"{path}: extends: got a circle of {path} → ")
+    assert said.count("→") == 2
+
+
+def test_a_path_with_a_zero_byte_is_refused(tmp_path: Path) -> None:
+    """No file system has such a name."""
+    path = write(tmp_path, "mine.toml", r'extends = "a\u0000.toml"')
+    assert "cannot be read" in refusal(path)
+
+
+def test_extends_lays_a_scenario_over_another_key_by_key(tmp_path: Path) -> None:
+    """Over two floors, and down to the keys of inner tables."""
+    write(
+        tmp_path,
+        "base.toml",
+        "seed = 5\nnetwork.uplink = { delay = 'constant', loss = 0.2 }\ncontrol.horizon = 30",
+    )
+    write(tmp_path, "middle.toml", "extends = 'base.toml'\nnetwork.uplink.loss = 0.3")
+    top = write(tmp_path, "top.toml", "extends = 'middle.toml'\ncontrol.dt = 0.1")
+    scenario = config.load(str(top))
+    assert (scenario.seed, scenario.control.horizon, scenario.control.dt) == (5, 30, 0.1)
+    assert scenario.network.uplink.delay == "constant"
+    assert (scenario.network.uplink.loss, scenario.network.downlink.loss) == (0.3, 0.1)
+
+
+def test_a_scenario_may_extend_one_that_comes_with_skytether(tmp_path: Path) -> None:
+    """By its name, from any folder."""
+    path = write(tmp_path, "mine.toml", 'extends = "paper"\nseed = 9')
+    ours, theirs = config.to_table(config.load("paper")), config.to_table(config.load(str(path)))
+    assert theirs == {**ours, "seed": 9}
+
+
+def test_what_is_left_out_is_the_default(tmp_path: Path) -> None:
+    """An empty file is a scenario."""
+    assert config.load(str(write(tmp_path, "empty.toml", ""))) == Scenario()
+
+
+@pytest.mark.parametrize("name", config.names())
+def test_every_scenario_that_comes_with_skytether_can_be_flown(name: str) -> None:
+    """It says in a line what it shows, and has a trajectory in as many axes as its model."""
+    scenario = config.load(name)
+    assert scenario.title
+    assert "\n" not in scenario.title
+    start = scenario.make_reference()(np.array(0.0))
+    assert start.shape == (scenario.model.axes, 2)
+
+
+@pytest.mark.parametrize("name", config.names())
+def test_a_scenario_survives_being_written_and_read(name: str, tmp_path: Path) -> None:
+    """Every value of it, without a base to extend."""
+    scenario = config.load(name)
+    path = tmp_path / "copy.toml"
+    path.write_bytes(config.to_toml(scenario))
+    assert config.load(str(path)) == scenario
+
+
+def test_a_scenario_survives_being_a_table() -> None:
+    """As the command line lays its flags over one."""
+    scenario = config.load("demo")
+    assert config.check(config.to_table(scenario), "flags") == scenario
+
+
+def test_the_names_of_scenarios_are_sorted_and_the_papers_are_there() -> None:
+    """As `skytether scenarios` lists them."""
+    assert config.names() == sorted(config.names())
+    assert {"demo", "paper", "paper-every-step", "paper-no-compensation"} <= set(config.names())
+
+
+TRAJECTORY = "t,x,y\n0,1,2\n1,3,4\n"
+
+
+def test_a_trajectory_is_looked_for_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
+    """Also when another one, elsewhere, extends that."""
+    for folder in ("base", "mine"):
+        (tmp_path / folder).mkdir()
+    write(tmp_path / "base", "path.csv", TRAJECTORY)
+    named = '[reference]\nshape = "csv"\nfile = "path.csv"'
+    paths = [
+        write(tmp_path / "base", "base.toml", named),
+        write(tmp_path / "mine", "mine.toml", 'extends = "../base/base.toml"'),
+    ]
+    for path in paths:
+        state = config.load(str(path)).make_reference()(np.array(0.5))
+        assert state.tolist() == [[2.0, 2.0], [3.0, 2.0]]
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        (None, "a readable file (No such file or directory)"),
+        ("t,x\n0,1\n1,2\n", "a table of the trajectory (line 1: expected the columns t, x, y)"),
+        ("t,x,y\n0,1,2\n1,3\n", "a table of the trajectory (line 3: expected 3 numbers)"),
+        ("t,x,y\n0,1,2\n1,3,b\n", "a table of the trajectory (line 3: expected 3 numbers)"),
+        (
+            "t,x,y\n0,1,2\n",
+            "a table of the trajectory (expected at least two lines of finite numbers)",
+        ),
+        (
+            "t,x,y\n0,1,2\n1,nan,4\n",
+            "a table of the trajectory (expected at least two lines of finite numbers)",
+        ),
+        (
+            "t,x,y\n1,1,2\n2,3,4\n",
+            "a table of the trajectory (column t must start at 0 and rise from line to line)",
+        ),
+        (
+            "t,x,y\n0,1,2\n0,3,4\n",
+            "a table of the trajectory (column t must start at 0 and rise from line to line)",
+        ),
+    ],
+)
+def test_a_trajectory_that_cannot_be_flown_is_refused(
+    table: str | None, said: str, tmp_path: Path
+) -> None:
+    """With the line that is wrong, where one is."""
+    path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
+    trajectory = tmp_path / "path.csv"
+    if table is not None:
+        trajectory.write_text(table)
+    assert refusal(path) == f"{path}: reference.file: got {str(trajectory)!r}, expected {said}"
+
+
+def test_a_trajectory_that_is_no_text_table_is_refused(tmp_path: Path) -> None:
+    """The csv module has an error of its own for lines that never end."""
+    write(tmp_path, "path.csv", f"t,x,y\n0,1,{'9' * 200_000}\n")
+    path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
+    assert "expected a table of the trajectory" in refusal(path)
+
+
+def test_one_value_is_for_all_axes() -> None:
+    """And a list has one for each."""
+    scenario = config.check(
+        {"model": {"axes": 3, "tau_s": [0.5], "u_max": [1.0, 2.0, 3.0]}}, "mine.toml"
+    )
+    assert scenario.tau_s.tolist() == [0.5, 0.5, 0.5]
+    assert scenario.u_max.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> None:
+    """Its time constants are the model's by default."""
+    model = {"tau_s": [0.5, 0.6]}
+    same = config.check({"model": model}, "mine.toml")
+    other = config.check({"model": model, "vehicle": {"tau_s": [0.9]}}, "mine.toml")
+    assert same.true_tau_s.tolist() == [0.5, 0.6]
+    assert other.true_tau_s.tolist() == [0.9, 0.9]
+
+
+def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
+    """With one number an axis, and the step in nanoseconds."""
+    assert Scenario().terms() == (50_000_000, 40, 2, (0.855, 0.855), (1.8, 1.8))
+
+
+@pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])
+def test_a_flight_has_as_many_steps_as_fit_its_duration(duration: float, steps: int) -> None:
+    """Rounded, and at least one."""
+    assert config.check({"duration": duration}, "mine.toml").steps == steps

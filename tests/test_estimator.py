@@ -1,0 +1,211 @@
+"""Downlink delay compensator, eq. (12)-(13): x̂(k) is the old state flown on by the known inputs."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from server.estimator import Estimator
+from shared.model import Array, discretise
+
+quick = settings(max_examples=60, deadline=None)
+
+REACH = 12
+MODEL = discretise(np.array([0.81, 0.3]), 0.05)
+ROW = np.array([0])
+
+
+def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
+    """An estimator over twelve steps."""
+    return Estimator(MODEL, capacity, REACH, compensate=compensate)
+
+
+def remember(estimator: Estimator, inputs: Array, *, start: int = 0) -> None:
+    """û(start), û(start + 1), … of the one vehicle; inputs of shape (steps, axes)."""
+    for step, u in enumerate(inputs, start):
+        estimator.remember(ROW, np.array([step]), u[None])
+
+
+def estimate(estimator: Estimator, step: int) -> Array:
+    """x̂(step) of the one vehicle."""
+    return estimator.estimate(ROW, np.array([step]))[0]
+
+
+def flown(x: Array, inputs: Array) -> Array:
+    """Where the model leads from x, input by input."""
+    for u in inputs:
+        x = MODEL.step(x, u)
+    return x
+
+
+@pytest.mark.parametrize("now", [20, 25, 40])
+@pytest.mark.parametrize("age", range(REACH + 1))
+def test_estimate_is_the_observation_flown_on(age: int, now: int) -> None:
+    """(13) for τ = 0 … reach, wherever the ring of inputs stands."""
+    rng = np.random.default_rng(age)
+    inputs, x = rng.normal(size=(now, 2)), rng.normal(size=(2, 2))
+    estimator = make()
+    estimator.observe(0, now - age, x)
+    remember(estimator, inputs)
+    assert estimator.age(ROW, np.array([now])).tolist() == [age]
+    assert estimator.within_reach(ROW, np.array([now])).tolist() == [True]
+    expected = flown(x, inputs[now - age :])
+    np.testing.assert_allclose(estimate(estimator, now), expected, rtol=0, atol=1e-13)
+
+
+def test_input_of_the_present_step_does_not_count_yet() -> None:
+    """û(k) acts from k on; x̂(k) is before it."""
+    estimator = make()
+    estimator.observe(0, 8, np.ones((2, 2)))
+    remember(estimator, np.zeros((10, 2)))
+    before = estimate(estimator, 10)
+    remember(estimator, np.full((1, 2), 9.0), start=10)
+    np.testing.assert_array_equal(estimate(estimator, 10), before)
+
+
+def test_vehicle_hovers_before_anything_was_computed() -> None:
+    """û = 0: the observed velocity dies away with τ."""
+    estimator = make()
+    x = np.array([[1.0, 2.0], [3.0, -4.0]])
+    estimator.observe(0, 0, x)
+    expected = flown(x, np.zeros((5, 2)))
+    np.testing.assert_allclose(estimate(estimator, 5), expected, rtol=0, atol=1e-13)
+
+
+def test_newest_observation_wins_after_reordering() -> None:
+    """E11: what comes late is refused and says so, as is a duplicate."""
+    estimator = make()
+    states = {step: np.full((2, 2), float(step)) for step in (3, 5, 7)}
+    kept = [estimator.observe(0, step, states[step]) for step in (5, 3, 7, 7, 5)]
+    assert kept == [True, False, True, False, False]
+    assert estimator.observed_step.tolist() == [7]
+    np.testing.assert_allclose(estimate(estimator, 7), states[7])
+
+
+@quick
+@given(st.permutations(range(6)))
+def test_order_of_arrival_does_not_matter(order: list[int]) -> None:
+    """Once all have arrived."""
+    estimator = make()
+    for step in order:
+        estimator.observe(0, step, np.full((2, 2), float(step)))
+    np.testing.assert_array_equal(estimate(estimator, 5), np.full((2, 2), 5.0))
+
+
+def test_estimate_keeps_its_own_copy_of_the_state() -> None:
+    """Whatever the caller does to its array afterwards."""
+    estimator, x = make(compensate=False), np.ones((2, 2))
+    estimator.observe(0, 0, x)
+    x[:] = 9.0
+    estimate(estimator, 0)[:] = 9.0
+    np.testing.assert_array_equal(estimate(estimator, 0), np.ones((2, 2)))
+
+
+def test_missed_steps_are_remembered_too() -> None:
+    """After steps 0, 1 and 5 the steps 2 … 4 were flown with û(1)."""
+    u = np.array([[1.0, -1.0], [2.0, 0.5], [0.3, 0.7]])
+    estimator = make()
+    remember(estimator, u[:2])
+    remember(estimator, u[2:], start=5)
+    estimator.observe(0, 0, np.zeros((2, 2)))
+    expected = flown(np.zeros((2, 2)), u[[0, 1, 1, 1, 1, 2]])
+    np.testing.assert_allclose(estimate(estimator, 6), expected, rtol=0, atol=1e-13)
+
+
+def test_gap_longer_than_the_ring_overwrites_all_of_it() -> None:
+    """Û(19) all along the gap, then û(k); and filling takes no longer than the ring is."""
+    estimator = make()
+    remember(estimator, np.full((20, 2), 7.0))
+    remember(estimator, np.array([[0.5, -0.5]]), start=10**12)
+    estimator.observe(0, 10**12 + 1 - REACH, np.zeros((2, 2)))
+    held = np.concatenate([np.full((REACH - 1, 2), 7.0), [[0.5, -0.5]]])
+    expected = flown(np.zeros((2, 2)), held)
+    np.testing.assert_allclose(estimate(estimator, 10**12 + 1), expected, rtol=0, atol=1e-13)
+
+
+def test_estimate_right_after_a_gap_knows_no_input_of_a_ring_ago() -> None:
+    """At step 23, nothing computed since 20: û(21), û(22) are not û(9), û(10).
+
+    The vehicle flew on with what it had: û(20) is the best that is known.
+    """
+    estimator = make()
+    old, new = np.full((15, 2), 7.0), np.full((6, 2), 0.5)
+    remember(estimator, np.concatenate([old, new]))
+    estimator.observe(0, 20, np.zeros((2, 2)))
+    expected = flown(np.zeros((2, 2)), np.tile([0.5, 0.5], (3, 1)))
+    np.testing.assert_allclose(estimate(estimator, 23), expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("observed", "now", "within"), [(5, 5, True), (5, 17, True), (5, 18, False), (30, 18, True)]
+)
+def test_old_observations_are_out_of_reach(observed: int, now: int, *, within: bool) -> None:
+    """Twelve steps are bridged, thirteen are not; one from ahead of us is as good as new."""
+    estimator = make()
+    estimator.observe(0, observed, np.zeros((2, 2)))
+    assert estimator.within_reach(ROW, np.array([now])).tolist() == [within]
+
+
+def test_vehicle_that_was_never_observed_is_out_of_reach() -> None:
+    """Also at step 0."""
+    assert make().within_reach(ROW, np.array([0])).tolist() == [False]
+
+
+def test_observation_from_ahead_is_taken_as_it_is() -> None:
+    """Where the clocks disagree by a step there is nothing to fly on by."""
+    estimator = make()
+    remember(estimator, np.ones((10, 2)))
+    x = np.array([[1.0, 2.0], [3.0, 4.0]])
+    estimator.observe(0, 11, x)
+    np.testing.assert_array_equal(estimate(estimator, 10), x)
+
+
+def test_without_compensation_the_observation_is_the_estimate() -> None:
+    """However old it is, and whatever was flown since."""
+    estimator = make(compensate=False)
+    x = np.array([[1.0, 2.0], [3.0, 4.0]])
+    estimator.observe(0, 0, x)
+    remember(estimator, np.ones((10, 2)))
+    np.testing.assert_array_equal(estimate(estimator, 10), x)
+
+
+def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
+    """Its old observation, its old inputs and its old step are gone; its neighbour's are not."""
+    estimator = make(2)
+    both, x = np.array([0, 1]), np.array([[1.0, 2.0], [3.0, 4.0]])
+    for row in both:
+        estimator.observe(row, 500, x)
+    for step in range(480, 501):
+        estimator.remember(both, np.full(2, step), np.ones((2, 2)))
+    estimator.forget(0)
+    assert estimator.within_reach(both, np.array([501, 501])).tolist() == [False, True]
+    assert estimator.observe(0, 0, x)
+    here, there = estimator.estimate(both, np.array([3, 501]))
+    np.testing.assert_allclose(here, flown(x, np.zeros((3, 2))), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(there, flown(x, np.ones((1, 2))), rtol=0, atol=1e-13)
+    remember(estimator, np.array([[0.5, 0.7]]))
+    expected = flown(x, np.array([[0.5, 0.7]]))
+    np.testing.assert_allclose(estimate(estimator, 1), expected, rtol=0, atol=1e-13)
+
+
+@quick
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.booleans())
+def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate: bool) -> None:
+    """Each with its own row, steps, gaps and age."""
+    rng = np.random.default_rng(seed)
+    rows = rng.permutation(8)[:vehicles]
+    together = make(8, compensate=compensate)
+    singles = [make(compensate=compensate) for _ in rows]
+    step = rng.integers(0, 50, vehicles)
+    for _ in range(30):
+        step += rng.integers(1, 4, vehicles)
+        u = rng.normal(size=(vehicles, 2))
+        together.remember(rows, step, u)
+        for i, single in enumerate(singles):
+            single.remember(ROW, step[[i]], u[[i]])
+    for i, (row, single) in enumerate(zip(rows, singles, strict=True)):
+        x, observed = rng.normal(size=(2, 2)), int(step[i] + 1 - rng.integers(0, REACH + 1))
+        together.observe(int(row), observed, x)
+        single.observe(0, observed, x)
+    expected = [estimate(single, int(k) + 1) for single, k in zip(singles, step, strict=True)]
+    np.testing.assert_allclose(together.estimate(rows, step + 1), expected, rtol=0, atol=1e-13)

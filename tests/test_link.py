@@ -1,0 +1,262 @@
+"""netem.link: one direction of the network, and what it counts."""
+
+import io
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem import link as link_module
+from netem.fate import Fate
+from netem.link import BINS, ERROR_BIN_NS, Histogram, Lane, Link
+from shared.endpoint import MILLISECOND_NS, Datagram
+from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Recorder, Rows, parse
+
+PEER = ("192.0.2.1", 5000)
+
+
+def make_link() -> Link:
+    """A link that writes nothing down."""
+    return Link(UPLINK, Recorder(PACKET_COLUMNS))
+
+
+def make_lane(*delays_ns: int, flow: int = 0, lost: Iterable[int] = ()) -> Lane:
+    """A flow whose packets have these delays; those with the numbers in `lost` are lost."""
+    lost = set(lost)
+    return Lane(flow, iter([Fate(delay, i in lost) for i, delay in enumerate(delays_ns)]))
+
+
+def packet(name: str) -> Datagram:
+    """A packet that can be told from others."""
+    return Datagram(name.encode(), PEER)
+
+
+def take(link: Link, lane: Lane, names: str, *, now_ns: int = 0) -> None:
+    """A packet for each letter enters."""
+    for name in names:
+        link.take(packet(name), lane, now_ns=now_ns)
+
+
+def give(link: Link, *, now_ns: int) -> str:
+    """The letters of the packets that leave."""
+    return "".join(datagram.payload.decode() for datagram in link.give(now_ns=now_ns))
+
+
+def test_packets_leave_when_they_are_due_and_not_before() -> None:
+    """In the order of their due times, whatever that of their arrival."""
+    link = make_link()
+    take(link, make_lane(30, 10, 20), "abc", now_ns=100)
+    assert [give(link, now_ns=now) for now in (109, 110, 119, 130)] == ["", "b", "", "ca"]
+
+
+def test_packets_due_at_once_leave_in_the_order_in_which_they_came() -> None:
+    """Whichever flow they are of, and however long they were under way."""
+    link, near, far = make_link(), make_lane(50, 0, flow=1), make_lane(50, 40, flow=0)
+    take(link, near, "a", now_ns=0)
+    take(link, far, "b", now_ns=0)
+    take(link, far, "c", now_ns=10)
+    take(link, near, "d", now_ns=50)
+    assert give(link, now_ns=50) == "abcd"
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 3), st.integers(0, 9), st.booleans()), max_size=60),
+    st.integers(0, 30),
+)
+def test_what_leaves_is_what_a_sorted_list_would_give(
+    packets: list[tuple[int, int, bool]], now_ns: int
+) -> None:
+    """The heap against an oracle: stable sort by due time, then cut."""
+    link = make_link()
+    delays = [delay for _, delay, _ in packets]
+    lane = make_lane(*delays, lost=[i for i, (_, _, lost) in enumerate(packets) if lost])
+    arrived, dues = 0, []
+    for number, (gap, delay, lost) in enumerate(packets):
+        arrived += gap
+        link.take(Datagram(bytes([number]), PEER), lane, now_ns=arrived)
+        dues += [] if lost else [(arrived + delay, number)]
+    left = [datagram.payload[0] for datagram in link.give(now_ns=now_ns)]
+    assert left == [number for due, number in sorted(dues) if due <= now_ns]
+    assert link.depth() == len(dues) - len(left)
+
+
+def test_a_packet_leaves_as_it_came() -> None:
+    """Payload, peer and socket are those that it was given."""
+    link, datagram = make_link(), Datagram(b"\x00\xff", PEER, 7)
+    link.take(datagram, make_lane(5), now_ns=0)
+    assert link.give(now_ns=5) == [datagram]
+
+
+def test_a_packet_leaves_once() -> None:
+    """Asking again gives nothing."""
+    link = make_link()
+    take(link, make_lane(5), "a")
+    assert [give(link, now_ns=5), give(link, now_ns=5)] == ["a", ""]
+
+
+def test_the_next_due_time_is_that_of_the_earliest_packet() -> None:
+    """And none is due of an empty link."""
+    link = make_link()
+    assert link.next_due_ns() is None
+    take(link, make_lane(30, 10), "ab", now_ns=100)
+    assert link.next_due_ns() == 110
+    give(link, now_ns=110)
+    assert link.next_due_ns() == 130
+    give(link, now_ns=130)
+    assert link.next_due_ns() is None
+
+
+def test_lost_packets_never_leave_and_are_counted() -> None:
+    """They are packets, but hold no place in the queue."""
+    link = make_link()
+    take(link, make_lane(0, 0, 0, lost=[0, 2]), "abc")
+    assert (link.counts.packets, link.counts.lost, link.depth()) == (3, 2, 1)
+    assert give(link, now_ns=0) == "b"
+    assert link.counts.forwarded == 1
+
+
+def test_a_full_queue_drops_what_comes_and_counts_it_apart_from_losses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is under way keeps its place; once there is room, packets pass again."""
+    monkeypatch.setattr(link_module, "QUEUE_MAX", 2)
+    link, lane = make_link(), make_lane(9, 8, 1, 1)
+    take(link, lane, "abc")
+    assert (link.counts.overflowed, link.counts.lost, link.depth()) == (1, 0, 2)
+    assert give(link, now_ns=8) == "b"
+    take(link, lane, "d", now_ns=8)
+    assert give(link, now_ns=9) == "ad"
+    assert (link.counts.packets, link.counts.forwarded) == (4, 3)
+
+
+def test_a_packet_that_overflows_uses_up_its_fate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fate belongs to a packet's number, so those of later packets do not shift."""
+    monkeypatch.setattr(link_module, "QUEUE_MAX", 1)
+    link, lane = make_link(), make_lane(1, 100, 7)
+    take(link, lane, "ab")
+    assert give(link, now_ns=1) == "a"
+    take(link, lane, "c", now_ns=1)
+    assert link.next_due_ns() == 8
+
+
+def test_the_greatest_depth_is_remembered() -> None:
+    """After the queue has emptied as well."""
+    link = make_link()
+    take(link, make_lane(1, 1, 1), "abc")
+    give(link, now_ns=1)
+    assert (link.depth(), link.counts.depth_max) == (0, 3)
+
+
+def test_overtaken_packets_are_counted_as_reordered() -> None:
+    """Two of four here: both come out after a later one."""
+    link = make_link()
+    take(link, make_lane(30, 20, 10, 40), "abcd")
+    assert give(link, now_ns=40) == "cbad"
+    assert link.counts.reordered == 2
+
+
+def test_flows_do_not_overtake_each_other() -> None:
+    """Reordering is of packets of one flow."""
+    link = make_link()
+    take(link, make_lane(20, flow=0), "a")
+    take(link, make_lane(5, 10, flow=1), "bc")
+    assert give(link, now_ns=20) == "bca"
+    assert link.counts.reordered == 0
+
+
+def test_a_lost_packet_overtakes_nobody() -> None:
+    """It never comes out."""
+    link = make_link()
+    take(link, make_lane(20, 0, lost=[1]), "ab")
+    assert give(link, now_ns=20) == "a"
+    assert link.counts.reordered == 0
+
+
+def test_the_bytes_of_all_packets_are_counted() -> None:
+    """Of lost ones as well: they were sent."""
+    link, lane = make_link(), make_lane(0, 0, lost=[0])
+    link.take(Datagram(bytes(600), PEER), lane, now_ns=0)
+    link.take(Datagram(b"", PEER), lane, now_ns=0)
+    assert link.counts.bytes == 600
+
+
+def test_the_added_delay_error_is_how_late_packets_left() -> None:
+    """Against their due time, by the clock that `give` is told."""
+    link = make_link()
+    take(link, make_lane(MILLISECOND_NS, 3 * MILLISECOND_NS), "ab")
+    give(link, now_ns=MILLISECOND_NS)
+    give(link, now_ns=5 * MILLISECOND_NS)
+    error = link.counts.error
+    assert error.largest_ns == 2 * MILLISECOND_NS
+    assert (error.quantile_ms(0.5), error.quantile_ms(0.99)) == (0.02, 2.0)
+
+
+def test_the_delay_histogram_is_of_delays_as_drawn() -> None:
+    """Of those that were forwarded, however late they left."""
+    link, ms = make_link(), MILLISECOND_NS
+    take(link, make_lane(400 * ms, 440 * ms, 440 * ms, 500 * ms, lost=[3]), "abcd")
+    give(link, now_ns=900 * ms)
+    assert str(link.counts.delay) == "400 ms: 1, 440 ms: 2"
+
+
+def recorded(direction: int, lane: Lane, names: str) -> Rows:
+    """What a link writes down of packets 1 µs apart that all leave in the end."""
+    sink = io.BytesIO()
+    link = Link(direction, Recorder(PACKET_COLUMNS, sink))
+    for index, name in enumerate(names):
+        link.take(packet(name), lane, now_ns=1000 * index)
+    link.give(now_ns=10**9)
+    return parse(sink.getvalue())
+
+
+def test_the_fate_of_every_packet_is_written_down() -> None:
+    """A lost one's at once, another's when it leaves."""
+    rows = recorded(DOWNLINK, make_lane(9000, 500, 70, flow=4, lost=[2]), "abc")
+    assert rows["number"].tolist() == [2, 1, 0]
+    assert rows["direction"].tolist() == [DOWNLINK] * 3
+    assert rows["flow"].tolist() == [4] * 3
+    assert rows["bytes"].tolist() == [1] * 3
+    assert rows["arrived_ns"].tolist() == [2000, 1000, 0]
+    assert rows["delay_ns"].tolist() == [70, 500, 9000]
+    assert rows["lost"].tolist() == [True, False, False]
+    assert rows["overtaken"].tolist() == [False, False, True]
+
+
+def filled(*values_ns: int) -> Histogram:
+    """A histogram with bins of 10 ns."""
+    histogram = Histogram(10)
+    for value_ns in values_ns:
+        histogram.add(value_ns)
+    return histogram
+
+
+def test_a_histogram_counts_by_bins_of_equal_width() -> None:
+    """The lower edge belongs to its bin; what is beyond the last bin is in it."""
+    counts = filled(0, 9, 10, 19, 20, 10 * BINS - 1, 10**9).counts
+    assert counts[:4] == [2, 2, 1, 0]
+    assert (counts[-1], sum(counts)) == (2, 7)
+
+
+def test_a_quantile_is_never_below_the_true_one_and_at_most_a_bin_above() -> None:
+    """For a hundred durations in a row."""
+    histogram = filled(*range(100, 200))
+    for share, true_ns in ((0.01, 100), (0.5, 149), (0.99, 198), (1.0, 199)):
+        assert true_ns <= histogram.quantile_ms(share) * MILLISECOND_NS <= true_ns + 10
+
+
+def test_a_quantile_of_nothing_is_zero() -> None:
+    """A report before the first packet needs a number."""
+    assert filled().quantile_ms(0.99) == 0.0
+
+
+def test_a_quantile_beyond_the_last_bin_is_not_understated() -> None:
+    """An overloaded netem that is 50 ms late must not report the last bin's edge of 10 ms."""
+    histogram = Histogram(ERROR_BIN_NS)
+    histogram.add(50 * MILLISECOND_NS)
+    assert histogram.quantile_ms(0.99) == 50.0
+
+
+def test_an_empty_histogram_says_so() -> None:
+    """In words, for the report."""
+    assert str(filled()) == "empty"

@@ -1,0 +1,177 @@
+"""What flies in simulation: the model exactly, and wind that is the stated noise."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad_vec
+from scipy.linalg import expm
+
+from client.plant import FirstOrderPlant, white_acceleration
+from shared.config import Scenario, check
+from shared.model import Array, discretise
+
+COMMANDS = np.random.default_rng(0).uniform(-1.8, 1.8, size=(50, 2))
+
+
+def scenario(**vehicle: object) -> Scenario:
+    """Two unlike axes; a vehicle at its default but for what is given."""
+    return check({"model": {"tau_s": [0.81, 0.3]}, "vehicle": vehicle}, "test")
+
+
+def plant(seed: int = 0, **vehicle: object) -> FirstOrderPlant:
+    """A vehicle of `scenario`, with a chance of its own."""
+    return FirstOrderPlant(scenario(**vehicle), np.random.default_rng(seed))
+
+
+def flight(flown: FirstOrderPlant, commands: Array = COMMANDS) -> Array:
+    """The states after each command."""
+    states = []
+    for command in commands:
+        flown.advance(command)
+        states.append(flown.state())
+    return np.array(states)
+
+
+def covariance(tau_s: float, dt_s: float) -> Array:
+    """∫ e^{As} G Gᵀ e^{Aᵀs} ds over a step, by quadrature of the matrix exponential."""
+    A, G = np.array([[0.0, 1.0], [0.0, -1.0 / tau_s]]), np.array([0.0, 1.0])
+
+    def spread(s: float) -> Array:
+        response = expm(A * s) @ G
+        return np.outer(response, response)
+
+    return quad_vec(spread, 0.0, dt_s, epsabs=1e-16, epsrel=1e-12)[0]
+
+
+def test_without_wind_the_plant_is_the_model() -> None:
+    """The controller's own prediction, to the last bit."""
+    flown = plant()
+    model, x = discretise(np.array([0.81, 0.3]), 0.05), flown.state()
+    for command, state in zip(COMMANDS, flight(flown), strict=True):
+        x = model.step(x, command)
+        np.testing.assert_array_equal(state, x)
+
+
+def test_true_time_constant_may_differ_from_the_model_s() -> None:
+    """The vehicle flies with its own τ, one for all axes or one each."""
+    for given, true in (([1.0], [1.0, 1.0]), ([1.0, 0.2], [1.0, 0.2])):
+        flown = plant(tau_s=given)
+        model, x = discretise(np.array(true), 0.05), flown.state()
+        for command, state in zip(COMMANDS, flight(flown), strict=True):
+            x = model.step(x, command)
+            np.testing.assert_array_equal(state, x)
+
+
+def test_flight_starts_at_rest_at_the_start_of_the_reference() -> None:
+    """The circle of 1.42 m begins at (1.42, 0), whatever its velocity there."""
+    assert plant().state().tolist() == [[1.42, 0.0], [0.0, 0.0]]
+
+
+def test_flight_starts_where_the_scenario_says() -> None:
+    """At rest there too, also in the middle."""
+    assert plant(start_m=[-3.0, 4.0]).state().tolist() == [[-3.0, 0.0], [4.0, 0.0]]
+    assert plant(start_m=[0.0, 0.0]).state().tolist() == [[0.0, 0.0], [0.0, 0.0]]
+
+
+def test_plant_flies_in_space() -> None:
+    """The third axis is one like the others."""
+    raw = {"model": {"axes": 3}, "reference": {"altitude_m": 2.0}}
+    flown = FirstOrderPlant(check(raw, "test"), np.random.default_rng(0))
+    assert flown.state().tolist() == [[1.42, 0.0], [0.0, 0.0], [2.0, 0.0]]
+    (state,) = flight(flown, np.array([[0.0, 0.0, 1.0]]))
+    expected = discretise(np.array([0.855]), 0.05).step(np.array([[2.0, 0.0]]), np.array([1.0]))
+    np.testing.assert_allclose(state, [[1.42, 0.0], [0.0, 0.0], expected[0]], atol=1e-15)
+
+
+def test_state_is_the_caller_s_own() -> None:
+    """Writing to it moves no vehicle."""
+    flown = plant()
+    flown.state()[:] = 9.0
+    assert flown.state().tolist() == [[1.42, 0.0], [0.0, 0.0]]
+
+
+def test_steady_gust_settles_at_u_plus_tau_a() -> None:
+    """An acceleration a acts like the input τ a; here one gust begins at once and never ends."""
+    flown = plant(gust_mps2=2.0, gust_every_s=1e-9, gust_s=1e9)
+    u, tau = np.array([0.5, -1.0]), np.array([0.81, 0.3])
+    velocity = flight(flown, np.tile(u, (600, 1)))[-1, :, 1]
+    acceleration = (velocity - u) / tau
+    assert np.linalg.norm(acceleration) == pytest.approx(2.0, rel=1e-9)
+    assert (np.abs(acceleration) > 0.01).all()
+
+
+def test_steady_gust_is_integrated_exactly() -> None:
+    """v̇ = (u - v)/τ + a, solved by quadrature over one step."""
+    tau, dt = np.array([0.81, 0.3]), 0.05
+    flown = plant(gust_mps2=2.0, gust_every_s=1e-9, gust_s=1e9)
+    long = flight(flown, np.zeros((600, 2)))
+    acceleration = long[-1, :, 1] / tau
+    rate = [np.array([[0.0, 1.0], [0.0, -1.0 / t]]) for t in tau]
+    before, after = long[0], long[1]
+    for axis in range(2):
+        pushed, _ = quad_vec(lambda s, A=rate[axis]: expm(A * s)[:, 1], 0.0, dt, epsrel=1e-12)
+        expected = expm(rate[axis] * dt) @ before[axis] + pushed * acceleration[axis]
+        np.testing.assert_allclose(after[axis], expected, rtol=0, atol=1e-10)
+
+
+def test_gusts_come_and_go_as_often_as_stated() -> None:
+    """2 s of gust after 4 s of calm, on average: a third of the time, in one piece each."""
+    flown = plant(gust_mps2=1.0, gust_every_s=4.0, gust_s=2.0)
+    velocity = flight(flown, np.zeros((40_000, 2)))[:, :, 1]
+    decay, settled = np.exp(-0.05 / np.array([0.81, 0.3])), np.array([0.81, 0.3])
+    push = (velocity[1:] - decay * velocity[:-1]) / ((1.0 - decay) * settled)
+    strength = np.linalg.norm(push, axis=1)
+    blowing = strength > 0.5
+    np.testing.assert_allclose(strength[blowing], 1.0, atol=1e-9)
+    np.testing.assert_allclose(strength[~blowing], 0.0, atol=1e-9)
+    assert blowing.mean() == pytest.approx(1 / 3, abs=0.05)
+    begun = np.flatnonzero(blowing[1:] & ~blowing[:-1]).size
+    assert blowing.sum() * 0.05 / begun == pytest.approx(2.0, rel=0.2)
+    same = blowing[1:] & blowing[:-1]
+    np.testing.assert_allclose(push[1:][same], push[:-1][same], atol=1e-9)
+
+
+@pytest.mark.parametrize("dt_s", [0.01, 0.05, 0.5])
+@pytest.mark.parametrize("tau_s", [0.05, 0.3, 0.81, 5.0])
+def test_wind_has_the_covariance_of_white_acceleration(tau_s: float, dt_s: float) -> None:
+    """The closed form against quadrature, for every pair of τ and Δt."""
+    L = white_acceleration(np.array([tau_s]), dt_s)[0]
+    expected = covariance(tau_s, dt_s)
+    assert L[0, 1] == 0.0
+    np.testing.assert_allclose(L @ L.T, expected, rtol=1e-8)
+
+
+def test_axes_have_covariances_of_their_own() -> None:
+    """Each with its own τ."""
+    both = white_acceleration(np.array([0.81, 0.3]), 0.05)
+    for axis, tau_s in enumerate((0.81, 0.3)):
+        np.testing.assert_array_equal(both[axis], white_acceleration(np.array([tau_s]), 0.05)[0])
+
+
+def test_wind_over_many_steps_varies_as_stated() -> None:
+    """What a step adds beyond the model has covariance wind² ∫ …, no mean, and no memory."""
+    flown = plant(wind=0.4)
+    model = discretise(np.array([0.81, 0.3]), 0.05)
+    states = np.concatenate([flown.state()[None], flight(flown, np.zeros((20_000, 2)))])
+    added = states[1:] - model.step(states[:-1], np.zeros((20_000, 2)))
+    for axis, tau_s in enumerate((0.81, 0.3)):
+        expected = 0.4**2 * covariance(tau_s, 0.05)
+        np.testing.assert_allclose(np.cov(added[:, axis].T), expected, rtol=0.05)
+        assert (np.abs(added[:, axis].mean(axis=0)) < 4 * np.sqrt(np.diag(expected) / 2e4)).all()
+    velocity = added[:, :, 1] / added[:, :, 1].std(axis=0)
+    assert abs(np.mean(velocity[:, 0] * velocity[:, 1])) < 0.03
+    assert (np.abs(np.mean(velocity[1:] * velocity[:-1], axis=0)) < 0.03).all()
+
+
+def test_same_chance_is_the_same_flight() -> None:
+    """Wind and gusts are those of the generator given, and of nothing else."""
+    wild = {"wind": 0.3, "gust_mps2": 1.0, "gust_every_s": 0.5}
+    first, again, other = (flight(plant(seed, **wild)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first[-1] != other[-1]).all()
+
+
+def test_calm_flight_needs_no_chance() -> None:
+    """Without wind and gusts the generator is left as it was."""
+    rng = np.random.default_rng(3)
+    flight(FirstOrderPlant(scenario(), rng))
+    assert rng.random() == np.random.default_rng(3).random()

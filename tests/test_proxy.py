@@ -1,0 +1,255 @@
+"""netem.proxy: an endpoint between clients and a server that reads none of their payloads."""
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from netem import link as link_module
+from netem import proxy as proxy_module
+from netem.fate import fates
+from netem.link import Link
+from netem.proxy import IDLE_NS, Proxy
+from shared.config import DirectionConfig, NetworkConfig, Scenario
+from shared.endpoint import MILLISECOND_NS, Datagram
+
+SERVER = ("192.0.2.9", 47001)
+ALICE, BOB, CAROL = (("192.0.2.1", 5000), ("192.0.2.1", 5001), ("192.0.2.2", 5000))
+
+AT_ONCE = DirectionConfig(delay="none", loss=0.0)
+IN_20_MS = DirectionConfig(delay="constant", minimum_s=0.02, loss=0.0)
+
+
+def make_proxy(
+    uplink: DirectionConfig = AT_ONCE, downlink: DirectionConfig | None = None, seed: int = 1
+) -> Proxy:
+    """A proxy with this network, the same both ways unless said."""
+    network = NetworkConfig(uplink=uplink, downlink=downlink or uplink)
+    return Proxy(Scenario(seed=seed, network=network), server=SERVER)
+
+
+def hear(proxy: Proxy, payload: bytes, peer: tuple[str, int], socket: int = 0, at: int = 0) -> None:
+    """A datagram arrives."""
+    proxy.receive(Datagram(payload, peer, socket), now_ns=at)
+
+
+def pass_on(proxy: Proxy, payload: bytes, client: tuple[str, int], at: int = 0) -> int:
+    """A client's packet crosses at once; the socket it leaves by."""
+    hear(proxy, payload, client, at=at)
+    (sent,) = proxy.outbox()
+    assert sent[:2] == (payload, SERVER)
+    return sent.socket
+
+
+def test_every_client_address_is_a_flow_with_a_socket_of_its_own() -> None:
+    """Another port is another client; the same address keeps its socket."""
+    proxy = make_proxy()
+    sockets = [pass_on(proxy, b"?", client) for client in (ALICE, BOB, CAROL, ALICE, CAROL)]
+    assert sockets == [1, 2, 3, 1, 3]
+    assert proxy.news() == [
+        "flow 0 for 192.0.2.1:5000",
+        "flow 1 for 192.0.2.1:5001",
+        "flow 2 for 192.0.2.2:5000",
+    ]
+
+
+def test_the_servers_answers_find_their_client() -> None:
+    """By the socket that they come in on, and leave by the one that is bound."""
+    proxy = make_proxy()
+    socket_of = {client: pass_on(proxy, b"?", client) for client in (ALICE, BOB, CAROL)}
+    for client in (BOB, ALICE, CAROL):
+        hear(proxy, b"!", SERVER, socket_of[client])
+        assert proxy.outbox() == [Datagram(b"!", client, 0)]
+
+
+def test_a_stranger_at_a_flows_socket_is_refused() -> None:
+    """Only the server may answer, not another host, nor another port of the server's."""
+    proxy = make_proxy()
+    socket = pass_on(proxy, b"?", ALICE)
+    for stranger in (BOB, (SERVER[0], 1), ("192.0.2.8", SERVER[1])):
+        hear(proxy, b"!", stranger, socket)
+    assert (proxy.outbox(), proxy.refused, proxy.uplink.counts.packets) == ([], 3, 0)
+
+
+def test_a_packet_at_a_socket_of_no_flow_is_refused() -> None:
+    """Even if the server sent it."""
+    proxy = make_proxy()
+    hear(proxy, b"!", SERVER, 1)
+    assert (proxy.outbox(), proxy.refused) == ([], 1)
+
+
+def test_a_client_too_many_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While those that are there stay served."""
+    monkeypatch.setattr(proxy_module, "FLOWS_MAX", 2)
+    proxy = make_proxy()
+    assert [pass_on(proxy, b"?", client) for client in (ALICE, BOB)] == [1, 2]
+    hear(proxy, b"?", CAROL)
+    assert (proxy.outbox(), proxy.refused) == ([], 1)
+    assert pass_on(proxy, b"?", BOB) == 2
+
+
+def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its socket then carries the new client's answers, and the old one has to wait."""
+    monkeypatch.setattr(proxy_module, "FLOWS_MAX", 2)
+    proxy = make_proxy()
+    pass_on(proxy, b"?", ALICE, at=0)
+    pass_on(proxy, b"?", BOB, at=1)
+    hear(proxy, b"?", CAROL, at=IDLE_NS - 1)
+    assert (proxy.outbox(), proxy.refused) == ([], 1)
+    assert pass_on(proxy, b"?", CAROL, at=IDLE_NS) == 1
+    hear(proxy, b"!", SERVER, 1, at=IDLE_NS)
+    assert proxy.outbox() == [Datagram(b"!", CAROL, 0)]
+    hear(proxy, b"?", ALICE, at=IDLE_NS)
+    assert (proxy.outbox(), proxy.refused) == ([], 2)
+
+
+def test_the_servers_packets_keep_a_flow_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that only listens is not idle."""
+    monkeypatch.setattr(proxy_module, "FLOWS_MAX", 1)
+    proxy = make_proxy()
+    socket = pass_on(proxy, b"?", ALICE)
+    hear(proxy, b"!", SERVER, socket, at=IDLE_NS - 1)
+    proxy.outbox()
+    hear(proxy, b"?", BOB, at=IDLE_NS)
+    assert (proxy.outbox(), proxy.refused) == ([], 1)
+
+
+def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And not the one that took it."""
+    monkeypatch.setattr(proxy_module, "FLOWS_MAX", 1)
+    slow = DirectionConfig(delay="constant", minimum_s=61.0, loss=0.0)
+    proxy = make_proxy(uplink=slow, downlink=AT_ONCE)
+    socket = pass_on(proxy, b"?", ALICE)
+    hear(proxy, b"!", SERVER, socket)
+    assert pass_on(proxy, b"?", BOB, at=IDLE_NS) == socket
+    proxy.wake(now_ns=61 * 1000 * MILLISECOND_NS)
+    assert proxy.outbox() == [Datagram(b"!", ALICE, 0)]
+
+
+@pytest.mark.parametrize("length", [0, 1, 600, 65_507])
+def test_payloads_pass_unread(length: int) -> None:
+    """Any bytes, none, and the longest that UDP takes, both ways."""
+    payload = random.Random(length).randbytes(length)
+    proxy = make_proxy()
+    socket = pass_on(proxy, payload, ALICE)
+    hear(proxy, payload, SERVER, socket)
+    assert proxy.outbox() == [Datagram(payload, ALICE, 0)]
+
+
+def test_without_delay_packets_are_forwarded_as_they_arrive() -> None:
+    """Nothing is left to be woken for."""
+    proxy = make_proxy()
+    pass_on(proxy, b"?", ALICE, at=123)
+    assert proxy.next_wake_ns() is None
+    assert proxy.downlink.counts.error.largest_ns == 0
+
+
+def test_a_duplicate_is_a_packet_of_its_own() -> None:
+    """netem tells no copies apart: each has its own number, and its own fate."""
+    proxy = make_proxy()
+    assert [pass_on(proxy, b"?", ALICE) for _ in range(3)] == [1, 1, 1]
+    assert proxy.downlink.counts.packets == 3
+
+
+def test_it_wants_to_be_woken_for_the_next_packet_of_either_direction() -> None:
+    """And then forwards what is due, and no more."""
+    slower = replace(IN_20_MS, minimum_s=0.03)
+    proxy, ms = make_proxy(uplink=slower, downlink=IN_20_MS), MILLISECOND_NS
+    hear(proxy, b"?", ALICE, at=0)
+    hear(proxy, b"!", SERVER, 1, at=0)
+    assert (proxy.outbox(), proxy.next_wake_ns()) == ([], 20 * ms)
+    proxy.wake(now_ns=20 * ms)
+    assert (proxy.outbox(), proxy.next_wake_ns()) == ([Datagram(b"?", SERVER, 1)], 30 * ms)
+    proxy.wake(now_ns=30 * ms)
+    assert (proxy.outbox(), proxy.next_wake_ns()) == ([Datagram(b"!", ALICE, 0)], None)
+
+
+def test_being_woken_early_does_no_harm() -> None:
+    """Drivers may be."""
+    proxy = make_proxy(IN_20_MS)
+    hear(proxy, b"?", ALICE, at=0)
+    proxy.wake(now_ns=20 * MILLISECOND_NS - 1)
+    assert (proxy.outbox(), proxy.next_wake_ns()) == ([], 20 * MILLISECOND_NS)
+
+
+def test_each_direction_and_flow_meets_its_own_fates() -> None:
+    """Those that netem.fate names, in the order of the packets."""
+    half = DirectionConfig(delay="none", loss=0.5)
+    proxy = make_proxy(half, seed=7)
+    for flow, client in enumerate((ALICE, BOB)):
+        for number in range(40):
+            hear(proxy, bytes([number]), client)
+            hear(proxy, bytes([number]), SERVER, flow + 1)
+        sent = proxy.outbox()
+        for name, peer in (("downlink", SERVER), ("uplink", client)):
+            drawn = [fate.lost for _, fate in zip(range(40), fates(half, 7, name, flow))]  # noqa: B905 - fates never end
+            passed = [datagram.payload[0] for datagram in sent if datagram.peer == peer]
+            assert passed == [number for number in range(40) if not drawn[number]]
+
+
+def test_what_is_sent_is_handed_out_once() -> None:
+    """The driver empties the outbox."""
+    proxy = make_proxy()
+    hear(proxy, b"?", ALICE)
+    assert [len(proxy.outbox()), len(proxy.outbox())] == [1, 0]
+
+
+def test_the_report_names_every_statistic() -> None:
+    """Flows, refusals, and by direction: forwarded, lost, reordered, queue, delay and its error."""
+    proxy, ms = make_proxy(uplink=DirectionConfig(loss=1.0), downlink=IN_20_MS), MILLISECOND_NS
+    hear(proxy, b"?", ALICE, at=0)
+    hear(proxy, b"?", ALICE, at=2 * ms)
+    hear(proxy, b"!", SERVER, 1, at=3 * ms)
+    hear(proxy, b"!", BOB, 1, at=3 * ms)
+    proxy.wake(now_ns=21 * ms)
+    assert proxy.report().splitlines() == [
+        "1 flows, 1 packets refused",
+        "uplink: 1 packets, 0 forwarded, 1 lost, 0 reordered, 0 overflowed, queue 0 (at most 0)",
+        "  delay: empty",
+        "  added-delay error: p50 0.00 ms, p99 0.00 ms, largest 0.00 ms",
+        "downlink: 2 packets, 1 forwarded, 0 lost, 0 reordered, 0 overflowed, queue 1 (at most 2)",
+        "  delay: 20 ms: 1",
+        "  added-delay error: p50 1.00 ms, p99 1.00 ms, largest 1.00 ms",
+    ]
+
+
+ARRIVALS = st.lists(
+    st.tuples(
+        st.sampled_from([(ALICE, 0), (BOB, 0), (CAROL, 0), (SERVER, 1), (SERVER, 2), (BOB, 2)]),
+        st.integers(0, 200),
+    ),
+    max_size=80,
+)
+
+
+@given(ARRIVALS, st.integers(0, 2**32 - 1))
+def test_no_packet_appears_or_vanishes(
+    arrivals: list[tuple[tuple[tuple[str, int], int], int]], seed: int
+) -> None:
+    """At every moment each one is forwarded, lost, overflowed, refused or still under way."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(link_module, "QUEUE_MAX", 8)
+        patch.setattr(proxy_module, "FLOWS_MAX", 2)
+        proxy, now_ns, sent = make_proxy(DirectionConfig(loss=0.3), seed=seed), 0, 0
+        links = (proxy.uplink, proxy.downlink)
+        for number, ((peer, socket), gap_ms) in enumerate(arrivals, start=1):
+            now_ns += gap_ms * MILLISECOND_NS
+            proxy.wake(now_ns=now_ns)
+            hear(proxy, b"", peer, socket, at=now_ns)
+            sent += len(proxy.outbox())
+            assert all(is_balanced(link) for link in links)
+            assert sum(link.counts.packets for link in links) + proxy.refused == number
+            assert sum(link.counts.forwarded for link in links) == sent
+
+
+def is_balanced(link: Link) -> bool:
+    """Whether what entered is accounted for, and the queue within its bound."""
+    counts = link.counts
+    gone = counts.forwarded + counts.lost + counts.overflowed
+    return counts.packets == gone + link.depth() and link.depth() <= 8

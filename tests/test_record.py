@@ -1,0 +1,136 @@
+"""shared.record: what is written down is what is read back."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared.record import (
+    PACKET_COLUMNS,
+    Recorder,
+    client_columns,
+    parse,
+    read,
+    server_columns,
+)
+
+Columns = np.dtype[np.void]
+
+COLUMN_SETS = {
+    "client in 2-D": client_columns(2),
+    "client in 3-D": client_columns(3),
+    "server in 2-D": server_columns(2),
+    "server in 3-D": server_columns(3),
+    "netem": PACKET_COLUMNS,
+}
+
+
+def some_rows(columns: Columns, count: int) -> dict[str, np.ndarray]:
+    """Values for every column, no two columns alike."""
+    rng = np.random.default_rng(len(columns))
+    return {
+        name: rng.integers(0, 2 if kind.base.kind == "b" else 250, (count, *kind.shape))
+        for name, kind in ((name, columns[name]) for name in columns.names)
+    }
+
+
+@pytest.fixture(params=COLUMN_SETS.values(), ids=COLUMN_SETS)
+def columns(request: pytest.FixtureRequest) -> Columns:
+    """Each set of columns in turn."""
+    return request.param
+
+
+def written(columns: Columns, count: int = 3) -> bytes:
+    """A part with some rows."""
+    sink = io.BytesIO()
+    Recorder(columns, sink).append(count, **some_rows(columns, count))
+    return sink.getvalue()
+
+
+def test_rows_survive_the_round_trip(columns: Columns) -> None:
+    """Every column, to the last bit, with its type and shape."""
+    rows = parse(written(columns))
+    assert rows.dtype == columns
+    for name, values in some_rows(columns, 3).items():
+        np.testing.assert_array_equal(rows[name], values)
+
+
+def test_a_row_cut_short_is_left_out(columns: Columns) -> None:
+    """A writer that is killed loses no more than its last row, wherever the cut is."""
+    part = written(columns)
+    for cut in (1, columns.itemsize // 2, columns.itemsize):
+        np.testing.assert_array_equal(parse(part[:-cut]), parse(part)[:2])
+
+
+def test_a_part_without_rows_is_read_as_none(columns: Columns) -> None:
+    """Killed before the first one, whole or half."""
+    header = written(columns, 0)
+    assert parse(header).size == parse(header + bytes(columns.itemsize - 1)).size == 0
+    assert parse(header).dtype == columns
+
+
+def test_a_part_begins_with_its_columns_in_a_line() -> None:
+    """So that a stranger can read it with numpy alone."""
+    header, _, _ = written(PACKET_COLUMNS).partition(b"\n")
+    assert header.startswith(b'[["direction", "|u1"], ["flow", "<u4"], ["number", "<u4"]')
+
+
+def test_one_value_is_broadcast_to_all_rows() -> None:
+    """And a value for each row keeps its place."""
+    sink = io.BytesIO()
+    Recorder(PACKET_COLUMNS, sink).append(3, flow=7, number=[4, 5, 6], lost=True)
+    rows = parse(sink.getvalue())
+    assert rows["flow"].tolist() == [7, 7, 7]
+    assert rows["number"].tolist() == [4, 5, 6]
+    assert rows["lost"].tolist() == [True, True, True]
+
+
+def test_a_column_left_out_is_zero() -> None:
+    """Nothing of an earlier row shows through."""
+    sink = io.BytesIO()
+    recorder = Recorder(client_columns(2), sink)
+    recorder.append(1, **some_rows(client_columns(2), 1))
+    recorder.append(1, step=9)
+    last = parse(sink.getvalue())[1]
+    assert (last["step"], last["vehicle"], last["age_ns"]) == (9, 0, 0)
+    assert not last["state"].any()
+
+
+def test_rows_stay_in_the_order_in_which_they_were_appended() -> None:
+    """Over several calls."""
+    sink = io.BytesIO()
+    recorder = Recorder(PACKET_COLUMNS, sink)
+    for numbers in ([0, 1], [], [2], [3, 4, 5]):
+        recorder.append(len(numbers), number=numbers)
+    assert parse(sink.getvalue())["number"].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_without_a_sink_nothing_is_looked_at() -> None:
+    """It costs an endpoint no time, not even that of checking its values."""
+    recorder = Recorder(PACKET_COLUMNS)
+    assert recorder.append(1, no_such_column=1) is None
+
+
+def test_a_misspelt_column_is_our_own_mistake() -> None:
+    """It does not vanish silently."""
+    with pytest.raises(ValueError, match="no field of name"):
+        Recorder(PACKET_COLUMNS, io.BytesIO()).append(1, no_such_column=1)
+
+
+def test_a_part_is_read_from_its_file(tmp_path: Path) -> None:
+    """As it is from memory."""
+    path = tmp_path / "netem"
+    path.write_bytes(written(PACKET_COLUMNS))
+    np.testing.assert_array_equal(read(path), parse(written(PACKET_COLUMNS)))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"a diary\n", b"\xff\x00", b"3\n", b"null\n", b"[]\n", b'[["a", "zzz"]]\n']
+)
+def test_a_file_that_is_no_part_is_a_value_error(tmp_path: Path, content: bytes) -> None:
+    """As `read` promises, whatever is in it."""
+    path = tmp_path / "netem"
+    path.write_bytes(content)
+    with pytest.raises(ValueError):  # noqa: PT011 - the words are those of json or numpy
+        read(path)

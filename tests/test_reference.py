@@ -1,0 +1,253 @@
+"""Desired trajectories: where they are, how fast, when they come round, and what a file may say."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from shared import reference
+from shared.config import ConfigError, check
+
+quick = settings(max_examples=80, deadline=None)
+
+SLOPE_S = 1e-5
+"""Half width of a central difference."""
+ROUTE = np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 6.0], [-1.0, 6.0]])
+"""Legs of 5, 2 and 4 m, and √37 m back."""
+
+
+def sample(desired: reference.Reference, t: float) -> tuple[list[float], list[float]]:
+    """Position and velocity at one time."""
+    state = desired(np.array(t))
+    return state[:, 0].tolist(), state[:, 1].tolist()
+
+
+@pytest.mark.parametrize(
+    ("t", "position", "velocity"),
+    [
+        (0.0, (2.0, 0.0), (0.0, 1.0)),
+        (np.pi, (0.0, 2.0), (-1.0, 0.0)),
+        (2 * np.pi, (-2.0, 0.0), (0.0, -1.0)),
+        (3 * np.pi, (0.0, -2.0), (1.0, 0.0)),
+    ],
+)
+def test_circle_runs_counter_clockwise(
+    t: float, position: tuple[float, ...], velocity: tuple[float, ...]
+) -> None:
+    """Radius 2 m in 4π s is 1 m/s, from (2, 0)."""
+    p, v = sample(reference.circle(2.0, 4 * np.pi, 2), t)
+    assert p == pytest.approx(position, abs=1e-12)
+    assert v == pytest.approx(velocity, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("eighths", "position"),
+    [
+        (0, (0.0, 0.0)),
+        (1, (3.0 * np.sqrt(0.5), 1.5)),
+        (2, (3.0, 0.0)),
+        (3, (3.0 * np.sqrt(0.5), -1.5)),
+        (4, (0.0, 0.0)),
+        (6, (-3.0, 0.0)),
+    ],
+)
+def test_figure_eight_passes_its_crossing_and_its_ends(
+    eighths: int, position: tuple[float, ...]
+) -> None:
+    """Radius 3 m: 6 m wide, 3 m high, through the origin twice."""
+    p, _ = sample(reference.figure_eight(3.0, 16.0, 2), 2.0 * eighths)
+    assert p == pytest.approx(position, abs=1e-12)
+
+
+def test_figure_eight_leaves_its_crossing_diagonally() -> None:
+    """At the origin both velocities are radius · ω."""
+    _, v = sample(reference.figure_eight(3.0, 2 * np.pi, 2), 0.0)
+    assert v == pytest.approx((3.0, 3.0))
+
+
+@quick
+@given(st.floats(0.0, 100.0), st.integers(1, 4), st.sampled_from(["circle", "figure_eight"]))
+def test_closed_curves_repeat_every_period(t: float, rounds: int, shape: str) -> None:
+    """A round later everything is as it was."""
+    desired = getattr(reference, shape)(1.5, 14.2, 2)
+    np.testing.assert_allclose(
+        desired(np.array(t + 14.2 * rounds)), desired(np.array(t)), rtol=0, atol=1e-11
+    )
+
+
+@quick
+@given(st.floats(0.0, 60.0), st.sampled_from(["circle", "figure_eight"]), st.sampled_from([2, 3]))
+def test_velocity_is_the_slope_of_a_smooth_curve(t: float, shape: str, axes: int) -> None:
+    """E6: the velocity that the controller is given is the derivative of the position."""
+    desired = getattr(reference, shape)(1.5, 14.2, axes, 0.7)
+    before, after = desired(np.array([t - SLOPE_S, t + SLOPE_S]))[..., 0]
+    slope = (after - before) / (2 * SLOPE_S)
+    np.testing.assert_allclose(desired(np.array(t))[:, 1], slope, rtol=0, atol=1e-8)
+
+
+@quick
+@given(st.floats(0.0, 40.0), st.booleans())
+def test_velocity_is_the_slope_between_waypoints(t: float, loop: bool) -> None:
+    """On every leg, on the way back, and after the end."""
+    desired = reference.waypoints(ROUTE, 2.0, loop=loop)
+    corners = np.cumsum([0.0, 5.0, 2.0, 4.0, np.sqrt(37.0)]) / 2.0
+    phase = t % corners[-1] if loop else t
+    assume(np.abs(phase - corners).min() > 2 * SLOPE_S)
+    before, after = desired(np.array([t - SLOPE_S, t + SLOPE_S]))[..., 0]
+    slope = (after - before) / (2 * SLOPE_S)
+    np.testing.assert_allclose(desired(np.array(t))[:, 1], slope, rtol=0, atol=1e-8)
+
+
+def test_plane_curves_fly_level_in_space() -> None:
+    """In 3-D they have an altitude and no climb."""
+    for desired in (
+        reference.circle(1.0, 10.0, 3, 2.5),
+        reference.figure_eight(1.0, 10.0, 3, 2.5),
+        reference.square(1.0, 10.0, 3, 2.5),
+    ):
+        up = desired(np.linspace(0.0, 25.0, 101))[:, 2]
+        np.testing.assert_array_equal(up, np.tile([2.5, 0.0], (101, 1)))
+
+
+def test_square_turns_at_its_corners() -> None:
+    """Radius 2 m in 16 s: a corner every 4 s, at 1 m/s, counter-clockwise."""
+    desired = reference.square(2.0, 16.0, 2)
+    corners = [[2.0, -2.0], [2.0, 2.0], [-2.0, 2.0], [-2.0, -2.0], [2.0, -2.0]]
+    ways = [[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [0.0, 1.0]]
+    states = desired(4.0 * np.arange(5))
+    np.testing.assert_allclose(states[..., 0], corners, atol=1e-12)
+    np.testing.assert_allclose(states[..., 1], ways, atol=1e-12)
+
+
+@quick
+@given(st.floats(0.0, 100.0))
+def test_square_keeps_to_its_edge_at_one_speed(t: float) -> None:
+    """Anywhere on it: the larger coordinate is the radius, the speed 8 radii a period."""
+    p, v = sample(reference.square(1.5, 12.0, 2), t)
+    assert max(np.abs(p)) == pytest.approx(1.5)
+    assert np.linalg.norm(v) == pytest.approx(1.0)
+
+
+def test_waypoints_are_passed_at_constant_speed() -> None:
+    """5 m, then 2 m, then 4 m at 2 m/s."""
+    desired = reference.waypoints(ROUTE, 2.0)
+    assert sample(desired, 0.0) == ([0.0, 0.0], pytest.approx([1.2, 1.6]))
+    assert sample(desired, 1.25) == (pytest.approx([1.5, 2.0]), pytest.approx([1.2, 1.6]))
+    assert sample(desired, 3.0) == (pytest.approx([3.0, 5.0]), [0.0, 2.0])
+    assert sample(desired, 4.5) == (pytest.approx([1.0, 6.0]), [-2.0, 0.0])
+
+
+@pytest.mark.parametrize("t", [5.5, 5.6, 1000.0])
+def test_waypoints_end_at_rest(t: float) -> None:
+    """From the last point on nothing moves."""
+    assert sample(reference.waypoints(ROUTE, 2.0), t) == ([-1.0, 6.0], [0.0, 0.0])
+
+
+def test_waypoints_begin_at_rest() -> None:
+    """Before the epoch the vehicle is to wait at the first point."""
+    assert sample(reference.waypoints(ROUTE, 2.0), -1.0) == ([0.0, 0.0], [0.0, 0.0])
+
+
+def test_looped_waypoints_fly_home_and_on() -> None:
+    """From the last point back to the first, and round again."""
+    desired = reference.waypoints(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), 1.0, loop=True)
+    assert sample(desired, 9.5) == (pytest.approx([1.5, 2.0]), pytest.approx([-0.6, -0.8]))
+    assert sample(desired, 12.0) == ([0.0, 0.0], [1.0, 0.0])
+    assert sample(desired, 13.0) == (pytest.approx([1.0, 0.0]), [1.0, 0.0])
+
+
+def test_hover_stays_where_it_is() -> None:
+    """One point, no velocity, at any time."""
+    states = reference.hover(np.array([1.0, -2.0, 3.0]))(np.array([0.0, 1.0, 1e6]))
+    np.testing.assert_array_equal(states[..., 0], [[1.0, -2.0, 3.0]] * 3)
+    np.testing.assert_array_equal(states[..., 1], np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"shape": "circle"},
+        {"shape": "figure-eight"},
+        {"shape": "square"},
+        {"shape": "waypoints", "points_m": [[0, 0, 0], [1, 2, 2]]},
+        {"shape": "hover", "points_m": [[1, 2, 3]]},
+    ],
+)
+def test_array_of_times_is_its_single_times(table: dict[str, object], axes: int) -> None:
+    """A reference is a function of each time alone, whatever the shape of the question."""
+    if "points_m" in table:
+        table = table | {"points_m": [point[:axes] for point in table["points_m"]]}
+    desired = check({"model": {"axes": axes}, "reference": table}, "test").make_reference()
+    times = np.array([[0.0, 0.3, 2.9], [14.2, 17.0, 100.0]])
+    singles = [[desired(np.array(t)) for t in row] for row in times]
+    np.testing.assert_array_equal(desired(times), singles)
+
+
+def test_file_is_flown_in_straight_lines(tmp_path: Path) -> None:
+    """Linear between its lines, at rest after the last, further columns ignored."""
+    path = tmp_path / "path.csv"
+    path.write_text("note,t,x,y,z\na,0,1,2,3\nb,2,5,2,1\nc,3,5,0,1\n")
+    desired = reference.from_csv(path, 3)
+    assert sample(desired, 0.5) == ([2.0, 2.0, 2.5], [2.0, 0.0, -1.0])
+    assert sample(desired, 2.5) == ([5.0, 1.0, 1.0], [0.0, -2.0, 0.0])
+    assert sample(desired, 3.0) == ([5.0, 0.0, 1.0], [0.0, 0.0, 0.0])
+
+
+def test_file_for_space_can_be_flown_in_the_plane(tmp_path: Path) -> None:
+    """With two axes the column z is not asked for."""
+    path = tmp_path / "path.csv"
+    path.write_text("t,x,y,z\n0,0,0,9\n1,2,4,9\n")
+    assert sample(reference.from_csv(path, 2), 0.5) == ([1.0, 2.0], [2.0, 4.0])
+
+
+FINITE = "expected at least two lines of finite numbers"
+RISING = "column t must start at 0 and rise from line to line"
+BAD_FILES = [
+    ("", "line 1: expected the columns t, x, y"),
+    ("t,x\n0,0\n1,1\n", "line 1: expected the columns t, x, y"),
+    ("0,0,0\n1,1,1\n", "line 1: expected the columns t, x, y"),
+    ("t,x,y\n0,0,0\n1,one,1\n", "line 3: expected 3 numbers"),
+    ("t,x,y\n0,0,0\n1,1\n", "line 3: expected 3 numbers"),
+    ("t,x,y\n0,0,0\n1,,1\n2,2,2\n", "line 3: expected 3 numbers"),
+    ("t,x,y\n0.1,0,0\n1,1,1\n", RISING),
+    ("t,x,y\n0,0,0\n2,1,1\n1,2,2\n", RISING),
+    ("t,x,y\n0,0,0\n1,1,1\n1,2,2\n", RISING),
+    ("t,x,y\n", FINITE),
+    ("t,x,y\n0,0,0\n", FINITE),
+    ("t,x,y\n0,0,0\n1,nan,1\n", FINITE),
+    ("t,x,y\n0,0,0\ninf,1,1\n", FINITE),
+    ("t,x,y\n0,0,0\n1,1e999,1\n", FINITE),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD_FILES)
+def test_bad_file_says_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:
+    """And in which line, where it is one line's fault."""
+    path = tmp_path / "path.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        reference.from_csv(path, 2)
+
+
+def test_line_of_a_bad_number_counts_empty_lines_too(tmp_path: Path) -> None:
+    """The line named is the one that an editor shows."""
+    path = tmp_path / "path.csv"
+    path.write_text("t,x,y\n0,0,0\n\n\n1,one,1\n")
+    with pytest.raises(ValueError, match=r"^line 5: expected 3 numbers$"):
+        reference.from_csv(path, 2)
+
+
+def test_scenario_with_a_bad_file_names_key_file_and_line(tmp_path: Path) -> None:
+    """The user hears which key of which scenario led to it."""
+    path = tmp_path / "path.csv"
+    path.write_text("t,x,y\n0,0,0\n1,one,1\n")
+    with pytest.raises(ConfigError) as caught:
+        check({"reference": {"shape": "csv", "file": str(path)}}, "mine.toml")
+    assert str(caught.value) == (
+        f"mine.toml: reference.file: got {str(path)!r}, "
+        "expected a table of the trajectory (line 3: expected 3 numbers)"
+    )
