@@ -89,9 +89,7 @@ class ClockMap:
             samples[:, OLD].sum(axis=1) >= STEP_SAMPLES
         )
         forward, backward = (minimum[:, :, RECENT].min(axis=2) - minimum[:, :, OLD].min(axis=2)).T
-        opposite = (forward * np.sign(backward) < 0) & (
-            np.abs(forward + backward) < np.maximum(STEP_NS, 0.2 * np.abs(forward))
-        )
+        opposite = np.abs(forward + backward) < np.maximum(STEP_NS, 0.2 * np.abs(forward))
         large = np.minimum(np.abs(forward), np.abs(backward)) > STEP_NS
         for row, order in zip(
             rows[enough & opposite & large], newest_first[enough & opposite & large], strict=True

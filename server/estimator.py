@@ -63,7 +63,7 @@ class Estimator:
         """x̂(k) of eq. (13), for vehicles within reach; shape (n, axes, 2)."""
         observed = self._state[rows]
         if not self._compensate:
-            return observed.copy()
+            return observed
         self._hold(rows, step)
         age = self.age(rows, step)
         i = np.arange(1, self._reach + 1)

@@ -122,17 +122,21 @@ def from_csv(path: Path, axes: int) -> Reference:
         ValueError: with what is wrong, and in which line.
     """
     names = ["t", "x", "y", "z"][: axes + 1]
-    with path.open(newline="") as file:
-        table = csv.DictReader(file)
-        missing = [name for name in names if name not in (table.fieldnames or ())]
-        if missing:
-            raise ValueError(f"line 1: expected the columns {', '.join(names)}")
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        table = csv.DictReader(file, skipinitialspace=True)
         try:
-            rows = [[float(row[name]) for name in names] for row in table]
-        except (TypeError, ValueError):
-            raise ValueError(f"line {table.line_num}: expected {len(names)} numbers") from None
+            missing = [name for name in names if name not in (table.fieldnames or ())]
+            lines = [] if missing else [(table.line_num, row) for row in table]
         except csv.Error as error:
-            raise ValueError(f"line {table.line_num}: {error}") from None
+            raise ValueError(f"line {table.reader.line_num}: {error}") from None
+    if missing:
+        raise ValueError(f"line 1: expected the columns {', '.join(names)}")
+    rows = []
+    for line, row in lines:
+        try:
+            rows.append([float(row[name]) for name in names])
+        except (TypeError, ValueError):
+            raise ValueError(f"line {line}: expected {len(names)} numbers") from None
     data = np.array(rows).reshape(-1, axes + 1)
     if len(data) < 2 or not np.isfinite(data).all():
         raise ValueError("expected at least two lines of finite numbers")

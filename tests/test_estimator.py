@@ -136,6 +136,20 @@ def test_estimate_right_after_a_gap_knows_no_input_of_a_ring_ago() -> None:
     np.testing.assert_allclose(estimate(estimator, 23), expected, rtol=0, atol=1e-13)
 
 
+def test_asking_for_estimates_changes_no_later_one() -> None:
+    """The trigger may ask at every step, also where nothing is computed after all."""
+    asked, silent = make(), make()
+    for estimator in (asked, silent):
+        remember(estimator, np.full((15, 2), 7.0))
+        remember(estimator, np.array([[0.5, -0.5]]), start=15)
+        estimator.observe(0, 14, np.ones((2, 2)))
+    for step in (16, 17, 17, 19):
+        estimate(asked, step)
+    for estimator in (asked, silent):
+        remember(estimator, np.array([[0.2, 0.9]]), start=20)
+    np.testing.assert_array_equal(estimate(asked, 24), estimate(silent, 24))
+
+
 @pytest.mark.parametrize(
     ("observed", "now", "within"), [(5, 5, True), (5, 17, True), (5, 18, False), (30, 18, True)]
 )

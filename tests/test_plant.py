@@ -9,12 +9,17 @@ from client.plant import FirstOrderPlant, white_acceleration
 from shared.config import Scenario, check
 from shared.model import Array, discretise
 
+FLIGHT = {
+    "model": {"tau_s": [0.81, 0.3]},
+    "control": {"dt": 0.05},
+    "reference": {"shape": "circle", "radius_m": 1.5, "period_s": 14.2},
+}
 COMMANDS = np.random.default_rng(0).uniform(-1.8, 1.8, size=(50, 2))
 
 
 def scenario(**vehicle: object) -> Scenario:
-    """Two unlike axes; a vehicle at its default but for what is given."""
-    return check({"model": {"tau_s": [0.81, 0.3]}, "vehicle": vehicle}, "test")
+    """Two unlike axes and a circle of 1.5 m; a vehicle at its default but for what is given."""
+    return check({**FLIGHT, "vehicle": vehicle}, "test")
 
 
 def plant(seed: int = 0, **vehicle: object) -> FirstOrderPlant:
@@ -62,8 +67,8 @@ def test_true_time_constant_may_differ_from_the_model_s() -> None:
 
 
 def test_flight_starts_at_rest_at_the_start_of_the_reference() -> None:
-    """The circle of 1.42 m begins at (1.42, 0), whatever its velocity there."""
-    assert plant().state().tolist() == [[1.42, 0.0], [0.0, 0.0]]
+    """A circle of 1.5 m begins at (1.5, 0), whatever its velocity there."""
+    assert plant().state().tolist() == [[1.5, 0.0], [0.0, 0.0]]
 
 
 def test_flight_starts_where_the_scenario_says() -> None:
@@ -74,19 +79,23 @@ def test_flight_starts_where_the_scenario_says() -> None:
 
 def test_plant_flies_in_space() -> None:
     """The third axis is one like the others."""
-    raw = {"model": {"axes": 3}, "reference": {"altitude_m": 2.0}}
+    raw = {
+        "model": {"axes": 3, "tau_s": [0.81]},
+        "control": {"dt": 0.05},
+        "reference": {"shape": "circle", "radius_m": 1.5, "altitude_m": 2.0},
+    }
     flown = FirstOrderPlant(check(raw, "test"), np.random.default_rng(0))
-    assert flown.state().tolist() == [[1.42, 0.0], [0.0, 0.0], [2.0, 0.0]]
+    assert flown.state().tolist() == [[1.5, 0.0], [0.0, 0.0], [2.0, 0.0]]
     (state,) = flight(flown, np.array([[0.0, 0.0, 1.0]]))
-    expected = discretise(np.array([0.855]), 0.05).step(np.array([[2.0, 0.0]]), np.array([1.0]))
-    np.testing.assert_allclose(state, [[1.42, 0.0], [0.0, 0.0], expected[0]], atol=1e-15)
+    expected = discretise(np.array([0.81]), 0.05).step(np.array([[2.0, 0.0]]), np.array([1.0]))
+    np.testing.assert_allclose(state, [[1.5, 0.0], [0.0, 0.0], expected[0]], atol=1e-15)
 
 
 def test_state_is_the_caller_s_own() -> None:
     """Writing to it moves no vehicle."""
     flown = plant()
     flown.state()[:] = 9.0
-    assert flown.state().tolist() == [[1.42, 0.0], [0.0, 0.0]]
+    assert flown.state().tolist() == [[1.5, 0.0], [0.0, 0.0]]
 
 
 def test_steady_gust_settles_at_u_plus_tau_a() -> None:

@@ -241,6 +241,16 @@ def test_line_of_a_bad_number_counts_empty_lines_too(tmp_path: Path) -> None:
         reference.from_csv(path, 2)
 
 
+@pytest.mark.parametrize("lines_before", [0, 1, 2])
+def test_file_that_is_no_table_is_refused_in_words(tmp_path: Path, lines_before: int) -> None:
+    """Somebody's JSON in one long line, as the header or below it."""
+    path = tmp_path / "path.csv"
+    path.write_text("".join(["t,x,y\n", "0,0,0\n"][:lines_before]) + "9" * 200_000 + "\n")
+    line = lines_before + 1
+    with pytest.raises(ValueError, match=rf"^line {line}: field larger than field limit"):
+        reference.from_csv(path, 2)
+
+
 def test_scenario_with_a_bad_file_names_key_file_and_line(tmp_path: Path) -> None:
     """The user hears which key of which scenario led to it."""
     path = tmp_path / "path.csv"
