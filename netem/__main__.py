@@ -32,7 +32,8 @@ def emulate(argv: Sequence[str]) -> None:
     options = command.parse(Options(), argv, "skytether netem", emulate.__doc__)
     sink = command.open_record(options.record) if options.record else None
     server = command.address(options.server)
-    endpoint = Proxy(options.config, server=server, recorder=Recorder(PACKET_COLUMNS, sink))
+    recorder = Recorder(PACKET_COLUMNS, sink) if sink else None
+    endpoint = Proxy(options.config, server=server, recorder=recorder)
     bind = command.address(options.bind)
     command.drive("netem", endpoint, bind, [server], f"clients of {options.server}")
     if sink:

@@ -26,8 +26,11 @@ class Histogram:
 
     def add(self, value_ns: int) -> None:
         """Count one."""
-        self.counts[min(value_ns // self.bin_ns, BINS - 1)] += 1
-        self.largest_ns = max(self.largest_ns, value_ns)
+        # Once a packet: comparisons cost half of what min() and max() do.
+        index = value_ns // self.bin_ns
+        self.counts[index if index < BINS else -1] += 1
+        if value_ns > self.largest_ns:  # noqa: PLR1730
+            self.largest_ns = value_ns
 
     def quantile_ms(self, share: float) -> float:
         """Upper edge of the bin in which this share of all lies below [ms]; 0 without any."""
@@ -82,10 +85,10 @@ class Link:
 
     Args:
         direction: UPLINK or DOWNLINK, for the record.
-        recorder: takes one row a packet.
+        recorder: takes one row a packet, where there is one.
     """
 
-    def __init__(self, direction: int, recorder: Recorder) -> None:
+    def __init__(self, direction: int, recorder: Recorder | None) -> None:
         self._direction = direction
         self._recorder = recorder
         self._heap: list[tuple[int, int, Datagram, Lane, int, Fate]] = []
@@ -144,6 +147,8 @@ class Link:
         *,
         overtaken: bool,
     ) -> None:
+        if self._recorder is None:
+            return
         self._recorder.append(
             1,
             direction=self._direction,

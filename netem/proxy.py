@@ -11,7 +11,7 @@ from netem.fate import fates
 from netem.link import Counts, Lane, Link
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
-from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Recorder
+from shared.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
 """Clients at once, a socket each; a packet of a further one is dropped, and counted."""
@@ -43,7 +43,6 @@ class Proxy(Endpoint):
         self, scenario: Scenario, *, server: Address, recorder: Recorder | None = None
     ) -> None:
         super().__init__()
-        recorder = recorder or Recorder(PACKET_COLUMNS)
         self._scenario = scenario
         self._server = server
         self.uplink = Link(UPLINK, recorder)
@@ -78,12 +77,16 @@ class Proxy(Endpoint):
 
     def _forward(self, now_ns: int) -> None:
         for link in (self.uplink, self.downlink):
-            self._out += link.give(now_ns=now_ns)
+            due_ns = link.next_due_ns()
+            if due_ns is not None and due_ns <= now_ns:
+                self._out += link.give(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
         """When the next packet is due."""
-        dues = (self.uplink.next_due_ns(), self.downlink.next_due_ns())
-        return min((due for due in dues if due is not None), default=None)
+        up_ns, down_ns = self.uplink.next_due_ns(), self.downlink.next_due_ns()
+        if up_ns is None or down_ns is None:
+            return up_ns if down_ns is None else down_ns
+        return min(up_ns, down_ns)
 
     def _open(self, client: Address, now_ns: int) -> Flow | None:
         socket = len(self._by_socket) + 1

@@ -34,7 +34,7 @@ def serve(argv: Sequence[str]) -> None:
     endpoint = Server(
         options.config,
         boot_id=secrets.randbits(64),
-        recorder=Recorder(server_columns(options.config.model.axes), sink),
+        recorder=Recorder(server_columns(options.config.model.axes), sink) if sink else None,
         stopwatch_ns=time.perf_counter_ns,
     )
     command.drive("server", endpoint, command.address(options.bind), (), "vehicles")

@@ -70,18 +70,15 @@ PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
 
 
 class Recorder:
-    """Appends rows to a binary file, or to nothing."""
+    """Appends rows to a binary file."""
 
-    def __init__(self, columns: np.dtype[np.void], sink: BinaryIO | None = None) -> None:
+    def __init__(self, columns: np.dtype[np.void], sink: BinaryIO) -> None:
         self.columns = columns
         self._sink = sink
-        if sink is not None:
-            sink.write(json.dumps(columns.descr).encode() + b"\n")
+        sink.write(json.dumps(columns.descr).encode() + b"\n")
 
     def append(self, count: int, **values: Any) -> None:
         """`count` rows; each value is one for all of them, or an array with the rows first."""
-        if self._sink is None:
-            return
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value

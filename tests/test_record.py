@@ -106,12 +106,6 @@ def test_rows_stay_in_the_order_in_which_they_were_appended() -> None:
     assert parse(sink.getvalue())["number"].tolist() == [0, 1, 2, 3, 4, 5]
 
 
-def test_without_a_sink_nothing_is_looked_at() -> None:
-    """It costs an endpoint no time, not even that of checking its values."""
-    recorder = Recorder(PACKET_COLUMNS)
-    assert recorder.append(1, no_such_column=1) is None
-
-
 def test_a_misspelt_column_is_our_own_mistake() -> None:
     """It does not vanish silently."""
     with pytest.raises(ValueError, match="no field of name"):

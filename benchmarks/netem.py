@@ -1,0 +1,380 @@
+"""How exactly netem delays: 20 000 packets/s through a real netem process on 127.0.0.1.
+
+A sender numbers and stamps its packets; the kernel stamps them as they reach the receiver. What
+netem drew for each is known, for fates are a function of seed, direction, flow and number. So the
+added-delay error is
+
+    (received - sent) - drawn
+
+and has in it, besides netem, two crossings of the kernel. The machine's own share is measured
+beside it: how late a process wakes that only sleeps, and how long netem waited for a core.
+
+The sender sends in batches, four a millisecond: no process can sleep for 50 µs.
+"""
+
+import contextlib
+import gc
+import json
+import multiprocessing
+import os
+import platform
+import re
+import signal
+import socket
+import statistics
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from itertools import islice
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from shared.config import DirectionConfig
+from shared.endpoint import MILLISECOND_NS, SECOND_NS
+from shared.udp import kernel_drops, open_socket
+
+HOST = "127.0.0.1"
+HEAD = struct.Struct("<qq")
+"""Number, and when it was sent [ns]; the rest of a packet is zeros."""
+BATCH_NS = MILLISECOND_NS // 4
+SO_TIMESTAMPNS = 35
+QUIET_S = 2
+"""Silence after which no packet is on its way: the paper's delay is far shorter."""
+PATIENCE_S = 90.0
+"""For an answer; the longest run takes 60 s."""
+TARGET_MS = 1.0
+"""For the median over the runs of the error's p99."""
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Of this benchmark."""
+
+    runs: int = 5
+    """How often to measure."""
+    seconds: int = 5
+    """How long each time [s]."""
+    rate: int = 20_000
+    """Packets per second."""
+    size: int = 600
+    """UDP payload of each [B]."""
+    realtime: bool = False
+    """Run before all other programs (needs the right to), so that these do not count."""
+    json: Path | None = None
+    """File for the figures."""
+
+    @property
+    def packets(self) -> int:
+        """Packets in a run."""
+        return self.rate * self.seconds
+
+    def is_bounded(self) -> bool:
+        """Whether a slip of the finger floods nothing."""
+        few = 1 <= self.runs <= 100 and 1 <= self.seconds <= 60 and 1 <= self.rate <= 100_000
+        return few and HEAD.size <= self.size <= 65_507
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run gave."""
+
+    sent: int
+    received: int
+    dropped_before: int
+    """Before netem read them: its receive buffer was full."""
+    dropped_within: int
+    """By netem: its queue was full, or the kernel refused to send."""
+    dropped_after: int
+    """After netem had sent them: the receiver's buffer was full."""
+    measured: int
+    """Packets whose drawn delay is known: those before the first that netem never read."""
+    error_ms_p50: float
+    error_ms_p99: float
+    error_ms_max: float
+    netem_ms_p99: float
+    """The error as netem reports it: from due to being handed to the shell."""
+    netem_cpu: float
+    """Share of a core that it used,"""
+    netem_waited: float
+    """and share of the time that it had work but no core to do it on."""
+    wake_ms_p50: float
+    """How late a process wakes that only sleeps,"""
+    wake_ms_p99: float
+    """in the same seconds."""
+
+
+def work(task: Callable[..., object], pipe: Connection, *args: object) -> None:
+    """Process: do a task, give its answer, and wait to be killed.
+
+    Ending by itself would take a core for 20 ms, in the middle of the measurement.
+    """
+    gc.disable()
+    pipe.send(task(pipe, *args))
+    signal.pause()
+
+
+def send(pipe: Connection, options: Options, port: int) -> int:
+    """Number, stamp and send packets by absolute deadlines; how many."""
+    sock = open_blocking()
+    sock.connect((HOST, port))
+    packet, number = bytearray(options.size), 0
+    pipe.send("ready")
+    start_ns = pipe.recv()
+    for batch_ns in range(BATCH_NS, options.seconds * SECOND_NS + 1, BATCH_NS):
+        sleep_until(start_ns + batch_ns)
+        while number < options.rate * batch_ns // SECOND_NS:
+            HEAD.pack_into(packet, 0, number, time.monotonic_ns())
+            sock.send(packet)
+            number += 1
+    return number
+
+
+def receive(pipe: Connection, options: Options) -> tuple[bytes, list[int], int]:
+    """Note when packets come; their heads, their arrivals [ns], and the kernel's drops."""
+    sock = open_blocking()
+    pipe.send(sock.getsockname()[1])
+    pipe.recv()
+    # The kernel's own time-out: Python's would ask poll() before every packet.
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", QUIET_S, 0))
+    sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    packet, heads, arrivals = bytearray(options.size), bytearray(), []
+    with contextlib.suppress(BlockingIOError):  # quiet
+        while len(arrivals) < options.packets:
+            _, ((_, _, stamp),), _, _ = sock.recvmsg_into([packet], 64)
+            seconds, ns = struct.unpack("ll", stamp)
+            # The kernel stamps by the wall clock.
+            wall_to_monotonic_ns = time.monotonic_ns() - time.time_ns()
+            arrivals.append(seconds * SECOND_NS + ns + wall_to_monotonic_ns)
+            heads += packet[: HEAD.size]
+    return bytes(heads), arrivals, kernel_drops(sock)
+
+
+def sleep(pipe: Connection, options: Options) -> list[int]:
+    """Sleep until every next millisecond; how late that was [ns]."""
+    pipe.send("ready")
+    start_ns, late_ns = pipe.recv(), []
+    for due_ns in range(start_ns, start_ns + options.seconds * SECOND_NS, MILLISECOND_NS):
+        sleep_until(due_ns)
+        late_ns.append(time.monotonic_ns() - due_ns)
+    return late_ns
+
+
+def sleep_until(due_ns: int) -> None:
+    """Wait for an absolute time; not at all if it has passed."""
+    time.sleep(max(0, due_ns - time.monotonic_ns()) / SECOND_NS)
+
+
+def open_blocking() -> socket.socket:
+    """A socket on a free port, with large buffers, that waits."""
+    sock = open_socket((HOST, 0))
+    sock.setblocking(True)
+    return sock
+
+
+def measure(options: Options, seed: int) -> Run:
+    """One run: netem, sender, receiver and sleeper, each a process; none outlives it."""
+    with ExitStack() as stack:
+        receiver = start(stack, receive, options)
+        netem, port = start_netem(stack, answer(receiver), seed)
+        sender, sleeper = start(stack, send, options, port), start(stack, sleep, options)
+        answer(sender), answer(sleeper)
+
+        used_ns, start_ns = scheduled_ns(netem.pid), time.monotonic_ns() + SECOND_NS // 10
+        for pipe in (receiver, sleeper, sender):
+            pipe.send(start_ns)
+        sent = answer(sender)
+        used_ns = scheduled_ns(netem.pid) - used_ns
+        (heads, arrivals, dropped_after), late_ns = answer(receiver), answer(sleeper)
+
+        netem.send_signal(signal.SIGTERM)
+        report, _ = netem.communicate(timeout=PATIENCE_S)
+
+    numbers, stamps = np.frombuffer(heads, "<i8").reshape(-1, 2).T
+    taken = int(said(report, r"downlink: (\d+) packets"))
+    # A packet that netem never read has no number there, and shifts those of all that follow.
+    known = sent if taken == sent else first_missing(numbers)
+    error_ns = (np.array(arrivals) - stamps - drawn_delays_ns(seed, sent)[numbers])[numbers < known]
+    return Run(
+        sent=sent,
+        received=len(numbers),
+        dropped_before=sent - taken,
+        dropped_within=int(said(report, r"downlink: .* (\d+) overflowed"))
+        + int(said(report, r"(\d+) datagrams could not be sent")),
+        dropped_after=dropped_after,
+        measured=len(error_ns),
+        error_ms_p50=quantile_ms(error_ns, 0.5),
+        error_ms_p99=quantile_ms(error_ns, 0.99),
+        error_ms_max=quantile_ms(error_ns, 1.0),
+        netem_ms_p99=float(said(report, r"(?s)downlink:.*error:.* p99 ([\d.]+) ms")),
+        netem_cpu=used_ns[0] / SECOND_NS / options.seconds,
+        netem_waited=used_ns[1] / SECOND_NS / options.seconds,
+        wake_ms_p50=quantile_ms(late_ns, 0.5),
+        wake_ms_p99=quantile_ms(late_ns, 0.99),
+    )
+
+
+def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Connection:
+    """Do a task in a process that ends with the stack; the pipe to it."""
+    ours, theirs = SPAWN.Pipe()
+    process = SPAWN.Process(target=work, args=(task, theirs, *args), daemon=True)
+    process.start()
+    theirs.close()
+    stack.callback(process.join)
+    stack.callback(process.kill)
+    return ours
+
+
+def start_netem(stack: ExitStack, server_port: int, seed: int) -> tuple[subprocess.Popen[str], int]:
+    """Run netem with the paper's delays and without losses; the process and its port."""
+    # -P: without it, a `netem` in the working directory would come first.
+    command = [sys.executable, "-P", "-m", "netem", "paper", f"--seed={seed}"]
+    command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--network.downlink.loss=0"]
+    netem = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    stack.callback(netem.wait)
+    stack.callback(netem.kill)
+    assert netem.stdout is not None
+    return netem, int(said(netem.stdout.readline(), rf"listening on {HOST}:(\d+)"))
+
+
+def answer(pipe: Connection) -> Any:
+    """What a process has to say."""
+    if not pipe.poll(PATIENCE_S):
+        raise TimeoutError("a process of the benchmark does not answer")
+    return pipe.recv()
+
+
+def said(report: str, pattern: str) -> str:
+    """What netem says of something; 0 where it says nothing."""
+    found = re.search(pattern, report)
+    return found[1] if found else "0"
+
+
+def scheduled_ns(pid: int) -> NDArray[np.int64]:
+    """How long a process has run, and has waited for a core to run on [ns]; shape (2,)."""
+    return np.array(Path(f"/proc/{pid}/schedstat").read_text().split()[:2], dtype=np.int64)
+
+
+def drawn_delays_ns(seed: int, count: int) -> NDArray[np.int64]:
+    """What netem drew for the packets of its first client; shape (count,)."""
+    from netem.fate import fates
+
+    drawn = islice(fates(DirectionConfig(loss=0.0), seed, "downlink", 0), count)
+    return np.array([fate.delay_ns for fate in drawn])
+
+
+def first_missing(numbers: NDArray[np.int64]) -> int:
+    """The lowest number that is not among these."""
+    present = np.zeros(numbers.max(initial=-1) + 2, bool)
+    present[numbers] = True
+    return int(present.argmin())
+
+
+def quantile_ms(values_ns: Any, share: float) -> float:
+    """A quantile of durations [ms]; not a number without any."""
+    return float(np.quantile(values_ns, share)) / MILLISECOND_NS if len(values_ns) else float("nan")
+
+
+def show(runs: list[Run], options: Options, console: Console) -> None:
+    """A table with a line for every run, and whether the target is met."""
+    title = f"netem, {options.rate} packets/s of {options.size} B, times in ms"
+    losses = [f"Run {i}: {where(run)}." for i, run in enumerate(runs, start=1) if lost(run)]
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0)
+    table.caption, table.caption_justify = "\n".join(losses), "left"
+    for heading in ("run", "packets\nsent", "\nreceived", "\nlost", "error\np50", "\np99", "\nmax"):
+        table.add_column(heading, justify="right")
+    for heading in ("netem\nCPU", "\nwaited", "machine\np50", "\np99"):
+        table.add_column(heading, justify="right")
+    for number, run in enumerate(runs, start=1):
+        table.add_row(
+            str(number),
+            str(run.sent),
+            str(run.received),
+            str(lost(run)),
+            f"{run.error_ms_p50:.2f}",
+            f"{run.error_ms_p99:.2f}",
+            f"{run.error_ms_max:.1f}",
+            f"{run.netem_cpu:.0%}",
+            f"{run.netem_waited:.0%}",
+            f"{run.wake_ms_p50:.2f}",
+            f"{run.wake_ms_p99:.2f}",
+        )
+    console.print(table)
+    own = sum(lost(run) - run.dropped_after for run in runs)
+    p99_ms = median(runs, "error_ms_p99")
+    met = own == 0 and p99_ms < TARGET_MS
+    console.print(
+        f"Median p99: {p99_ms:.2f} ms; the machine's own: {median(runs, 'wake_ms_p99'):.2f} ms. "
+        f"Lost by netem: {own}.\n"
+        f"Target, under {TARGET_MS:g} ms and none lost: {'met' if met else 'missed'}."
+    )
+
+
+def lost(run: Run) -> int:
+    """Packets that never came; netem was told to lose none."""
+    return run.sent - run.received
+
+
+def where(run: Run) -> str:
+    """Where they went."""
+    places = {
+        "unread by netem": run.dropped_before,
+        "dropped by netem": run.dropped_within,
+        "unread by the receiver": run.dropped_after,
+    }
+    places["lost elsewhere"] = lost(run) - sum(places.values())
+    return ", ".join(f"{count} {place}" for place, count in places.items() if count)
+
+
+def median(runs: list[Run], name: str) -> float:
+    """Over the runs, of one figure."""
+    return float(statistics.median(getattr(run, name) for run in runs))
+
+
+def main() -> int:
+    """Entry point; the exit code."""
+    options, console = tyro.cli(Options, description=__doc__), Console()
+    if not options.is_bounded():
+        console.print("expected 1 to 100 runs, 1 to 60 s, up to 100000 packets/s of 16 to 65507 B")
+        return 2
+    try:
+        if options.realtime:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        seeds = track(range(1, options.runs + 1), "measuring", console=console, transient=True)
+        runs = [measure(options, seed) for seed in seeds]
+    except PermissionError:
+        console.print("--realtime: this user may not")
+        return 2
+    except (EOFError, OSError) as error:
+        console.print(f"netem, or a process of this benchmark, ended before its time: {error}")
+        return 1
+    show(runs, options, console)
+    if options.json is not None:
+        figures = {
+            "options": {**asdict(options), "json": str(options.json)},
+            "machine": {"cpus": os.cpu_count(), "python": platform.python_version()},
+            "median": {name: median(runs, name) for name in asdict(runs[0])},
+            "runs": [asdict(run) for run in runs],
+        }
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    # In this folder, `netem` would be this file.
+    sys.path[:] = [path for path in sys.path if Path(path).resolve() != Path(__file__).parent]
+    sys.exit(main())
