@@ -18,7 +18,7 @@ from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import Scenario
 from shared.record import Recorder, client_columns, parse
 from shared.summary import summarise
-from shared.udp import ANYWHERE
+from shared.udp import within_reach_of
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ def fly(argv: Sequence[str]) -> None:
             boot_id=secrets.randbits(64),
             recorder=Recorder(client_columns(scenario.model.axes), sink),
         )
-        command.drive("client", endpoint, ANYWHERE, [server], f"the server at {options.server}")
+        bind = within_reach_of([server])
+        command.drive("client", endpoint, bind, [server], f"the server at {options.server}")
         sink.flush()
         sink.seek(0)
         rows = parse(sink.read())

@@ -23,7 +23,7 @@ from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint
 from shared.shell import Shell, run
 from shared.summary import Summary
-from shared.udp import AddressError
+from shared.udp import AddressError, is_loopback
 
 CONFIGURATION, RUN = 2, 1
 """Exit codes: the command asked for something impossible, or it went wrong on the way."""
@@ -127,7 +127,7 @@ def drive(
     def start() -> None:
         host, port = shell.address
         say(f"listening on {host}:{port}, waiting for {waiting_for}")
-        if any(not address[0].startswith("127.") for address in (bind, *peers)):
+        if not all(map(is_loopback, (bind, *peers))):
             say("plaintext and unauthenticated: only for a network that you trust")
 
     def report() -> None:
@@ -174,24 +174,23 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
 
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
+    """Name and value of what the summary knows."""
     s = summary
-    rmse_m = ", ".join(_number(value, ".4f") for value in (s.rmse_x, s.rmse_y, s.rmse_xy))
-    solve_ms = ", ".join(_number(value, ".2f") for value in (s.solve_ms_p50, s.solve_ms_p99))
-    height = [("RMSE z [m]", _number(s.rmse_z, ".4f"))] if s.rmse_z is not None else []
-    return [
+    rows = [
         ("steps", f"{s.steps} in {s.duration_s:g} s"),
-        ("RMSE x, y, xy [m]", rmse_m),
-        *height,
-        ("event ratio", _number(s.event_ratio, ".3f")),
-        ("uplink", f"{_number(s.uplink_packets)} packets, {_number(s.uplink_bytes)} bytes"),
-        ("downlink", f"{_number(s.downlink_packets)} packets, {_number(s.downlink_bytes)} bytes"),
-        ("lost, reordered", f"{_number(s.lost)}, {_number(s.reordered)} packets"),
-        ("discarded as stale", f"{s.stale} packets"),
-        ("age p50, p99 [ms]", f"{_number(s.age_ms_p50, '.0f')}, {_number(s.age_ms_p99, '.0f')}"),
-        ("solve p50, p99 [ms]", solve_ms),
-        ("deadline misses", str(s.deadline_misses)),
+        ("RMSE x, y, xy [m]", _values(".4f", s.rmse_x, s.rmse_y, s.rmse_xy)),
+        ("RMSE z [m]", _values(".4f", s.rmse_z)),
+        ("event ratio", _values(".3f", s.event_ratio)),
+        ("uplink packets, bytes", _values("d", s.uplink_packets, s.uplink_bytes)),
+        ("downlink packets, bytes", _values("d", s.downlink_packets, s.downlink_bytes)),
+        ("lost, reordered packets", _values("d", s.lost, s.reordered)),
+        ("stale packets", _values("d", s.stale)),
+        ("age p50, p99 [ms]", _values(".0f", s.age_ms_p50, s.age_ms_p99)),
+        ("solve p50, p99 [ms]", _values(".2f", s.solve_ms_p50, s.solve_ms_p99)),
+        ("deadline misses", _values("d", s.deadline_misses)),
     ]
+    return [(name, values) for name, values in rows if values]
 
 
-def _number(value: float | None, spec: str = "d") -> str:
-    return "–" if value is None else format(value, spec)
+def _values(spec: str, *values: float | None) -> str:
+    return ", ".join(format(value, spec) for value in values if value is not None)

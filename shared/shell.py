@@ -9,11 +9,11 @@ import contextlib
 import gc
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 from shared.endpoint import Address, Datagram, Endpoint
 from shared.timer import make_timer
-from shared.udp import ANYWHERE, Names, kernel_drops, open_socket
+from shared.udp import Names, kernel_drops, open_socket, within_reach_of
 
 BURST_MAX = 128
 """Datagrams read from one socket before timers and other sockets have their turn."""
@@ -44,11 +44,12 @@ class Shell:
         AddressError: the address cannot be bound, or a name cannot be found.
     """
 
-    def __init__(self, endpoint: Endpoint, bind: Address, peers: Iterable[Address] = ()) -> None:
+    def __init__(self, endpoint: Endpoint, bind: Address, peers: Sequence[Address] = ()) -> None:
         self.endpoint = endpoint
         self.send_errors = 0
         self._drops = 0
         self._names = Names(peers)
+        self._elsewhere = within_reach_of(peers)
         self._sockets = {0: open_socket(bind)}
         self.address: Address = self._sockets[0].getsockname()
 
@@ -119,7 +120,7 @@ class Shell:
         to = self._names.number(datagram.peer)
         try:
             if datagram.socket not in self._sockets:
-                self._sockets[datagram.socket] = open_socket(ANYWHERE)
+                self._sockets[datagram.socket] = open_socket(self._elsewhere)
                 self._listen(datagram.socket)
             self._sockets[datagram.socket].sendto(datagram.payload, to)
         except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet

@@ -8,8 +8,6 @@ from collections.abc import Iterable
 
 from shared.endpoint import Address
 
-ANYWHERE: Address = ("0.0.0.0", 0)
-"""A free port on every interface: what an endpoint's further sockets are bound to."""
 BUFFER_BYTES = 4 * 1024 * 1024
 """The default receive buffer holds 166 datagrams of 600 B."""
 
@@ -18,6 +16,16 @@ _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 
 class AddressError(OSError):
     """An address that the user gave is of no use; the message says which and why."""
+
+
+def within_reach_of(peers: Iterable[Address]) -> Address:
+    """What to bind a socket to that talks to these: a free port, on loopback if all are there."""
+    return ("127.0.0.1" if all(map(is_loopback, peers)) else "0.0.0.0", 0)
+
+
+def is_loopback(address: Address) -> bool:
+    """Whether only this machine can be, or reach, an address."""
+    return _is_numeric(address[0]) and ipaddress.ip_address(address[0]).is_loopback
 
 
 def open_socket(address: Address) -> socket.socket:
