@@ -1,0 +1,40 @@
+# The one image that server, netem and client run from: what requirements.lock pins, and our wheel.
+# BASE_IMAGE may be any with Python 3.11 or later and its venv; either builder of Docker will do.
+ARG BASE_IMAGE=python:3.12-slim
+
+FROM ${BASE_IMAGE} AS build
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+WORKDIR /source
+RUN python3 -m venv /build && python3 -m venv --without-pip /opt/skytether
+
+COPY requirements.lock ./
+RUN /build/bin/pip --python /opt/skytether/bin/python install --quiet \
+        --require-hashes --only-binary :all: -r requirements.lock \
+    && find /opt/skytether -type d -name tests -prune -exec rm -r {} +
+
+# What makes the wheel stays behind; it has the version that developers have.
+COPY requirements-dev.lock ./
+RUN sed -n 's/^\([a-z0-9-]*==[^ ;]*\).*/\1/p' requirements-dev.lock >/build/pins \
+    && /build/bin/pip install --quiet --only-binary :all: --constraint /build/pins hatchling
+
+COPY . ./
+RUN /build/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /build/wheel . \
+    && /build/bin/pip --python /opt/skytether/bin/python install --quiet \
+        --no-deps --no-index /build/wheel/*.whl
+
+
+FROM ${BASE_IMAGE}
+# One thread each: BLAS would start one a core, for matrices that are 40 wide.
+ENV PATH=/opt/skytether/bin:$PATH \
+    HOME=/tmp \
+    LANG=C.UTF-8 \
+    PYTHONUNBUFFERED=1 \
+    OMP_NUM_THREADS=1 \
+    OPENBLAS_NUM_THREADS=1
+COPY --from=build /opt/skytether /opt/skytether
+RUN install --directory --owner 10001 --group 10001 /results
+USER 10001:10001
+WORKDIR /results
+STOPSIGNAL SIGTERM
+ENTRYPOINT ["skytether"]
+CMD ["--help"]

@@ -1,0 +1,394 @@
+"""The three containers, flown for real: how they are locked in, and what a flight survives.
+
+`make docker-test` needs a Docker engine with Compose and takes about three minutes; `-s` shows how
+it goes. COMPOSE is the command to use where neither `docker compose` nor `docker-compose` will do,
+BASE_IMAGE what to build the image on.
+"""
+
+import contextlib
+import json
+import os
+import re
+import secrets
+import shlex
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import msgspec
+import pytest
+
+from shared import config
+from shared.summary import Summary
+
+pytestmark = [pytest.mark.docker, pytest.mark.timeout(900)]
+
+ROOT = Path(__file__).parents[1]
+SERVICES = ("server", "netem", "client")
+STEPS_PER_S = round(1 / config.load("demo").control.dt)
+
+FLIGHT_S = 60
+FAULTY_FLIGHT_S = 75
+"""The faults and what proves their end take 45 s of it."""
+FAULT_S = 3.0
+"""More than the demo's `link.timeout_s`, so that the client notices."""
+HORIZONS = 10
+"""So many new ones show that orders flow."""
+HOVER_M = 1.58
+"""`rmse_xy` of the demo for a vehicle that stays at its start."""
+
+
+def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
+    """From `up` to the summary, with the doors that ought to be locked tried on the way."""
+    with containers(compose, FLIGHT_S) as three:
+        three.flies()
+        for service in SERVICES:
+            three.check_privileges(service)
+        three.check_isolation()
+        say("locked in: not root, read-only, no capabilities, no way round netem")
+
+        summary = three.land(tmp_path)
+        assert summary.scenario == "demo"
+        assert summary.steps + summary.deadline_misses == FLIGHT_S * STEPS_PER_S
+        assert summary.rmse_xy is not None
+        assert 0 < summary.rmse_xy < 0.5 * HOVER_M
+        assert summary.deadline_misses < 0.1 * summary.steps
+
+        three.compose("up", "--detach")
+        until("a second flight", lambda: three.said("client").count("session open, flying") == 2)
+        say("flying again, until SIGTERM")
+        three.compose("stop")
+        for service in SERVICES:
+            assert three.state(service)["ExitCode"] == 0, three.said(service)
+        last_words = three.said("client").rsplit("flying", 1)[1]
+        assert 0 < number(r"step (\d+)", last_words) < FLIGHT_S * STEPS_PER_S
+        say("SIGTERM ended all three with 0")
+
+
+def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) -> None:
+    """One flight, in which everything that can break breaks, and horizons flow again."""
+    with containers(compose, FAULTY_FLIGHT_S) as three:
+        three.flies()
+
+        with three.fault(f"netem is paused for {FAULT_S:g} s"):
+            three.docker("pause", three.id("netem"))
+            time.sleep(FAULT_S)
+            three.docker("unpause", three.id("netem"))
+
+        before = three.addresses("server")
+        with three.fault("the server is killed, and started at another address"):
+            three.docker("kill", three.id("server"))
+            with three.squatter("ground"):
+                time.sleep(FAULT_S)
+                three.docker("start", three.id("server"))
+        assert three.addresses("server") != before
+
+        with three.fault("the server crashes, and Docker restarts it"):
+            # Everything of its user's but this shell; the init process follows.
+            three.inside("server", "sh", "-c", "kill -9 -1")
+            until("the restart", lambda: three.inspect("server")["RestartCount"] == 1)
+
+        with three.fault("netem is killed, and started again"):
+            three.docker("kill", three.id("netem"))
+            time.sleep(FAULT_S)
+            three.docker("start", three.id("netem"))
+
+        before = three.addresses("client")
+        with three.fault(f"the client has no network for {FAULT_S:g} s, then another address"):
+            three.docker("network", "disconnect", three.network("air"), three.id("client"))
+            with three.squatter("air"):
+                time.sleep(FAULT_S)
+                three.docker("network", "connect", three.network("air"), three.id("client"))
+        assert three.addresses("client") != before
+
+        summary = three.land(tmp_path)
+        assert three.said("client").count("session open, flying") == 1
+        assert three.said("client").count("the server has restarted") == 2
+        assert summary.steps + summary.deadline_misses == FAULTY_FLIGHT_S * STEPS_PER_S
+        assert summary.rmse_xy is not None
+        assert summary.rmse_xy < HOVER_M
+        three.compose("stop")
+        assert [three.state(service)["ExitCode"] for service in SERVICES] == [0, 0, 0]
+
+
+@dataclass
+class Containers:
+    """The project of one test."""
+
+    command: list[str]
+    """Compose."""
+    seconds: int
+    """Length of the flight."""
+    project: str = field(default_factory=lambda: f"skytether-test-{secrets.token_hex(4)}")
+    ids: dict[str, str] = field(default_factory=dict)
+    """Of the containers, by service; they stay the same from `up` to `down`."""
+
+    def compose(self, *arguments: str) -> str:
+        """What Compose printed."""
+        file = str(ROOT / "docker-compose.yml")
+        flight = {"FLIGHT_SECONDS": str(self.seconds), "SCENARIO": "demo"}
+        return run(*self.command, "-f", file, "-p", self.project, *arguments, more_env=flight)
+
+    def docker(self, *arguments: str) -> str:
+        """What Docker printed."""
+        return run("docker", *arguments)
+
+    def id(self, service: str) -> str:
+        """The container of a service, running or not."""
+        if service not in self.ids:
+            self.ids[service] = self.compose("ps", "--all", "--quiet", service).strip()
+        return self.ids[service]
+
+    def network(self, name: str) -> str:
+        """Its name with Docker."""
+        return f"{self.project}_{name}"
+
+    def inspect(self, service: str) -> dict[str, Any]:
+        """All that Docker knows."""
+        return json.loads(self.docker("inspect", self.id(service)))[0]
+
+    def state(self, service: str) -> dict[str, Any]:
+        """Status, ExitCode, Health."""
+        return self.inspect(service)["State"]
+
+    def addresses(self, service: str) -> dict[str, str]:
+        """By network."""
+        networks = self.inspect(service)["NetworkSettings"]["Networks"]
+        return {name: network["IPAddress"] for name, network in networks.items()}
+
+    def said(self, service: str) -> str:
+        """Its log."""
+        return attempt("docker", "logs", self.id(service))[1]
+
+    def inside(self, service: str, *command: str) -> tuple[int, str]:
+        """Exit code and output of a command in a container."""
+        return attempt("docker", "exec", self.id(service), *command)
+
+    def has_said(self, service: str, what: str, *, since: int = 0) -> bool:
+        """Whether its log has the words, from a place on."""
+        return what in self.said(service)[since:]
+
+    # -- the flight --------------------------------------------------------------------------
+
+    def report(self, service: str) -> str:
+        """The line of counts that a process gives at SIGUSR1."""
+        pattern = {"client": r"step \d+ of .*", "server": r"\d+ vehicles, .*"}[service]
+        before = len(re.findall(pattern, self.said(service)))
+        self.docker("kill", "--signal", "USR1", self.id(service))
+        new = until(
+            f"a report of the {service}", lambda: re.findall(pattern, self.said(service))[before:]
+        )
+        return str(new[-1])
+
+    def flies(self) -> None:
+        """Wait until orders reach the vehicle, newly made ones."""
+        until("the session", lambda: self.has_said("server", "vehicle 1 flies"))
+        first = self.report("client")
+        # A second later netem holds nothing that it held until now.
+        second = self.report_of(r"step (\d+)", number(r"step (\d+)", first) + STEPS_PER_S)
+        server = self.report("server")
+        last = self.report_of(r"(\d+) horizons", number(r"(\d+) horizons", second) + HORIZONS)
+        events = r"(\d+) events"
+        assert number(events, self.report("server")) > number(events, server)
+        say(f"orders reach the vehicle: {first} ... {last}")
+
+    def report_of(self, pattern: str, least: int) -> str:
+        """The first report of the client that counts so many of something."""
+
+        def enough() -> str | None:
+            assert self.state("client")["Status"] == "running", "the flight has ended too soon"
+            report = self.report("client")
+            return report if number(pattern, report) >= least else None
+
+        return until(f"{pattern}: {least}", enough)
+
+    @contextlib.contextmanager
+    def fault(self, what: str) -> Iterator[None]:
+        """Something that the client notices, and that is over when this block has ended."""
+        before = len(self.said("client"))
+        say(what)
+        yield
+        began_s = time.monotonic()
+        for news in ("the server is silent", "the server is heard again"):
+            until(news, partial(self.has_said, "client", news, since=before))
+        say(f"the server is heard again, {time.monotonic() - began_s:.1f} s after the repair")
+        self.flies()
+
+    @contextlib.contextmanager
+    def squatter(self, network: str) -> Iterator[None]:
+        """A stranger who takes the address that a container had in a network."""
+        stranger = self.docker(
+            *("run", "--detach", "--rm", "--network", self.network(network)),
+            *("--entrypoint", "sleep", "skytether", "600"),
+        ).strip()
+        try:
+            yield
+        finally:
+            self.docker("rm", "--force", stranger)
+
+    def land(self, folder: Path) -> Summary:
+        """The summary of the flight, once the client has ended with 0."""
+        until(
+            "the end of the flight",
+            lambda: self.state("client")["Status"] == "exited",
+            within_s=self.seconds + 30,
+        )
+        assert self.state("client")["ExitCode"] == 0, self.said("client")
+        self.docker("cp", f"{self.id('client')}:/results/.", str(folder))
+        summary = msgspec.json.decode((folder / "summary.json").read_bytes(), type=Summary)
+        say(f"landed: {summary.steps} steps, rmse_xy {summary.rmse_xy:.3f} m")
+        return summary
+
+    # -- the locks ---------------------------------------------------------------------------
+
+    def check_privileges(self, service: str) -> None:
+        """As Docker was told, and as the process finds it."""
+        host = self.inspect(service)["HostConfig"]
+        assert host["ReadonlyRootfs"]
+        assert host["CapDrop"] == ["ALL"]
+        assert not host["CapAdd"]
+        assert not host["Privileged"]
+        assert not host["PortBindings"]
+        assert host["Memory"] > 0
+        assert host["NanoCpus"] > 0
+        assert host["PidsLimit"] > 0
+
+        _, status = self.inside(service, "cat", "/proc/1/status")
+        assert re.search(r"^Uid:(\s10001){4}$", status, re.MULTILINE)
+        assert re.search(r"^Gid:(\s10001){4}$", status, re.MULTILINE)
+        assert set(re.findall(r"^Cap(?:Eff|Prm|Bnd):\s(\w+)$", status, re.MULTILINE)) == {"0" * 16}
+        assert "NoNewPrivs:\t1" in status
+        code, output = self.inside(service, "touch", "/opt/skytether/file")
+        assert code != 0
+        assert "Read-only file system" in output
+        assert self.inside(service, "touch", "/tmp/file")[0] == 0
+
+        code, where = self.inside(service, "python", "-c", "import shared; print(shared.__file__)")
+        assert where.startswith("/opt/skytether/lib/"), where
+        assert self.inside(service, "sh", "-c", "command -v cc gcc g++ make")[0] != 0
+
+    def check_isolation(self) -> None:
+        """Client and server share no network; netem is the client's only neighbour."""
+        client, server = self.addresses("client"), self.addresses("server")
+        assert set(client) == {self.network("air")}
+        assert set(server) == {self.network("ground")}
+        assert set(self.addresses("netem")) == {self.network("air"), self.network("ground")}
+        for name in ("air", "ground"):
+            assert json.loads(self.docker("network", "inspect", self.network(name)))[0]["Internal"]
+
+        for service in ("server", "netem"):
+            assert self.state(service)["Health"]["Status"] == "healthy"
+            # The same question in a container where nobody listens: it can say no.
+            _, *question = self.inspect(service)["Config"]["Healthcheck"]["Test"]
+            assert self.inside(service, *question)[0] == 0
+            assert self.inside("client", *question)[0] == 1
+
+        (address,) = server.values()
+        code, output = self.ask_for_the_server("server")
+        assert (code, "cannot find server" in output) == (1, True), output
+        code, output = self.ask_for_the_server(address)
+        assert (code, f"no answer from {address}" in output) == (1, True), output
+
+    def ask_for_the_server(self, host: str) -> tuple[int, str]:
+        """Exit code and output of another client, where the client is."""
+        return attempt(
+            *("docker", "run", "--rm", "--network", f"container:{self.id('client')}", "skytether"),
+            *("client", "demo", "--id=2", "--link.connect-s=2", f"--server={host}:47001"),
+        )
+
+
+@contextlib.contextmanager
+def containers(compose: list[str], seconds: int) -> Iterator[Containers]:
+    """The three, up; whatever happens, nothing of them stays."""
+    three = Containers(compose, seconds)
+    try:
+        three.compose("up", "--detach")
+        say(f"up, for a flight of {seconds} s")
+        yield three
+    except BaseException:
+        with contextlib.suppress(AssertionError):
+            print(three.compose("logs", "--no-color"))
+        raise
+    finally:
+        three.compose("down", "--volumes", "--remove-orphans")
+
+
+@pytest.fixture(scope="module")
+def compose() -> list[str]:
+    """The command for Compose, after it has built the image."""
+    given = os.environ.get("COMPOSE")
+    known = [given] if given else ["docker compose", "docker-compose"]
+    if not works("docker", "version"):
+        pytest.skip("no Docker engine answers")
+    command = next((found for found in map(shlex.split, known) if works(*found, "version")), None)
+    if command is None:
+        pytest.skip(f"no Compose: tried {' and '.join(known)}")
+    say(f"{shlex.join(command)} builds the image")
+    Containers(command, FLIGHT_S).compose("build")
+    size = run("docker", "image", "inspect", "--format", "{{.Size}}", "skytether")
+    say(f"the image has {int(size) / 1e6:.0f} MB")
+    return command
+
+
+def works(*command: str) -> bool:
+    """Whether a command exists and succeeds."""
+    try:
+        return attempt(*command)[0] == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+def attempt(*command: str) -> tuple[int, str]:
+    """Exit code and output of a command."""
+    done = subprocess.run(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    return done.returncode, done.stdout
+
+
+def run(*command: str, more_env: Mapping[str, str] = MappingProxyType({})) -> str:
+    """The standard output of a command that ought to succeed."""
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+        env={**os.environ, **more_env},
+    )
+    said = f"{shlex.join(command)}\n{done.stdout[-4000:]}{done.stderr[-4000:]}"
+    assert done.returncode == 0, said
+    return done.stdout
+
+
+def number(pattern: str, report: str) -> int:
+    """What a report counts; nothing is 0."""
+    found = re.search(pattern, report)
+    return int(found[1]) if found else 0
+
+
+T = TypeVar("T")
+
+
+def until(what: str, condition: Callable[[], T | None], within_s: float = 30.0) -> T:
+    """What a condition gives once it holds."""
+    deadline_s = time.monotonic() + within_s
+    while not (value := condition()):
+        assert time.monotonic() < deadline_s, f"in {within_s:g} s not come: {what}"
+        time.sleep(0.2)
+    return value
+
+
+def say(text: str) -> None:
+    """A line for whoever watches."""
+    print(f"{time.strftime('%H:%M:%S')}  {text}", flush=True)
