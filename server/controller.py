@@ -283,4 +283,5 @@ class Server(Endpoint):
     def report(self) -> str:
         """See `Endpoint`."""
         counts = ", ".join(f"{value} {name}" for name, value in sorted(self.counts.items()))
-        return f"{len(self._sessions)} vehicles, {self.missed} ticks missed, {counts or 'no steps'}"
+        here = f"{len(self._sessions)} in session, {self.missed} ticks missed"
+        return f"{here}, {counts or 'no steps'}"

@@ -84,23 +84,27 @@ class Shell:
 
     def _read(self, number: int) -> None:
         receive, endpoint = self._sockets[number].recvfrom, self.endpoint
-        for _ in range(BURST_MAX):
-            try:
-                payload, peer = receive(DATAGRAM_BYTES_MAX)
-            except BlockingIOError:
-                break
-            except OSError:  # an earlier packet of ours found the peer's port closed
-                continue
-            datagram = Datagram(payload, self._names.name(peer), number)
-            endpoint.receive(datagram, now_ns=time.monotonic_ns())
-        self._after()
+        try:
+            for _ in range(BURST_MAX):
+                try:
+                    payload, peer = receive(DATAGRAM_BYTES_MAX)
+                except BlockingIOError:
+                    break
+                except OSError:  # an earlier packet of ours found the peer's port closed
+                    continue
+                datagram = Datagram(payload, self._names.name(peer), number)
+                endpoint.receive(datagram, now_ns=time.monotonic_ns())
+        finally:  # a fault of ours goes to the loop's handler, and the flight goes on
+            self._after()
 
     def _wake(self) -> None:
         self._armed = None
         now_ns, due_ns = time.monotonic_ns(), self.endpoint.next_wake_ns()
-        if due_ns is not None and due_ns <= now_ns:
-            self.endpoint.wake(now_ns=now_ns)
-        self._after()
+        try:
+            if due_ns is not None and due_ns <= now_ns:
+                self.endpoint.wake(now_ns=now_ns)
+        finally:
+            self._after()
 
     def _after(self) -> None:
         """Send what the endpoint wants sent, say its news, arm its timer."""

@@ -177,7 +177,7 @@ class Containers:
 
     def report(self, service: str) -> str:
         """The line of counts that a process gives at SIGUSR1."""
-        pattern = {"client": r"step \d+ of .*", "server": r"\d+ vehicles, .*"}[service]
+        pattern = {"client": r"step \d+ of .*", "server": r"\d+ in session, .*"}[service]
         before = len(re.findall(pattern, self.said(service)))
         self.docker("kill", "--signal", "USR1", self.id(service))
         new = until(

@@ -118,6 +118,34 @@ async def test_wakes_come_in_time_and_never_early(
     assert min(echo.woken_ns) >= 0
 
 
+async def test_a_fault_of_ours_is_told_and_does_not_end_the_flight() -> None:
+    """An exception in a wake or in a datagram: the loop's handler hears it, the timer goes on."""
+
+    class Faulty(Echo):
+        def wake(self, *, now_ns: int) -> None:
+            super().wake(now_ns=now_ns)
+            if len(self.woken_ns) == 1:
+                raise ZeroDivisionError
+
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            super().receive(datagram, now_ns=now_ns)
+            if len(self.heard) == 1:
+                raise ZeroDivisionError
+
+    told: list[object] = []
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _, context: told.append(type(context["exception"])))
+    now_ns = time.monotonic_ns()
+    faulty = Faulty([now_ns, now_ns + 1_000_000], last=4)
+    driver = Shell(faulty, LOOPBACK)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        for _ in range(2):
+            peer.sendto(b"x", driver.address)
+        await asyncio.wait_for(driver.run(), 5)
+    assert told == [ZeroDivisionError] * 2
+    assert (len(faulty.heard), len(faulty.woken_ns)) == (2, 2)
+
+
 async def test_a_closed_port_and_an_unknown_network_are_lost_packets() -> None:
     """Nothing that a peer's absence does to a socket reaches the endpoint."""
     echo = Echo()

@@ -326,4 +326,4 @@ def test_report_tells_what_was_counted() -> None:
     vehicles.observe(vehicles.open(), 0)
     vehicles.tick()
     report = vehicles.server.report()
-    assert report == "1 vehicles, 0 ticks missed, 1 events, 1 steps, 0 unsolved"
+    assert report == "1 in session, 0 ticks missed, 1 events, 1 steps, 0 unsolved"
