@@ -101,7 +101,7 @@ def open_record(path: Path) -> BinaryIO:
         CommandError: it cannot be written.
     """
     try:
-        return path.open("w+b")
+        return path.open("w+b", buffering=0)  # a process that is killed keeps what it wrote
     except OSError as error:
         raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None
 

@@ -1,6 +1,7 @@
 """The commands as a user runs them: real processes, real sockets, and one line for a mistake."""
 
 import json
+import os
 import re
 import signal
 import socket
@@ -15,6 +16,7 @@ import pytest
 
 import skytether.__main__
 from shared import config
+from shared.record import client_columns
 
 PATIENCE_S = 30.0
 """How long a test waits for something before it gives up."""
@@ -264,20 +266,21 @@ def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
     assert summary["lost"] == 0
 
 
-def test_ctrl_c_ends_the_flight_and_still_shows_it() -> None:
+def test_ctrl_c_ends_the_flight_and_still_shows_it(tmp_path: Path) -> None:
     """What was flown until then; nothing is left running."""
     command = [sys.executable, "-P", "-m", "skytether", "fly", "demo", *QUICK]
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     ) as fly:
-        children = []
         deadline = time.monotonic() + PATIENCE_S
-        while len(children) < 3 and time.monotonic() < deadline:
-            listed = Path(f"/proc/{fly.pid}/task/{fly.pid}/children").read_text().split()
-            children = [int(pid) for pid in listed]
+        row_bytes = client_columns(2).itemsize
+        while sum(part.stat().st_size for part in tmp_path.glob("*/client")) < 20 * row_bytes:
+            assert time.monotonic() < deadline
             time.sleep(0.05)
+        listed = Path(f"/proc/{fly.pid}/task/{fly.pid}/children").read_text().split()
+        children = [int(pid) for pid in listed]
         assert len(children) == 3
-        time.sleep(2.0)  # of flight: this is about what is in the table afterwards
         fly.send_signal(signal.SIGINT)
         out, err = fly.communicate(timeout=PATIENCE_S)
     assert fly.returncode == 0, err

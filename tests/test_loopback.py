@@ -292,11 +292,26 @@ async def test_two_vehicles_in_space_on_one_server() -> None:
     assert set(flight.netem["flow"]) == {0, 1}
 
 
+def differences(real: Flight, virtual: Flight) -> list[str]:
+    """Columns in which two flights of one scenario are not equal to the last bit."""
+    steps = min(len(real.server), len(virtual.server))
+    return [
+        column
+        for flown, expected, columns in (
+            (real.server[:steps], virtual.server[:steps], virtual.server.dtype.names),
+            (real.client, virtual.client, virtual.client.dtype.names),
+        )
+        for column in columns or ()
+        if column != "age_ns" and not np.array_equal(flown[column], expected[column])
+    ]
+
+
 async def test_both_worlds_decide_the_same_on_a_network_without_delay() -> None:
     """The same scenario over loopback and in virtual time: same events, same inputs, same order.
 
-    Steps are 0.2 s, and the server ticks in the middle of the vehicle's: a pause of this machine
-    would have to take 0.1 s to change a decision, and then shows as a missed or repeated step.
+    Steps are 0.2 s, and the server ticks in the middle of the vehicle's. Only a pause of the
+    machine by 0.1 s can change a decision; then the flight is flown again. No two flights are alike
+    to the last bit by chance.
     """
     none = {"delay": "none", "loss": 0.0}
     changes = {
@@ -306,17 +321,14 @@ async def test_both_worlds_decide_the_same_on_a_network_without_delay() -> None:
         "seed": 4,
     }
     flown = scenario("paper", **changes)
-    real = await fly(flown, at_phase=0.5)
     virtual = fly_virtually(flown)
-    steps = min(len(real.server), len(virtual.server))
-    assert steps >= 24
-    for column in ("step", "observed_step", "event", "solved"):
-        assert real.server[column][:steps].tolist() == virtual.server[column][:steps].tolist()
-    for column in ("estimate", "planned", "input", "error", "threshold"):
-        np.testing.assert_array_equal(real.server[column][:steps], virtual.server[column][:steps])
-    assert 2 <= real.server["event"].sum() < steps
-    for column in ("step", "state", "input", "in_force"):
-        np.testing.assert_array_equal(real.client[column], virtual.client[column])
+    for _ in range(4):
+        real = await fly(flown, at_phase=0.5)
+        if not differences(real, virtual):
+            break
+    assert differences(real, virtual) == []
+    assert min(len(real.server), len(virtual.server)) >= 24
+    assert 2 <= real.server["event"].sum() < len(real.server)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="SO_MEMINFO is Linux's")
