@@ -21,14 +21,18 @@ from shared.model import Array, Indices, Model
 class MPC:
     """One horizon of (9) in condensed form; n vehicles in one call."""
 
+    model: Model
+    """A and B of eq. (4)."""
     free: Array
     """Φ: states without any input; shape (axes, H, 2, 2)."""
     forced: Array
     """Γ: what the inputs add; shape (axes, H, 2, H)."""
     weights: Array
     """W, diagonal; shape (H, 2)."""
-    input_weight: float
-    """R where the input itself has a target (E7), else 0."""
+    input_weights: Array
+    """R + S, of all that weighs the input itself; shape (H,)."""
+    target_weight: float
+    """R where the input has a target of its own (E7), else 0."""
     change_weights: Array
     """S of the stages 0 … H-2, and 0 of the last; shape (H,)."""
     hessian: Array
@@ -47,7 +51,7 @@ class MPC:
         """
         deviation = np.einsum("aipq,naq->naip", self.free, x) - target[:, :, 1:]
         pulled = np.einsum("aipk,ip,naip->nak", self.forced, self.weights, deviation)
-        toward = self.change_weights * previous + self.input_weight * target[:, :, :-1, 1]
+        toward = self.change_weights * previous + self.target_weight * target[:, :, :-1, 1]
         return pulled - toward
 
     def predict(self, x: Array, u: Array) -> Array:
@@ -77,9 +81,10 @@ def condense(model: Model, control: ControlConfig, *, change_weight: float) -> M
     change_weights = np.full(H, change_weight)
     change_weights[-1] = 0.0
     hessian = np.einsum("aipk,ip,aipl->akl", forced, weights, forced)
-    hessian += np.diag(control.input_weight + change_weights)
-    input_weight = control.input_weight if control.input_reference else 0.0
-    return MPC(free, forced, weights, input_weight, change_weights, hessian)
+    input_weights = control.input_weight + change_weights
+    hessian += np.diag(input_weights)
+    target_weight = control.input_weight if control.input_reference else 0.0
+    return MPC(model, free, forced, weights, input_weights, target_weight, change_weights, hessian)
 
 
 def shift(inputs: Array, steps: Indices) -> Array:

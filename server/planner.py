@@ -9,22 +9,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from server.exact import ExactSolver
 from server.mpc import MPC, condense, shift
-from server.solver import OsqpSolver
-from shared.config import Scenario
+from server.solver import OsqpSolver, Solver
+from shared.config import ControlConfig, Scenario
 from shared.model import Array, Flags, Indices, Model
+
+
+def make_solver(control: ControlConfig, mpc: MPC, u_max: Array) -> Solver:
+    """The solver that a scenario names, for the QPs of one MPC."""
+    if control.solver == "exact":
+        return ExactSolver(mpc, u_max)
+    return OsqpSolver(mpc.hessian, u_max)
 
 
 class Successive:
     """One MPC solved at every step, for up to `capacity` vehicles."""
 
-    def __init__(self, mpc: MPC, first: MPC, u_max: Array, capacity: int) -> None:
+    def __init__(
+        self, mpc: MPC, first: MPC, control: ControlConfig, u_max: Array, capacity: int
+    ) -> None:
         axes, H = mpc.hessian.shape[:2]
         self._mpc = mpc
-        self._solver = OsqpSolver(mpc.hessian, u_max)
+        self._solver = make_solver(control, mpc, u_max)
         # Without a horizon before there is no S-term (E8), which is another Hessian.
         self._first = first
-        self._first_solver = OsqpSolver(first.hessian, u_max)
+        self._first_solver = make_solver(control, first, u_max)
         self.inputs = np.zeros((capacity, axes, H))
         """U(k-1), the horizon computed last."""
         self.states = np.zeros((capacity, axes, H, 2))
@@ -76,8 +86,8 @@ class Planner:
         self._dt = control.dt
         self._H = control.horizon
         self._reference = scenario.make_reference()
-        self._generator = Successive(mpc, first, scenario.u_max, capacity)
-        self._tracker = Successive(mpc, first, scenario.u_max, capacity)
+        self._generator = Successive(mpc, first, control, scenario.u_max, capacity)
+        self._tracker = Successive(mpc, first, control, scenario.u_max, capacity)
         self._step = np.full(capacity, -1, dtype=np.int64)
 
     def forget(self, row: int) -> None:

@@ -61,6 +61,8 @@ class ControlConfig(Section, frozen=True):
     """Delay compensation at both ends: eq. (11) and (13), or none."""
     trigger: Literal["paper", "always"] = "paper"
     """When a horizon is sent: eq. (16), or at every step."""
+    solver: Literal["exact", "osqp"] = "exact"
+    """What solves (9): Riccati active set, exact and fast, or OSQP, the reference."""
     epsilon: NonNegative = 3.6
     """Tolerance ε of eq. (16)."""
     decay_rate: NonNegative = 1.5

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import gc
 import signal
+import threading
 import time
 from collections.abc import Callable, Sequence
 
@@ -133,7 +134,21 @@ class Shell:
     async def _keep_resolving(self) -> None:
         while self._names:
             await asyncio.sleep(RESOLVE_EVERY_S)
-            self._names.learn(await self._loop.run_in_executor(None, self._names.look_up))
+            found: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
+            # No executor: it would be waited for at the end, and where a name is gone a look-up
+            # can take 20 s.
+            threading.Thread(target=self._look_up, args=(found,), daemon=True).start()
+            self._names.learn(await found)
+
+    def _look_up(self, found: "asyncio.Future[dict[Address, Address]]") -> None:
+        numbers = self._names.look_up()
+
+        def tell() -> None:
+            if not found.done():
+                found.set_result(numbers)
+
+        with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
+            self._loop.call_soon_threadsafe(tell)
 
 
 def run(

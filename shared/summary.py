@@ -83,7 +83,7 @@ def summarise(
     return Summary(
         scenario=name,
         seed=scenario.seed,
-        duration_s=len(client) * scenario.control.dt,
+        duration_s=(_last(client, "step") + 1) * scenario.control.dt,
         steps=len(client),
         rmse_x=rmse[0] if rmse else None,
         rmse_y=rmse[1] if rmse else None,

@@ -1,0 +1,162 @@
+"""The exact solver: right to rounding, the same whatever came before, and never a guess."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+
+from server import exact
+from server.exact import ExactSolver
+from server.mpc import MPC, condense
+from server.solver import OsqpSolver
+from shared import config
+from shared.config import ControlConfig
+from shared.model import Array, discretise
+
+U_MAX = np.array([1.8, 1.0])
+
+
+def mpc(tau_s: tuple[float, ...] = (0.855, 0.3), **control: Any) -> MPC:
+    """The paper's problem, with some keys of `control` changed."""
+    settings_ = ControlConfig(**control)
+    model = discretise(np.array(tau_s), settings_.dt)
+    return condense(model, settings_, change_weight=settings_.change_weight)
+
+
+ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 1.0)}
+"""Long steps and hardly a cost of the input: here sets wander in circles."""
+
+
+def problems(problem: MPC, count: int, scale: float, seed: int) -> tuple[Array, Array]:
+    """Random gradients, of moving targets and states `scale` away, and random guesses."""
+    rng = np.random.default_rng(seed)
+    axes, H = problem.hessian.shape[:2]
+    x = rng.normal(0.0, scale, (count, axes, 2))
+    target = np.cumsum(rng.normal(0.0, 0.2 * scale, (count, axes, H + 1, 2)), axis=2)
+    guess = np.clip(rng.normal(0.0, 1.0, (count, axes, H)), -U_MAX[:, None], U_MAX[:, None])
+    return problem.gradient(x, target, guess), guess
+
+
+def residual(problem: MPC, inputs: Array, gradient: Array) -> float:
+    """How far inputs are from meeting the optimality conditions, relative to the gradient."""
+    slope = np.einsum("akl,nal->nak", problem.hessian, inputs) + gradient
+    at_bound = np.abs(inputs) >= U_MAX[:, None]
+    wrong = np.where(at_bound, np.maximum(np.sign(inputs) * slope, 0.0), slope)
+    return float((np.abs(wrong) / (1.0 + np.abs(gradient).max(axis=2, keepdims=True))).max())
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 40, 100])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_it_equals_an_independent_reference(horizon: int, scale: float) -> None:
+    """Bounded least squares of scipy, from bounds never to nearly always active."""
+    problem = mpc(horizon=horizon)
+    gradient, guess = problems(problem, 20, scale, seed=horizon)
+    inputs, solved = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    assert solved.all()
+    for n in range(20):
+        for axis, bound in enumerate(U_MAX):
+            root = np.linalg.cholesky(problem.hessian[axis])
+            aim = -np.linalg.solve(root, gradient[n, axis])
+            reference = lsq_linear(root.T, aim, (-bound, bound), method="bvls", tol=1e-15).x
+            np.testing.assert_allclose(inputs[n, axis], reference, rtol=0, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    scale=st.sampled_from([0.1, 1.0, 3.0, 30.0]),
+    horizon=st.sampled_from([1, 7, 50]),
+    input_reference=st.booleans(),
+    change_weight=st.sampled_from([0.0, 0.033, 5.0]),
+)
+def test_every_answer_is_optimal_and_within_its_box(
+    seed: int, scale: float, horizon: int, *, input_reference: bool, change_weight: float
+) -> None:
+    """The conditions of optimality, on random problems."""
+    problem = mpc(horizon=horizon, input_reference=input_reference, change_weight=change_weight)
+    gradient, guess = problems(problem, 10, scale, seed)
+    inputs, solved = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    assert solved.all()
+    assert (np.abs(inputs) <= U_MAX[:, None]).all()
+    assert residual(problem, inputs, gradient) < 1e-10
+
+
+def test_problems_that_cycle_are_solved_all_the_same() -> None:
+    """By DAQP, and as exactly."""
+    problem = mpc((0.4, 0.6), **ROUGH)
+    gradient, guess = problems(problem, 300, 3.0, seed=1)
+    solver = ExactSolver(problem, U_MAX)
+    inputs, solved = solver.solve(gradient, guess)
+    assert solved.all()
+    assert solver.fallbacks > 10
+    assert (np.abs(inputs) <= U_MAX[:, None]).all()
+    assert residual(problem, inputs, gradient) < 1e-7
+
+
+def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A wrong answer of DAQP is not believed: those vehicles keep their guess, others fly on."""
+    problem = mpc((0.4, 0.6), **ROUGH)
+    gradient, guess = problems(problem, 300, 3.0, seed=1)
+    right, _ = ExactSolver(problem, U_MAX).solve(gradient, guess)
+
+    def wrong(hessian: Array, *_: object, **__: object) -> tuple[Array, float, int, dict[str, int]]:
+        return np.zeros(len(hessian)), 0.0, -4, {"iterations": 9}
+
+    monkeypatch.setattr(exact.daqp, "solve", wrong)
+    inputs, solved = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    assert 0 < (~solved).sum() < 300
+    np.testing.assert_array_equal(inputs[~solved], guess[~solved])
+    np.testing.assert_array_equal(inputs[solved], right[solved])
+
+
+def test_a_problem_that_is_not_finite_fails_alone() -> None:
+    """NaN and infinity for one vehicle each; the third is solved as if it were alone."""
+    problem = mpc()
+    gradient, guess = problems(problem, 3, 1.0, seed=2)
+    alone, _ = ExactSolver(problem, U_MAX).solve(gradient[2:], guess[2:])
+    gradient[0, 1, 5], gradient[1, 0, 0] = np.nan, np.inf
+    inputs, solved = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    assert solved.tolist() == [False, False, True]
+    np.testing.assert_array_equal(inputs[:2], guess[:2])
+    np.testing.assert_array_equal(inputs[2:], alone)
+
+
+def test_a_batch_equals_its_singles_on_every_run() -> None:
+    """To the last bit, in any company."""
+    problem = mpc()
+    gradient, guess = problems(problem, 50, 2.0, seed=3)
+    solver = ExactSolver(problem, U_MAX)
+    together, _ = solver.solve(gradient, guess)
+    for n in range(50):
+        alone, _ = solver.solve(gradient[n : n + 1], guess[n : n + 1])
+        np.testing.assert_array_equal(alone[0], together[n])
+
+
+def test_the_guess_decides_nothing_but_the_time() -> None:
+    """Whatever set it starts from, it ends at the one optimum."""
+    problem = mpc()
+    gradient, guess = problems(problem, 50, 2.0, seed=4)
+    solver = ExactSolver(problem, U_MAX)
+    from_guess, _ = solver.solve(gradient, guess)
+    from_zero, _ = solver.solve(gradient, np.zeros_like(guess))
+    np.testing.assert_allclose(from_guess, from_zero, rtol=0, atol=1e-12)
+
+
+def test_osqp_agrees_to_its_tolerance() -> None:
+    """Both solvers, the same problems."""
+    problem = mpc()
+    gradient, guess = problems(problem, 50, 2.0, seed=5)
+    exactly, _ = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    nearly, solved = OsqpSolver(problem.hessian, U_MAX).solve(gradient, guess)
+    assert solved.all()
+    np.testing.assert_allclose(nearly, exactly, rtol=0, atol=1e-6)
+
+
+def test_a_scenario_names_its_solver() -> None:
+    """Exact is the default; osqp is the reference."""
+    assert config.load("paper").control.solver == "exact"
