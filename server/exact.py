@@ -15,7 +15,6 @@ DAQP, a dual active-set method, and its answer is believed once it meets the opt
 import daqp
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from server.mpc import MPC
 from server.solver import SolverFailed
@@ -31,8 +30,6 @@ CYCLED = -1
 class ExactSolver:
     """See `server.solver.Solver`; the answer depends on the problem alone, to rounding.
 
-    Compiled when the first is made, and kept on disk where that is possible.
-
     Args:
         mpc: whose QPs.
         u_max: bound of every input [m/s]; shape (axes,).
@@ -43,26 +40,14 @@ class ExactSolver:
         self._u_max = np.asarray(u_max, dtype=np.float64)
         self.fallbacks = 0
         """Problems that DAQP had to solve."""
-        empty = np.zeros((0, len(self._u_max), len(mpc.weights)))
-        self._riccati(empty, empty)
-
-    def _riccati(self, gradient: Array, guess: Array) -> tuple[Array, NDArray[np.int64]]:
-        mpc = self._mpc
-        inputs, rounds = _riccati_active_set(
-            mpc.model.A,
-            mpc.model.B,
-            mpc.weights,
-            mpc.input_weights,
-            self._u_max,
-            gradient,
-            guess,
-            ROUNDS_MAX,
-        )
-        return inputs, rounds
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
         """See `Solver`."""
-        inputs, rounds = self._riccati(gradient, guess)
+        mpc, model = self._mpc, self._mpc.model
+        inputs, rounds = _riccati_active_set(
+            *(model.A, model.B, mpc.weights, mpc.input_weights, self._u_max),
+            *(np.ascontiguousarray(gradient), np.ascontiguousarray(guess), ROUNDS_MAX),
+        )
         solved: Flags = np.asarray(np.isfinite(inputs + gradient).all(axis=(1, 2)))
         for vehicle, axis in np.argwhere((rounds == CYCLED) & solved[:, None]):
             self.fallbacks += 1
@@ -88,7 +73,12 @@ class ExactSolver:
         return inputs
 
 
-@njit(cache=True, error_model="numpy")
+@njit(
+    "Tuple((f8[:,:,::1], i8[:,::1]))(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1],"
+    "f8[:,:,::1], f8[:,:,::1], i8)",
+    cache=True,
+    error_model="numpy",
+)
 def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
     A: Array,
     B: Array,

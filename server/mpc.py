@@ -7,11 +7,16 @@ axis,
 
 whose Hessian 𝓗 = ΓᵀWΓ + R + S is the same at every step; only the gradient g follows the state, the
 target and the horizon before. W holds Q at the stages 1 … H-1 and P at H.
+
+What is done at every step is done in O(H), by recursion along the horizon. It is compiled when this
+module is imported, and kept on disk where that is possible. Each vehicle gets the same bits alone
+as in a batch, which a product with Γ by BLAS does not promise.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from shared.config import ControlConfig
 from shared.model import Array, Indices, Model
@@ -23,10 +28,6 @@ class MPC:
 
     model: Model
     """A and B of eq. (4)."""
-    free: Array
-    """Φ: states without any input; shape (axes, H, 2, 2)."""
-    forced: Array
-    """Γ: what the inputs add; shape (axes, H, 2, H)."""
     weights: Array
     """W, diagonal; shape (H, 2)."""
     input_weights: Array
@@ -49,16 +50,16 @@ class MPC:
         Returns:
             shape (n, axes, H).
         """
-        deviation = np.einsum("aipq,naq->naip", self.free, x) - target[:, :, 1:]
-        pulled = np.einsum("aipk,ip,naip->nak", self.forced, self.weights, deviation)
+        x, target = np.ascontiguousarray(x), np.ascontiguousarray(target)
+        pulled = _pull(self.model.A, self.model.B, self.weights, x, target)
         toward = self.change_weights * previous + self.target_weight * target[:, :, :-1, 1]
         return pulled - toward
 
     def predict(self, x: Array, u: Array) -> Array:
         """X(k) of eq. (7): the states at the stages 1 … H; shape (n, axes, H, 2)."""
-        return np.einsum("aipq,naq->naip", self.free, x) + np.einsum(
-            "aipk,nak->naip", self.forced, u
-        )
+        x, u = np.ascontiguousarray(x), np.ascontiguousarray(u)
+        states: Array = _roll_out(self.model.A, self.model.B, x, u)
+        return states
 
 
 def condense(model: Model, control: ControlConfig, *, change_weight: float) -> MPC:
@@ -68,14 +69,13 @@ def condense(model: Model, control: ControlConfig, *, change_weight: float) -> M
         change_weight: S; zero at the first step of a flight, where no horizon came before (E8).
     """
     axes, H = len(model.B), control.horizon
-    free = np.empty((axes, H, 2, 2))
     forced = np.zeros((axes, H, 2, H))
-    power, response = model.A, model.B
+    """Γ: what the inputs add to the states 1 … H."""
+    response = model.B
     for stage in range(H):
-        free[:, stage] = power
         for later in range(stage, H):
             forced[:, later, :, later - stage] = response
-        power, response = model.A @ power, np.einsum("aij,aj->ai", model.A, response)
+        response = np.einsum("aij,aj->ai", model.A, response)
     weights = np.tile(np.array(control.state_weight), (H, 1))
     weights[-1] = control.terminal_weight
     change_weights = np.full(H, change_weight)
@@ -84,7 +84,7 @@ def condense(model: Model, control: ControlConfig, *, change_weight: float) -> M
     input_weights = control.input_weight + change_weights
     hessian += np.diag(input_weights)
     target_weight = control.input_weight if control.input_reference else 0.0
-    return MPC(model, free, forced, weights, input_weights, target_weight, change_weights, hessian)
+    return MPC(model, weights, input_weights, target_weight, change_weights, hessian)
 
 
 def shift(inputs: Array, steps: Indices) -> Array:
@@ -97,3 +97,48 @@ def shift(inputs: Array, steps: Indices) -> Array:
     H = inputs.shape[2]
     stages = np.minimum(np.arange(H) + steps[:, None], H - 1)
     return np.take_along_axis(inputs, stages[:, None, :], axis=2)
+
+
+@njit(
+    "f8[:,:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1])",
+    cache=True,
+    error_model="numpy",
+)
+def _roll_out(A, B, x, u):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    """Eq. (4) along a horizon: u of shape (n, axes, H) from x, shape (n, axes, 2)."""
+    n, axes, H = u.shape
+    states = np.empty((n, axes, H, 2))
+    for vehicle in range(n):
+        for axis in range(axes):
+            p, v = x[vehicle, axis, 0], x[vehicle, axis, 1]
+            for i in range(H):
+                p, v = (
+                    A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u[vehicle, axis, i],
+                    A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u[vehicle, axis, i],
+                )
+                states[vehicle, axis, i, 0], states[vehicle, axis, i, 1] = p, v
+    return states
+
+
+@njit(
+    "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,:,::1])",
+    cache=True,
+    error_model="numpy",
+)
+def _pull(A, B, W, x, target):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    """ΓᵀW (Φ x - target): the adjoint of (4), from stage H back to 0; shape (n, axes, H)."""
+    n, axes, H = len(x), len(A), len(W)
+    states = _roll_out(A, B, x, np.zeros((n, axes, H)))
+    pull = np.empty((n, axes, H))
+    for vehicle in range(n):
+        for axis in range(axes):
+            l0, l1 = 0.0, 0.0
+            for i in range(H - 1, -1, -1):
+                l0, l1 = (
+                    A[axis, 0, 0] * l0 + A[axis, 1, 0] * l1,
+                    A[axis, 0, 1] * l0 + A[axis, 1, 1] * l1,
+                )
+                l0 += W[i, 0] * (states[vehicle, axis, i, 0] - target[vehicle, axis, i + 1, 0])
+                l1 += W[i, 1] * (states[vehicle, axis, i, 1] - target[vehicle, axis, i + 1, 1])
+                pull[vehicle, axis, i] = B[axis, 0] * l0 + B[axis, 1] * l1
+    return pull
