@@ -20,7 +20,14 @@ from server.estimator import Estimator
 from server.planner import Planner
 from server.trigger import make_trigger
 from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
+from shared.endpoint import (
+    MILLISECOND_NS,
+    SECOND_NS,
+    Address,
+    Datagram,
+    Endpoint,
+    seconds_to_ns,
+)
 from shared.model import Flags, Indices, discretise
 from shared.protocol import (
     Heartbeat,
@@ -284,4 +291,9 @@ class Server(Endpoint):
         """See `Endpoint`."""
         counts = ", ".join(f"{value} {name}" for name, value in sorted(self.counts.items()))
         here = f"{len(self._sessions)} in session, {self.missed} ticks missed"
-        return f"{here}, {counts or 'no steps'}"
+        lines = [f"{here}, {counts or 'no steps'}"]
+        for session in self._sessions.values():
+            step = self._last_step[session.row]
+            bound_ms = self._clock.bound_ns(np.array([session.row]))[0] / MILLISECOND_NS
+            lines.append(f"vehicle {session.vehicle}: step {step}, clock within {bound_ms:.1f} ms")
+        return "\n".join(lines)

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from server.mpc import MPC
-from server.solver import SolverFailed
+from server.solver import NEAR, SolverFailed
 from shared.model import Array, Flags
 
 ROUNDS_MAX = 30
@@ -112,7 +112,7 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
             b0, b1, bound = B[axis, 0], B[axis, 1], u_max[axis]
             for i in range(H):
                 u = guess[vehicle, axis, i]
-                side[i] = 1.0 if u >= bound else -1.0 if u <= -bound else 0.0
+                side[i] = 1.0 if u >= NEAR * bound else -1.0 if u <= -NEAR * bound else 0.0
             for count in range(1, rounds_max + 1):
                 # Backward: the cost to go from stage i + 1 is ½ xᵀPx + qᵀx.
                 p00, p01, p11, q0, q1 = W[H - 1, 0], 0.0, W[H - 1, 1], 0.0, 0.0

@@ -19,6 +19,9 @@ TOLERANCE = 1e-9
 RHO_PER_CURVATURE = 2.5
 """OSQP's step size over the mean curvature of the Hessian: fewest iterations in the worst case."""
 
+NEAR = 1.0 - 1e-6
+"""How much of its bound a guessed input must reach to count as being at it: it was a float32."""
+
 
 class SolverFailed(Exception):
     """The QP of one vehicle has no trustworthy answer."""
@@ -80,7 +83,7 @@ class OsqpSolver:
         problem, bound = self._axes[axis], self._u_max[axis]
         # Multipliers that make the guess stationary where it is at its bound, and nowhere else.
         slope = self._hessian[axis] @ guess + gradient
-        multipliers = np.where(np.abs(guess) >= bound, -slope, 0.0)
+        multipliers = np.where(np.abs(guess) >= NEAR * bound, -slope, 0.0)
         problem.update(q=gradient)
         problem.warm_start(x=guess, y=multipliers)
         result = problem.solve(raise_error=False)

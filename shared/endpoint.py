@@ -53,7 +53,7 @@ class Endpoint(ABC):
 
     @abstractmethod
     def report(self) -> str:
-        """What was counted so far, as one line for the operator."""
+        """What was counted so far, as a few lines for the operator."""
 
     @property
     def finished(self) -> bool:

@@ -147,6 +147,22 @@ def test_the_guess_decides_nothing_but_the_time() -> None:
     np.testing.assert_allclose(from_guess, from_zero, rtol=0, atol=1e-12)
 
 
+def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
+    """The warm start of every saturated flight: one round, though 1.8 has become 1.7999999."""
+    problem = mpc((0.855, 0.855))
+    u_max = np.array([1.8, 1.8])
+    gradient, guess = problems(problem, 20, 10.0, seed=6)
+    solver = ExactSolver(problem, u_max)
+    inputs, _ = solver.solve(gradient, guess)
+    assert (np.abs(inputs) == 1.8).mean() > 0.5
+    rounded = inputs.astype(np.float32).astype(np.float64)
+    assert np.abs(rounded).max() < 1.8
+    weights = (problem.model.A, problem.model.B, problem.weights, problem.input_weights)
+    again, rounds = exact._riccati_active_set(*weights, u_max, gradient, rounded, 1)
+    assert (rounds == 1).all()
+    np.testing.assert_array_equal(again, inputs)
+
+
 def test_osqp_agrees_to_its_tolerance() -> None:
     """Both solvers, the same problems."""
     problem = mpc()
