@@ -46,7 +46,7 @@ class ExactSolver:
         mpc, model = self._mpc, self._mpc.model
         inputs, rounds = _riccati_active_set(
             *(model.A, model.B, mpc.weights, mpc.input_weights, self._u_max),
-            *(np.ascontiguousarray(gradient), np.ascontiguousarray(guess), ROUNDS_MAX),
+            *(np.ascontiguousarray(gradient), np.ascontiguousarray(guess), NEAR, ROUNDS_MAX),
         )
         solved: Flags = np.asarray(np.isfinite(inputs + gradient).all(axis=(1, 2)))
         for vehicle, axis in np.argwhere((rounds == CYCLED) & solved[:, None]):
@@ -75,7 +75,7 @@ class ExactSolver:
 
 @njit(
     "Tuple((f8[:,:,::1], i8[:,::1]))(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1],"
-    "f8[:,:,::1], f8[:,:,::1], i8)",
+    "f8[:,:,::1], f8[:,:,::1], f8, i8)",
     cache=True,
     error_model="numpy",
 )
@@ -87,6 +87,7 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
     u_max: Array,
     gradient: Array,
     guess: Array,
+    near: float,
     rounds_max: int,
 ):
     """Inputs (n, axes, H) and rounds taken (n, axes), CYCLED where the set was not found.
@@ -98,6 +99,8 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
         u_max: shape (axes,).
         gradient: shape (n, axes, H).
         guess: inputs whose bounds are the first set; shape (n, axes, H).
+        near: how much of the bound they must reach for that (an argument: numba would not notice
+            that a constant of another module has changed).
         rounds_max: after so many the set is given up.
     """
     n, axes, H = gradient.shape
@@ -112,7 +115,7 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
             b0, b1, bound = B[axis, 0], B[axis, 1], u_max[axis]
             for i in range(H):
                 u = guess[vehicle, axis, i]
-                side[i] = 1.0 if u >= NEAR * bound else -1.0 if u <= -NEAR * bound else 0.0
+                side[i] = 1.0 if u >= near * bound else -1.0 if u <= -near * bound else 0.0
             for count in range(1, rounds_max + 1):
                 # Backward: the cost to go from stage i + 1 is ½ xᵀPx + qᵀx.
                 p00, p01, p11, q0, q1 = W[H - 1, 0], 0.0, W[H - 1, 1], 0.0, 0.0

@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 from server import exact
 from server.exact import ExactSolver
 from server.mpc import MPC, condense
-from server.solver import OsqpSolver
+from server.solver import NEAR, OsqpSolver
 from shared import config
 from shared.config import ControlConfig
 from shared.model import Array, discretise
@@ -158,9 +158,11 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     rounded = inputs.astype(np.float32).astype(np.float64)
     assert np.abs(rounded).max() < 1.8
     weights = (problem.model.A, problem.model.B, problem.weights, problem.input_weights)
-    again, rounds = exact._riccati_active_set(*weights, u_max, gradient, rounded, 1)
+    again, rounds = exact._riccati_active_set(*weights, u_max, gradient, rounded, NEAR, 1)
     assert (rounds == 1).all()
     np.testing.assert_array_equal(again, inputs)
+    _, rounds = exact._riccati_active_set(*weights, u_max, gradient, rounded, 1.0, 1)
+    assert (rounds == exact.CYCLED).any()
 
 
 def test_osqp_agrees_to_its_tolerance() -> None:
