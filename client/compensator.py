@@ -6,7 +6,6 @@ The horizon of the newest generation wins, in whatever order they arrive (E11).
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shared.config import Scenario
 from shared.model import Array
@@ -21,8 +20,8 @@ class Compensator:
         self._compensate = scenario.control.scheme == "paper"
         self._brakes = scenario.vehicle.exhausted == "brake"
         self._brake_per_step = scenario.vehicle.brake_mps2 * scenario.control.dt
-        self._u_max = scenario.u_max
-        self._inputs: Array = np.zeros((scenario.model.axes, self._H))
+        self._bound = scenario.u_max[:, None]
+        self._inputs: Array = np.zeros((self._H, scenario.model.axes))
         self.in_force = NO_HORIZON
         """k_h, or NO_HORIZON: then the vehicle hovers."""
         self.observed_ns = -1
@@ -43,22 +42,22 @@ class Compensator:
             return
         self.in_force = horizon.step
         self.observed_ns = horizon.observed_ns
-        self._inputs = np.clip(horizon.inputs, -self._u_max[:, None], self._u_max[:, None])
+        self._inputs = horizon.inputs.clip(-self._bound, self._bound).T
 
     def choose(self, step: int) -> Array:
         """u* for `step` [m/s]; shape (axes,)."""
         if self.in_force == NO_HORIZON:
-            return np.zeros(len(self._u_max))
+            return np.zeros(len(self._bound))
         if not self._compensate:
-            return self._inputs[:, 0].copy()
+            return self._inputs[0].copy()
         stage = step - self.in_force
         if stage >= self._H and self._brakes:
             return self._braked(stage - self._H + 1)
-        return self._inputs[:, min(max(stage, 0), self._H - 1)].copy()
+        return self._inputs[min(max(stage, 0), self._H - 1)].copy()
 
     def _braked(self, steps: int) -> Array:
         """The last input, slowed down for `steps` at a constant rate, straight ahead."""
-        last: NDArray[np.float64] = self._inputs[:, -1]
+        last: Array = self._inputs[-1]
         speed = float(np.linalg.norm(last))
         left = max(0.0, speed - steps * self._brake_per_step)
         return last * (left / speed) if speed > 0.0 else last.copy()

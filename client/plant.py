@@ -32,42 +32,46 @@ class FirstOrderPlant:
     """
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
-        vehicle, dt = scenario.vehicle, scenario.control.dt
-        self._tau = scenario.true_tau_s
-        self._model = discretise(self._tau, dt)
+        vehicle, dt, tau = scenario.vehicle, scenario.control.dt, scenario.true_tau_s
+        # Plain numbers, of each axis: numpy costs more than it saves on so few.
+        model = discretise(tau, dt)
+        self._tau, self._A, self._B = tau.tolist(), model.A.tolist(), model.B.tolist()
         self._rng = rng
-        self._wind = vehicle.wind * white_acceleration(self._tau, dt) if vehicle.wind else None
+        self._wind = (vehicle.wind * white_acceleration(tau, dt)).tolist() if vehicle.wind else []
         self._gust_mps2 = vehicle.gust_mps2
-        self._gust_end_chance = -np.expm1(-dt / vehicle.gust_s)
-        self._gust_start_chance = -np.expm1(-dt / vehicle.gust_every_s)
-        self._gust = np.zeros(len(self._tau))
-        self._x = np.zeros((len(self._tau), 2))
+        self._gust_end_chance = float(-np.expm1(-dt / vehicle.gust_s))
+        self._gust_start_chance = float(-np.expm1(-dt / vehicle.gust_every_s))
+        self._gust = [0.0] * len(tau)
         start = scenario.vehicle.start_m or scenario.make_reference()(np.zeros(()))[:, 0]
-        self._x[:, 0] = start
+        self._x = [(float(position), 0.0) for position in start]
 
     def state(self) -> Array:
         """See `Plant`."""
-        return self._x.copy()
+        return np.array(self._x)
 
     def advance(self, command: Array) -> None:
         """See `Plant`."""
         self._blow()
-        self._x = self._model.step(self._x, command + self._tau * self._gust)
-        if self._wind is not None:
-            noise = self._rng.standard_normal((len(self._tau), 2))
-            self._x += np.einsum("aij,aj->ai", self._wind, noise)
+        for i, u in enumerate(command.tolist()):
+            (p, v), A, B = self._x[i], self._A[i], self._B[i]
+            w = u + self._tau[i] * self._gust[i]
+            self._x[i] = (p + A[0][1] * v + B[0] * w, A[1][1] * v + B[1] * w)
+        if self._wind:
+            for i, (n, m) in enumerate(self._rng.standard_normal((len(self._x), 2)).tolist()):
+                (p, v), L = self._x[i], self._wind[i]
+                self._x[i] = (p + L[0][0] * n, v + (L[1][0] * n + L[1][1] * m))
 
     def _blow(self) -> None:
         """Gusts begin and end by chance, each blowing one way all along."""
         if self._gust_mps2 == 0.0:
             return
         chance = self._rng.random()
-        if self._gust.any():
+        if any(self._gust):
             if chance < self._gust_end_chance:
-                self._gust[:] = 0.0
+                self._gust = [0.0] * len(self._gust)
         elif chance < self._gust_start_chance:
-            way = self._rng.standard_normal(len(self._tau))
-            self._gust = self._gust_mps2 * way / np.linalg.norm(way)
+            way = self._rng.standard_normal(len(self._gust))
+            self._gust = (self._gust_mps2 * way / np.linalg.norm(way)).tolist()
 
 
 def white_acceleration(tau_s: Array, dt_s: float) -> Array:

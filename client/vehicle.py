@@ -184,16 +184,15 @@ class Client(Endpoint):
         if self._recorder is None:
             return
         observed_ns = self._compensator.observed_ns
-        self._recorder.append(
-            1,
-            vehicle=self._vehicle,
-            step=present,
-            state=state,
-            input=self._input,
-            in_force=self._compensator.in_force,
-            age_ns=-1 if observed_ns < 0 else stamp_ns - observed_ns,
-            stale=self._compensator.stale,
-            missed=self.missed,
+        self._recorder.append_row(
+            self._vehicle,
+            present,
+            *state.ravel().tolist(),
+            *self._input.tolist(),
+            self._compensator.in_force,
+            -1 if observed_ns < 0 else stamp_ns - observed_ns,
+            self._compensator.stale,
+            self.missed,
         )
 
     def _send(self, message: Hello | Observation) -> None:

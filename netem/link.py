@@ -6,6 +6,7 @@ from heapq import heappop, heappush
 
 from netem.fate import Fate
 from shared.endpoint import MILLISECOND_NS, Datagram
+from shared.histogram import Histogram
 from shared.record import Recorder
 
 QUEUE_MAX = 65536
@@ -13,41 +14,6 @@ QUEUE_MAX = 65536
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
 ERROR_BIN_NS = MILLISECOND_NS // 50
-BINS = 500
-
-
-class Histogram:
-    """Counts of durations in bins of equal width; the last bin takes all that is longer."""
-
-    def __init__(self, bin_ns: int) -> None:
-        self.bin_ns = bin_ns
-        self.counts = [0] * BINS
-        self.largest_ns = 0
-
-    def add(self, value_ns: int) -> None:
-        """Count one."""
-        # Once a packet: comparisons cost half of what min() and max() do.
-        index = value_ns // self.bin_ns
-        self.counts[index if index < BINS else -1] += 1
-        if value_ns > self.largest_ns:  # noqa: PLR1730
-            self.largest_ns = value_ns
-
-    def quantile_ms(self, share: float) -> float:
-        """Upper edge of the bin in which this share of all lies below [ms]; 0 without any."""
-        wanted, seen = share * sum(self.counts), 0
-        for index, count in enumerate(self.counts):
-            seen += count
-            if count and seen >= wanted and index < BINS - 1:
-                return min((index + 1) * self.bin_ns, self.largest_ns) / MILLISECOND_NS
-        return self.largest_ns / MILLISECOND_NS
-
-    def __str__(self) -> str:
-        bins = [
-            f"{index * self.bin_ns / MILLISECOND_NS:g} ms: {count}"
-            for index, count in enumerate(self.counts)
-            if count
-        ]
-        return ", ".join(bins) or "empty"
 
 
 @dataclass(slots=True)
@@ -91,41 +57,52 @@ class Link:
     def __init__(self, direction: int, recorder: Recorder | None) -> None:
         self._direction = direction
         self._recorder = recorder
-        self._heap: list[tuple[int, int, Datagram, Lane, int, Fate]] = []
+        self._heap: list[tuple[int, int, Datagram, Lane, int, int]] = []
+        """Due time and order of entry, then packet, lane, number in it, and delay."""
         self._entered = 0
         self.counts = Counts()
 
     def take(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> None:
         """A packet enters, addressed to where it is to come out."""
-        counts, number, fate = self.counts, lane.taken, next(lane.fates)
+        counts, number, size = self.counts, lane.taken, len(datagram.payload)
+        delay_ns, lost = next(lane.fates)
         lane.taken += 1
         counts.packets += 1
-        counts.bytes += len(datagram.payload)
-        if fate.lost:
+        counts.bytes += size
+        depth = len(self._heap)
+        if lost:
             counts.lost += 1
-            self._record(datagram, lane, number, fate, now_ns, overtaken=False)
-        elif len(self._heap) >= QUEUE_MAX:
+            if self._recorder is not None:
+                self._recorder.append_row(
+                    self._direction, lane.flow, number, size, now_ns, delay_ns, True, False
+                )
+        elif depth >= QUEUE_MAX:
             counts.overflowed += 1
         else:
             self._entered += 1
-            due_ns = now_ns + fate.delay_ns
-            heappush(self._heap, (due_ns, self._entered, datagram, lane, number, fate))
-            counts.depth_max = max(counts.depth_max, len(self._heap))
+            due_ns = now_ns + delay_ns
+            heappush(self._heap, (due_ns, self._entered, datagram, lane, number, delay_ns))
+            if depth >= counts.depth_max:
+                counts.depth_max = depth + 1
 
     def give(self, *, now_ns: int) -> list[Datagram]:
         """The packets that are due."""
         heap, counts, out = self._heap, self.counts, []
         while heap and heap[0][0] <= now_ns:
-            due_ns, _, datagram, lane, number, fate = heappop(heap)
+            due_ns, _, datagram, lane, number, delay_ns = heappop(heap)
             overtaken = number < lane.newest_out
             if overtaken:
                 counts.reordered += 1
             else:
                 lane.newest_out = number
             counts.forwarded += 1
-            counts.delay.add(fate.delay_ns)
+            counts.delay.add(delay_ns)
             counts.error.add(now_ns - due_ns)
-            self._record(datagram, lane, number, fate, due_ns - fate.delay_ns, overtaken=overtaken)
+            if self._recorder is not None:
+                size, arrived_ns = len(datagram.payload), due_ns - delay_ns
+                self._recorder.append_row(
+                    self._direction, lane.flow, number, size, arrived_ns, delay_ns, False, overtaken
+                )
             out.append(datagram)
         return out
 
@@ -136,27 +113,3 @@ class Link:
     def depth(self) -> int:
         """Packets under way."""
         return len(self._heap)
-
-    def _record(
-        self,
-        datagram: Datagram,
-        lane: Lane,
-        number: int,
-        fate: Fate,
-        arrived_ns: int,
-        *,
-        overtaken: bool,
-    ) -> None:
-        if self._recorder is None:
-            return
-        self._recorder.append(
-            1,
-            direction=self._direction,
-            flow=lane.flow,
-            number=number,
-            bytes=len(datagram.payload),
-            arrived_ns=arrived_ns,
-            delay_ns=fate.delay_ns,
-            lost=fate.lost,
-            overtaken=overtaken,
-        )

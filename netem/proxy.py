@@ -55,19 +55,20 @@ class Proxy(Endpoint):
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """A packet enters the network."""
-        if datagram.socket == 0:
-            flow = self._by_client.get(datagram.peer) or self._open(datagram.peer, now_ns)
+        payload, peer, socket = datagram
+        if socket == 0:
+            flow = self._by_client.get(peer) or self._open(peer, now_ns)
             if flow is None:
                 self.refused += 1
                 return
-            onward = Datagram(datagram.payload, self._server, flow.socket)
+            onward = Datagram(payload, self._server, flow.socket)
             self.downlink.take(onward, flow.downlink, now_ns=now_ns)
         else:
-            flow = self._by_socket.get(datagram.socket)
-            if flow is None or datagram.peer != self._server:
+            flow = self._by_socket.get(socket)
+            if flow is None or peer != self._server:
                 self.refused += 1
                 return
-            self.uplink.take(Datagram(datagram.payload, flow.client), flow.uplink, now_ns=now_ns)
+            self.uplink.take(Datagram(payload, flow.client), flow.uplink, now_ns=now_ns)
         flow.used_ns = now_ns
         self._forward(now_ns)
 
@@ -76,17 +77,15 @@ class Proxy(Endpoint):
         self._forward(now_ns)
 
     def _forward(self, now_ns: int) -> None:
-        for link in (self.uplink, self.downlink):
-            due_ns = link.next_due_ns()
-            if due_ns is not None and due_ns <= now_ns:
-                self._out += link.give(now_ns=now_ns)
+        self._out += self.uplink.give(now_ns=now_ns)
+        self._out += self.downlink.give(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
         """When the next packet is due."""
         up_ns, down_ns = self.uplink.next_due_ns(), self.downlink.next_due_ns()
-        if up_ns is None or down_ns is None:
-            return up_ns if down_ns is None else down_ns
-        return min(up_ns, down_ns)
+        if up_ns is None or (down_ns is not None and down_ns < up_ns):
+            return down_ns
+        return up_ns
 
     def _open(self, client: Address, now_ns: int) -> Flow | None:
         socket = len(self._by_socket) + 1

@@ -18,7 +18,7 @@ mistake, to be dropped and counted by its reason, never answered.
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
@@ -129,21 +129,34 @@ class Heartbeat(NamedTuple):
 
 Message = Hello | Welcome | Observation | Horizon | Heartbeat
 
-_Check = Callable[[object, Terms], object]
+_Check = range | Callable[[object, Terms], object]
+"""The integers a field may be, or what makes the field of what was sent, or refuses it."""
 
 
-def _integer(low: int, high: int) -> _Check:
-    def check(value: object, _: Terms) -> int:
-        # `type`, not `isinstance`: True is no integer on this wire.
-        if type(value) is not int or not low <= value <= high:
-            raise ProtocolError("field")
-        return value
+def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> list[object]:
+    """As many values as checks, each as its check makes it."""
+    for i, check in enumerate(checks):
+        if type(check) is range:
+            # `type`, not `isinstance`: True is no integer on this wire.
+            if type(values[i]) is not int or values[i] not in check:
+                raise ProtocolError("field")
+        else:
+            values[i] = check(values[i], terms)
+    return values
 
-    return check
+
+def _terms(value: object, ours: Terms) -> Terms:
+    """The peer's terms: they may differ from ours, but must make sense."""
+    if type(value) is not tuple or len(value) != len(_TERMS):
+        raise ProtocolError("field")
+    terms = Terms._make(_checked(list(value), _TERMS, ours))
+    if not len(terms.tau_s) == len(terms.u_max) == terms.axes:
+        raise ProtocolError("field")
+    return terms
 
 
-def _floats(value: object, *, count: int) -> tuple[float, ...]:
-    if type(value) is not tuple or len(value) != count:
+def _positive(value: object, _: Terms) -> tuple[float, ...]:
+    if type(value) is not tuple:
         raise ProtocolError("field")
     for number in value:
         if type(number) is not float or not 0.0 < number < math.inf:
@@ -151,46 +164,40 @@ def _floats(value: object, *, count: int) -> tuple[float, ...]:
     return value
 
 
-def _terms(value: object, ours: Terms) -> Terms:
-    """The peer's terms: they may differ from ours, but must make sense."""
-    if type(value) is not tuple or len(value) != len(Terms._fields):
-        raise ProtocolError("field")
-    dt_ns, horizon, axes, tau_s, u_max = value
-    count = _AXES(axes, ours)
-    assert isinstance(count, int)
-    _STAMP(dt_ns, ours)
-    _HORIZON(horizon, ours)
-    return Terms(dt_ns, horizon, axes, _floats(tau_s, count=count), _floats(u_max, count=count))
-
-
-def _finite_array(value: object, dtype: str, shape: tuple[int, int]) -> NDArray[np.floating]:
-    if type(value) is not bytes or len(value) != shape[0] * shape[1] * np.dtype(dtype).itemsize:
-        raise ProtocolError("shape")
-    array = np.frombuffer(value, dtype).reshape(shape)
-    if not np.isfinite(array).all():
+def _state(value: object, ours: Terms) -> NDArray[np.float64]:
+    state = _array(value, _FLOAT64, (ours.axes, 2))
+    if not all(map(math.isfinite, state.ravel().tolist())):
         raise ProtocolError("not finite")
-    return array
+    return state
 
 
-def _state(value: object, ours: Terms) -> NDArray[np.floating]:
-    return _finite_array(value, "<f8", (ours.axes, 2))
-
-
-def _inputs(value: object, ours: Terms) -> NDArray[np.floating]:
-    inputs = _finite_array(value, "<f4", (ours.axes, ours.horizon))
-    if (np.abs(inputs).max(axis=1) > np.multiply(ours.u_max, INPUT_TOLERANCE)).any():
-        raise ProtocolError("input out of range")
+def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
+    inputs = _array(value, _FLOAT32, (ours.axes, ours.horizon))
+    largest = np.abs(inputs).max(axis=1).tolist()  # NaN where there is one
+    if not all(map(math.isfinite, largest)):
+        raise ProtocolError("not finite")
+    for most, bound in zip(largest, ours.u_max, strict=True):
+        if most > bound * INPUT_TOLERANCE:
+            raise ProtocolError("input out of range")
     return inputs
 
 
-_U16 = _integer(0, 2**16 - 1)
-_U32 = _integer(0, 2**32 - 1)
-_U64 = _integer(0, 2**64 - 1)
-_STAMP = _integer(0, 2**63 - 1)
-_STEP = _integer(0, 2**40)
-_STEP_OR_NONE = _integer(NO_HORIZON, 2**40)
-_AXES = _integer(1, AXES_MAX)
-_HORIZON = _integer(1, INPUTS_MAX)
+def _array(value: object, dtype: np.dtype[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    if type(value) is not bytes or len(value) != shape[0] * shape[1] * dtype.itemsize:
+        raise ProtocolError("shape")
+    return np.ndarray(shape, dtype, value)
+
+
+_FLOAT32 = np.dtype("<f4")
+_FLOAT64 = np.dtype("<f8")
+_U16 = range(2**16)
+_U32 = range(2**32)
+_U64 = range(2**64)
+_STAMP = range(2**63)
+_STEP = range(2**40 + 1)
+_STEP_OR_NONE = range(NO_HORIZON, 2**40 + 1)
+_TERMS = (_STAMP, range(1, INPUTS_MAX + 1), range(1, AXES_MAX + 1), _positive, _positive)
+"""Check of each of the `Terms`."""
 
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),
@@ -202,12 +209,12 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
 """Message of each type number (from 1) and the check of each of its fields."""
 
 _NUMBERS = {message: number for number, (message, _) in enumerate(_TYPES, start=1)}
+_PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
 def encode(message: Message) -> bytes:
     """The datagram of a message; arrays travel as little-endian bytes."""
-    body = [field.tobytes() if isinstance(field, np.ndarray) else field for field in message]
-    payload: bytes = msgpack.packb([VERSION, _NUMBERS[type(message)], *body])
+    payload: bytes = _PACKER.pack([VERSION, _NUMBERS[type(message)], *message])
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
 
@@ -234,5 +241,4 @@ def decode(payload: bytes, terms: Terms) -> Message:
     message, checks = _TYPES[number - 1]
     if len(body) != len(checks):
         raise ProtocolError("not a message")
-    checked = (check(value, terms) for check, value in zip(checks, body, strict=True))
-    return message(*checked)  # type: ignore[arg-type]
+    return message._make(_checked(body, checks, terms))

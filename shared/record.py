@@ -6,7 +6,9 @@ So a writer that is killed loses no more than its last row, and nothing is held 
 """
 
 import json
+import math
 from pathlib import Path
+from struct import Struct
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -75,6 +77,7 @@ class Recorder:
     def __init__(self, columns: np.dtype[np.void], sink: BinaryIO) -> None:
         self.columns = columns
         self._sink = sink
+        self._row = _row(columns)
         sink.write(json.dumps(columns.descr).encode() + b"\n")
 
     def append(self, count: int, **values: Any) -> None:
@@ -83,6 +86,20 @@ class Recorder:
         for name, value in values.items():
             rows[name] = value
         self._sink.write(rows.tobytes())
+
+    def append_row(self, *values: float) -> None:
+        """One row, faster: a value for every column in their order, arrays number by number."""
+        self._sink.write(self._row.pack(*values))
+
+
+def _row(columns: np.dtype[np.void]) -> Struct:
+    """How a row lies in memory."""
+    formats = {"u1": "B", "u2": "H", "u4": "I", "i8": "q", "f8": "d", "b1": "?"}
+    row = "<"
+    for name in columns.names or ():
+        kind = columns[name]
+        row += f"{math.prod(kind.shape)}{formats[kind.base.str[1:]]}"
+    return Struct(row)
 
 
 def parse(part: bytes) -> Rows:

@@ -84,7 +84,8 @@ class Shell:
         self._loop.add_reader(self._sockets[number], self._read, number)
 
     def _read(self, number: int) -> None:
-        receive, endpoint = self._sockets[number].recvfrom, self.endpoint
+        receive, name = self._sockets[number].recvfrom, self._names.name
+        hear, clock_ns = self.endpoint.receive, time.monotonic_ns
         try:
             for _ in range(BURST_MAX):
                 try:
@@ -93,8 +94,7 @@ class Shell:
                     break
                 except OSError:  # an earlier packet of ours found the peer's port closed
                     continue
-                datagram = Datagram(payload, self._names.name(peer), number)
-                endpoint.receive(datagram, now_ns=time.monotonic_ns())
+                hear(Datagram(payload, name(peer), number), now_ns=clock_ns())
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
             self._after()
 
@@ -122,12 +122,13 @@ class Shell:
             self._done.set_result(None)
 
     def _send(self, datagram: Datagram) -> None:
-        to = self._names.number(datagram.peer)
+        payload, peer, number = datagram
         try:
-            if datagram.socket not in self._sockets:
-                self._sockets[datagram.socket] = open_socket(self._elsewhere)
-                self._listen(datagram.socket)
-            self._sockets[datagram.socket].sendto(datagram.payload, to)
+            sock = self._sockets.get(number)
+            if sock is None:
+                sock = self._sockets[number] = open_socket(self._elsewhere)
+                self._listen(number)
+            sock.sendto(payload, self._names.number(peer))
         except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet
             self.send_errors += 1
 

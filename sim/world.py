@@ -25,11 +25,12 @@ class Clock:
 
     def local(self, time_ns: int) -> int:
         """What it shows at a time of the world."""
-        return self.offset_ns + time_ns * (BILLION + self.drift_ppb) // BILLION
+        return self.offset_ns + time_ns + time_ns * self.drift_ppb // BILLION
 
     def world(self, local_ns: int) -> int:
         """The first time of the world at which it shows at least this."""
-        return -((self.offset_ns - local_ns) * BILLION // (BILLION + self.drift_ppb))
+        passed_ns = local_ns - self.offset_ns
+        return passed_ns - passed_ns * self.drift_ppb // (BILLION + self.drift_ppb)
 
 
 @dataclass(slots=True)
@@ -44,8 +45,6 @@ class Host:
     armed_ns: int | None = None
 
 
-Event = Callable[[], None]
-
 ARRIVAL, WAKE = 0, 1
 """At one instant, what has arrived is heard before anybody acts on the time."""
 
@@ -56,7 +55,8 @@ class World:
     def __init__(self) -> None:
         self.now_ns = 0
         self._hosts: dict[str, Host] = {}
-        self._events: list[tuple[int, int, int, Event]] = []
+        self._events: list[tuple[int, int, int, Host, Datagram | None]] = []
+        """Time, ARRIVAL or WAKE, order of entry; to whom, and what arrives."""
         self._scheduled = 0
 
     def add(
@@ -77,15 +77,18 @@ class World:
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""
         while self._events and not until():
-            time_ns, _, _, event = heappop(self._events)
+            time_ns, _, _, host, datagram = heappop(self._events)
             if time_ns > limit_ns:
                 return
             self.now_ns = time_ns
-            event()
+            if datagram is None:
+                self._wake(host)
+            else:
+                self._receive(host, datagram)
 
-    def _at(self, time_ns: int, order: int, event: Event) -> None:
+    def _at(self, time_ns: int, order: int, host: Host, datagram: Datagram | None) -> None:
         self._scheduled += 1
-        heappush(self._events, (time_ns, order, self._scheduled, event))
+        heappush(self._events, (time_ns, order, self._scheduled, host, datagram))
 
     def _arm(self, host: Host) -> None:
         due_ns = host.endpoint.next_wake_ns()
@@ -95,10 +98,10 @@ class World:
         time_ns = max(self.now_ns, host.busy_until_ns, host.clock.world(due_ns))
         if time_ns != host.armed_ns:
             host.armed_ns = time_ns
-            self._at(time_ns, WAKE, lambda: self._wake(host, time_ns))
+            self._at(time_ns, WAKE, host, None)
 
-    def _wake(self, host: Host, armed_ns: int) -> None:
-        if host.armed_ns != armed_ns:
+    def _wake(self, host: Host) -> None:
+        if host.armed_ns != self.now_ns:
             return  # it has changed its mind since
         host.armed_ns = None
         host.endpoint.wake(now_ns=host.clock.local(self.now_ns))
@@ -107,7 +110,7 @@ class World:
 
     def _receive(self, host: Host, datagram: Datagram) -> None:
         if self.now_ns < host.busy_until_ns:
-            self._at(host.busy_until_ns, ARRIVAL, lambda: self._receive(host, datagram))
+            self._at(host.busy_until_ns, ARRIVAL, host, datagram)
             return
         host.endpoint.receive(datagram, now_ns=host.clock.local(self.now_ns))
         self._after(host)
@@ -119,9 +122,5 @@ class World:
             receiver = self._hosts.get(name)
             if receiver is not None:
                 arrived = Datagram(payload, (host.name, source), socket)
-                self._at(leaves_ns, ARRIVAL, _delivery(self, receiver, arrived))
+                self._at(leaves_ns, ARRIVAL, receiver, arrived)
         self._arm(host)
-
-
-def _delivery(world: World, receiver: Host, datagram: Datagram) -> Event:
-    return lambda: world._receive(receiver, datagram)

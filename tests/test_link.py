@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from netem import link as link_module
 from netem.fate import Fate
-from netem.link import BINS, ERROR_BIN_NS, Histogram, Lane, Link
+from netem.link import Lane, Link
 from shared.endpoint import MILLISECOND_NS, Datagram
 from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Recorder, Rows, parse
 
@@ -221,42 +221,3 @@ def test_the_fate_of_every_packet_is_written_down() -> None:
     assert rows["delay_ns"].tolist() == [70, 500, 9000]
     assert rows["lost"].tolist() == [True, False, False]
     assert rows["overtaken"].tolist() == [False, False, True]
-
-
-def filled(*values_ns: int) -> Histogram:
-    """A histogram with bins of 10 ns."""
-    histogram = Histogram(10)
-    for value_ns in values_ns:
-        histogram.add(value_ns)
-    return histogram
-
-
-def test_a_histogram_counts_by_bins_of_equal_width() -> None:
-    """The lower edge belongs to its bin; what is beyond the last bin is in it."""
-    counts = filled(0, 9, 10, 19, 20, 10 * BINS - 1, 10**9).counts
-    assert counts[:4] == [2, 2, 1, 0]
-    assert (counts[-1], sum(counts)) == (2, 7)
-
-
-def test_a_quantile_is_never_below_the_true_one_and_at_most_a_bin_above() -> None:
-    """For a hundred durations in a row."""
-    histogram = filled(*range(100, 200))
-    for share, true_ns in ((0.01, 100), (0.5, 149), (0.99, 198), (1.0, 199)):
-        assert true_ns <= histogram.quantile_ms(share) * MILLISECOND_NS <= true_ns + 10
-
-
-def test_a_quantile_of_nothing_is_zero() -> None:
-    """A report before the first packet needs a number."""
-    assert filled().quantile_ms(0.99) == 0.0
-
-
-def test_a_quantile_beyond_the_last_bin_is_not_understated() -> None:
-    """An overloaded netem that is 50 ms late must not report the last bin's edge of 10 ms."""
-    histogram = Histogram(ERROR_BIN_NS)
-    histogram.add(50 * MILLISECOND_NS)
-    assert histogram.quantile_ms(0.99) == 50.0
-
-
-def test_an_empty_histogram_says_so() -> None:
-    """In words, for the report."""
-    assert str(filled()) == "empty"

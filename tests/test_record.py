@@ -1,6 +1,7 @@
 """shared.record: what is written down is what is read back."""
 
 import io
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,21 @@ def test_rows_survive_the_round_trip(columns: Columns) -> None:
     assert rows.dtype == columns
     for name, values in some_rows(columns, 3).items():
         np.testing.assert_array_equal(rows[name], values)
+
+
+def test_one_row_is_written_as_many_are(columns: Columns) -> None:
+    """Number by number in the order of the columns: the same bytes."""
+    rows, sink = some_rows(columns, 1), io.BytesIO()
+    numbers = [number for values in rows.values() for number in values.ravel().tolist()]
+    Recorder(columns, sink).append_row(*numbers)
+    assert sink.getvalue() == written(columns, 1)
+
+
+@pytest.mark.parametrize("count", [0, 7, 9])
+def test_a_row_with_too_few_or_too_many_numbers_is_our_own_mistake(count: int) -> None:
+    """It would put all others out of place."""
+    with pytest.raises(struct.error, match="expected 8 items"):
+        Recorder(PACKET_COLUMNS, io.BytesIO()).append_row(*[0] * count)
 
 
 def test_a_row_cut_short_is_left_out(columns: Columns) -> None:
