@@ -12,6 +12,7 @@ from shared import command
 from shared.command import ScenarioFlags, ScenarioName
 from shared.config import Scenario
 from shared.record import Recorder, server_columns
+from shared.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ def serve(argv: Sequence[str]) -> None:
         options.config,
         boot_id=secrets.randbits(64),
         recorder=Recorder(server_columns(options.config.model.axes), sink) if sink else None,
-        stopwatch_ns=time.perf_counter_ns,
+        stopwatch=Stopwatch(time.perf_counter_ns),
     )
     command.drive("server", endpoint, command.address(options.bind), (), "vehicles")
     if sink:

@@ -10,15 +10,15 @@ offset is right to within the bound and no better.
 """
 
 import numpy as np
+from numba import njit
 
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
-from shared.model import Flags, Indices
+from shared.model import Indices
 
 BUCKET_NS = SECOND_NS // 2
 BUCKETS = 40
 """Minima are kept for each half second, over 20 s."""
-RECENT = slice(0, 3)
-OLD = slice(8, BUCKETS)
+RECENT, OLD = 3, 8
 """A clock that stepped shows between the last 1.5 s and what is older than 4 s,"""
 STEP_SAMPLES = 5
 """in so many samples of each,"""
@@ -42,24 +42,14 @@ class ClockMap:
 
     def forget(self, row: int) -> None:
         """A new vehicle in this row, or a new life of it."""
-        self._drop(row, np.arange(BUCKETS))
+        self._minimum[row] = UNSEEN
+        self._samples[row] = 0
         self._adopted[row] = UNSEEN
-
-    def _drop(self, row: int, slots: Indices) -> None:
-        self._minimum[row][:, slots] = UNSEEN
-        self._samples[row, slots] = 0
 
     def observe(self, row: int, forward_ns: int, backward_ns: int, *, now_ns: int) -> None:
         """One F and one G of a vehicle, received at `now_ns`."""
-        bucket = now_ns // BUCKET_NS
-        passed = min(bucket - int(self._newest[row]), BUCKETS)
-        if passed > 0:
-            self._drop(row, (bucket - np.arange(passed)) % BUCKETS)
-            self._newest[row] = bucket
-        slot, minimum = bucket % BUCKETS, self._minimum[row]
-        minimum[0, slot] = min(minimum[0, slot], forward_ns)
-        minimum[1, slot] = min(minimum[1, slot], backward_ns)
-        self._samples[row, slot] += 1
+        history = (self._minimum[row], self._samples[row], self._newest[row : row + 1])
+        _observe(*history, forward_ns, backward_ns, now_ns // BUCKET_NS)
 
     def offset_ns(self, rows: Indices) -> Indices:
         """Vehicle's clock minus ours, for vehicles observed at least once; shape (n,).
@@ -68,12 +58,8 @@ class ClockMap:
         went back and forth at a boundary would skip and repeat steps for nothing.
         """
         self._drop_stepped(rows)
-        smallest = self._minimum[rows].min(axis=2)
-        estimate = (smallest[:, 1] - smallest[:, 0]) // 2
-        adopted = self._adopted[rows]
-        moved = (adopted == UNSEEN) | (np.abs(estimate - adopted) > self._half_step_ns)
-        self._adopted[rows] = adopted = np.where(moved, estimate, adopted)
-        return adopted
+        offset: Indices = _follow(self._minimum, self._adopted, rows, self._half_step_ns)
+        return offset
 
     def bound_ns(self, rows: Indices) -> Indices:
         """How far the offset may be off; shape (n,)."""
@@ -82,16 +68,50 @@ class ClockMap:
 
     def _drop_stepped(self, rows: Indices) -> None:
         """Where one of the two clocks has stepped, keep only what came since."""
-        newest_first = (self._newest[rows, None] - np.arange(BUCKETS)) % BUCKETS
-        samples = np.take_along_axis(self._samples[rows], newest_first, axis=1)
-        minimum = np.take_along_axis(self._minimum[rows], newest_first[:, None], axis=2)
-        enough: Flags = (samples[:, RECENT].sum(axis=1) >= STEP_SAMPLES) & (
-            samples[:, OLD].sum(axis=1) >= STEP_SAMPLES
-        )
-        forward, backward = (minimum[:, :, RECENT].min(axis=2) - minimum[:, :, OLD].min(axis=2)).T
-        opposite = np.abs(forward + backward) < np.maximum(STEP_NS, 0.2 * np.abs(forward))
-        large = np.minimum(np.abs(forward), np.abs(backward)) > STEP_NS
-        for row, order in zip(
-            rows[enough & opposite & large], newest_first[enough & opposite & large], strict=True
-        ):
-            self._drop(int(row), order[RECENT.stop :])
+        _drop_stepped(self._minimum, self._samples, self._newest, rows)
+
+
+@njit("(i8[:,::1], i8[::1], i8[::1], i8, i8, i8)", cache=True)
+def _observe(minimum, samples, newest, forward, backward, bucket):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    for passed in range(max(newest[0] + 1, bucket - BUCKETS + 1), bucket + 1):
+        minimum[:, passed % BUCKETS], samples[passed % BUCKETS] = UNSEEN, 0
+    newest[0] = max(newest[0], bucket)
+    slot = bucket % BUCKETS
+    minimum[0, slot] = min(minimum[0, slot], forward)
+    minimum[1, slot] = min(minimum[1, slot], backward)
+    samples[slot] += 1
+
+
+@njit("i8[::1](i8[:,:,::1], i8[::1], i8[:], i8)", cache=True)
+def _follow(minimum, adopted, rows, half_step):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    offset = np.empty(len(rows), dtype=np.int64)
+    for i in range(len(rows)):
+        row = rows[i]
+        estimate = (minimum[row, 1].min() - minimum[row, 0].min()) // 2
+        if adopted[row] == UNSEEN or abs(estimate - adopted[row]) > half_step:
+            adopted[row] = estimate
+        offset[i] = adopted[row]
+    return offset
+
+
+@njit("(i8[:,:,::1], i8[:,::1], i8[::1], i8[:])", cache=True)
+def _drop_stepped(minimum, samples, newest, rows):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    for row in rows:
+        recent, old = np.full(2, UNSEEN), np.full(2, UNSEEN)
+        recent_samples, old_samples = 0, 0
+        for age in range(BUCKETS):
+            slot = (newest[row] - age) % BUCKETS
+            if age < RECENT:
+                recent_samples += samples[row, slot]
+                recent = np.minimum(recent, minimum[row, :, slot])
+            elif age >= OLD:
+                old_samples += samples[row, slot]
+                old = np.minimum(old, minimum[row, :, slot])
+        if min(recent_samples, old_samples) < STEP_SAMPLES:
+            continue
+        forward, backward = recent - old
+        large = min(abs(forward), abs(backward)) > STEP_NS
+        if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
+            for age in range(RECENT, BUCKETS):
+                slot = (newest[row] - age) % BUCKETS
+                minimum[row, :, slot], samples[row, slot] = UNSEEN, 0

@@ -10,8 +10,8 @@ skipped and counted, never caught up with.
 """
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
+from heapq import heappop, heappush
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from shared.endpoint import (
     Endpoint,
     seconds_to_ns,
 )
+from shared.histogram import Histogram
 from shared.model import Flags, Indices, discretise
 from shared.protocol import (
     Heartbeat,
@@ -40,13 +41,15 @@ from shared.protocol import (
     encode,
 )
 from shared.record import Recorder
+from shared.stopwatch import Stopwatch
 
 VEHICLES_MAX = 64
-"""Sessions at once; the server has no room for further vehicles."""
+"""Sessions at once, unless room is made for more."""
 SESSION_NS = 30 * SECOND_NS
 """A vehicle unheard for so long is forgotten."""
 REACH_S = 2.0
 """Observations older than this are no base for an estimate."""
+TICK_BIN_NS = MILLISECOND_NS // 20
 
 
 @dataclass(slots=True)
@@ -56,13 +59,10 @@ class Session:
     vehicle: int
     session: int
     boot_id: int
-    row: int
     address: Address
     """Where its newest observation came from."""
-    heard_ns: int
-    sent_ns: int
-    epoch_ns: int = -1
-    """Its step 0 [vehicle's clock]; -1 until the first observation."""
+    row: int = -1
+    """-1 until the first observation."""
     observed_ns: int = -1
     """Stamp of its newest observation [vehicle's clock]."""
 
@@ -73,8 +73,9 @@ class Server(Endpoint):
     Args:
         scenario: what to fly, and how to plan.
         boot_id: a number that no other life of the server has had.
+        room: for how many vehicles at once.
         recorder: takes one row a tick and vehicle.
-        stopwatch_ns: a clock to measure solving with; the core has none of its own.
+        stopwatch: measures the parts of a tick; the core has no clock of its own.
     """
 
     def __init__(
@@ -82,8 +83,9 @@ class Server(Endpoint):
         scenario: Scenario,
         *,
         boot_id: int,
+        room: int = VEHICLES_MAX,
         recorder: Recorder | None = None,
-        stopwatch_ns: Callable[[], int] | None = None,
+        stopwatch: Stopwatch | None = None,
     ) -> None:
         super().__init__()
         control, model = scenario.control, discretise(scenario.tau_s, scenario.control.dt)
@@ -91,42 +93,57 @@ class Server(Endpoint):
         self._dt_ns = scenario.dt_ns
         self._heartbeat_ns = seconds_to_ns(scenario.link.heartbeat_s)
         self._boot_id = boot_id
+        self._room = room
         self._recorder = recorder
-        self._stopwatch_ns = stopwatch_ns
-        self._clock = ClockMap(VEHICLES_MAX, self._dt_ns)
+        self.stopwatch = stopwatch or Stopwatch()
+        self._clock = ClockMap(room, self._dt_ns)
         self._estimator = Estimator(
             model,
-            VEHICLES_MAX,
+            room,
             reach=max(1, round(REACH_S / control.dt)),
             compensate=control.scheme == "paper",
         )
-        self._planner = Planner(scenario, model, VEHICLES_MAX)
-        self._trigger = make_trigger(control, VEHICLES_MAX)
-        self._last_step = np.full(VEHICLES_MAX, -1, dtype=np.int64)
-        self._stale = np.zeros(VEHICLES_MAX, dtype=np.int64)
+        self._planner = Planner(scenario, model, room, self.stopwatch)
+        self._trigger = make_trigger(control, room)
+        self._vehicle = np.zeros(room, dtype=np.int64)
+        self._epoch_ns = np.zeros(room, dtype=np.int64)
+        """Step 0 of each [vehicle's clock]."""
+        self._heard_ns = np.zeros(room, dtype=np.int64)
+        self._sent_ns = np.zeros(room, dtype=np.int64)
+        self._stale = np.zeros(room, dtype=np.int64)
         self._sessions: dict[int, Session] = {}
         """By vehicle."""
         self._welcomed: dict[int, Session] = {}
         """New lives of vehicles, until their first observation; by vehicle."""
+        self._by_row: dict[int, Session] = {}
+        self._free_rows = list(range(room))
+        """A heap: what is in use lies close together."""
+        self._rows: Indices = np.zeros(0, dtype=np.int64)
+        """Those in use, rising."""
         self._opened = 0
         self._due_ns: int | None = None
         self.missed = 0
+        self.ticks = Histogram(TICK_BIN_NS)
+        """How long each took, as far as the stopwatch runs."""
         self.counts: Counter[str] = Counter()
 
     # -- datagrams ---------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """HELLO opens a session, OBSERVATION feeds it; anything else is dropped and counted."""
+        self.stopwatch.start()
         try:
-            match decode(datagram.payload, self._terms):
-                case Hello() as hello:
-                    self._hello(hello, datagram.peer, now_ns)
-                case Observation() as observation:
-                    self._observe(observation, datagram.peer, now_ns)
-                case _:
-                    raise ProtocolError("not for a server")
+            message = decode(datagram.payload, self._terms)
+            self.stopwatch.lap("decode")
+            if isinstance(message, Observation):
+                self._observe(message, datagram.peer, now_ns)
+            elif isinstance(message, Hello):
+                self._hello(message, datagram.peer, now_ns)
+            else:
+                raise ProtocolError("not for a server")
         except ProtocolError as error:
             self.counts[f"dropped: {error.reason}"] += 1
+        self.stopwatch.lap("observe")
 
     def _hello(self, hello: Hello, address: Address, now_ns: int) -> None:
         if hello.terms != self._terms:
@@ -140,16 +157,14 @@ class Server(Endpoint):
                 self._welcome(hello, session.session, address, now_ns)
                 return
         taken = self._sessions.keys() | self._welcomed.keys()
-        if hello.vehicle not in taken and len(taken) >= VEHICLES_MAX:
+        if hello.vehicle not in taken and len(taken) >= self._room:
             if not self._welcomed:
                 raise ProtocolError("no room for another vehicle")
             del self._welcomed[next(iter(self._welcomed))]  # the oldest that never came
         # The session of an earlier life goes on until this one proves to be heard.
         self._opened += 1
         number = (self._boot_id + self._opened) % 2**32
-        self._welcomed[hello.vehicle] = Session(
-            hello.vehicle, number, hello.boot_id, -1, address, now_ns, now_ns
-        )
+        self._welcomed[hello.vehicle] = Session(hello.vehicle, number, hello.boot_id, address)
         self._welcome(hello, number, address, now_ns)
 
     def _welcome(self, hello: Hello, session: int, address: Address, now_ns: int) -> None:
@@ -159,42 +174,40 @@ class Server(Endpoint):
     def _observe(self, observation: Observation, address: Address, now_ns: int) -> None:
         session = self._sessions.get(observation.vehicle)
         if session is None or session.session != observation.session:
-            session = self._begin(observation)
-        session.heard_ns = now_ns
+            session = self._begin(observation, now_ns)
+        row = session.row
+        self._heard_ns[row] = now_ns
         self._clock.observe(
-            session.row,
+            row,
             now_ns - observation.stamp_ns,
             observation.received_ns - observation.server_ns,
             now_ns=now_ns,
         )
-        if not self._estimator.observe(session.row, observation.step, observation.state):
-            self._stale[session.row] += 1
+        if not self._estimator.observe(row, observation.step, observation.state):
+            self._stale[row] += 1
             return
         session.address = address
-        session.epoch_ns = observation.stamp_ns - observation.step * self._dt_ns
         session.observed_ns = observation.stamp_ns
+        self._epoch_ns[row] = observation.stamp_ns - observation.step * self._dt_ns
         if self._due_ns is None:
             self._due_ns = (now_ns // self._dt_ns + 1) * self._dt_ns
 
-    def _begin(self, observation: Observation) -> Session:
+    def _begin(self, observation: Observation, now_ns: int) -> Session:
         """The welcomed session of a first observation, now live."""
         session = self._welcomed.get(observation.vehicle)
         if session is None or session.session != observation.session:
             raise ProtocolError("unknown session")
         del self._welcomed[observation.vehicle]
         before = self._sessions.get(session.vehicle)
-        taken = {other.row for other in self._sessions.values()}
-        session.row = (
-            next(row for row in range(VEHICLES_MAX) if row not in taken)
-            if before is None
-            else before.row
-        )
-        self._sessions[session.vehicle] = session
-        self._clock.forget(session.row)
-        self._estimator.forget(session.row)
-        self._planner.forget(session.row)
-        self._last_step[session.row] = -1
-        self._stale[session.row] = 0
+        row = session.row = heappop(self._free_rows) if before is None else before.row
+        self._sessions[session.vehicle] = self._by_row[row] = session
+        self._rows = np.array(sorted(self._by_row), dtype=np.int64)
+        self._vehicle[row] = session.vehicle
+        self._sent_ns[row] = now_ns
+        self._stale[row] = 0
+        self._clock.forget(row)
+        self._estimator.forget(row)
+        self._planner.forget(row)
         host, port = session.address
         self._news.append(f"vehicle {session.vehicle} flies, from {host}:{port}")
         return session
@@ -220,55 +233,61 @@ class Server(Endpoint):
             self._due_ns = None
 
     def _expire(self, now_ns: int) -> None:
-        for session in list(self._sessions.values()):
-            if now_ns - session.heard_ns > SESSION_NS:
-                del self._sessions[session.vehicle]
-                self._news.append(f"vehicle {session.vehicle} is gone")
+        gone = self._rows[now_ns - self._heard_ns[self._rows] > SESSION_NS].tolist()
+        for row in gone:
+            session = self._by_row.pop(row)
+            del self._sessions[session.vehicle]
+            heappush(self._free_rows, row)
+            self._news.append(f"vehicle {session.vehicle} is gone")
+        if gone:
+            self._rows = np.array(sorted(self._by_row), dtype=np.int64)
 
     def _tick(self, tick_ns: int, now_ns: int) -> None:
-        sessions = list(self._sessions.values())
-        rows = np.array([session.row for session in sessions], dtype=np.int64)
-        epochs = np.array([session.epoch_ns for session in sessions], dtype=np.int64)
-        step = (tick_ns + self._clock.offset_ns(rows) - epochs) // self._dt_ns
-        able: Flags = (step > self._last_step[rows]) & self._estimator.within_reach(rows, step)
-        flying = [session for session, yes in zip(sessions, able, strict=True) if yes]
-        if flying:
-            self._control(flying, rows[able], step[able], now_ns)
-        for session in sessions:
-            if now_ns - session.sent_ns >= self._heartbeat_ns:
-                self._send(session, Heartbeat(session.vehicle, session.session, now_ns), now_ns)
+        self.stopwatch.start()
+        before_ns = self.stopwatch.spent_ns.total()
+        rows = self._rows
+        step = (tick_ns + self._clock.offset_ns(rows) - self._epoch_ns[rows]) // self._dt_ns
+        able: Flags = (step > self._estimator.last_step[rows]) & self._estimator.within_reach(
+            rows, step
+        )
+        if able.any():
+            self._control(rows[able], step[able], now_ns)
+        for row in rows[now_ns - self._sent_ns[rows] >= self._heartbeat_ns].tolist():
+            session = self._by_row[row]
+            self._send(session, Heartbeat(session.vehicle, session.session, now_ns), now_ns)
+        self.stopwatch.lap("encode")
+        self.ticks.add(self.stopwatch.spent_ns.total() - before_ns)
 
-    def _control(self, sessions: list[Session], rows: Indices, step: Indices, now_ns: int) -> None:
+    def _control(self, rows: Indices, step: Indices, now_ns: int) -> None:
         """Algorithms 1 and 2 of the paper, for the vehicles in `rows` at their steps k."""
-        self._last_step[rows] = step
+        stopwatch = self.stopwatch
         estimate = self._estimator.estimate(rows, step)  # (13)
+        stopwatch.lap("estimate")
         planned, fresh = self._planner.planned(rows, step, estimate)
         verdict = self._trigger.test(rows, step, estimate, planned, fresh)  # (16)
-        began_ns = self._stopwatch_ns() if self._stopwatch_ns else 0
+        stopwatch.lap("trigger")
         plan = self._planner.plan(rows, step, estimate, planned, fresh)  # (14), (15)
-        solve_ns = self._stopwatch_ns() - began_ns if self._stopwatch_ns else -1
         self._estimator.remember(rows, step, plan.inputs[:, :, 0])  # (12)
         event = verdict.event & plan.solved
-        self._trigger.sent(rows[event], step[event], verdict.error[event])
-        for i in np.flatnonzero(event):
-            session = sessions[i]
+        sent = np.flatnonzero(event)
+        self._trigger.sent(rows[sent], step[sent], verdict.error[sent])
+        stopwatch.lap("plan")
+        inputs = plan.inputs.astype(np.float32)
+        for i, row, k in zip(sent.tolist(), rows[sent].tolist(), step[sent].tolist(), strict=True):
+            session = self._by_row[row]
             horizon = Horizon(
-                session.vehicle,
-                session.session,
-                int(step[i]),
-                now_ns,
-                session.observed_ns,
-                plan.inputs[i].astype(np.float32),
+                session.vehicle, session.session, k, now_ns, session.observed_ns, inputs[i]
             )
             self._send(session, horizon, now_ns)
         self.counts["steps"] += len(rows)
-        self.counts["events"] += int(event.sum())
-        self.counts["unsolved"] += int((~plan.solved).sum())
+        self.counts["events"] += len(sent)
+        self.counts["unsolved"] += len(rows) - int(plan.solved.sum())
+        stopwatch.lap("encode")
         if self._recorder is None:
             return
         self._recorder.append(
             len(rows),
-            vehicle=[session.vehicle for session in sessions],
+            vehicle=self._vehicle[rows],
             step=step,
             estimate=estimate,
             planned=planned,
@@ -278,13 +297,14 @@ class Server(Endpoint):
             threshold=verdict.threshold,
             event=event,
             solved=plan.solved,
-            solve_ns=solve_ns,
+            solve_ns=plan.solve_ns,
             stale=self._stale[rows],
             missed=self.missed,
         )
+        stopwatch.lap("record")
 
     def _send(self, session: Session, message: Horizon | Heartbeat, now_ns: int) -> None:
-        session.sent_ns = now_ns
+        self._sent_ns[session.row] = now_ns
         self._out.append(Datagram(encode(message), session.address))
 
     def report(self) -> str:
@@ -293,7 +313,7 @@ class Server(Endpoint):
         here = f"{len(self._sessions)} in session, {self.missed} ticks missed"
         lines = [f"{here}, {counts or 'no steps'}"]
         for session in self._sessions.values():
-            step = self._last_step[session.row]
+            step = self._estimator.last_step[session.row]
             bound_ms = self._clock.bound_ns(np.array([session.row]))[0] / MILLISECOND_NS
             lines.append(f"vehicle {session.vehicle}: step {step}, clock within {bound_ms:.1f} ms")
         return "\n".join(lines)

@@ -2,10 +2,12 @@
 
     x̂(k) = A^τ x(k-τ) + Σ_{i=1…τ} A^{i-1} B û(k-i)        τ: age of the observation in steps
 
-û is the history (12) of the first inputs the server computed, whether sent or not (E12).
+û is the history (12) of the first inputs the server computed, whether sent or not (E12). The sum is
+not formed: one step of (4) after the other says the same.
 """
 
 import numpy as np
+from numba import njit
 
 from shared.model import Array, Flags, Indices, Model
 
@@ -21,27 +23,22 @@ class Estimator:
 
     def __init__(self, model: Model, capacity: int, reach: int, *, compensate: bool) -> None:
         axes = len(model.B)
+        self._model = model
         self._reach = reach
         self._compensate = compensate
-        self._powers = np.empty((axes, reach + 1, 2, 2))
-        """A^τ for τ = 0 … reach."""
-        self._powers[:, 0] = np.eye(2)
-        for i in range(reach):
-            self._powers[:, i + 1] = model.A @ self._powers[:, i]
-        self._responses = np.einsum("aipq,aq->aip", self._powers[:, :-1], model.B)
-        """A^{i-1} B for i = 1 … reach."""
         self.observed_step = np.full(capacity, -1, dtype=np.int64)
         """Step of the newest observation, or -1; shape (capacity,)."""
         self._state = np.zeros((capacity, axes, 2))
         self._inputs = np.zeros((capacity, axes, reach))
         """û, a ring over the steps: zero, hovering, where nothing was computed."""
-        self._last_step = np.full(capacity, -1, dtype=np.int64)
+        self.last_step = np.full(capacity, -1, dtype=np.int64)
+        """The step whose û was computed last, or -1; shape (capacity,)."""
 
     def forget(self, row: int) -> None:
         """A new vehicle in this row."""
         self.observed_step[row] = -1
         self._inputs[row] = 0.0
-        self._last_step[row] = -1
+        self.last_step[row] = -1
 
     def observe(self, row: int, step: int, state: Array) -> bool:
         """Keep x(step), unless a newer one is known (E11); whether it was kept."""
@@ -61,30 +58,53 @@ class Estimator:
 
     def estimate(self, rows: Indices, step: Indices) -> Array:
         """x̂(k) of eq. (13), for vehicles within reach; shape (n, axes, 2)."""
-        observed = self._state[rows]
         if not self._compensate:
-            return observed
-        self._hold(rows, step)
-        age = self.age(rows, step)
-        i = np.arange(1, self._reach + 1)
-        ring = (step[:, None] - i) % self._reach
-        past = np.take_along_axis(self._inputs[rows], ring[:, None, :], axis=2)
-        past = np.where((i <= age[:, None])[:, None, :], past, 0.0)
-        free = np.einsum("anpq,naq->nap", self._powers[:, age], observed)
-        return free + np.einsum("aip,nai->nap", self._responses, past)
+            return self._state[rows]
+        estimate: Array = _fly_on(
+            *(self._model.A, self._model.B, self._state, self.observed_step),
+            *(self._inputs, self.last_step, rows, step),
+        )
+        return estimate
 
     def remember(self, rows: Indices, step: Indices, inputs: Array) -> None:
-        """û(k) ← u(k|k), eq. (12); inputs of shape (n, axes)."""
-        self._hold(rows, step)
-        self._inputs[rows, :, step % self._reach] = inputs
-        self._last_step[rows] = step
+        """û(k) ← u(k|k), eq. (12); inputs of shape (n, axes).
 
-    def _hold(self, rows: Indices, step: Indices) -> None:
-        """Steps before this one at which nothing was computed: û is what it was before them."""
-        last = self._last_step[rows]
-        held = np.take_along_axis(self._inputs[rows], (last % self._reach)[:, None, None], axis=2)
-        missed = np.where(last < 0, 0, np.minimum(step - 1 - last, self._reach))
-        for back in range(1, int(missed.max(initial=0)) + 1):
-            some = missed >= back
-            self._inputs[rows[some], :, (step[some] - back) % self._reach] = held[some, :, 0]
-        self._last_step[rows] = np.where(missed > 0, step - 1, last)
+        Steps before at which nothing was computed flew on with the input of before them.
+        """
+        _write_down(self._inputs, self.last_step, rows, step, inputs)
+
+
+@njit(
+    "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8[::1], f8[:,:,::1], i8[::1], i8[:], i8[:])",
+    cache=True,
+    error_model="numpy",
+)
+def _fly_on(A, B, state, observed_step, inputs, last_step, rows, steps):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    n, axes, reach = len(rows), len(A), inputs.shape[2]
+    estimate = np.empty((n, axes, 2))
+    for i in range(n):
+        row = rows[i]
+        for axis in range(axes):
+            p, v = state[row, axis, 0], state[row, axis, 1]
+            for step in range(observed_step[row], steps[i]):
+                u = inputs[row, axis, min(step, last_step[row]) % reach]
+                p, v = (
+                    A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u,
+                    A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u,
+                )
+            estimate[i, axis, 0], estimate[i, axis, 1] = p, v
+    return estimate
+
+
+@njit("(f8[:,:,::1], i8[::1], i8[:], i8[:], f8[:,:])", cache=True)
+def _write_down(inputs, last_step, rows, steps, new):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    reach = inputs.shape[2]
+    for i in range(len(rows)):
+        row, step, last = rows[i], steps[i], last_step[rows[i]]
+        if last >= 0:
+            for axis in range(len(new[i])):
+                held = inputs[row, axis, last % reach]
+                for missed in range(max(last + 1, step - reach + 1), step):
+                    inputs[row, axis, missed % reach] = held
+        inputs[row, :, step % reach] = new[i]
+        last_step[row] = step

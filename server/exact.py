@@ -24,7 +24,8 @@ ROUNDS_MAX = 30
 """Of the active set; seven have been the most on recorded flights."""
 RESIDUAL_MAX = 1e-7
 """Of the optimality conditions, relative to the gradient, for an answer of DAQP."""
-CYCLED = -1
+CYCLED, NOT_FINITE = -1, -2
+"""In place of a number of rounds."""
 
 
 class ExactSolver:
@@ -36,19 +37,27 @@ class ExactSolver:
     """
 
     def __init__(self, mpc: MPC, u_max: Array) -> None:
-        self._mpc = mpc
-        self._u_max = np.asarray(u_max, dtype=np.float64)
+        model, u_max = mpc.model, np.asarray(u_max, dtype=np.float64)
+        self._hessian = mpc.hessian
+        self._u_max = u_max
+        axes, H = mpc.hessian.shape[:2]
+        free = np.empty((axes, H, 8))
+        for axis in range(axes):
+            of_axis = (model.A[axis], model.B[axis], mpc.weights, mpc.input_weights)
+            _backward(free[axis], np.zeros(H), H - 1, *of_axis)
+        self._problem = (model.A, model.B, mpc.weights, mpc.input_weights, u_max, free)
         self.fallbacks = 0
         """Problems that DAQP had to solve."""
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
         """See `Solver`."""
-        mpc, model = self._mpc, self._mpc.model
-        inputs, rounds = _riccati_active_set(
-            *(model.A, model.B, mpc.weights, mpc.input_weights, self._u_max),
-            *(np.ascontiguousarray(gradient), np.ascontiguousarray(guess), NEAR, ROUNDS_MAX),
+        inputs, rounds, worst = _riccati_active_set(
+            *self._problem, gradient, guess, NEAR, ROUNDS_MAX
         )
-        solved: Flags = np.asarray(np.isfinite(inputs + gradient).all(axis=(1, 2)))
+        solved = np.ones(len(gradient), dtype=np.bool_)
+        if worst > 0:
+            return inputs, solved
+        solved &= (rounds != NOT_FINITE).all(axis=1)
         for vehicle, axis in np.argwhere((rounds == CYCLED) & solved[:, None]):
             self.fallbacks += 1
             try:
@@ -59,7 +68,7 @@ class ExactSolver:
         return inputs, solved
 
     def _dual(self, axis: int, gradient: Array) -> Array:
-        hessian, bound = self._mpc.hessian[axis], np.full(len(gradient), self._u_max[axis])
+        hessian, bound = self._hessian[axis], np.full(len(gradient), self._u_max[axis])
         nothing = np.zeros((0, len(gradient)))
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12
@@ -73,9 +82,47 @@ class ExactSolver:
         return inputs
 
 
+# One stage of a backward pass: what depends on the active set alone. The cost to go from the stage
+# is ½ c u² + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
+S0, S1, K0, K1, INVERSE, P00, P01, P11 = range(8)
+"""s, k = s / c, 1 / c and P: the columns of a row of `stages`."""
+
+
+@njit("(f8[:,:], f8[::1], i8, f8[:,:], f8[:], f8[:,::1], f8[::1])", cache=True, error_model="numpy")
+def _backward(stages, side, last, A, B, W, rho):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    """The rows of `stages` from `last` to 0, for an active set; those after it are right already.
+
+    Args:
+        stages: shape (H, 8).
+        side: -1 or 1 where the input is at that bound, 0 where it is free; shape (H,).
+        last: the last stage whose side is another than the one its row was made for.
+        A, B: of one axis; shape (2, 2) and (2,).
+        W, rho: weights of the states 1 … H and of the inputs; shape (H, 2) and (H,).
+    """
+    a00, a01, a10, a11, b0, b1 = A[0, 0], A[0, 1], A[1, 0], A[1, 1], B[0], B[1]
+    p00, p01, p11 = W[-1, 0], 0.0, W[-1, 1]
+    if last + 1 < len(stages):
+        p00, p01, p11 = stages[last + 1, P00], stages[last + 1, P01], stages[last + 1, P11]
+    for i in range(last, -1, -1):
+        pb0, pb1 = p00 * b0 + p01 * b1, p01 * b0 + p11 * b1
+        inverse = 1.0 / (rho[i] + b0 * pb0 + b1 * pb1)
+        s0, s1 = pb0 * a00 + pb1 * a10, pb0 * a01 + pb1 * a11
+        k0, k1 = s0 * inverse, s1 * inverse
+        e00, e01 = p00 * a00 + p01 * a10, p00 * a01 + p01 * a11
+        e10, e11 = p01 * a00 + p11 * a10, p01 * a01 + p11 * a11
+        p00, p01, p11 = a00 * e00 + a10 * e10, a00 * e01 + a10 * e11, a01 * e01 + a11 * e11
+        if side[i] == 0.0:
+            p00, p01, p11 = p00 - s0 * k0, p01 - s0 * k1, p11 - s1 * k1
+        if i > 0:
+            p00, p11 = p00 + W[i - 1, 0], p11 + W[i - 1, 1]
+        row = stages[i]
+        row[S0], row[S1], row[K0], row[K1], row[INVERSE] = s0, s1, k0, k1, inverse
+        row[P00], row[P01], row[P11] = p00, p01, p11
+
+
 @njit(
-    "Tuple((f8[:,:,::1], i8[:,::1]))(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1],"
-    "f8[:,:,::1], f8[:,:,::1], f8, i8)",
+    "Tuple((f8[:,:,::1], i8[:,::1], i8))(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1],"
+    "f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8, i8)",
     cache=True,
     error_model="numpy",
 )
@@ -85,18 +132,20 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
     W: Array,
     rho: Array,
     u_max: Array,
+    free: Array,
     gradient: Array,
     guess: Array,
     near: float,
     rounds_max: int,
 ):
-    """Inputs (n, axes, H) and rounds taken (n, axes), CYCLED where the set was not found.
+    """Inputs (n, axes, H), rounds taken (n, axes), and the worst of these (CYCLED, NOT_FINITE).
 
     Args:
         A, B: shape (axes, 2, 2) and (axes, 2).
         W: weights of the states 1 … H; shape (H, 2).
         rho: weights of the inputs; shape (H,).
         u_max: shape (axes,).
+        free: the stages of `_backward` with no input at its bound; shape (axes, H, 8).
         gradient: shape (n, axes, H).
         guess: inputs whose bounds are the first set; shape (n, axes, H).
         near: how much of the bound they must reach for that (an argument: numba would not notice
@@ -106,53 +155,52 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
     n, axes, H = gradient.shape
     inputs = np.empty((n, axes, H))
     rounds = np.full((n, axes), CYCLED)
-    side = np.empty(H)
-    """-1 or 1: at that bound; 0: free."""
-    curvature, slope_0, slope_1, offset = np.empty(H), np.empty(H), np.empty(H), np.empty(H)
+    worst = rounds_max
+    side, own, stages = np.empty(H), np.empty(H), np.empty((H, 8))
     for vehicle in range(n):
         for axis in range(axes):
             a00, a01, a10, a11 = A[axis, 0, 0], A[axis, 0, 1], A[axis, 1, 0], A[axis, 1, 1]
             b0, b1, bound = B[axis, 0], B[axis, 1], u_max[axis]
+            g, u = gradient[vehicle, axis], inputs[vehicle, axis]
+            last, total = -1, 0.0
             for i in range(H):
-                u = guess[vehicle, axis, i]
-                side[i] = 1.0 if u >= near * bound else -1.0 if u <= -near * bound else 0.0
+                v = guess[vehicle, axis, i]
+                side[i] = 1.0 if v >= near * bound else -1.0 if v <= -near * bound else 0.0
+                if side[i] != 0.0:
+                    last = i
+                total += g[i]
+            stages[:] = free[axis]
             for count in range(1, rounds_max + 1):
-                # Backward: the cost to go from stage i + 1 is ½ xᵀPx + qᵀx.
-                p00, p01, p11, q0, q1 = W[H - 1, 0], 0.0, W[H - 1, 1], 0.0, 0.0
+                _backward(stages, side, last, A[axis], B[axis], W, rho)
+                # Backward: own is what the stage would choose for itself at x = 0.
+                q0, q1 = 0.0, 0.0
                 for i in range(H - 1, -1, -1):
-                    pb0, pb1 = p00 * b0 + p01 * b1, p01 * b0 + p11 * b1
-                    # The stage's own cost: ½ curvature u² + (slope x + offset) u.
-                    c = rho[i] + b0 * pb0 + b1 * pb1
-                    s0, s1 = pb0 * a00 + pb1 * a10, pb0 * a01 + pb1 * a11
-                    d = b0 * q0 + b1 * q1 + gradient[vehicle, axis, i]
-                    curvature[i], slope_0[i], slope_1[i], offset[i] = c, s0, s1, d
-                    if i == 0:
-                        break
-                    e00, e01 = p00 * a00 + p01 * a10, p00 * a01 + p01 * a11
-                    e10, e11 = p01 * a00 + p11 * a10, p01 * a01 + p11 * a11
-                    p00, p01 = a00 * e00 + a10 * e10, a00 * e01 + a10 * e11
-                    p11 = a01 * e01 + a11 * e11
+                    row = stages[i]
+                    d = b0 * q0 + b1 * q1 + g[i]
+                    own[i] = -d * row[INVERSE]
                     q0, q1 = a00 * q0 + a10 * q1, a01 * q0 + a11 * q1
                     if side[i] == 0.0:
-                        p00, p01, p11 = p00 - s0 * s0 / c, p01 - s0 * s1 / c, p11 - s1 * s1 / c
-                        q0, q1 = q0 - s0 * d / c, q1 - s1 * d / c
+                        q0, q1 = q0 - row[K0] * d, q1 - row[K1] * d
                     else:
-                        q0, q1 = q0 + s0 * side[i] * bound, q1 + s1 * side[i] * bound
-                    p00, p11 = p00 + W[i - 1, 0], p11 + W[i - 1, 1]
+                        q0, q1 = q0 + row[S0] * side[i] * bound, q1 + row[S1] * side[i] * bound
                 # Forward: what each stage would choose for itself is its verdict on the set.
-                x0, x1, unchanged = 0.0, 0.0, True
+                x0, x1, last = 0.0, 0.0, -1
                 for i in range(H):
-                    u = -(slope_0[i] * x0 + slope_1[i] * x1 + offset[i]) / curvature[i]
-                    verdict = 1.0 if u > bound else -1.0 if u < -bound else 0.0
+                    row = stages[i]
+                    v = own[i] - (row[K0] * x0 + row[K1] * x1)
+                    verdict = 1.0 if v > bound else -1.0 if v < -bound else 0.0
                     if side[i] != 0.0:
-                        u = side[i] * bound
+                        v = side[i] * bound
                     elif verdict != 0.0:
-                        u = verdict * bound
-                    unchanged = unchanged and verdict == side[i]
-                    side[i] = verdict
-                    inputs[vehicle, axis, i] = u
-                    x0, x1 = a00 * x0 + a01 * x1 + b0 * u, a10 * x0 + a11 * x1 + b1 * u
-                if unchanged:
+                        v = verdict * bound
+                    if verdict != side[i]:
+                        side[i], last = verdict, i
+                    u[i] = v
+                    x0, x1 = a00 * x0 + a01 * x1 + b0 * v, a10 * x0 + a11 * x1 + b1 * v
+                if last < 0:
                     rounds[vehicle, axis] = count
                     break
-    return inputs, rounds
+            if not np.isfinite(total + x0 + x1):
+                rounds[vehicle, axis] = NOT_FINITE
+            worst = min(worst, rounds[vehicle, axis])
+    return inputs, rounds, worst

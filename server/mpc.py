@@ -50,14 +50,14 @@ class MPC:
         Returns:
             shape (n, axes, H).
         """
-        x, target = np.ascontiguousarray(x), np.ascontiguousarray(target)
-        pulled = _pull(self.model.A, self.model.B, self.weights, x, target)
-        toward = self.change_weights * previous + self.target_weight * target[:, :, :-1, 1]
-        return pulled - toward
+        gradient: Array = _gradient(
+            *(self.model.A, self.model.B, self.weights, self.target_weight, self.change_weights),
+            *(x, target, previous),
+        )
+        return gradient
 
     def predict(self, x: Array, u: Array) -> Array:
-        """X(k) of eq. (7): the states at the stages 1 … H; shape (n, axes, H, 2)."""
-        x, u = np.ascontiguousarray(x), np.ascontiguousarray(u)
+        """x, then X(k) of eq. (7): the states at the stages 0 … H; shape (n, axes, H + 1, 2)."""
         states: Array = _roll_out(self.model.A, self.model.B, x, u)
         return states
 
@@ -87,58 +87,80 @@ def condense(model: Model, control: ControlConfig, *, change_weight: float) -> M
     return MPC(model, weights, input_weights, target_weight, change_weights, hessian)
 
 
+@njit("f8[:,:,::1](f8[:,:,::1], i8[:])", cache=True)
+def _shift(inputs, steps):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    n, axes, H = inputs.shape
+    shifted = np.empty((n, axes, H))
+    for vehicle in range(n):
+        for axis in range(axes):
+            for i in range(H):
+                shifted[vehicle, axis, i] = inputs[vehicle, axis, min(i + steps[vehicle], H - 1)]
+    return shifted
+
+
 def shift(inputs: Array, steps: Indices) -> Array:
     """A horizon as seen `steps` later, its last input repeated at the end (11).
 
     Args:
         inputs: shape (n, axes, H).
-        steps: shape (n,).
+        steps: none negative; shape (n,).
     """
-    H = inputs.shape[2]
-    stages = np.minimum(np.arange(H) + steps[:, None], H - 1)
-    return np.take_along_axis(inputs, stages[:, None, :], axis=2)
+    shifted: Array = _shift(inputs, steps)
+    return shifted
 
 
 @njit(
-    "f8[:,:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1])",
+    "f8[:,:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,:,:], f8[:,:,::1])",
     cache=True,
     error_model="numpy",
 )
 def _roll_out(A, B, x, u):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
     """Eq. (4) along a horizon: u of shape (n, axes, H) from x, shape (n, axes, 2)."""
     n, axes, H = u.shape
-    states = np.empty((n, axes, H, 2))
+    states = np.empty((n, axes, H + 1, 2))
     for vehicle in range(n):
         for axis in range(axes):
             p, v = x[vehicle, axis, 0], x[vehicle, axis, 1]
+            states[vehicle, axis, 0, 0], states[vehicle, axis, 0, 1] = p, v
             for i in range(H):
                 p, v = (
                     A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u[vehicle, axis, i],
                     A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u[vehicle, axis, i],
                 )
-                states[vehicle, axis, i, 0], states[vehicle, axis, i, 1] = p, v
+                states[vehicle, axis, i + 1, 0], states[vehicle, axis, i + 1, 1] = p, v
     return states
 
 
 @njit(
-    "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,:,::1])",
+    "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,::1], f8, f8[::1], f8[:,:,:], f8[:,:,:,:],"
+    "f8[:,:,::1])",
     cache=True,
     error_model="numpy",
 )
-def _pull(A, B, W, x, target):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    """ΓᵀW (Φ x - target): the adjoint of (4), from stage H back to 0; shape (n, axes, H)."""
-    n, axes, H = len(x), len(A), len(W)
-    states = _roll_out(A, B, x, np.zeros((n, axes, H)))
-    pull = np.empty((n, axes, H))
+def _gradient(A, B, W, R, S, x, target, previous):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    """ΓᵀW (Φ x - target) by the adjoint of (4), from stage H back to 0, less R and S terms.
+
+    Args:
+        A, B: shape (axes, 2, 2) and (axes, 2).
+        W: shape (H, 2).
+        R: weight of the input's own target.
+        S: shape (H,).
+        x, target, previous: see `MPC.gradient`.
+    """
+    n, axes, H = previous.shape
+    gradient, drift = np.empty((n, axes, H)), np.empty((H, 2))
     for vehicle in range(n):
         for axis in range(axes):
+            a00, a01, a10, a11 = A[axis, 0, 0], A[axis, 0, 1], A[axis, 1, 0], A[axis, 1, 1]
+            b0, b1 = B[axis, 0], B[axis, 1]
+            p, v = x[vehicle, axis, 0], x[vehicle, axis, 1]
+            for i in range(H):
+                p, v = a00 * p + a01 * v, a10 * p + a11 * v
+                drift[i, 0] = W[i, 0] * (p - target[vehicle, axis, i + 1, 0])
+                drift[i, 1] = W[i, 1] * (v - target[vehicle, axis, i + 1, 1])
             l0, l1 = 0.0, 0.0
             for i in range(H - 1, -1, -1):
-                l0, l1 = (
-                    A[axis, 0, 0] * l0 + A[axis, 1, 0] * l1,
-                    A[axis, 0, 1] * l0 + A[axis, 1, 1] * l1,
-                )
-                l0 += W[i, 0] * (states[vehicle, axis, i, 0] - target[vehicle, axis, i + 1, 0])
-                l1 += W[i, 1] * (states[vehicle, axis, i, 1] - target[vehicle, axis, i + 1, 1])
-                pull[vehicle, axis, i] = B[axis, 0] * l0 + B[axis, 1] * l1
-    return pull
+                l0, l1 = a00 * l0 + a10 * l1 + drift[i, 0], a01 * l0 + a11 * l1 + drift[i, 1]
+                toward = S[i] * previous[vehicle, axis, i] + R * target[vehicle, axis, i, 1]
+                gradient[vehicle, axis, i] = b0 * l0 + b1 * l1 - toward
+    return gradient

@@ -8,12 +8,18 @@ the UAV's estimated state along the generator's plan.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from server.exact import ExactSolver
 from server.mpc import MPC, condense, shift
 from server.solver import OsqpSolver, Solver
 from shared.config import ControlConfig, Scenario
 from shared.model import Array, Flags, Indices, Model
+from shared.reference import Reference
+from shared.stopwatch import Stopwatch
+
+WINDOW = 4096
+"""Steps of the reference that are held at a time."""
 
 
 def make_solver(control: ControlConfig, mpc: MPC, u_max: Array) -> Solver:
@@ -27,8 +33,15 @@ class Successive:
     """One MPC solved at every step, for up to `capacity` vehicles."""
 
     def __init__(
-        self, mpc: MPC, first: MPC, control: ControlConfig, u_max: Array, capacity: int
+        self,
+        mpc: MPC,
+        first: MPC,
+        control: ControlConfig,
+        u_max: Array,
+        capacity: int,
+        stopwatch: Stopwatch,
     ) -> None:
+        self._stopwatch = stopwatch
         axes, H = mpc.hessian.shape[:2]
         self._mpc = mpc
         self._solver = make_solver(control, mpc, u_max)
@@ -37,15 +50,17 @@ class Successive:
         self._first_solver = make_solver(control, first, u_max)
         self.inputs = np.zeros((capacity, axes, H))
         """U(k-1), the horizon computed last."""
-        self.states = np.zeros((capacity, axes, H, 2))
-        """X(k-1), the states predicted with it."""
+        self.states = np.zeros((capacity, axes, H + 1, 2))
+        """Where it was computed from, and X(k-1), the states predicted with it."""
+        self.solve_ns = 0
+        """How long solving took last, where the stopwatch runs."""
 
     def solve(self, rows: Indices, gap: Indices, fresh: Flags, x: Array, target: Array) -> Flags:
         """{X(k), U(k)} ← MPC, eq. (10), into `states` and `inputs`.
 
         Args:
             rows: the vehicles; shape (n,).
-            gap: steps since each was solved last; shape (n,).
+            gap: steps since each was solved last, of no matter where it starts anew; shape (n,).
             fresh: which of them start anew; shape (n,).
             x: state at stage 0; shape (n, axes, 2).
             target: desired states at the stages 0 … H; shape (n, axes, H + 1, 2).
@@ -54,16 +69,48 @@ class Successive:
             which were solved; the others go on with their horizon of before, shifted.
         """
         previous = shift(self.inputs[rows], gap)
-        previous[fresh] = 0.0
-        inputs, solved = self._solver.solve(self._mpc.gradient(x, target, previous), previous)
-        if fresh.any():
+        anew = fresh.any()
+        if anew:
+            previous[fresh] = 0.0
+        gradient = self._mpc.gradient(x, target, previous)
+        self._stopwatch.lap("plan")
+        inputs, solved = self._solver.solve(gradient, previous)
+        if anew:
             gradient = self._first.gradient(x[fresh], target[fresh], previous[fresh])
             inputs[fresh], solved[fresh] = self._first_solver.solve(gradient, previous[fresh])
+        self.solve_ns = self._stopwatch.lap("solve")
         # What is sent is float32: planning goes on with what the vehicle will really be told.
         inputs = inputs.astype(np.float32).astype(np.float64)
         self.inputs[rows] = inputs
         self.states[rows] = self._mpc.predict(x, inputs)
         return solved
+
+
+class Desired:
+    """The reference at the stages 0 … H of any step, looked up rather than computed each time."""
+
+    def __init__(self, reference: Reference, dt_s: float, H: int) -> None:
+        self._reference = reference
+        self._dt_s = dt_s
+        self._stages = np.arange(H + 1)
+        self._steps = np.arange(WINDOW + H)
+        self._first = 0
+        self._fill(0)
+
+    def __call__(self, step: Indices) -> Array:
+        """x_d(k|k) … x_d(k+H|k) for each of these k; shape (n, axes, H + 1, 2)."""
+        low, high = int(step.min()), int(step.max())
+        if high - low >= WINDOW:  # vehicles that fly hours apart share no table
+            times = (step[:, None] + self._stages) * self._dt_s
+            return self._reference(times).transpose(0, 2, 1, 3)
+        if not self._first <= low <= high < self._first + WINDOW:
+            self._fill(low)
+        return self._windows[:, step - self._first].transpose(1, 0, 2, 3)
+
+    def _fill(self, first: int) -> None:
+        states = self._reference((first + self._steps) * self._dt_s).transpose(1, 0, 2)
+        windows = sliding_window_view(np.ascontiguousarray(states), len(self._stages), axis=1)
+        self._first, self._windows = first, windows.swapaxes(2, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,20 +121,25 @@ class Plan:
     """U(k) of (15) [m/s]; shape (n, axes, H)."""
     solved: Flags
     """Whether U(k) is new and right, so that it may be sent; shape (n,)."""
+    solve_ns: int
+    """How long it took to solve both problems of all n; -1 where nobody measured."""
 
 
 class Planner:
     """Trajectory generator and tracker of up to `capacity` vehicles."""
 
-    def __init__(self, scenario: Scenario, model: Model, capacity: int) -> None:
+    def __init__(
+        self, scenario: Scenario, model: Model, capacity: int, stopwatch: Stopwatch
+    ) -> None:
         control = scenario.control
         mpc = condense(model, control, change_weight=control.change_weight)
         first = condense(model, control, change_weight=0.0)
-        self._dt = control.dt
         self._H = control.horizon
-        self._reference = scenario.make_reference()
-        self._generator = Successive(mpc, first, control, scenario.u_max, capacity)
-        self._tracker = Successive(mpc, first, control, scenario.u_max, capacity)
+        self._desired = Desired(scenario.make_reference(), control.dt, control.horizon)
+        problem = (mpc, first, control, scenario.u_max, capacity, stopwatch)
+        self._generator = Successive(*problem)
+        self._tracker = Successive(*problem)
+        self._stopwatch = stopwatch
         self._step = np.full(capacity, -1, dtype=np.int64)
 
     def forget(self, row: int) -> None:
@@ -102,11 +154,12 @@ class Planner:
         Returns:
             shape (n, axes, 2) and (n,).
         """
-        gap = step - self._step[rows]
-        fresh = (self._step[rows] < 0) | (gap > self._H)
-        stage = np.where(fresh, 1, gap) - 1
-        planned = self._generator.states[rows, :, stage]
-        return np.where(fresh[:, None, None], estimate, planned), fresh
+        last = self._step[rows]
+        gap = step - last
+        fresh = (last < 0) | (gap > self._H)
+        planned = self._generator.states[rows, :, np.minimum(gap, self._H)]
+        planned[fresh] = estimate[fresh]
+        return planned, fresh
 
     def plan(
         self, rows: Indices, step: Indices, estimate: Array, planned: Array, fresh: Flags
@@ -119,13 +172,11 @@ class Planner:
             estimate: x̂(k); shape (n, axes, 2).
             planned: x_p(k|k-1), and `fresh`: from `planned`.
         """
-        gap = np.where(fresh, 0, step - self._step[rows])
-        stages = np.arange(self._H + 1)
-        desired = self._reference((step[:, None] + stages) * self._dt).transpose(0, 2, 1, 3)
-        led = self._generator.solve(rows, gap, fresh, planned, desired)
-        trajectory = np.concatenate([planned[:, :, None], self._generator.states[rows]], axis=2)
-        tracked = self._tracker.solve(rows, gap, fresh, estimate, trajectory)
-        solved = led & tracked
+        gap = step - self._step[rows]
+        led = self._generator.solve(rows, gap, fresh, planned, self._desired(step))
+        trajectory = self._generator.states[rows]
+        solved = led & self._tracker.solve(rows, gap, fresh, estimate, trajectory)
         # A first plan that failed is no plan to go on from.
         self._step[rows] = np.where(fresh & ~solved, -1, step)
-        return Plan(self._tracker.inputs[rows], solved)
+        solve_ns = self._generator.solve_ns + self._tracker.solve_ns
+        return Plan(self._tracker.inputs[rows], solved, solve_ns if self._stopwatch.runs else -1)

@@ -157,11 +157,10 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     assert (np.abs(inputs) == 1.8).mean() > 0.5
     rounded = inputs.astype(np.float32).astype(np.float64)
     assert np.abs(rounded).max() < 1.8
-    weights = (problem.model.A, problem.model.B, problem.weights, problem.input_weights)
-    again, rounds = exact._riccati_active_set(*weights, u_max, gradient, rounded, NEAR, 1)
+    again, rounds, _ = exact._riccati_active_set(*solver._problem, gradient, rounded, NEAR, 1)
     assert (rounds == 1).all()
     np.testing.assert_array_equal(again, inputs)
-    _, rounds = exact._riccati_active_set(*weights, u_max, gradient, rounded, 1.0, 1)
+    _, rounds, _ = exact._riccati_active_set(*solver._problem, gradient, rounded, 1.0, 1)
     assert (rounds == exact.CYCLED).any()
 
 

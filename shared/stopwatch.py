@@ -1,0 +1,31 @@
+"""What each part of the work costs: laps of a clock that the driver lends to a core."""
+
+from collections import Counter
+from collections.abc import Callable
+
+
+class Stopwatch:
+    """Adds up how long things take.
+
+    Args:
+        clock_ns: any clock [ns]; None counts nothing, for time that is virtual.
+    """
+
+    def __init__(self, clock_ns: Callable[[], int] | None = None) -> None:
+        self.runs = clock_ns is not None
+        self._clock_ns = clock_ns or (lambda: 0)
+        self._since_ns = 0
+        self.spent_ns: Counter[str] = Counter()
+        """In all laps so far, by name."""
+
+    def start(self) -> None:
+        """The next lap begins."""
+        self._since_ns = self._clock_ns()
+
+    def lap(self, name: str) -> int:
+        """It ends and the one after it begins; how long it took [ns]."""
+        now_ns = self._clock_ns()
+        took_ns = now_ns - self._since_ns
+        self.spent_ns[name] += took_ns
+        self._since_ns = now_ns
+        return took_ns
