@@ -89,7 +89,7 @@ S0, S1, K0, K1, INVERSE, P00, P01, P11 = range(8)
 
 
 @njit("(f8[:,:], f8[::1], i8, f8[:,:], f8[:], f8[:,::1], f8[::1])", cache=True, error_model="numpy")
-def _backward(stages, side, last, A, B, W, rho):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+def _backward(stages, side, last, A, B, W, rho):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """The rows of `stages` from `last` to 0, for an active set; those after it are right already.
 
     Args:
@@ -126,7 +126,7 @@ def _backward(stages, side, last, A, B, W, rho):  # type: ignore[no-untyped-def]
     cache=True,
     error_model="numpy",
 )
-def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
+def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0912, PLR0917 - compiled
     A: Array,
     B: Array,
     W: Array,

@@ -33,21 +33,15 @@ class Successive:
     """One MPC solved at every step, for up to `capacity` vehicles."""
 
     def __init__(
-        self,
-        mpc: MPC,
-        first: MPC,
-        control: ControlConfig,
-        u_max: Array,
-        capacity: int,
-        stopwatch: Stopwatch,
+        self, scenario: Scenario, model: Model, capacity: int, stopwatch: Stopwatch
     ) -> None:
+        control, axes, H = scenario.control, len(model.B), scenario.control.horizon
         self._stopwatch = stopwatch
-        axes, H = mpc.hessian.shape[:2]
-        self._mpc = mpc
-        self._solver = make_solver(control, mpc, u_max)
+        self._mpc = condense(model, control, change_weight=control.change_weight)
+        self._solver = make_solver(control, self._mpc, scenario.u_max)
         # Without a horizon before there is no S-term (E8), which is another Hessian.
-        self._first = first
-        self._first_solver = make_solver(control, first, u_max)
+        self._first = condense(model, control, change_weight=0.0)
+        self._first_solver = make_solver(control, self._first, scenario.u_max)
         self.inputs = np.zeros((capacity, axes, H))
         """U(k-1), the horizon computed last."""
         self.states = np.zeros((capacity, axes, H + 1, 2))
@@ -132,13 +126,10 @@ class Planner:
         self, scenario: Scenario, model: Model, capacity: int, stopwatch: Stopwatch
     ) -> None:
         control = scenario.control
-        mpc = condense(model, control, change_weight=control.change_weight)
-        first = condense(model, control, change_weight=0.0)
         self._H = control.horizon
         self._desired = Desired(scenario.make_reference(), control.dt, control.horizon)
-        problem = (mpc, first, control, scenario.u_max, capacity, stopwatch)
-        self._generator = Successive(*problem)
-        self._tracker = Successive(*problem)
+        self._generator = Successive(scenario, model, capacity, stopwatch)
+        self._tracker = Successive(scenario, model, capacity, stopwatch)
         self._stopwatch = stopwatch
         self._step = np.full(capacity, -1, dtype=np.int64)
 
