@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from client.fleet import Fleet
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from shared import command
@@ -18,7 +19,7 @@ from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import Scenario
 from shared.record import Recorder, client_columns, parse
 from shared.summary import summarise
-from shared.udp import within_reach_of
+from shared.udp import allow_sockets, within_reach_of
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,13 @@ class Options:
     """HOST:PORT where the server is to be met: netem's, or its own."""
     number: Annotated[int, tyro.conf.arg(name="id")] = 1
     """Number of this vehicle, unlike any other of the server's (0 to 65535)."""
+    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Fly so many in this process, numbered from --id on."""
     record: Path | None = None
     """File for the client's part of the record."""
     json: Path | None = None
-    """File for the summary of the flight, as far as the vehicle knows it."""
+    """File for the summary of the flight, as far as the vehicle knows it; of a fleet, for what was
+    counted, and what it cost."""
     config: ScenarioFlags = Scenario()
 
 
@@ -42,27 +46,39 @@ def fly(argv: Sequence[str]) -> None:
     """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM."""
     options = command.parse(Options(), argv, "skytether client", fly.__doc__)
     scenario, server = options.config, command.address(options.server)
-    if not 0 <= options.number < 2**16:
+    command.check_count("--vehicles", options.vehicles, 65_536)
+    numbers = range(options.number, options.number + options.vehicles)
+    if not (numbers[0] >= 0 and numbers[-1] < 2**16):
         raise CommandError(f"--id: got {options.number}, expected 0 to 65535", 2)
+    allow_sockets(len(numbers))
     with (
         command.open_record(options.record) if options.record else tempfile.TemporaryFile()
     ) as sink:
-        endpoint = Client(
-            scenario,
-            FirstOrderPlant(scenario, stream(scenario.seed, "wind", options.number)),
-            server=server,
-            vehicle=options.number,
-            boot_id=secrets.randbits(64),
-            recorder=Recorder(client_columns(scenario.model.axes), sink),
+        recorder = Recorder(client_columns(scenario.model.axes), sink)
+        clients = [
+            Client(
+                scenario,
+                FirstOrderPlant(scenario, stream(scenario.seed, "wind", number)),
+                server=server,
+                vehicle=number,
+                boot_id=secrets.randbits(64),
+                recorder=recorder,
+            )
+            for number in numbers
+        ]
+        alone = len(clients) == 1
+        endpoint = clients[0] if alone else Fleet(clients)
+        command.drive(
+            *("client", endpoint, within_reach_of([server]), [server]),
+            f"the server at {options.server}",
+            json=None if alone else options.json,
         )
-        bind = within_reach_of([server])
-        command.drive("client", endpoint, bind, [server], f"the server at {options.server}")
         sink.flush()
         sink.seek(0)
         rows = parse(sink.read())
     if endpoint.failure:
         raise CommandError(endpoint.failure)
-    if len(rows):
+    if alone and len(rows):
         command.finish(summarise(scenario, options.scenario, rows), "client", options.json)
 
 

@@ -58,7 +58,7 @@ class Client(Endpoint):
         self._plant = plant
         self._compensator = Compensator(scenario)
         self._server = server
-        self._vehicle = vehicle
+        self.vehicle = vehicle
         self._boot_id = boot_id
         self._recorder = recorder
 
@@ -106,7 +106,7 @@ class Client(Endpoint):
             self.counts[f"dropped: {error.reason}"] += 1
 
     def _welcome(self, welcome: Welcome, now_ns: int) -> None:
-        if (welcome.vehicle, welcome.boot_id) != (self._vehicle, self._boot_id):
+        if (welcome.vehicle, welcome.boot_id) != (self.vehicle, self._boot_id):
             raise ProtocolError("for another life")
         if welcome.terms != self._terms:
             if self._session is None:
@@ -122,7 +122,7 @@ class Client(Endpoint):
             self._news.append("session open, flying")
 
     def _heard(self, message: Welcome | Horizon | Heartbeat, now_ns: int) -> None:
-        if (message.vehicle, message.session) != (self._vehicle, self._session):
+        if (message.vehicle, message.session) != (self.vehicle, self._session):
             raise ProtocolError("unknown session")
         if self._hello_due_ns is not None and self._epoch_ns is not None:
             self._news.append("the server is heard again")
@@ -158,7 +158,7 @@ class Client(Endpoint):
                 self._hello_due_ns = now_ns
         if self._hello_due_ns is not None and now_ns >= self._hello_due_ns:
             self._hello_due_ns = now_ns + HELLO_NS
-            self._send(Hello(self._vehicle, self._boot_id, self._terms))
+            self._send(Hello(self.vehicle, self._boot_id, self._terms))
 
     def _fly(self, now_ns: int, epoch_ns: int) -> None:
         """Advance to the present step; one that was slept through was flown with the old input."""
@@ -172,7 +172,7 @@ class Client(Endpoint):
         assert self._session is not None
         self._send(
             Observation(
-                self._vehicle,
+                self.vehicle,
                 self._session,
                 present,
                 stamp_ns,
@@ -185,7 +185,7 @@ class Client(Endpoint):
             return
         observed_ns = self._compensator.observed_ns
         self._recorder.append_row(
-            self._vehicle,
+            self.vehicle,
             present,
             *state.ravel().tolist(),
             *self._input.tolist(),

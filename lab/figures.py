@@ -7,6 +7,8 @@ import numpy as np
 
 from shared.command import CommandError
 from shared.config import Scenario
+from shared.record import Rows
+from shared.summary import position_error
 from sim.flight import Flight
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -56,4 +58,41 @@ def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
     grid[0, 0].set_ylabel("y [m]")
     grid[0, 0].legend(loc="upper right", fontsize=8)
     grid[1, 0].set_ylabel("sent")
+    figure.savefig(path, dpi=130)
+
+
+def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
+    """Draw a fleet: all paths over the reference, and how the tracking error spreads.
+
+    Args:
+        path: of a file in one of FORMATS.
+        client: rows of all vehicles.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.4, 4.8), layout="constrained")
+    plane, spread = figure.subplots(1, 2)
+    flights = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
+    for rows in flights:
+        plane.plot(
+            *rows["state"][:, :2, 0].T, "k-", linewidth=0.6, alpha=max(0.05, 1 / len(flights))
+        )
+    desired = scenario.make_reference()(np.unique(client["step"]) * scenario.control.dt)
+    plane.plot(*desired[:, :2, 0].T, "r--", label="reference")
+    plane.set_aspect("equal", adjustable="datalim")
+    plane.set_xlabel("x [m]")
+    plane.set_ylabel("y [m]")
+    plane.legend(loc="upper right", fontsize=8)
+    settled = [rows[rows["step"] * scenario.control.dt >= scenario.settle] for rows in flights]
+    errors = [
+        np.sqrt((position_error(scenario, rows)[:, :2] ** 2).sum(axis=1).mean())
+        for rows in settled
+        if len(rows)
+    ]
+    spread.hist(errors, bins=max(5, round(np.sqrt(len(errors)))), color="0.4")
+    spread.set_xlabel("RMSE xy of a vehicle [m]")
+    spread.set_ylabel("vehicles")
+    for axes in (plane, spread):
+        axes.grid(alpha=0.3)
+    figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=130)

@@ -4,12 +4,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from netem.proxy import Proxy
+import tyro
+
+from netem.proxy import FLOWS_MAX, Proxy
 from shared import command
 from shared.command import ScenarioFlags, ScenarioName
 from shared.config import Scenario
 from shared.record import PACKET_COLUMNS, Recorder
+from shared.udp import allow_sockets
 
 
 @dataclass(frozen=True)
@@ -24,18 +28,25 @@ class Options:
     """HOST:PORT of the server."""
     record: Path | None = None
     """File for the fate of every packet."""
+    flows: Annotated[int, tyro.conf.arg(metavar="N")] = FLOWS_MAX
+    """Clients at once; each takes a socket."""
+    json: Path | None = None
+    """File for what was counted, and what it cost."""
     config: ScenarioFlags = Scenario()
 
 
 def emulate(argv: Sequence[str]) -> None:
     """Delay, reorder and lose datagrams between clients and a server; statistics at SIGUSR1."""
     options = command.parse(Options(), argv, "skytether netem", emulate.__doc__)
+    command.check_count("--flows", options.flows, 65_536)
+    allow_sockets(1 + options.flows)
     sink = command.open_record(options.record) if options.record else None
     server = command.address(options.server)
     recorder = Recorder(PACKET_COLUMNS, sink) if sink else None
-    endpoint = Proxy(options.config, server=server, recorder=recorder)
+    endpoint = Proxy(options.config, server=server, flows=options.flows, recorder=recorder)
     bind = command.address(options.bind)
-    command.drive("netem", endpoint, bind, [server], f"clients of {options.server}")
+    waiting_for = f"clients of {options.server}"
+    command.drive("netem", endpoint, bind, [server], waiting_for, json=options.json)
     if sink:
         sink.close()
 

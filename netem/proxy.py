@@ -6,6 +6,7 @@ client to server, as in the paper.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 from netem.fate import fates
 from netem.link import Counts, Lane, Link
@@ -14,7 +15,7 @@ from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
 from shared.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
-"""Clients at once, a socket each; a packet of a further one is dropped, and counted."""
+"""Clients at once, unless more are asked for; a packet of a further one is dropped and counted."""
 IDLE_NS = 60 * SECOND_NS
 """A flow without a packet for so long gives its place, and its socket, to a new client."""
 
@@ -36,13 +37,20 @@ class Proxy(Endpoint):
     Args:
         scenario: its `network` and `seed`.
         server: where the server is.
+        flows: clients at once, a socket each.
         recorder: takes one row a packet.
     """
 
     def __init__(
-        self, scenario: Scenario, *, server: Address, recorder: Recorder | None = None
+        self,
+        scenario: Scenario,
+        *,
+        server: Address,
+        flows: int = FLOWS_MAX,
+        recorder: Recorder | None = None,
     ) -> None:
         super().__init__()
+        self._flows_max = flows
         self._scenario = scenario
         self._server = server
         self.uplink = Link(UPLINK, recorder)
@@ -51,7 +59,7 @@ class Proxy(Endpoint):
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
         self.refused = 0
-        """Packets of clients beyond FLOWS_MAX, and of strangers at a flow's socket."""
+        """Packets of clients beyond the last flow, and of strangers at a flow's socket."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """A packet enters the network."""
@@ -89,7 +97,7 @@ class Proxy(Endpoint):
 
     def _open(self, client: Address, now_ns: int) -> Flow | None:
         socket = len(self._by_socket) + 1
-        if socket > FLOWS_MAX:
+        if socket > self._flows_max:
             idle = min(self._by_socket.values(), key=lambda flow: flow.used_ns)
             if now_ns - idle.used_ns < IDLE_NS:
                 return None
@@ -118,6 +126,20 @@ class Proxy(Endpoint):
                 _describe("downlink", self.downlink.counts, self.downlink.depth()),
             ]
         )
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`."""
+        figures: dict[str, Any] = {"flows": len(self._by_socket), "refused": self.refused}
+        for name, link in (("uplink", self.uplink), ("downlink", self.downlink)):
+            counts = link.counts
+            figures[name] = {
+                "packets": counts.packets,
+                "bytes": counts.bytes,
+                "lost": counts.lost,
+                "overflowed": counts.overflowed,
+                "error_ms_p99": counts.error.quantile_ms(0.99),
+            }
+        return figures
 
 
 def _describe(name: str, counts: Counts, depth: int) -> str:

@@ -6,13 +6,19 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from socket import socket
+from typing import Annotated
 
-from server.controller import Server
-from shared import command
-from shared.command import ScenarioFlags, ScenarioName
+import tyro
+
+from server.controller import VEHICLES_MAX, Server
+from shared import command, workers
+from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import Scenario
+from shared.endpoint import Address
 from shared.record import Recorder, server_columns
 from shared.stopwatch import Stopwatch
+from shared.udp import AddressError
 
 
 @dataclass(frozen=True)
@@ -25,20 +31,57 @@ class Options:
     """HOST:PORT to listen on; port 0 takes a free one."""
     record: Path | None = None
     """File for the server's part of the record."""
+    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = VEHICLES_MAX
+    """Room for so many vehicles at once, in each worker."""
+    workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Processes that share the address and the vehicles, one a core; each writes files of its own,
+    numbered, as in RECORD.1."""
+    json: Path | None = None
+    """File for what was counted, and what it cost."""
     config: ScenarioFlags = Scenario()
 
 
 def serve(argv: Sequence[str]) -> None:
     """Plan for every vehicle that says HELLO, until SIGINT or SIGTERM."""
     options = command.parse(Options(), argv, "skytether server", serve.__doc__)
-    sink = command.open_record(options.record) if options.record else None
+    command.check_count("--vehicles", options.vehicles, 65_536)
+    command.check_count("--workers", options.workers, 64)
+    bind = command.address(options.bind)
+    if options.workers == 1:
+        _work(options, bind, "")
+        return
+    try:
+        worst = workers.run(
+            options.workers, bind, lambda number, sock: _work(options, sock, f".{number}")
+        )
+    except AddressError as error:
+        raise CommandError(str(error)) from None
+    if worst:
+        raise CommandError("a worker has failed", worst)
+
+
+def _work(options: Options, bind: Address | socket, suffix: str) -> None:
+    """One worker; its files have names that end in `suffix`."""
+
+    def own(path: Path | None) -> Path | None:
+        return path and path.with_name(path.name + suffix)
+
+    record = own(options.record)
+    sink = command.open_record(record) if record else None
+    stopwatch = Stopwatch(time.perf_counter_ns)
     endpoint = Server(
         options.config,
         boot_id=secrets.randbits(64),
+        room=options.vehicles,
         recorder=Recorder(server_columns(options.config.model.axes), sink) if sink else None,
-        stopwatch=Stopwatch(time.perf_counter_ns),
+        stopwatch=stopwatch,
     )
-    command.drive("server", endpoint, command.address(options.bind), (), "vehicles")
+    command.drive(
+        f"server{suffix}",
+        *(endpoint, bind, (), "vehicles"),
+        json=own(options.json),
+        stopwatch=stopwatch,
+    )
     if sink:
         sink.close()
 

@@ -12,6 +12,7 @@ skipped and counted, never caught up with.
 from collections import Counter
 from dataclasses import dataclass
 from heapq import heappop, heappush
+from typing import Any
 
 import numpy as np
 
@@ -317,3 +318,14 @@ class Server(Endpoint):
             bound_ms = self._clock.bound_ns(np.array([session.row]))[0] / MILLISECOND_NS
             lines.append(f"vehicle {session.vehicle}: step {step}, clock within {bound_ms:.1f} ms")
         return "\n".join(lines)
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`."""
+        return {
+            "vehicles": len(self._sessions),
+            "missed": self.missed,
+            "tick_ms_p50": self.ticks.quantile_ms(0.5),
+            "tick_ms_p99": self.ticks.quantile_ms(0.99),
+            "spent_ns": dict(self.stopwatch.spent_ns),
+            "counts": dict(self.counts),
+        }

@@ -7,14 +7,20 @@ the scenario itself, whose every key is a flag: the file comes first, flags lie 
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from inspect import cleandoc
 from pathlib import Path
+from socket import socket
 from typing import Annotated, BinaryIO, Protocol, TypeVar
 
+import msgspec
 import tyro
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -22,6 +28,7 @@ from shared import config
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint
 from shared.shell import Shell, run
+from shared.stopwatch import Stopwatch
 from shared.summary import Summary
 from shared.udp import AddressError, is_loopback
 
@@ -94,6 +101,16 @@ def address(text: str) -> Address:
     return host, int(port)
 
 
+def check_count(flag: str, given: int, most: int) -> None:
+    """Refuse a number of things that cannot be.
+
+    Raises:
+        CommandError: with what would do.
+    """
+    if not 1 <= given <= most:
+        raise CommandError(f"{flag}: got {given}, expected 1 to {most}", CONFIGURATION)
+
+
 def open_record(path: Path) -> BinaryIO:
     """A file for a part of the record.
 
@@ -107,12 +124,23 @@ def open_record(path: Path) -> BinaryIO:
 
 
 def drive(
-    prog: str, endpoint: Endpoint, bind: Address, peers: Sequence[Address], waiting_for: str
+    prog: str,
+    endpoint: Endpoint,
+    bind: Address | socket,
+    peers: Sequence[Address],
+    waiting_for: str,
+    *,
+    json: Path | None = None,
+    stopwatch: Stopwatch | None = None,
 ) -> None:
     """Run one endpoint as a process until it has finished or is told to stop.
 
+    Args:
+        prog: what it is called in what it says.
+        json: file for its figures in the end, with the CPU time it took.
+
     Raises:
-        CommandError: it cannot start.
+        CommandError: it cannot start, or the file cannot be written.
     """
 
     def say(text: str) -> None:
@@ -120,14 +148,14 @@ def drive(
             print(f"{prog}: {line}", flush=True)
 
     try:
-        shell = Shell(endpoint, bind, peers)
+        shell = Shell(endpoint, bind, peers, stopwatch)
     except AddressError as error:
         raise CommandError(str(error)) from None
 
     def start() -> None:
         host, port = shell.address
         say(f"listening on {host}:{port}, waiting for {waiting_for}")
-        if not all(map(is_loopback, (bind, *peers))):
+        if not all(map(is_loopback, (shell.address, *peers))):
             say("plaintext and unauthenticated: only for a network that you trust")
 
     def report() -> None:
@@ -137,8 +165,42 @@ def drive(
         if shell.send_errors:
             say(f"{shell.send_errors} datagrams could not be sent")
 
+    began_s = time.process_time()
     run([shell], on_start=start, on_news=say, on_report=report)
     report()
+    if json:
+        figures = endpoint.figures() | {
+            "cpu_s": time.process_time() - began_s,
+            "kernel_drops": shell.kernel_drops(),
+            "send_errors": shell.send_errors,
+        }
+        write(json, msgspec.json.encode(figures))
+
+
+@contextmanager
+def progress(title: str, total_s: float) -> Iterator[Callable[[float], None]]:
+    """A bar on stderr; what is yielded takes the time flown so far [s]."""
+    with Progress(
+        TextColumn(title),
+        BarColumn(),
+        TextColumn("{task.completed:.0f} of {task.total:.0f} s"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
+        task = bar.add_task("", total=total_s)
+        yield lambda flown_s: bar.update(task, completed=min(flown_s, total_s))
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Within it Ctrl-C only makes true what is yielded, so that work may end in order."""
+    interrupted = threading.Event()
+    before = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+    try:
+        yield interrupted.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, prog: str) -> int:
@@ -167,10 +229,19 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
         table.add_row(*map(Text, row))  # as text: "[m]" would be markup
     Console().print(table)
     if json is not None:
-        try:
-            json.write_bytes(summary.to_json())
-        except OSError as error:
-            raise CommandError(f"{json}: cannot be written: {error.strerror}") from None
+        write(json, msgspec.json.encode(summary))
+
+
+def write(path: Path, json: bytes) -> None:
+    """A file of indented JSON.
+
+    Raises:
+        CommandError: it cannot be written.
+    """
+    try:
+        path.write_bytes(msgspec.json.format(json, indent=2) + b"\n")
+    except OSError as error:
+        raise CommandError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:

@@ -6,7 +6,7 @@ An endpoint opens no socket, reads no clock, draws no unseeded number and prints
 
 from abc import ABC, abstractmethod
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 Address = tuple[str, int]
 
@@ -54,6 +54,10 @@ class Endpoint(ABC):
     @abstractmethod
     def report(self) -> str:
         """What was counted so far, as a few lines for the operator."""
+
+    def figures(self) -> dict[str, Any]:
+        """The same as numbers, by name, for a program."""
+        return {}
 
     @property
     def finished(self) -> bool:

@@ -11,8 +11,10 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
+from socket import socket
 
 from shared.endpoint import Address, Datagram, Endpoint
+from shared.stopwatch import Stopwatch
 from shared.timer import make_timer
 from shared.udp import Names, kernel_drops, open_socket, within_reach_of
 
@@ -37,21 +39,30 @@ class Shell:
 
     Args:
         endpoint: what to drive.
-        bind: address of its socket 0; port 0 takes a free one. Other sockets open as it uses them.
+        bind: address of its socket 0, where port 0 takes a free one, or that socket itself. Other
+            sockets open as it uses them.
         peers: addresses it will send to; where they are names they are looked up here, and the
             endpoint sees the name in place of whatever address it stands for.
+        stopwatch: measures receiving and sending.
 
     Raises:
         AddressError: the address cannot be bound, or a name cannot be found.
     """
 
-    def __init__(self, endpoint: Endpoint, bind: Address, peers: Sequence[Address] = ()) -> None:
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        bind: Address | socket,
+        peers: Sequence[Address] = (),
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
         self.endpoint = endpoint
+        self._stopwatch = stopwatch or Stopwatch()
         self.send_errors = 0
         self._drops = 0
         self._names = Names(peers)
         self._elsewhere = within_reach_of(peers)
-        self._sockets = {0: open_socket(bind)}
+        self._sockets = {0: bind if isinstance(bind, socket) else open_socket(bind)}
         self.address: Address = self._sockets[0].getsockname()
 
     async def run(self, on_news: Callable[[str], None] = lambda _: None) -> None:
@@ -85,15 +96,17 @@ class Shell:
 
     def _read(self, number: int) -> None:
         receive, name = self._sockets[number].recvfrom, self._names.name
-        hear, clock_ns = self.endpoint.receive, time.monotonic_ns
+        hear, clock_ns, stopwatch = self.endpoint.receive, time.monotonic_ns, self._stopwatch
         try:
             for _ in range(BURST_MAX):
+                stopwatch.start()
                 try:
                     payload, peer = receive(DATAGRAM_BYTES_MAX)
                 except BlockingIOError:
                     break
                 except OSError:  # an earlier packet of ours found the peer's port closed
                     continue
+                stopwatch.lap("receive")
                 hear(Datagram(payload, name(peer), number), now_ns=clock_ns())
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
             self._after()
@@ -110,8 +123,10 @@ class Shell:
     def _after(self) -> None:
         """Send what the endpoint wants sent, say its news, arm its timer."""
         endpoint = self.endpoint
+        self._stopwatch.start()
         for datagram in endpoint.outbox():
             self._send(datagram)
+        self._stopwatch.lap("send")
         for line in endpoint.news():
             self._on_news(line)
         due_ns = endpoint.next_wake_ns()

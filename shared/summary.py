@@ -49,10 +49,6 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     secure: bool = False
     """Whether the link was authenticated and encrypted."""
 
-    def to_json(self) -> bytes:
-        """As one indented JSON object."""
-        return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
-
 
 def summarise(
     scenario: Scenario,

@@ -2,6 +2,7 @@
 
 import contextlib
 import ipaddress
+import resource
 import socket
 import struct
 from collections.abc import Iterable
@@ -10,6 +11,9 @@ from shared.endpoint import Address
 
 BUFFER_BYTES = 4 * 1024 * 1024
 """The default receive buffer holds 166 datagrams of 600 B."""
+
+SPARE_FILES = 64
+"""Open files beside the sockets."""
 
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 
@@ -28,8 +32,11 @@ def is_loopback(address: Address) -> bool:
     return _is_numeric(address[0]) and ipaddress.ip_address(address[0]).is_loopback
 
 
-def open_socket(address: Address) -> socket.socket:
+def open_socket(address: Address, *, shared: bool = False) -> socket.socket:
     """A non-blocking UDP socket with large buffers.
+
+    Args:
+        shared: several sockets may have this address; the kernel deals out peers among them.
 
     Raises:
         AddressError: the address cannot be bound.
@@ -37,6 +44,8 @@ def open_socket(address: Address) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         sock.setblocking(False)
+        if shared:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         for plain, forced in (
             (socket.SO_RCVBUF, _SO_RCVBUFFORCE),
             (socket.SO_SNDBUF, _SO_SNDBUFFORCE),
@@ -50,6 +59,15 @@ def open_socket(address: Address) -> socket.socket:
         reason = f"cannot listen on {address[0]}:{address[1]}: {error.strerror}"
         raise AddressError(reason) from None
     return sock
+
+
+def allow_sockets(count: int) -> None:
+    """Let this process have so many sockets open, as far as the system does."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = count + SPARE_FILES
+    soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    if soft > resource.getrlimit(resource.RLIMIT_NOFILE)[0]:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def kernel_drops(sock: socket.socket) -> int:

@@ -2,8 +2,9 @@
 
 import hashlib
 import io
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
@@ -20,6 +21,7 @@ from shared.record import (
     parse,
     server_columns,
 )
+from shared.stopwatch import Stopwatch
 from sim.world import Clock, World
 
 MIDNIGHT_NS = 86_400 * SECOND_NS
@@ -34,6 +36,8 @@ class Flight:
     server: Rows
     netem: Rows
     failure: str | None = None
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    """Of the endpoints "server" and "netem" (see `Endpoint.figures`)."""
 
     def trace_hash(self) -> str:
         """Equal for two flights that went the same to the last bit."""
@@ -45,6 +49,7 @@ def fly(
     scenario: Scenario,
     *,
     vehicles: int = 1,
+    stopwatch: Stopwatch | None = None,
     on_second: Callable[[int], None] = lambda _: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Flight:
@@ -55,6 +60,7 @@ def fly(
 
     Args:
         vehicles: how many, numbered from 1, all with the same plan and winds of their own.
+        stopwatch: measures the server; its clock makes the record one of a kind.
         on_second: called with the time flown [s], once a second of it.
         stopped: asked often; once it says so, the flight is broken off.
     """
@@ -65,19 +71,20 @@ def fly(
 
     world = World()
     phase_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
-    server = world.add(
-        "server",
-        Server(scenario, boot_id=1, recorder=recorders[1]),
+    server = Server(scenario, boot_id=1, room=vehicles, recorder=recorders[1], stopwatch=stopwatch)
+    server_at = world.add(
+        *("server", server),
         clock=Clock(offset_ns=MIDNIGHT_NS + phase_ns),
         compute_ns=seconds_to_ns(simulation.compute_s),
     )
-    netem = world.add("netem", Proxy(scenario, server=server, recorder=recorders[2]))
+    netem = Proxy(scenario, server=server_at, flows=vehicles, recorder=recorders[2])
+    netem_at = world.add("netem", netem)
     clients = []
     for number in range(1, vehicles + 1):
         client = Client(
             scenario,
             FirstOrderPlant(scenario, stream(scenario.seed, "wind", number)),
-            server=netem,
+            server=netem_at,
             vehicle=number,
             boot_id=1,
             recorder=recorders[0],
@@ -102,4 +109,5 @@ def fly(
     world.run(over, limit_ns=seconds_to_ns(longest_s))
     failure = next((client.failure for client in clients if client.failure), None)
     client_rows, server_rows, netem_rows = (parse(sink.getvalue()) for sink in sinks)
-    return Flight(client_rows, server_rows, netem_rows, failure)
+    figures = {"server": server.figures(), "netem": netem.figures()}
+    return Flight(client_rows, server_rows, netem_rows, failure, figures)

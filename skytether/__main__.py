@@ -9,6 +9,7 @@ import client.__main__
 import netem.__main__
 import server.__main__
 from shared import command, config
+from skytether.fleet import fleet
 from skytether.fly import fly
 
 USAGE = """usage: skytether COMMAND ...
@@ -17,6 +18,7 @@ Flies a UAV over a bad network: a server plans, a client flies, and netem, betwe
 reorders and loses their packets.
 
   fly [SCENARIO]        one flight, with everything it needs; the place to start
+  fleet [SCENARIO]      many vehicles on one server, and what each costs it
   scenarios             what can be flown
   server [SCENARIO]     one process by hand: plan for vehicles
   netem [SCENARIO]      one process by hand: be the network
@@ -37,6 +39,7 @@ def list_scenarios(argv: Sequence[str]) -> None:
 
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "fly": lambda argv: command.main(fly, argv, "fly"),
+    "fleet": lambda argv: command.main(fleet, argv, "fleet"),
     "scenarios": lambda argv: command.main(list_scenarios, argv, "skytether"),
     "server": server.__main__.main,
     "netem": netem.__main__.main,

@@ -1,29 +1,19 @@
 """`skytether fly`: one flight, over real UDP or in virtual time, and what came of it."""
 
-import asyncio
-import contextlib
-import signal
 import tempfile
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lab import figures
 from shared import command, config, record
 from shared.command import CommandError, ScenarioFlags, ScenarioName
-from shared.config import ConfigError, Scenario, to_toml
-from shared.shell import new_event_loop
+from shared.config import ConfigError, Scenario
 from shared.summary import Summary, summarise
 from sim import flight
 from skytether import processes
-
-GRACE_S = 30.0
-"""How much longer than planned a flight may take, beside the time to connect."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +46,7 @@ def fly(argv: Sequence[str]) -> None:
     beside = _beside(options)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{options.scenario}, {where}, seed {scenario.seed}"
-    with Progress(
-        TextColumn(f"flying {title}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f} of {task.total:.0f} s"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    ) as progress:
-        task = progress.add_task("", total=scenario.duration)
-
-        def on_second(flown_s: float) -> None:
-            progress.update(task, completed=min(flown_s, scenario.duration))
-
+    with command.progress(f"flying {title}", scenario.duration) as on_second:
         flown = (_virtually if options.virtual else _really)(scenario, on_second)
     if flown.failure:
         raise CommandError(flown.failure)
@@ -100,31 +78,13 @@ def _summarise(scenario: Scenario, name: str, flown: flight.Flight) -> Summary:
 
 
 def _virtually(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
-    stop = threading.Event()
-    before = signal.signal(signal.SIGINT, lambda *_: stop.set())
-    try:
-        return flight.fly(scenario, on_second=on_second, stopped=stop.is_set)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with command.interruptible() as interrupted:
+        return flight.fly(scenario, on_second=on_second, stopped=interrupted)
 
 
 def _really(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
         parts = Path(folder)
-        file = parts / "scenario.toml"
-        file.write_bytes(to_toml(scenario))
-        timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
-
-        async def main() -> None:
-            task = asyncio.current_task()
-            assert task is not None
-            loop = asyncio.get_running_loop()
-            for number in (signal.SIGINT, signal.SIGTERM):
-                loop.add_signal_handler(number, task.cancel)
-            with contextlib.suppress(asyncio.CancelledError):  # what was flown until now is there
-                await processes.fly(file, parts, timeout_s=timeout_s, on_second=on_second)
-
-        with asyncio.Runner(loop_factory=new_event_loop) as runner:
-            runner.run(main())
+        processes.run(scenario, parts, on_second=on_second)
         client, server, netem = (record.read(parts / part) for part in processes.NAMES)
         return flight.Flight(client, server, netem)

@@ -2,22 +2,26 @@
 
 import asyncio
 import contextlib
-import ctypes
 import re
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from shared.command import CommandError
+from shared.config import Scenario, to_toml
 from shared.endpoint import Address
+from shared.shell import new_event_loop
+from shared.workers import die_with_parent
 
 NAMES = ("client", "server", "netem")
 """Of the processes, and of their parts of the record."""
 
 START_S = 30.0
 """How long a process may take to say what it listens on."""
+GRACE_S = 30.0
+"""How much longer than planned a flight may take, beside the time to connect."""
 STOP_S = 5.0
 """How long it may take to end once it is told to."""
 LINES_MAX = 20
@@ -54,7 +58,7 @@ async def started(name: str, *arguments: str) -> AsyncIterator[Child]:
         stderr=asyncio.subprocess.STDOUT,
         # Ctrl-C is for the command alone: it ends its children in order.
         start_new_session=True,
-        preexec_fn=_die_with_parent,
+        preexec_fn=die_with_parent,
     )
     child = Child(name, process, [])
     assert process.stdout is not None
@@ -90,38 +94,65 @@ async def _read(
             listening.set_result((found[1], int(found[2])))
 
 
-def _die_with_parent() -> None:
-    """Runs in the child: should the command be killed outright, nothing of it flies on."""
-    pr_set_pdeathsig = 1
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)
-
-
-async def fly(
-    scenario: Path, parts: Path, *, timeout_s: float, on_second: Callable[[float], None]
+def run(
+    scenario: Scenario,
+    parts: Path,
+    *,
+    on_second: Callable[[float], None],
+    vehicles: int = 1,
+    workers: int = 1,
+    watched: bool = True,
 ) -> None:
-    """Fly a scenario file; the parts of the record come to lie in the folder `parts`.
+    """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
 
     Args:
-        timeout_s: after so long the flight is broken off.
+        parts: the folder, for a record of each process and, as `.json`, its figures.
         on_second: called with the time flown [s], several times a second.
+        vehicles: how many, all in one process.
+        workers: processes of the server.
+        watched: whether server and netem record, too.
 
     Raises:
         CommandError: one of the processes failed.
     """
+    file = parts / "scenario.toml"
+    file.write_bytes(to_toml(scenario))
+    timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
+
+    def common(name: str, *, recorded: bool) -> tuple[str, ...]:
+        part = ("--record", str(parts / name)) if recorded else ()
+        return (name, str(file), "--json", str(parts / f"{name}.json"), *part)
+
+    fleet = ("--vehicles", str(vehicles))
+    server = (*common("server", recorded=watched), *fleet, "--workers", str(workers))
+    netem = (*common("netem", recorded=watched), "--flows", str(vehicles))
+    client = (*common("client", recorded=True), *fleet)
+
+    async def main() -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, task.cancel)
+        with contextlib.suppress(asyncio.CancelledError):
+            await _fly(server, netem, client, timeout_s, on_second)
+
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(main())
+
+
+async def _fly(
+    server_command: Sequence[str],
+    netem_command: Sequence[str],
+    client_command: Sequence[str],
+    timeout_s: float,
+    on_second: Callable[[float], None],
+) -> None:
+    anywhere = ("--bind", "127.0.0.1:0")
     async with (
-        started(
-            "server", str(scenario), "--bind", "127.0.0.1:0", "--record", str(parts / "server")
-        ) as server,
-        started(
-            "netem",
-            *(str(scenario), "--bind", "127.0.0.1:0"),
-            *("--server", _text(server.address), "--record", str(parts / "netem")),
-        ) as netem,
-        started(
-            "client",
-            *(str(scenario), "--server", _text(netem.address), "--record", str(parts / "client")),
-        ) as client,
+        started(*server_command, *anywhere) as server,
+        started(*netem_command, *anywhere, "--server", _text(server.address)) as netem,
+        started(*client_command, "--server", _text(netem.address)) as client,
     ):
         loop = asyncio.get_running_loop()
         began_s, flying_s = loop.time(), None

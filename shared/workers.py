@@ -1,0 +1,84 @@
+"""One address served by several processes, so that a server may use several cores.
+
+Each has a socket of its own at the address (SO_REUSEPORT): the kernel deals out peers among them by
+a hash of their address, so one peer always meets the same process while all of them live. When one
+ends, all do.
+"""
+
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
+from contextlib import closing
+from multiprocessing.connection import wait
+from socket import socket
+
+from shared.endpoint import Address
+from shared.udp import open_socket
+
+FORK = multiprocessing.get_context("fork")
+"""What has been imported and compiled is there at once, and in memory only once."""
+PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+
+
+def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
+    """Let `count` processes work until the first of them ends; the worst of their exit codes.
+
+    Args:
+        bind: their address; port 0 takes a free one.
+        work: what each does with its number, from 1, and its socket.
+
+    Raises:
+        AddressError: the address cannot be bound.
+    """
+    sockets = [open_socket(bind, shared=True)]
+    sockets += [open_socket(sockets[0].getsockname(), shared=True) for _ in range(count - 1)]
+    children = [
+        FORK.Process(target=_work, args=(work, number, sockets, os.getpid()))
+        for number in range(1, count + 1)
+    ]
+    # Until they are told otherwise, children would do with a signal what is meant for their parent.
+    signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)
+    for child in children:
+        child.start()
+    for sock in sockets:
+        sock.close()
+
+    def pass_on(number: int, _: object) -> None:
+        for child in children:
+            if child.is_alive() and child.pid:
+                os.kill(child.pid, number)
+
+    for number in PASSED_ON:
+        signal.signal(number, pass_on)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, PASSED_ON)
+    wait([child.sentinel for child in children])
+    pass_on(signal.SIGTERM, None)
+    for child in children:
+        child.join()
+    return max(abs(child.exitcode or 0) for child in children)
+
+
+def _work(
+    work: Callable[[int, socket], None], number: int, sockets: list[socket], parent: int
+) -> None:
+    die_with_parent()
+    if os.getppid() != parent:  # it was gone before
+        return
+    for other, sock in enumerate(sockets, start=1):
+        if other != number:
+            sock.close()
+    for passed_on in PASSED_ON:
+        signal.signal(passed_on, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, PASSED_ON)
+    with closing(sockets[number - 1]) as sock:
+        work(number, sock)
+
+
+def die_with_parent() -> None:
+    """Runs in a child: should its parent be killed outright, nothing of it goes on."""
+    pr_set_pdeathsig = 1
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)

@@ -1,0 +1,293 @@
+"""`skytether fleet`: many vehicles on one server, over real UDP or in virtual time."""
+
+import json
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, Self
+
+import msgspec
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from lab import figures
+from shared import command, record
+from shared.command import CommandError, ScenarioFlags, ScenarioName
+from shared.config import Scenario
+from shared.record import Rows
+from shared.stopwatch import Stopwatch
+from shared.summary import summarise
+from sim import flight
+from skytether import processes
+
+STAGES = ("receive", "decode", "observe", "estimate", "trigger", "plan", "solve", "encode", "send")
+"""Of the server's work, in the order in which they come; `record` is the price of watching."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Of `skytether fleet`."""
+
+    scenario: ScenarioName = "fleet"
+    """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
+    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 20
+    """How many."""
+    workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Processes of the server, which share the vehicles."""
+    virtual: bool = False
+    """Fly in virtual time, all in this process."""
+    json: Path | None = None
+    """File for the summary."""
+    figure: Path | None = None
+    """File for a picture of it (.png, .pdf or .svg)."""
+    config: ScenarioFlags = Scenario()
+
+
+class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What a fleet flew, and what that cost; None is what was not measured."""
+
+    scenario: str
+    seed: int
+    vehicles: int
+    workers: int
+    duration_s: float
+    """Flown by the longest flight."""
+    steps: int
+    """Flown by all vehicles,"""
+    server_steps: int
+    """and planned for by the server."""
+    event_ratio: float
+    rmse_xy: tuple[float, float, float] | None
+    """Smallest, median and largest of the vehicles [m]."""
+    uplink_packets_per_s: float
+    """From the server into the network,"""
+    downlink_packets_per_s: float
+    """and from the vehicles."""
+    lost: int
+    """By the network, both ways."""
+    dropped: int
+    """By kernels and full queues, which no network was asked for."""
+    tick_ms_p50: float
+    """How long a tick of the server took, all vehicles together, of the slowest worker."""
+    tick_ms_p99: float
+    server_missed: int
+    """Ticks that a worker slept through,"""
+    client_missed: int
+    """steps that vehicles slept through,"""
+    machine_missed: int | None
+    """and those that a process which only sleeps would have, in the same time."""
+    machine_late_ms_max: float | None
+    """How late that one woke at worst."""
+    server_cpu_us: dict[str, float]
+    """Of the server, a vehicle and step [µs]: stages on the wall clock, `total` in CPU time."""
+    client_cpu_us: float | None
+    """Of the vehicles' process, for a vehicle and step [µs]."""
+    netem_cpu_us: float | None
+    """Of netem, for a packet [µs]."""
+    vehicle_steps_per_core_s: float | None
+    """In virtual time: flown in a second of CPU time, with everything included."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """A fleet's flight: what the vehicles recorded, and the figures of each process."""
+
+    client: Rows
+    servers: list[dict[str, Any]]
+    """A worker each."""
+    netem: dict[str, Any]
+    processes: dict[str, dict[str, Any]]
+    """Of "client" and "netem", where these are processes."""
+    machine: "Metronome | None" = None
+    cpu_s: float | None = None
+    """Of everything together, in virtual time."""
+
+
+def fleet(argv: Sequence[str]) -> None:
+    """Fly many vehicles on one server, each over a network of its own.
+
+    Server, netem and all vehicles are three processes on loopback, or everything flies in virtual
+    time in this one. What the server's work cost is told for one vehicle and one step. Ctrl-C ends
+    the flight and still shows what was flown.
+    """
+    options = command.parse(Options(), argv, "skytether fleet", fleet.__doc__)
+    command.check_count("--vehicles", options.vehicles, 65_535)
+    command.check_count("--workers", options.workers, 64)
+    if options.virtual and options.workers > 1:
+        raise CommandError("--workers: got --virtual as well, where there is but one", 2)
+    if options.figure:
+        figures.check(options.figure)
+    where = "in virtual time" if options.virtual else "over UDP on loopback"
+    title = f"{options.vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
+    with command.progress(f"flying {title}", options.config.duration) as on_second:
+        flown = (_virtually if options.virtual else _really)(options, on_second)
+    if not len(flown.client):
+        raise CommandError("ended before the first step")
+    summary = _summarise(options, flown)
+    _show(summary, title)
+    if options.json:
+        command.write(options.json, msgspec.json.encode(summary))
+    if options.figure:
+        figures.fleet(options.figure, title, options.config, flown.client)
+
+
+def _virtually(options: Options, on_second: Callable[[float], None]) -> Flown:
+    began_s = time.process_time()
+    with command.interruptible() as interrupted:
+        flown = flight.fly(
+            options.config,
+            vehicles=options.vehicles,
+            stopwatch=Stopwatch(time.perf_counter_ns),
+            on_second=on_second,
+            stopped=interrupted,
+        )
+    if flown.failure:
+        raise CommandError(flown.failure)
+    return Flown(
+        *(flown.client, [flown.figures["server"]], flown.figures["netem"], {}),
+        cpu_s=time.process_time() - began_s,
+    )
+
+
+def _really(options: Options, on_second: Callable[[float], None]) -> Flown:
+    with tempfile.TemporaryDirectory(prefix="skytether-") as folder, Metronome(options) as machine:
+        parts = Path(folder)
+        processes.run(
+            *(options.config, parts),
+            on_second=on_second,
+            vehicles=options.vehicles,
+            workers=options.workers,
+            watched=False,
+        )
+        servers = [json.loads(part.read_bytes()) for part in parts.glob("server.json*")]
+        rest = {
+            name: json.loads((parts / f"{name}.json").read_bytes()) for name in ("netem", "client")
+        }
+        return Flown(record.read(parts / "client"), servers, rest["netem"], rest, machine)
+
+
+class Metronome:
+    """A thread that only sleeps, step by step: what it misses, the machine has taken."""
+
+    def __init__(self, options: Options) -> None:
+        self._dt_s = options.config.control.dt
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._sleep, daemon=True)
+        self.missed = 0
+        self.late_s_max = 0.0
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _sleep(self) -> None:
+        due_s = time.monotonic()
+        while not self._over.is_set():
+            due_s += self._dt_s
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            late_s = time.monotonic() - due_s
+            self.late_s_max = max(self.late_s_max, late_s)
+            missed = int(late_s / self._dt_s)
+            self.missed += missed
+            due_s += missed * self._dt_s
+
+
+def _summarise(options: Options, flown: Flown) -> FleetSummary:
+    scenario, client, servers, netem = options.config, flown.client, flown.servers, flown.netem
+    steps = sum(server["counts"].get("steps", 0) for server in servers)
+    spent_us = {
+        stage: sum(server["spent_ns"].get(stage, 0) for server in servers) / 1e3 / max(steps, 1)
+        for stage in STAGES
+    }
+    spent_us = {stage: us for stage, us in spent_us.items() if us}
+    if all("cpu_s" in server for server in servers):
+        spent_us["total"] = sum(server["cpu_s"] for server in servers) * 1e6 / max(steps, 1)
+    duration_s = (int(client["step"].max()) + 1) * scenario.control.dt
+    each = [client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])]
+    rmse = [summarise(scenario, options.scenario, rows).rmse_xy for rows in each]
+    known = [value for value in rmse if value is not None]
+    links = (netem["uplink"], netem["downlink"])
+    packets = sum(link["packets"] for link in links)
+    cpu_s = {name: figures["cpu_s"] for name, figures in flown.processes.items()}
+    return FleetSummary(
+        scenario=options.scenario,
+        seed=scenario.seed,
+        vehicles=len(each),
+        workers=len(servers),
+        duration_s=duration_s,
+        steps=len(client),
+        server_steps=steps,
+        event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
+        rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
+        uplink_packets_per_s=links[0]["packets"] / duration_s,
+        downlink_packets_per_s=links[1]["packets"] / duration_s,
+        lost=sum(link["lost"] for link in links),
+        dropped=sum(link["overflowed"] for link in links)
+        + sum(
+            process["kernel_drops"] + process["send_errors"]
+            for process in (*flown.processes.values(), *servers)
+            if "cpu_s" in process
+        ),
+        tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
+        tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
+        server_missed=sum(server["missed"] for server in servers),
+        client_missed=sum(int(rows["missed"][-1]) for rows in each),
+        machine_missed=flown.machine.missed if flown.machine else None,
+        machine_late_ms_max=flown.machine.late_s_max * 1e3 if flown.machine else None,
+        server_cpu_us=spent_us,
+        client_cpu_us=cpu_s["client"] * 1e6 / len(client) if cpu_s else None,
+        netem_cpu_us=cpu_s["netem"] * 1e6 / max(packets, 1) if cpu_s else None,
+        vehicle_steps_per_core_s=len(client) / flown.cpu_s if flown.cpu_s else None,
+    )
+
+
+def _show(summary: FleetSummary, title: str) -> None:
+    s = summary
+    rows = [
+        ("vehicles, server's workers", f"{s.vehicles}, {s.workers}"),
+        ("steps flown, planned for", f"{s.steps}, {s.server_steps} in {s.duration_s:g} s"),
+        ("RMSE xy min, median, max [m]", s.rmse_xy and ", ".join(f"{x:.4f}" for x in s.rmse_xy)),
+        ("event ratio", f"{s.event_ratio:.3f}"),
+        (
+            "uplink, downlink packets/s",
+            f"{s.uplink_packets_per_s:.0f}, {s.downlink_packets_per_s:.0f}",
+        ),
+        ("lost packets, dropped by accident", f"{s.lost}, {s.dropped}"),
+        ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
+        ("deadlines missed by server, clients", f"{s.server_missed}, {s.client_missed}"),
+        (
+            "  by a process that only sleeps",
+            None
+            if s.machine_late_ms_max is None
+            else f"{s.machine_missed}; {s.machine_late_ms_max:.1f} ms late at worst",
+        ),
+        *((f"server's {stage} [µs]", f"{us:.2f}") for stage, us in s.server_cpu_us.items()),
+        ("client, a step [µs]", _value(s.client_cpu_us)),
+        ("netem, a packet [µs]", _value(s.netem_cpu_us)),
+        (
+            "vehicle-steps per core-second",
+            _value(s.vehicle_steps_per_core_s, ".0f"),
+        ),
+    ]
+    table = Table(title=title, title_justify="left", show_header=False)
+    for name, value in rows:
+        if value is not None:
+            table.add_row(Text(name), value)  # as text: "[m]" would be markup
+    Console().print(table)
+
+
+def _value(value: float | None, spec: str = ".1f") -> str | None:
+    return None if value is None else format(value, spec)
