@@ -49,7 +49,8 @@ def fly(argv: Sequence[str]) -> None:
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
-        raise CommandError(f"--id: got {options.number}, expected 0 to 65535", 2)
+        given = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else numbers[0]
+        raise CommandError(f"--id: got {given}, expected 0 to 65535", 2)
     allow_sockets(len(numbers))
     with (
         command.open_record(options.record) if options.record else tempfile.TemporaryFile()

@@ -5,10 +5,12 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 from server.mpc import condense, shift
-from server.planner import Plan, Planner, Successive
+from server.planner import WINDOW, Desired, Plan, Planner, Successive
 from server.solver import OsqpSolver
 from shared.config import Scenario, check
 from shared.model import Array, Flags, discretise
@@ -288,3 +290,34 @@ def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> 
     assert [plan.solved.tolist() for plan in plans] == [[True, True], [False, True], [True, True]]
     shifted = shift(plans[0].inputs, np.array([1, 1]))
     np.testing.assert_array_equal(plans[1].inputs[0], shifted[0])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.lists(st.integers(0, 3 * WINDOW), min_size=1, max_size=4), min_size=1, max_size=5)
+)
+def test_the_reference_looked_up_is_the_reference(calls: list[list[int]]) -> None:
+    """To the last bit: forwards and backwards, near each other and hours apart."""
+    reference = SCENARIO.make_reference()
+    desired = Desired(reference, SCENARIO.control.dt, H)
+    for steps in calls:
+        expected = [reference((step + np.arange(H + 1)) * SCENARIO.control.dt) for step in steps]
+        found = desired(np.array(steps)).transpose(0, 2, 1, 3)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_the_reference_is_computed_once_for_a_window_of_steps() -> None:
+    """Not at every step."""
+    asked = []
+
+    def reference(times: Array) -> Array:
+        asked.append(times)
+        return SCENARIO.make_reference()(times)
+
+    desired = Desired(reference, SCENARIO.control.dt, H)
+    for step in range(WINDOW):
+        desired(np.array([step]))
+    assert len(asked) == 1
+    desired(np.array([WINDOW]))
+    desired(np.array([0, WINDOW]))
+    assert [times.shape for times in asked] == [(WINDOW + H,), (WINDOW + H,), (2, H + 1)]

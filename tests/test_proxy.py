@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from netem import link as link_module
-from netem import proxy as proxy_module
 from netem.fate import fates
 from netem.link import Link
-from netem.proxy import IDLE_NS, Proxy
+from netem.proxy import FLOWS_MAX, IDLE_NS, Proxy
 from shared.config import DirectionConfig, NetworkConfig, Scenario
 from shared.endpoint import MILLISECOND_NS, Datagram
 
@@ -23,11 +22,14 @@ IN_20_MS = DirectionConfig(delay="constant", minimum_s=0.02, loss=0.0)
 
 
 def make_proxy(
-    uplink: DirectionConfig = AT_ONCE, downlink: DirectionConfig | None = None, seed: int = 1
+    uplink: DirectionConfig = AT_ONCE,
+    downlink: DirectionConfig | None = None,
+    seed: int = 1,
+    flows: int = FLOWS_MAX,
 ) -> Proxy:
     """A proxy with this network, the same both ways unless said."""
     network = NetworkConfig(uplink=uplink, downlink=downlink or uplink)
-    return Proxy(Scenario(seed=seed, network=network), server=SERVER)
+    return Proxy(Scenario(seed=seed, network=network), server=SERVER, flows=flows)
 
 
 def hear(proxy: Proxy, payload: bytes, peer: tuple[str, int], socket: int = 0, at: int = 0) -> None:
@@ -80,22 +82,18 @@ def test_a_packet_at_a_socket_of_no_flow_is_refused() -> None:
     assert (proxy.outbox(), proxy.refused) == ([], 1)
 
 
-def test_a_client_too_many_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_too_many_is_refused() -> None:
     """While those that are there stay served."""
-    monkeypatch.setattr(proxy_module, "FLOWS_MAX", 2)
-    proxy = make_proxy()
+    proxy = make_proxy(flows=2)
     assert [pass_on(proxy, b"?", client) for client in (ALICE, BOB)] == [1, 2]
     hear(proxy, b"?", CAROL)
     assert (proxy.outbox(), proxy.refused) == ([], 1)
     assert pass_on(proxy, b"?", BOB) == 2
 
 
-def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client() -> None:
     """Its socket then carries the new client's answers, and the old one has to wait."""
-    monkeypatch.setattr(proxy_module, "FLOWS_MAX", 2)
-    proxy = make_proxy()
+    proxy = make_proxy(flows=2)
     pass_on(proxy, b"?", ALICE, at=0)
     pass_on(proxy, b"?", BOB, at=1)
     hear(proxy, b"?", CAROL, at=IDLE_NS - 1)
@@ -107,10 +105,9 @@ def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client(
     assert (proxy.outbox(), proxy.refused) == ([], 2)
 
 
-def test_the_servers_packets_keep_a_flow_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_servers_packets_keep_a_flow_in_use() -> None:
     """A client that only listens is not idle."""
-    monkeypatch.setattr(proxy_module, "FLOWS_MAX", 1)
-    proxy = make_proxy()
+    proxy = make_proxy(flows=1)
     socket = pass_on(proxy, b"?", ALICE)
     hear(proxy, b"!", SERVER, socket, at=IDLE_NS - 1)
     proxy.outbox()
@@ -118,13 +115,10 @@ def test_the_servers_packets_keep_a_flow_in_use(monkeypatch: pytest.MonkeyPatch)
     assert (proxy.outbox(), proxy.refused) == ([], 1)
 
 
-def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() -> None:
     """And not the one that took it."""
-    monkeypatch.setattr(proxy_module, "FLOWS_MAX", 1)
     slow = DirectionConfig(delay="constant", minimum_s=61.0, loss=0.0)
-    proxy = make_proxy(uplink=slow, downlink=AT_ONCE)
+    proxy = make_proxy(uplink=slow, downlink=AT_ONCE, flows=1)
     socket = pass_on(proxy, b"?", ALICE)
     hear(proxy, b"!", SERVER, socket)
     assert pass_on(proxy, b"?", BOB, at=IDLE_NS) == socket
@@ -235,8 +229,7 @@ def test_no_packet_appears_or_vanishes(
     """At every moment each one is forwarded, lost, overflowed, refused or still under way."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(link_module, "QUEUE_MAX", 8)
-        patch.setattr(proxy_module, "FLOWS_MAX", 2)
-        proxy, now_ns, sent = make_proxy(DirectionConfig(loss=0.3), seed=seed), 0, 0
+        proxy, now_ns, sent = make_proxy(DirectionConfig(loss=0.3), seed=seed, flows=2), 0, 0
         links = (proxy.uplink, proxy.downlink)
         for number, ((peer, socket), gap_ms) in enumerate(arrivals, start=1):
             now_ns += gap_ms * MILLISECOND_NS

@@ -267,6 +267,7 @@ def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
 def test_no_more_vehicles_than_there_is_room_for() -> None:
     """The one too many gets no answer; one that is known always does."""
     vehicles = Vehicles(scenario())
+    assert vehicles.server._room == controller.VEHICLES_MAX
     for number in range(controller.VEHICLES_MAX):
         vehicles.observe(vehicles.open(vehicle=number), 0)
     assert vehicles.say(Hello(1000, 1, vehicles.terms)) == []
@@ -305,6 +306,35 @@ def test_two_vehicles_fly_as_each_would_alone() -> None:
     assert together[2] == horizons((2,))[2]
     assert together[1] != together[2]
     assert [len(sent) for sent in together.values()] == [20, 20]
+
+
+def test_a_row_that_was_left_is_used_again_as_if_it_were_new() -> None:
+    """The first of three vehicles falls silent; a fourth takes its row, and flies as if alone."""
+
+    def fourth(others: tuple[int, ...]) -> list[bytes]:
+        vehicles = Vehicles(scenario())
+        welcomes = {number: vehicles.open(vehicle=number) for number in others}
+        for number, welcome in welcomes.items():
+            vehicles.observe(welcome, 100, ((number, 1.0), (2.0, 3.0)))
+        for step in range(101, 901):
+            for number, welcome in welcomes.items():
+                if number != 1:
+                    vehicles.observe(welcome, step)
+            if welcomes:
+                vehicles.tick()
+        vehicles.now_ns = 50 * SECOND_NS + 20 * MILLISECOND_NS
+        assert set(vehicles.server._sessions) == set(others) - {1}
+        welcome, sent = vehicles.open(vehicle=4, sender=("v", 4)), []
+        for step in range(10):
+            vehicles.observe(welcome, step, ((1.0, 0.1), (0.1 * step, 0.2)), ("v", 4))
+            sent += [message for message, peer in vehicles.tick() if peer == ("v", 4)]
+        if others:
+            assert vehicles.server._sessions[4].row == 0
+        return [message.inputs.tobytes() for message in sent if isinstance(message, Horizon)]
+
+    alone = fourth(())
+    assert len(alone) == 10
+    assert fourth((1, 2, 3)) == alone
 
 
 def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:

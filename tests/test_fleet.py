@@ -1,0 +1,245 @@
+"""Many vehicles: in one process, on one server, on several workers, and what they cost."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from socket import SOCK_DGRAM, socket
+
+import numpy as np
+import pytest
+
+from client.fleet import Fleet
+from client.plant import FirstOrderPlant
+from client.vehicle import Client
+from netem.proxy import Proxy
+from server.controller import Server
+from shared import config, workers
+from shared.chance import stream
+from shared.config import Scenario
+from shared.endpoint import SECOND_NS, Address, Datagram
+from shared.record import Recorder, Rows, client_columns, parse
+from sim.world import Clock, World
+from skytether.fleet import STAGES
+
+GUSTY = config.check(
+    config.to_table(config.load("fleet"))
+    | {"duration": 4.0, "settle": 0.0, "vehicle": {"wind": 0.1, "gust_mps2": 0.5}},
+    "test",
+)
+"""Four seconds at 50 Hz, every vehicle in a wind of its own."""
+
+
+def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Client], io.BytesIO]:
+    """Vehicles 1, 2, … and what they record."""
+    sink = io.BytesIO()
+    recorder = Recorder(client_columns(scenario.model.axes), sink)
+    made = [
+        Client(
+            scenario,
+            FirstOrderPlant(scenario, stream(scenario.seed, "wind", number)),
+            server=server,
+            vehicle=number,
+            boot_id=number,
+            recorder=recorder,
+        )
+        for number in range(1, count + 1)
+    ]
+    return made, sink
+
+
+def flown(count: int, *, together: bool) -> Rows:
+    """What so many vehicles record in virtual time, in one process or in one each."""
+    world = World()
+    # Ticks 7 ms into the vehicles' steps: no horizon comes at the very instant that a step begins.
+    server = world.add("server", Server(GUSTY, boot_id=1, room=count), clock=Clock(13_000_000))
+    netem = world.add("netem", Proxy(GUSTY, server=server))
+    vehicles, sink = clients(GUSTY, count, netem)
+    fleet = Fleet(vehicles)
+    if together:
+        world.add("fleet", fleet)
+    else:
+        for client in vehicles:
+            world.add(f"client {client.vehicle}", client)
+    world.run(
+        lambda: fleet.finished if together else all(client.finished for client in vehicles),
+        limit_ns=60 * SECOND_NS,
+    )
+    rows = parse(sink.getvalue())
+    return rows[np.lexsort((rows["step"], rows["vehicle"]))]
+
+
+def test_a_fleet_flies_as_its_vehicles_would_alone() -> None:
+    """To the last bit, each over a flow of its own."""
+    together, alone = flown(5, together=True), flown(5, together=False)
+    assert len(together) == 5 * 200
+    np.testing.assert_array_equal(together, alone)
+    assert len({rows["input"].tobytes() for rows in np.split(together, 5)}) == 5
+
+
+def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() -> None:
+    """Nobody answers: each says HELLO through its own socket, and gives up in the end."""
+    vehicles, _ = clients(GUSTY, 3, ("nowhere", 1))
+    fleet = Fleet(vehicles)
+    assert fleet.next_wake_ns() == 0
+    fleet.wake(now_ns=SECOND_NS)
+    assert [datagram.socket for datagram in fleet.outbox()] == [0, 1, 2]
+    fleet.wake(now_ns=SECOND_NS)
+    assert fleet.outbox() == []
+    assert fleet.next_wake_ns() == 2 * SECOND_NS
+    assert not fleet.finished
+    assert fleet.failure is None
+    fleet.wake(now_ns=20 * SECOND_NS)
+    assert fleet.finished
+    assert fleet.failure == "no answer from nowhere:1 in 19 s"
+    assert fleet.next_wake_ns() is None
+
+
+def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -> None:
+    """Counted there, and told under its name."""
+    vehicles, _ = clients(GUSTY, 2, ("server", 1))
+    fleet = Fleet(vehicles)
+    fleet.receive(Datagram(b"?", ("server", 1), 1), now_ns=0)
+    assert [client.counts.total() for client in vehicles] == [0, 1]
+    assert fleet.report().splitlines()[1].startswith("vehicle 2: step 0 of 200")
+
+
+# -- the command ---------------------------------------------------------------------------------
+
+
+def fleet_command(tmp_path: Path, *argv: str) -> dict[str, object]:
+    """The summary of `skytether fleet`."""
+    file = tmp_path / "fleet.json"
+    subprocess.run(
+        [sys.executable, "-P", "-m", "skytether", "fleet", *argv, "--json", str(file)],
+        check=True,
+        capture_output=True,
+        timeout=100,
+    )
+    summary: dict[str, object] = json.loads(file.read_bytes())
+    return summary
+
+
+def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
+    """Each vehicle flies every step and is planned for at every tick that knows it."""
+    figure = tmp_path / "fleet.png"
+    argv = ("--virtual", "--vehicles", "3", "--duration", "8", "--figure", str(figure))
+    summary = fleet_command(tmp_path, *argv)
+    assert (summary["vehicles"], summary["workers"], summary["steps"]) == (3, 1, 1200)
+    assert (summary["event_ratio"], summary["server_missed"]) == (1.0, 0)
+    smallest, median, largest = summary["rmse_xy"]
+    assert 0.05 < smallest <= median <= largest < 0.8
+    assert set(summary["server_cpu_us"]) == set(STAGES) - {"receive", "send"}
+    assert summary["machine_missed"] is None
+    assert summary["vehicle_steps_per_core_s"] > 0
+    assert figure.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_fleet_over_udp_is_summed_up(tmp_path: Path, count: int) -> None:
+    """Six vehicles in one process; one server, and two workers at one address."""
+    argv = ("--vehicles", "6", "--duration", "6", "--workers", str(count))
+    summary = fleet_command(tmp_path, *argv)
+    assert (summary["vehicles"], summary["workers"]) == (6, count)
+    assert summary["steps"] + summary["client_missed"] == 6 * 300
+    assert summary["server_steps"] > 6 * 200
+    assert set(summary["server_cpu_us"]) == {*STAGES, "total"}
+    assert summary["dropped"] == 0
+    # 50 Hz, each way, less what the first round trip takes.
+    assert 6 * 40 < summary["downlink_packets_per_s"] <= 6 * 51
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (["fleet", "--vehicles", "0"], "fleet: --vehicles: got 0, expected 1 to 65535"),
+        (["fleet", "--workers", "99"], "fleet: --workers: got 99, expected 1 to 64"),
+        (
+            ["fleet", "--virtual", "--workers", "2"],
+            "fleet: --workers: got --virtual as well, where there is but one",
+        ),
+        (["server", "--vehicles", "-1"], "server: --vehicles: got -1, expected 1 to 65536"),
+        (["netem", "--flows", "0"], "netem: --flows: got 0, expected 1 to 65536"),
+        (
+            ["client", "--id", "65530", "--vehicles", "10"],
+            "client: --id: got 65530 to 65539, expected 0 to 65535",
+        ),
+    ],
+)
+def test_impossible_numbers_are_refused(argv: list[str], line: str) -> None:
+    """In one line, with what would do."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "skytether", *argv],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert (done.returncode, done.stderr.strip()) == (2, line)
+
+
+# -- workers -------------------------------------------------------------------------------------
+
+
+def supervise(work: object) -> int:
+    """The exit code of two workers, supervised in a process of its own; 250 where it hangs."""
+    pid = os.fork()
+    if pid == 0:
+        signal.alarm(20)
+        os._exit(workers.run(2, ("127.0.0.1", 0), work))
+    _, status = os.waitpid(pid, 0)
+    return os.waitstatus_to_exitcode(status)
+
+
+def test_the_end_of_one_worker_is_the_end_of_all() -> None:
+    """A worker that dies takes its vehicles' sessions with it: better start anew than limp."""
+
+    def work(number: int, _: socket) -> None:
+        if number == 2:
+            os._exit(3)
+        time.sleep(60)
+
+    assert supervise(work) == signal.SIGTERM
+
+
+def test_workers_share_one_address_and_every_peer_keeps_its_worker() -> None:
+    """Forty peers, each heard by one of the two and always the same; both have some to hear."""
+
+    def work(number: int, sock: socket) -> None:
+        sock.setblocking(True)
+        while True:
+            payload, peer = sock.recvfrom(100)
+            if payload == b"end":
+                return
+            sock.sendto(b"%d" % number, peer)
+
+    ready, announce = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        signal.alarm(20)
+
+        def announced(number: int, sock: socket) -> None:
+            os.write(announce, b"%5d" % sock.getsockname()[1])
+            work(number, sock)
+
+        os._exit(workers.run(2, ("127.0.0.1", 0), announced))
+    ports = {int(os.read(ready, 5)) for _ in range(2)}
+    assert len(ports) == 1
+    (port,) = ports
+    heard = []
+    for _ in range(40):
+        with socket(type=SOCK_DGRAM) as peer:
+            peer.settimeout(10)
+            answers = []
+            for _ in range(3):
+                peer.sendto(b"?", ("127.0.0.1", port))
+                answers.append(peer.recv(100))
+            assert len(set(answers)) == 1
+            heard.append(answers[0])
+    assert set(heard) == {b"1", b"2"}
+    os.kill(pid, signal.SIGTERM)
+    assert os.WIFEXITED(os.waitpid(pid, 0)[1])
