@@ -37,6 +37,11 @@ FAULTY_FLIGHT_S = 75
 """The faults and what proves their end take 45 s of it."""
 FAULT_S = 3.0
 """More than the demo's `link.timeout_s`, so that the client notices."""
+COUNT_COMPILED = """
+from server.exact import _riccati_active_set as kernel
+print(sum(kernel.stats.cache_misses.values()))
+"""
+"""Kernels that did not come with the image."""
 HORIZONS = 10
 """So many new ones show that orders flow."""
 HOVER_M = 1.58
@@ -50,6 +55,7 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
         for service in SERVICES:
             three.check_privileges(service)
         three.check_isolation()
+        assert three.inside("server", "python", "-c", COUNT_COMPILED) == (0, "0\n")
         say("locked in: not root, read-only, no capabilities, no way round netem")
 
         summary = three.land(tmp_path)
