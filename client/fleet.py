@@ -8,6 +8,10 @@ from client.vehicle import Client
 from shared.endpoint import Datagram, Endpoint
 
 
+TOLD_MAX = 16
+"""Vehicles that a report tells of one by one."""
+
+
 class Fleet(Endpoint):
     """Clients driven as one endpoint; the n-th uses socket n."""
 
@@ -65,7 +69,9 @@ class Fleet(Endpoint):
 
     def report(self) -> str:
         """See `Endpoint`."""
-        return "\n".join(f"vehicle {client.vehicle}: {client.report()}" for client in self._clients)
+        lines = [f"vehicle {client.vehicle}: {client.report()}" for client in self._clients]
+        more = [f"and {len(lines) - TOLD_MAX} more"] if len(lines) > TOLD_MAX else []
+        return "\n".join(lines[:TOLD_MAX] + more)
 
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""

@@ -12,6 +12,7 @@ skipped and counted, never caught up with.
 from collections import Counter
 from dataclasses import dataclass
 from heapq import heappop, heappush
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,8 @@ SESSION_NS = 30 * SECOND_NS
 """A vehicle unheard for so long is forgotten."""
 REACH_S = 2.0
 """Observations older than this are no base for an estimate."""
+TOLD_MAX = 16
+"""Vehicles that a report tells of one by one."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 
 
@@ -313,10 +316,12 @@ class Server(Endpoint):
         counts = ", ".join(f"{value} {name}" for name, value in sorted(self.counts.items()))
         here = f"{len(self._sessions)} in session, {self.missed} ticks missed"
         lines = [f"{here}, {counts or 'no steps'}"]
-        for session in self._sessions.values():
+        for session in islice(self._sessions.values(), TOLD_MAX):
             step = self._estimator.last_step[session.row]
             bound_ms = self._clock.bound_ns(np.array([session.row]))[0] / MILLISECOND_NS
             lines.append(f"vehicle {session.vehicle}: step {step}, clock within {bound_ms:.1f} ms")
+        if len(self._sessions) > TOLD_MAX:
+            lines.append(f"and {len(self._sessions) - TOLD_MAX} more")
         return "\n".join(lines)
 
     def figures(self) -> dict[str, Any]:

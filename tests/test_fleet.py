@@ -108,6 +108,13 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
     assert fleet.report().splitlines()[1].startswith("vehicle 2: step 0 of 200")
 
 
+def test_a_report_of_many_vehicles_stays_readable() -> None:
+    """It tells of sixteen, and how many more there are."""
+    vehicles, _ = clients(GUSTY, 20, ("server", 1))
+    lines = Fleet(vehicles).report().splitlines()
+    assert (len(lines), lines[-1]) == (17, "and 4 more")
+
+
 # -- the command ---------------------------------------------------------------------------------
 
 

@@ -350,6 +350,15 @@ def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
     assert vehicles.server.counts["unsolved"] == 1
 
 
+def test_report_of_many_vehicles_stays_readable() -> None:
+    """Sixteen of them, and how many more."""
+    vehicles = Vehicles(scenario())
+    for number in range(20):
+        vehicles.observe(vehicles.open(vehicle=number), 0)
+    lines = vehicles.server.report().splitlines()
+    assert (len(lines), lines[-1]) == (18, "and 4 more")
+
+
 def test_report_tells_what_was_counted() -> None:
     """For the operator, with how well each vehicle's clock is known."""
     vehicles = Vehicles(scenario())

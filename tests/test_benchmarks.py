@@ -1,0 +1,158 @@
+"""The benchmarks run, with counts too small to mean anything, and write what they say they write.
+
+What is not installed does not compete; nothing here asserts a time.
+"""
+
+import json
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import accuracy, netem, solvers, tick, wire
+from benchmarks.__main__ import DOCUMENT, ROOT, SECTIONS, write
+from benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, contestants
+from benchmarks.harness import HOT, PACED, Lateness, Table, interleave, machine, refresh
+from benchmarks.problems import derive, record
+from benchmarks.reference import Reference
+from server.exact import ExactSolver
+
+TINY = MappingProxyType(
+    {
+        "netem": netem.Options(runs=1, seconds=1, rate=1000),
+        "solvers": solvers.Counts(hot=6, paced=2, tuning=3),
+        "tick": tick.Counts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
+        "wire": wire.Counts(each=10),
+        "accuracy": accuracy.Counts(ticks=3, random=2, horizons=(1, 30)),
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[str, Any]:
+    """Of every benchmark, as small as it goes."""
+    return {
+        name: {"machine": machine(), **section.measure(TINY[name])}
+        for name, section in SECTIONS.items()
+    }
+
+
+def test_every_table_has_its_place_in_the_document(
+    results: Mapping[str, Any], tmp_path: Path
+) -> None:
+    """And is written there, figures and figure beside it; a section not run stays as it was."""
+    file, figure, document = (tmp_path / name for name in ("a.json", "b.png", "c.md"))
+    document.write_text(DOCUMENT.read_text())
+    write(results, file, document, figure)
+    assert set(json.loads(file.read_text())) == set(SECTIONS)
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    for name, section in SECTIONS.items():
+        for table in section.tables(results[name]).values():
+            assert table.markdown() in document.read_text()
+    before = json.loads(file.read_text())
+    write({"wire": {**results["wire"], "nothing": {"p50_us": 1.0, "p99_us": 2.0}}}, file, document)
+    after = json.loads(file.read_text())
+    assert after["wire"]["nothing"] == {"p50_us": 1.0, "p99_us": 2.0}
+    assert {**after, "wire": 0} == {**before, "wire": 0}
+
+
+def test_the_exact_solver_is_found_exact(results: Mapping[str, Any]) -> None:
+    """On both cores and over all kinds of problems."""
+    found = results["accuracy"]["all"]
+    assert found["problems"] == 2 * 6 * (2 * 3 * 4 + 5 * 2 * 2)
+    assert found["error"] < accuracy.TARGET
+    assert (found["outside"], found["other_bits"], found["unproved"]) == (0, 0, 0)
+    for flight in solvers.flights():
+        assert results["solvers"][flight]["contestants"][OURS]["error"] < accuracy.TARGET
+
+
+def test_the_flights_are_what_they_are_called(results: Mapping[str, Any]) -> None:
+    """Never at a bound, and often."""
+    assert results["solvers"]["smooth"]["active"] == 0.0
+    assert record(solvers.flights()["saturated"], 1000).active() > 0.2
+
+
+@pytest.mark.parametrize("name", contestants(TUNINGS[0]).keys() - {NOTHING})
+def test_contestants_solve_the_same_problems(name: str) -> None:
+    """Whatever form they are given them in; at OSQP's own tolerance only roughly."""
+    recorded = record(solvers.flights()["saturated"], 20)
+    entry = solvers.Entry(contestants(TUNINGS[0])[name], recorded)
+    for i in range(20):
+        entry.tick(i)
+    assert entry.unsolved() == 0
+    exact = solvers.Entry(ExactSolver, recorded)
+    for i in range(20):
+        exact.tick(i)
+    np.testing.assert_allclose(entry.inputs(), exact.inputs(), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("tuning", TUNINGS[::8], ids=str)
+def test_every_form_of_osqp_is_the_same_problem(tuning: Any) -> None:
+    """Condensed by axis, jointly, and with states."""
+    recorded = record(solvers.flights()["smooth"], 5)
+    ours, theirs = (solvers.Entry(make, recorded) for make in (ExactSolver, tuning.make))
+    for i in range(5):
+        ours.tick(i)
+        theirs.tick(i)
+    np.testing.assert_allclose(theirs.inputs(), ours.inputs(), rtol=0, atol=1e-4)
+
+
+def test_what_is_not_installed_does_not_compete() -> None:
+    """Ours and OSQP always do."""
+    names = contestants(TUNINGS[0])
+    assert {OURS, TUNED} < names.keys()
+    assert ("PIQP" in names) == (find_spec("piqp") is not None)
+
+
+@pytest.mark.skipif(find_spec("quadprog") is None, reason="quadprog is not installed")
+def test_the_reference_is_the_same_whoever_finds_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """quadprog or scipy: what is proved is the one optimum."""
+    recorded = record(derive("paper-every-step", reference={"shape": "square", "period_s": 6.0}), 5)
+    reference = Reference(recorded.mpc.hessian[0], recorded.u_max[0])
+    gradient = recorded.gradient[0, 0, 0]
+    by_quadprog = reference.solve(gradient)
+    monkeypatch.setattr("benchmarks.reference.find_spec", lambda _: None)
+    np.testing.assert_allclose(reference.solve(gradient), by_quadprog, rtol=0, atol=1e-14)
+
+
+def test_contestants_take_turns_at_the_same_problems() -> None:
+    """Hot in a row, of which the first only warms up; paced one by one, each after a pause."""
+    done: list[tuple[str, int]] = []
+    contest = {name: lambda i, name=name: done.append((name, i)) for name in "ab"}
+    lateness = Lateness()
+    spent = interleave(contest, 3, PACED, lateness, "paced")
+    assert [i for _, i in done] == [0, 0, 1, 1, 2, 2]
+    assert {len(durations) for durations in spent.values()} == {3}
+    assert len(lateness.late_ns) == 6
+    done.clear()
+    spent = interleave(contest, 2 * HOT.turn, HOT, lateness, "hot")
+    assert len({name for name, _ in done[: HOT.turn]}) == 1
+    assert {len(durations) for durations in spent.values()} == {2 * (HOT.turn - 1)}
+
+
+def test_a_table_without_a_place_is_an_error() -> None:
+    """The document and the benchmarks have drifted apart."""
+    table = Table(["a", "b"], [["1", "2"]])
+    text = refresh("x\n<!-- table: one -->\nold\n<!-- end -->\ny\n", {"one": table})
+    assert (
+        text
+        == "x\n<!-- table: one -->\n\n| a | b |\n| --- | ---: |\n| 1 | 2 |\n\n<!-- end -->\ny\n"
+    )
+    with pytest.raises(ValueError, match="table two: got 0 places in the document, expected 1"):
+        refresh(text, {"two": table})
+
+
+def test_the_lock_file_carries_hashes_and_no_addresses() -> None:
+    """As the others do, and agrees with what the program itself is locked to."""
+    program, extra = (
+        [line for line in (ROOT / name).read_text().splitlines() if line and line[0].isalnum()]
+        for name in ("requirements.lock", "requirements-bench.lock")
+    )
+    assert set(program) <= set(extra)
+    text = (ROOT / "requirements-bench.lock").read_text()
+    assert text.count("--hash=sha256:") >= len(extra)
+    assert "://" not in text
