@@ -3,6 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.ready
+BENCH_STAMP := .venv/.ready-to-bench
 COMPILE := $(BIN)/pip-compile --quiet --strip-extras --generate-hashes --allow-unsafe --no-header \
 	--no-emit-index-url --no-emit-trusted-host --no-emit-find-links
 
@@ -37,14 +38,20 @@ format: setup  ## as `check` wants it
 docker-test: setup  ## the three containers, and what they survive; needs a Docker engine
 	$(BIN)/pytest -q -rs -m docker
 
-bench: setup  ## netem's accuracy beside the machine's own
-	$(BIN)/python benchmarks/netem.py
+bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew
+	$(BIN)/python -m benchmarks
+
+$(BENCH_STAMP): $(STAMP) requirements-bench.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-bench.lock
+	touch $@
 
 lock:  ## pin what pyproject.toml asks for
 	$(BIN)/pip install --quiet pip-tools
 	$(COMPILE) --upgrade --output-file requirements.lock pyproject.toml
 	$(COMPILE) --upgrade --extra dev --constraint requirements.lock \
 		--output-file requirements-dev.lock pyproject.toml
+	$(COMPILE) --upgrade --extra bench --constraint requirements.lock \
+		--output-file requirements-bench.lock pyproject.toml
 
 clean:
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

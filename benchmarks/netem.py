@@ -17,16 +17,14 @@ import gc
 import json
 import multiprocessing
 import os
-import platform
 import re
 import signal
 import socket
-import statistics
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from itertools import islice
@@ -37,11 +35,8 @@ from typing import Any
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
+from benchmarks.harness import CONSOLE, Table, machine, median, progress, quantile_ms, sleep_until
 from shared.config import DirectionConfig
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
 from shared.udp import kernel_drops, open_socket
@@ -89,6 +84,9 @@ class Options:
         return few and HEAD.size <= self.size <= 65_507
 
 
+FULL, QUICK = Options(), Options(runs=1, seconds=1)
+
+
 @dataclass(frozen=True)
 class Run:
     """What one run gave."""
@@ -115,6 +113,7 @@ class Run:
     wake_ms_p50: float
     """How late a process wakes that only sleeps,"""
     wake_ms_p99: float
+    wake_ms_max: float
     """in the same seconds."""
 
 
@@ -174,11 +173,6 @@ def sleep(pipe: Connection, options: Options) -> list[int]:
     return late_ns
 
 
-def sleep_until(due_ns: int) -> None:
-    """Wait for an absolute time; not at all if it has passed."""
-    time.sleep(max(0, due_ns - time.monotonic_ns()) / SECOND_NS)
-
-
 def open_blocking() -> socket.socket:
     """A socket on a free port, with large buffers, that waits."""
     sock = open_socket((HOST, 0))
@@ -186,7 +180,7 @@ def open_blocking() -> socket.socket:
     return sock
 
 
-def measure(options: Options, seed: int) -> Run:
+def measure_once(options: Options, seed: int) -> Run:
     """One run: netem, sender, receiver and sleeper, each a process; none outlives it."""
     with ExitStack() as stack:
         receiver = start(stack, receive, options)
@@ -225,6 +219,7 @@ def measure(options: Options, seed: int) -> Run:
         netem_waited=used_ns[1] / SECOND_NS / options.seconds,
         wake_ms_p50=quantile_ms(late_ns, 0.5),
         wake_ms_p99=quantile_ms(late_ns, 0.99),
+        wake_ms_max=quantile_ms(late_ns, 1.0),
     )
 
 
@@ -284,23 +279,28 @@ def first_missing(numbers: NDArray[np.int64]) -> int:
     return int(present.argmin())
 
 
-def quantile_ms(values_ns: Any, share: float) -> float:
-    """A quantile of durations [ms]; not a number without any."""
-    return float(np.quantile(values_ns, share)) / MILLISECOND_NS if len(values_ns) else float("nan")
+def measure(options: Options) -> dict[str, Any]:
+    """All runs, and the median of each figure over them."""
+    seeds = range(1, options.runs + 1)
+    runs = [measure_once(options, seed) for seed in progress(seeds, "netem")]
+    return {
+        "options": {**asdict(options), "json": str(options.json)},
+        "median": {name: median(getattr(run, name) for run in runs) for name in asdict(runs[0])},
+        "runs": [asdict(run) for run in runs],
+        "wake": {
+            "p50_ms": median(run.wake_ms_p50 for run in runs),
+            "p99_ms": median(run.wake_ms_p99 for run in runs),
+            "max_ms": max(run.wake_ms_max for run in runs),
+        },
+    }
 
 
-def show(runs: list[Run], options: Options, console: Console) -> None:
-    """A table with a line for every run, and whether the target is met."""
-    title = f"netem, {options.rate} packets/s of {options.size} B, times in ms"
-    losses = [f"Run {i}: {where(run)}." for i, run in enumerate(runs, start=1) if lost(run)]
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0)
-    table.caption, table.caption_justify = "\n".join(losses), "left"
-    for heading in ("run", "packets\nsent", "\nreceived", "\nlost", "error\np50", "\np99", "\nmax"):
-        table.add_column(heading, justify="right")
-    for heading in ("netem\nCPU", "\nwaited", "machine\np50", "\np99"):
-        table.add_column(heading, justify="right")
-    for number, run in enumerate(runs, start=1):
-        table.add_row(
+def tables(result: Mapping[str, Any]) -> dict[str, Table]:
+    """A line for every run."""
+    headings = ["run", "packets\nsent", "\nreceived", "\nlost", "error [ms]\np50", "\np99", "\nmax"]
+    headings += ["netem\nCPU", "\nwaited", "machine [ms]\np50", "\np99"]
+    rows = [
+        [
             str(number),
             str(run.sent),
             str(run.received),
@@ -312,13 +312,29 @@ def show(runs: list[Run], options: Options, console: Console) -> None:
             f"{run.netem_waited:.0%}",
             f"{run.wake_ms_p50:.2f}",
             f"{run.wake_ms_p99:.2f}",
-        )
-    console.print(table)
+        ]
+        for number, run in enumerate(runs_of(result), start=1)
+    ]
+    return {"netem": Table(headings, rows)}
+
+
+def runs_of(result: Mapping[str, Any]) -> list[Run]:
+    """The runs in the figures of `measure`."""
+    return [Run(**run) for run in result["runs"]]
+
+
+def show(result: Mapping[str, Any], options: Options) -> None:
+    """A table with a line for every run, and whether the target is met."""
+    runs = runs_of(result)
+    tables(result)["netem"].show(f"netem, {options.rate} packets/s of {options.size} B")
+    for number, run in enumerate(runs, start=1):
+        if lost(run):
+            CONSOLE.print(f"Run {number}: {where(run)}.")
     own = sum(lost(run) - run.dropped_after for run in runs)
-    p99_ms = median(runs, "error_ms_p99")
+    p99_ms, wake_ms = result["median"]["error_ms_p99"], result["median"]["wake_ms_p99"]
     met = own == 0 and p99_ms < TARGET_MS
-    console.print(
-        f"Median p99: {p99_ms:.2f} ms; the machine's own: {median(runs, 'wake_ms_p99'):.2f} ms. "
+    CONSOLE.print(
+        f"Median p99: {p99_ms:.2f} ms; the machine's own: {wake_ms:.2f} ms. "
         f"Lost by netem: {own}.\n"
         f"Target, under {TARGET_MS:g} ms and none lost: {'met' if met else 'missed'}."
     )
@@ -340,37 +356,25 @@ def where(run: Run) -> str:
     return ", ".join(f"{count} {place}" for place, count in places.items() if count)
 
 
-def median(runs: list[Run], name: str) -> float:
-    """Over the runs, of one figure."""
-    return float(statistics.median(getattr(run, name) for run in runs))
-
-
 def main() -> int:
     """Entry point; the exit code."""
-    options, console = tyro.cli(Options, description=__doc__), Console()
+    options = tyro.cli(Options, description=__doc__)
     if not options.is_bounded():
-        console.print("expected 1 to 100 runs, 1 to 60 s, up to 100000 packets/s of 16 to 65507 B")
+        CONSOLE.print("expected 1 to 100 runs, 1 to 60 s, up to 100000 packets/s of 16 to 65507 B")
         return 2
     try:
         if options.realtime:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        seeds = track(range(1, options.runs + 1), "measuring", console=console, transient=True)
-        runs = [measure(options, seed) for seed in seeds]
+        result = measure(options)
     except PermissionError:
-        console.print("--realtime: this user may not")
+        CONSOLE.print("--realtime: this user may not")
         return 2
     except (EOFError, OSError) as error:
-        console.print(f"netem, or a process of this benchmark, ended before its time: {error}")
+        CONSOLE.print(f"netem, or a process of this benchmark, ended before its time: {error}")
         return 1
-    show(runs, options, console)
+    show(result, options)
     if options.json is not None:
-        figures = {
-            "options": {**asdict(options), "json": str(options.json)},
-            "machine": {"cpus": os.cpu_count(), "python": platform.python_version()},
-            "median": {name: median(runs, name) for name in asdict(runs[0])},
-            "runs": [asdict(run) for run in runs],
-        }
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+        options.json.write_text(json.dumps({**result, "machine": machine()}, indent=2) + "\n")
     return 0
 
 

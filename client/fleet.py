@@ -7,7 +7,6 @@ from typing import Any
 from client.vehicle import Client
 from shared.endpoint import Datagram, Endpoint
 
-
 TOLD_MAX = 16
 """Vehicles that a report tells of one by one."""
 

@@ -4,7 +4,7 @@ What is not installed does not compete; nothing here asserts a time.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
@@ -15,9 +15,9 @@ import pytest
 
 from benchmarks import accuracy, netem, solvers, tick, wire
 from benchmarks.__main__ import DOCUMENT, ROOT, SECTIONS, write
-from benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, contestants
+from benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
 from benchmarks.harness import HOT, PACED, Lateness, Table, interleave, machine, refresh
-from benchmarks.problems import derive, record
+from benchmarks.problems import Recorded, record
 from benchmarks.reference import Reference
 from server.exact import ExactSolver
 
@@ -33,12 +33,25 @@ TINY = MappingProxyType(
 
 
 @pytest.fixture(scope="module")
-def results() -> dict[str, Any]:
+def results() -> Iterator[dict[str, Any]]:
     """Of every benchmark, as small as it goes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tick, "SETTLE", 2)
+        patch.setattr(solvers, "TUNINGS", TUNINGS[::8])
+        yield _results()
+
+
+def _results() -> dict[str, Any]:
     return {
         name: {"machine": machine(), **section.measure(TINY[name])}
         for name, section in SECTIONS.items()
     }
+
+
+@pytest.fixture(scope="module")
+def saturated() -> Recorded:
+    """A flight that often meets its bounds."""
+    return record(solvers.flights()["saturated"], 1000)
 
 
 def test_every_table_has_its_place_in_the_document(
@@ -70,31 +83,31 @@ def test_the_exact_solver_is_found_exact(results: Mapping[str, Any]) -> None:
         assert results["solvers"][flight]["contestants"][OURS]["error"] < accuracy.TARGET
 
 
-def test_the_flights_are_what_they_are_called(results: Mapping[str, Any]) -> None:
+def test_the_flights_are_what_they_are_called(
+    results: Mapping[str, Any], saturated: Recorded
+) -> None:
     """Never at a bound, and often."""
     assert results["solvers"]["smooth"]["active"] == 0.0
-    assert record(solvers.flights()["saturated"], 1000).active() > 0.2
+    assert saturated.active() > 0.2
 
 
 @pytest.mark.parametrize("name", contestants(TUNINGS[0]).keys() - {NOTHING})
-def test_contestants_solve_the_same_problems(name: str) -> None:
+def test_contestants_solve_the_same_problems(name: str, saturated: Recorded) -> None:
     """Whatever form they are given them in; at OSQP's own tolerance only roughly."""
-    recorded = record(solvers.flights()["saturated"], 20)
-    entry = solvers.Entry(contestants(TUNINGS[0])[name], recorded)
+    entry = solvers.Entry(contestants(TUNINGS[0])[name], saturated)
     for i in range(20):
         entry.tick(i)
     assert entry.unsolved() == 0
-    exact = solvers.Entry(ExactSolver, recorded)
+    exact = solvers.Entry(ExactSolver, saturated)
     for i in range(20):
         exact.tick(i)
     np.testing.assert_allclose(entry.inputs(), exact.inputs(), rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("tuning", TUNINGS[::8], ids=str)
-def test_every_form_of_osqp_is_the_same_problem(tuning: Any) -> None:
+def test_every_form_of_osqp_is_the_same_problem(tuning: Tuning, saturated: Recorded) -> None:
     """Condensed by axis, jointly, and with states."""
-    recorded = record(solvers.flights()["smooth"], 5)
-    ours, theirs = (solvers.Entry(make, recorded) for make in (ExactSolver, tuning.make))
+    ours, theirs = (solvers.Entry(make, saturated) for make in (ExactSolver, tuning.make))
     for i in range(5):
         ours.tick(i)
         theirs.tick(i)
@@ -109,14 +122,16 @@ def test_what_is_not_installed_does_not_compete() -> None:
 
 
 @pytest.mark.skipif(find_spec("quadprog") is None, reason="quadprog is not installed")
-def test_the_reference_is_the_same_whoever_finds_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reference_is_the_same_whoever_finds_it(
+    monkeypatch: pytest.MonkeyPatch, saturated: Recorded
+) -> None:
     """quadprog or scipy: what is proved is the one optimum."""
-    recorded = record(derive("paper-every-step", reference={"shape": "square", "period_s": 6.0}), 5)
-    reference = Reference(recorded.mpc.hessian[0], recorded.u_max[0])
-    gradient = recorded.gradient[0, 0, 0]
-    by_quadprog = reference.solve(gradient)
+    reference = Reference(saturated.mpc.hessian[0], saturated.u_max[0])
+    gradients = saturated.gradient[0, ::50, 0]
+    by_quadprog = [reference.solve(gradient) for gradient in gradients]
     monkeypatch.setattr("benchmarks.reference.find_spec", lambda _: None)
-    np.testing.assert_allclose(reference.solve(gradient), by_quadprog, rtol=0, atol=1e-14)
+    by_scipy = [reference.solve(gradient) for gradient in gradients]
+    np.testing.assert_allclose(by_scipy, by_quadprog, rtol=0, atol=1e-14)
 
 
 def test_contestants_take_turns_at_the_same_problems() -> None:
