@@ -194,7 +194,7 @@ class Server(Endpoint):
         session.observed_ns = observation.stamp_ns
         self._epoch_ns[row] = observation.stamp_ns - observation.step * self._dt_ns
         if self._due_ns is None:
-            self._due_ns = (now_ns // self._dt_ns + 1) * self._dt_ns
+            self._due_ns = -(-now_ns // self._dt_ns) * self._dt_ns  # the next of the grid, or now
 
     def _begin(self, observation: Observation, now_ns: int) -> Session:
         """The welcomed session of a first observation, now live."""

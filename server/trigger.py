@@ -1,4 +1,4 @@
-"""When a horizon is worth a packet: the event trigger (16), and sending always.
+"""When a horizon is worth a packet: the event trigger (16), sending always, sending periodically.
 
     V(k) = ‖x̂(k) - x_p(k|k-1)‖²_P
     S(k) = V(k_i) exp(-λ Δt (k - k_i)) + ε          k_i: the last event
@@ -100,6 +100,34 @@ class Paper:
         self._event_error[rows] = error
 
 
+class Periodic:
+    """A packet every so many steps, counted from the last one that was sent."""
+
+    def __init__(self, control: ControlConfig, capacity: int) -> None:
+        self._P = control.terminal_weight
+        self._period = control.period
+        self._sent_step = np.zeros(capacity, dtype=np.int64)
+
+    def test(
+        self, rows: Indices, step: Indices, estimate: Array, planned: Array, fresh: Flags
+    ) -> Verdict:
+        """See `Trigger`."""
+        self._sent_step[rows[fresh]] = step[fresh] - self._period  # due now, and until it is sent
+        error = planning_error(estimate, planned, self._P)
+        event = step - self._sent_step[rows] >= self._period
+        return Verdict(event, error, np.zeros(len(rows)))
+
+    def sent(self, rows: Indices, step: Indices, error: Array) -> None:  # noqa: ARG002
+        """See `Trigger`."""
+        self._sent_step[rows] = step
+
+
 def make_trigger(control: ControlConfig, capacity: int) -> Trigger:
     """The trigger that a scenario names."""
-    return Paper(control, capacity) if control.trigger == "paper" else Always(control)
+    match control.trigger:
+        case "paper":
+            return Paper(control, capacity)
+        case "always":
+            return Always(control)
+        case "periodic":
+            return Periodic(control, capacity)

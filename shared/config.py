@@ -59,8 +59,10 @@ class ControlConfig(Section, frozen=True):
     """Steps planned ahead, H."""
     scheme: Literal["paper", "none"] = "paper"
     """Delay compensation at both ends: eq. (11) and (13), or none."""
-    trigger: Literal["paper", "always"] = "paper"
-    """When a horizon is sent: eq. (16), or at every step."""
+    trigger: Literal["paper", "always", "periodic"] = "paper"
+    """When a horizon is sent: eq. (16), at every step, or every `period` steps."""
+    period: Annotated[int, Meta(ge=1, le=1_000_000)] = 10
+    """Steps from one horizon to the next of the periodic trigger."""
     solver: Literal["exact", "osqp"] = "exact"
     """What solves (9): Riccati active set, exact and fast, or OSQP, the reference."""
     epsilon: NonNegative = 3.6

@@ -1,10 +1,21 @@
-"""One scenario flown in virtual time: scenario + seed → World → record."""
+"""One scenario flown in virtual time: scenario + seed → World → record.
+
+**A run is the same in any company.** Runs of a batch share one server, which solves for all of them
+at once, and nothing else: each has a network, winds and clocks of its own, from its seed. Three
+things make their records equal, to the last bit, to those of the runs one by one. The server's
+ticks lie on the grid of its clock, whoever flies, and the phase that a seed draws is when its
+vehicles start. What the server computes delays what it sends, not what it hears, and it is woken
+after everybody else (`sim.world`). And what differs from run to run, vehicle and session number,
+takes as many bytes on the wire in any of them.
+"""
 
 import hashlib
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+import msgspec
 
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
@@ -12,7 +23,7 @@ from netem.proxy import Proxy
 from server.controller import Server
 from shared.chance import stream
 from shared.config import Scenario
-from shared.endpoint import SECOND_NS, seconds_to_ns
+from shared.endpoint import SECOND_NS, Address, seconds_to_ns
 from shared.record import (
     PACKET_COLUMNS,
     Recorder,
@@ -26,6 +37,11 @@ from sim.world import Clock, World
 
 MIDNIGHT_NS = 86_400 * SECOND_NS
 """What the server's clock shows at the start, about: no stamp may become negative."""
+BOOT_ID = 2**63 + 2**31
+"""Of every endpoint: as long on the wire as one drawn by chance, and so are its sessions' numbers."""
+SERVER: Address = ("server", 0)
+COMPANY_MAX = 100
+"""Runs that share a server. More would be no faster, and a vehicle's number takes one byte."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +53,7 @@ class Flight:
     netem: Rows
     failure: str | None = None
     figures: Mapping[str, Any] = field(default_factory=dict)
-    """Of the endpoints "server" and "netem" (see `Endpoint.figures`)."""
+    """Of the endpoints "server" and "netem" (see `Endpoint.figures`); in a batch, at its end."""
 
     def trace_hash(self) -> str:
         """Equal for two flights that went the same to the last bit."""
@@ -55,8 +71,8 @@ def fly(
 ) -> Flight:
     """Fly a scenario in virtual time.
 
-    The server's clock starts at a time of day given by the seed, so that its ticks fall anywhere
-    within the vehicle's steps, as they do in life.
+    The vehicles start at a phase of the server's grid given by the seed, so that its ticks fall
+    anywhere within their steps, as they do in life.
 
     Args:
         vehicles: how many, numbered from 1, all with the same plan and winds of their own.
@@ -64,50 +80,140 @@ def fly(
         on_second: called with the time flown [s], once a second of it.
         stopped: asked often; once it says so, the flight is broken off.
     """
-    axes, simulation = scenario.model.axes, scenario.simulation
-    sinks = [io.BytesIO() for _ in range(3)]
-    columns = (client_columns(axes), server_columns(axes), PACKET_COLUMNS)
-    recorders = [Recorder(column, sink) for column, sink in zip(columns, sinks, strict=True)]
+    (flight,) = _fly(scenario, (scenario.seed,), vehicles, stopwatch, on_second, stopped)
+    return flight
 
-    world = World()
-    phase_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
-    server = Server(scenario, boot_id=1, room=vehicles, recorder=recorders[1], stopwatch=stopwatch)
-    server_at = world.add(
-        *("server", server),
-        clock=Clock(offset_ns=MIDNIGHT_NS + phase_ns),
-        compute_ns=seconds_to_ns(simulation.compute_s),
-    )
-    netem = Proxy(scenario, server=server_at, flows=vehicles, recorder=recorders[2])
-    netem_at = world.add("netem", netem)
-    clients = []
-    for number in range(1, vehicles + 1):
-        client = Client(
+
+def fly_batch(
+    scenario: Scenario,
+    seeds: Sequence[int],
+    *,
+    on_second: Callable[[int], None] = lambda _: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> list[Flight]:
+    """Fly a scenario once for each of these seeds, many times faster than one by one.
+
+    Each flight is the one that `fly` makes of the scenario with that seed, to the last bit, but for
+    `figures`. Where the server takes longer than a step and so sleeps through some (which ones, is a
+    matter of when it began), runs are flown one by one.
+
+    Args:
+        seeds: no two alike; they take the place of the scenario's.
+        on_second, stopped: see `fly`; the time begins anew every COMPANY_MAX runs.
+    """
+    in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
+    company = COMPANY_MAX if in_time else 1
+    groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
+    return [
+        flight for group in groups for flight in _fly(scenario, group, 1, None, on_second, stopped)
+    ]
+
+
+class Run:
+    """The vehicles of one seed and their network, in a world with others.
+
+    Args:
+        number: from 0; its vehicles' numbers follow those of the runs before.
+    """
+
+    def __init__(
+        self, world: World, scenario: Scenario, server: Server, number: int, vehicles: int
+    ) -> None:
+        self._server = server
+        self._before = number * vehicles
+        self._sinks = io.BytesIO(), io.BytesIO()
+        recorder = Recorder(client_columns(scenario.model.axes), self._sinks[0])
+        self.netem = Proxy(
             scenario,
-            FirstOrderPlant(scenario, stream(scenario.seed, "wind", number)),
-            server=netem_at,
-            vehicle=number,
-            boot_id=1,
-            recorder=recorders[0],
+            server=SERVER,
+            flows=vehicles,
+            recorder=Recorder(PACKET_COLUMNS, self._sinks[1]),
         )
-        offset_ns = MIDNIGHT_NS + seconds_to_ns(simulation.clock_offset_s)
-        drift_ppb = round(simulation.clock_drift_ppm * 1000)
-        world.add(f"client {number}", client, clock=Clock(offset_ns, drift_ppb))
-        clients.append(client)
+        netem_at = world.add(f"netem {scenario.seed}", self.netem)
+        simulation = scenario.simulation
+        clock = Clock(
+            MIDNIGHT_NS + seconds_to_ns(simulation.clock_offset_s),
+            round(simulation.clock_drift_ppm * 1000),
+        )
+        start_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
+        self._clients = [
+            Client(
+                scenario,
+                FirstOrderPlant(scenario, stream(scenario.seed, "wind", vehicle)),
+                server=netem_at,
+                vehicle=self._before + vehicle,
+                boot_id=BOOT_ID,
+                recorder=recorder,
+            )
+            for vehicle in range(1, vehicles + 1)
+        ]
+        for client in self._clients:
+            name = f"client {client.vehicle}"
+            on_finished = self._one_has_finished
+            world.add(name, client, clock=clock, start_ns=start_ns, on_finished=on_finished)
+        self.flying = vehicles
+        self._ends: tuple[int | None, int | None] = None, None
+        """Rows of the server and bytes of netem by the time the last vehicle had finished."""
 
-    flown_s, flying = 0, clients.copy()
+    def _one_has_finished(self) -> None:
+        self.flying -= 1
+        if not self.flying:
+            self._ends = self._server.counts["steps"], self._sinks[1].tell()
+
+    def flight(self, server_rows: Rows) -> Flight:
+        """Its record, as if it had been alone.
+
+        Args:
+            server_rows: of all runs.
+        """
+        rows_end, bytes_end = self._ends
+        client = parse(self._sinks[0].getvalue()).copy()
+        netem = parse(self._sinks[1].getvalue()[:bytes_end])
+        server = server_rows[:rows_end]
+        last = self._before + len(self._clients)
+        server = server[(server["vehicle"] > self._before) & (server["vehicle"] <= last)]
+        for rows in (client, server):
+            rows["vehicle"] -= self._before
+        failure = next((client.failure for client in self._clients if client.failure), None)
+        figures = {"server": self._server.figures(), "netem": self.netem.figures()}
+        return Flight(client, server, netem, failure, figures)
+
+
+def _fly(
+    scenario: Scenario,
+    seeds: Sequence[int],
+    vehicles: int,
+    stopwatch: Stopwatch | None,
+    on_second: Callable[[int], None],
+    stopped: Callable[[], bool],
+) -> list[Flight]:
+    world, sink = World(), io.BytesIO()
+    server = Server(
+        scenario,
+        boot_id=BOOT_ID,
+        room=len(seeds) * vehicles,
+        recorder=Recorder(server_columns(scenario.model.axes), sink),
+        stopwatch=stopwatch,
+    )
+    runs = [
+        Run(world, msgspec.structs.replace(scenario, seed=seed), server, number, vehicles)
+        for number, seed in enumerate(seeds)
+    ]
+    # Added last, it is woken last: it has heard all there is to hear at that instant.
+    compute_ns = seconds_to_ns(scenario.simulation.compute_s)
+    world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
+    flown_s, flying = 0, runs.copy()
 
     def over() -> bool:
         nonlocal flown_s
         if world.now_ns // SECOND_NS != flown_s:
             flown_s = world.now_ns // SECOND_NS
             on_second(flown_s)
-        while flying and flying[-1].finished:
+        while flying and not flying[-1].flying:
             flying.pop()
         return not flying or stopped()
 
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
     world.run(over, limit_ns=seconds_to_ns(longest_s))
-    failure = next((client.failure for client in clients if client.failure), None)
-    client_rows, server_rows, netem_rows = (parse(sink.getvalue()) for sink in sinks)
-    figures = {"server": server.figures(), "netem": netem.figures()}
-    return Flight(client_rows, server_rows, netem_rows, failure, figures)
+    server_rows = parse(sink.getvalue())
+    return [run.flight(server_rows) for run in runs]

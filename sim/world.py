@@ -2,8 +2,10 @@
 
 Between endpoints a datagram takes no time (delays are netem's business, and netem is an endpoint
 here as well). Every host has a clock of its own, with offset and drift, and may take time to
-compute: it then hears nothing and sends nothing until it is done. Time is integer nanoseconds, so
-the same inputs give the same events in the same order, everywhere.
+compute when it is woken: what it then sends leaves, and it can be woken again, only once it is
+done. It hears all along, so that what one host costs another delays nobody who only talks to it.
+Time is integer nanoseconds, and whatever happens at one instant happens in a fixed order: the same
+inputs give the same events everywhere, and hosts that never meet do not change each other's.
 """
 
 from collections.abc import Callable
@@ -40,13 +42,16 @@ class Host:
     name: str
     endpoint: Endpoint
     clock: Clock
+    turn: int
+    """At one instant hosts are woken in the order in which they were added, from 1."""
     compute_ns: int
-    busy_until_ns: int = 0
+    busy_until_ns: int
+    on_finished: Callable[[], None] | None
     armed_ns: int | None = None
 
 
-ARRIVAL, WAKE = 0, 1
-"""At one instant, what has arrived is heard before anybody acts on the time."""
+ARRIVAL = 0
+"""Turn of a datagram: what has arrived is heard before anybody acts on the time."""
 
 
 class World:
@@ -56,21 +61,33 @@ class World:
         self.now_ns = 0
         self._hosts: dict[str, Host] = {}
         self._events: list[tuple[int, int, int, Host, Datagram | None]] = []
-        """Time, ARRIVAL or WAKE, order of entry; to whom, and what arrives."""
+        """Time, turn, order of entry; to whom, and what arrives."""
         self._scheduled = 0
 
     def add(
-        self, name: str, endpoint: Endpoint, *, clock: Clock = Clock(), compute_ns: int = 0
+        self,
+        name: str,
+        endpoint: Endpoint,
+        *,
+        clock: Clock = Clock(),
+        start_ns: int = 0,
+        compute_ns: int = 0,
+        on_finished: Callable[[], None] | None = None,
     ) -> Address:
-        """A new host.
+        """A new host, called like no other.
 
         Args:
+            start_ns: it is not woken before this time of the world.
             compute_ns: how long it works whenever it is woken.
+            on_finished: called once, when the endpoint has just finished.
 
         Returns:
             its address.
         """
-        host = self._hosts[name] = Host(name, endpoint, clock, compute_ns)
+        assert name not in self._hosts
+        turn = len(self._hosts) + 1
+        host = Host(name, endpoint, clock, turn, compute_ns, start_ns, on_finished)
+        self._hosts[name] = host
         self._arm(host)
         return (name, 0)
 
@@ -86,9 +103,9 @@ class World:
             else:
                 self._receive(host, datagram)
 
-    def _at(self, time_ns: int, order: int, host: Host, datagram: Datagram | None) -> None:
+    def _at(self, time_ns: int, turn: int, host: Host, datagram: Datagram | None) -> None:
         self._scheduled += 1
-        heappush(self._events, (time_ns, order, self._scheduled, host, datagram))
+        heappush(self._events, (time_ns, turn, self._scheduled, host, datagram))
 
     def _arm(self, host: Host) -> None:
         due_ns = host.endpoint.next_wake_ns()
@@ -98,7 +115,7 @@ class World:
         time_ns = max(self.now_ns, host.busy_until_ns, host.clock.world(due_ns))
         if time_ns != host.armed_ns:
             host.armed_ns = time_ns
-            self._at(time_ns, WAKE, host, None)
+            self._at(time_ns, host.turn, host, None)
 
     def _wake(self, host: Host) -> None:
         if host.armed_ns != self.now_ns:
@@ -106,21 +123,20 @@ class World:
         host.armed_ns = None
         host.endpoint.wake(now_ns=host.clock.local(self.now_ns))
         host.busy_until_ns = self.now_ns + host.compute_ns
-        self._after(host)
+        self._after(host, host.busy_until_ns)
 
     def _receive(self, host: Host, datagram: Datagram) -> None:
-        if self.now_ns < host.busy_until_ns:
-            self._at(host.busy_until_ns, ARRIVAL, host, datagram)
-            return
         host.endpoint.receive(datagram, now_ns=host.clock.local(self.now_ns))
-        self._after(host)
+        self._after(host, self.now_ns)
 
-    def _after(self, host: Host) -> None:
-        """Its datagrams leave once it is done computing; then it waits again."""
-        leaves_ns = max(self.now_ns, host.busy_until_ns)
+    def _after(self, host: Host, leaves_ns: int) -> None:
+        """Its datagrams leave; then it waits again."""
         for payload, (name, socket), source in host.endpoint.outbox():
             receiver = self._hosts.get(name)
             if receiver is not None:
                 arrived = Datagram(payload, (host.name, source), socket)
                 self._at(leaves_ns, ARRIVAL, receiver, arrived)
         self._arm(host)
+        if host.on_finished is not None and host.endpoint.finished:
+            host.on_finished()
+            host.on_finished = None

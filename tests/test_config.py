@@ -93,6 +93,11 @@ WRONG = {
         'control.scheme = "papr"',
         "control.scheme: got 'papr', expected 'paper' or 'none'",
     ),
+    "a trigger nobody knows": (
+        'control.trigger = "often"',
+        "control.trigger: got 'often', expected 'paper' or 'always' or 'periodic'",
+    ),
+    "no period": ("control.period = 0", "control.period: got 0, expected a whole number >= 1"),
     "a shape that is none": (
         'reference.shape = "ring"',
         (

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.trigger import Always, Paper, Verdict, make_trigger
+from server.trigger import Always, Paper, Periodic, Trigger, Verdict, make_trigger
 from shared.config import ControlConfig
 from shared.model import Array
 
@@ -25,7 +25,7 @@ def off_by(error: float) -> Array:
     return estimate
 
 
-def ask(trigger: Paper, step: int, estimate: Array, *, fresh: bool = False) -> Verdict:
+def ask(trigger: Trigger, step: int, estimate: Array, *, fresh: bool = False) -> Verdict:
     """The verdict on one vehicle."""
     return trigger.test(ROW, np.array([step]), estimate, PLANNED, np.array([fresh]))
 
@@ -149,10 +149,54 @@ def test_always_sends_even_without_an_error() -> None:
         trigger.sent(ROW, np.array([step]), verdict.error)
 
 
+def events(trigger: Trigger, first: int, last: int, *, unsent: tuple[int, ...] = ()) -> list[int]:
+    """The steps at which it wants to send; it does, but for those in `unsent`."""
+    wanted = []
+    for step in range(first, last + 1):
+        verdict = ask(trigger, step, off_by(100.0), fresh=step == first)
+        if verdict.event[0]:
+            wanted.append(step)
+            if step not in unsent:
+                trigger.sent(ROW, np.array([step]), verdict.error)
+    return wanted
+
+
+def test_periodic_sends_at_the_first_step_and_every_so_many_after() -> None:
+    """Whatever the error; period 1 is every step."""
+    assert events(Periodic(ControlConfig(period=4), 1), 3, 16) == [3, 7, 11, 15]
+    assert events(Periodic(ControlConfig(period=1), 1), 0, 4) == [0, 1, 2, 3, 4]
+    verdict = ask(Periodic(CONTROL, 1), 0, off_by(2.0), fresh=True)
+    assert (verdict.error, verdict.threshold) == (pytest.approx([2.0]), [0.0])
+
+
+def test_periodic_counts_from_what_was_sent() -> None:
+    """A horizon that was not solved for is due until one is; so is a first one."""
+    assert events(Periodic(ControlConfig(period=4), 1), 0, 13, unsent=(4, 5)) == [0, 4, 5, 6, 10]
+    assert events(Periodic(ControlConfig(period=4), 1), 0, 8, unsent=(0, 1)) == [0, 1, 2, 6]
+
+
+def test_periodic_begins_anew_with_a_new_life() -> None:
+    """Step 0 owes nothing to step 5000 of before."""
+    trigger = Periodic(ControlConfig(period=4), 1)
+    assert events(trigger, 5000, 5001) == [5000]
+    assert events(trigger, 0, 5) == [0, 4]
+
+
+def test_periodic_counts_for_each_vehicle_by_itself() -> None:
+    """Two vehicles, last sent to at steps 3 and 5, both at step 7."""
+    trigger = Periodic(ControlConfig(period=4), 6)
+    rows, step = np.array([5, 2]), np.array([7, 7])
+    trigger.sent(rows, np.array([3, 5]), np.zeros(2))
+    both = np.repeat(PLANNED, 2, axis=0)
+    verdict = trigger.test(rows, step, both, both, np.array([False, False]))
+    assert verdict.event.tolist() == [True, False]
+
+
 def test_scenario_names_its_trigger() -> None:
-    """`paper` is eq. (16), `always` is always."""
+    """`paper` is eq. (16), `always` is always, `periodic` is now and then."""
     assert isinstance(make_trigger(ControlConfig(trigger="paper"), 1), Paper)
     assert isinstance(make_trigger(ControlConfig(trigger="always"), 1), Always)
+    assert isinstance(make_trigger(ControlConfig(trigger="periodic"), 1), Periodic)
 
 
 @quick

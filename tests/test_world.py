@@ -109,15 +109,15 @@ def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
     assert later.log[0] == ("wake", 50)
 
 
-def test_a_computing_host_sends_late_and_hears_late() -> None:
-    """It is busy for 30 ns after its wake at 50: its word leaves at 80, and it listens from 80."""
+def test_a_computing_host_sends_late_and_hears_at_once() -> None:
+    """It is busy for 30 ns after its wake at 50: its word leaves at 80, but it heard one at 60."""
     world, busy, other = World(), Probe([50]), Probe([60])
     busy_address = world.add("busy", busy, compute_ns=30)
     other_address = world.add("other", other)
     busy.answer_to, other.answer_to = other_address, busy_address
     world.run(never, limit_ns=SECOND_NS)
     assert other.log == [("wake", 60), ("hi from busy 2", 80)]
-    assert busy.log == [("wake", 50), ("hi from other 2", 80)]
+    assert busy.log == [("wake", 50), ("hi from other 2", 60)]
 
 
 def test_a_wake_during_computing_comes_late() -> None:
@@ -126,6 +126,42 @@ def test_a_wake_during_computing_comes_late() -> None:
     world.add("busy", busy, compute_ns=30)
     world.run(never, limit_ns=SECOND_NS)
     assert busy.log == [("wake", 50), ("wake", 80)]
+
+
+def test_at_one_instant_hosts_are_woken_in_the_order_they_were_added() -> None:
+    """Not in the order in which they came to want it, which depends on who else is there."""
+    world, first, second = World(), Probe([70, 90]), Probe([90])
+    there = world.add("there", Probe([]))
+    for name, probe in (("first", first), ("second", second)):
+        probe.answer_to = there
+        world.add(name, probe)
+    woken: list[int] = []
+    world.run(lambda: bool(woken.append(len(first.log) - len(second.log))), limit_ns=SECOND_NS)
+    # `second` has wanted to be woken at 90 all along, `first` only since 70.
+    assert max(woken) == 2
+
+
+def test_a_host_is_not_woken_before_its_start() -> None:
+    """However long it has been wanting it."""
+    world, probe = World(), Probe([0])
+    world.add("host", probe, clock=Clock(offset_ns=1000), start_ns=40)
+    world.run(never, limit_ns=SECOND_NS)
+    assert probe.log == [("wake", 1040)]
+
+
+def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
+    """After the wake with which it finished, before anything else happens."""
+
+    class Finite(Probe):
+        @property
+        def finished(self) -> bool:
+            """After the second of three wakes."""
+            return len(self.wakes_ns) < 2
+
+    world, probe, told_ns = World(), Finite([50, 60, 70]), []
+    world.add("host", probe, on_finished=lambda: told_ns.append(world.now_ns))
+    world.run(never, limit_ns=SECOND_NS)
+    assert told_ns == [60]
 
 
 @pytest.mark.parametrize("limit_ns", [49, 50])

@@ -1,0 +1,178 @@
+"""Runs that share a server: each is, to the last bit, what it would be alone."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from shared import chance, config
+from shared.config import Scenario
+from shared.endpoint import MILLISECOND_NS
+from shared.protocol import Heartbeat, encode
+from sim import flight
+from sim.flight import BOOT_ID, COMPANY_MAX, Flight, fly, fly_batch
+
+
+def scenario(**changes: Any) -> Scenario:
+    """The paper's for two seconds, with some keys changed."""
+    table = config.to_table(config.load("paper")) | {"duration": 2.0, "settle": 0.0}
+    for key, value in changes.items():
+        table[key] = table[key] | value if isinstance(value, dict) else value
+    return config.check(table, "test")
+
+
+def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Flight]:
+    """Every part of every run's record; the runs."""
+    flights = fly_batch(flown, seeds)
+    assert len(flights) == len(seeds)
+    for seed, together in zip(seeds, flights, strict=True):
+        alone = fly(replace(flown, seed=seed))
+        for part in ("client", "server", "netem"):
+            np.testing.assert_array_equal(getattr(together, part), getattr(alone, part), part)
+        assert together.trace_hash() == alone.trace_hash()
+        assert together.failure == alone.failure
+    return flights
+
+
+directions = st.fixed_dictionaries(
+    {
+        "delay": st.sampled_from(["paper", "constant", "none"]),
+        "minimum_s": st.sampled_from([0.0, 0.05, 0.1, 0.4]),
+        "loss": st.sampled_from([0.0, 0.1, 0.5]),
+    }
+)
+
+scenarios = st.fixed_dictionaries(
+    {
+        "control": st.fixed_dictionaries(
+            {
+                "dt": st.sampled_from([0.05, 0.03]),
+                "scheme": st.sampled_from(["paper", "none"]),
+                "trigger": st.sampled_from(["paper", "always", "periodic"]),
+                "epsilon": st.sampled_from([0.01, 0.5]),
+                "solver": st.sampled_from(["exact", "exact", "exact", "osqp"]),
+            }
+        ),
+        "model": st.fixed_dictionaries({"axes": st.sampled_from([2, 3])}),
+        "vehicle": st.fixed_dictionaries(
+            {"wind": st.sampled_from([0.0, 0.3]), "gust_mps2": st.sampled_from([0.0, 0.5])}
+        ),
+        "network": st.fixed_dictionaries({"uplink": directions, "downlink": directions}),
+        "link": st.just({"heartbeat_s": 0.2, "timeout_s": 0.5}),
+        "simulation": st.fixed_dictionaries(
+            {
+                "compute_s": st.sampled_from([0.0, 0.001, 0.01, 0.03, 0.08]),
+                "clock_offset_s": st.sampled_from([0.0, -3600.0]),
+                "clock_drift_ppm": st.sampled_from([0.0, 200.0, -1000.0]),
+            }
+        ),
+    }
+)
+companies = st.lists(st.integers(0, 2**32 - 1), min_size=2, max_size=4, unique=True)
+phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, max_size=4)
+"""None leaves them to the seeds; the others make everything fall on the same instants."""
+
+
+@settings(max_examples=25, deadline=None)
+@given(scenarios, companies, phases_ms)
+def test_a_run_is_the_same_in_any_company(
+    changes: dict[str, Any], seeds: list[int], phases: list[int] | None
+) -> None:
+    """Whatever flies, whoever else flies, also where all that happens happens at once."""
+    with pytest.MonkeyPatch.context() as patch:
+        if phases:
+            given_ns = {
+                seed: phase * MILLISECOND_NS for seed, phase in zip(seeds, phases, strict=False)
+            }
+            patch.setattr(flight, "stream", lambda seed, *names: Drawn.of(given_ns, seed, *names))
+        assert_as_alone(scenario(**changes), seeds)
+
+
+class Drawn:
+    """A phase that is given, in place of chance."""
+
+    def __init__(self, phase_ns: int) -> None:
+        self._phase_ns = phase_ns
+
+    def integers(self, _: int) -> int:
+        """The phase."""
+        return self._phase_ns
+
+    @classmethod
+    def of(cls, given_ns: dict[int, int], seed: int, *names: str | int) -> Any:
+        """The stream of these names, but for the phase."""
+        return cls(given_ns[seed]) if names == ("phase",) else chance.stream(seed, *names)
+
+
+def test_runs_are_the_same_in_another_order_and_in_larger_company() -> None:
+    """Five seeds, then those and three more, backwards."""
+    flown = scenario(vehicle={"wind": 0.3})
+    few = fly_batch(flown, range(3, 8))
+    many = fly_batch(flown, range(9, 1, -1))
+    assert [run.trace_hash() for run in few] == [run.trace_hash() for run in many[2:7]][::-1]
+    assert len({run.trace_hash() for run in many}) == 8
+
+
+def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:
+    """Half a minute unheard: alone, the server stops ticking; in company it ticks on."""
+    rare = {"downlink": {"delay": "none", "loss": 0.93}, "uplink": {"delay": "none", "loss": 0.0}}
+    flown = scenario(
+        duration=240.0, control={"dt": 1.0, "horizon": 3}, network=rare, link={"connect_s": 60.0}
+    )
+    flights = assert_as_alone(flown, range(4))
+    assert flights[0].figures["server"]["counts"]["dropped: unknown session"] > 0
+
+
+def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
+    """Five packets in six are lost: some give up, at different times, and some fly."""
+    deaf = {"uplink": {"loss": 0.85}, "downlink": {"loss": 0.5}}
+    flights = assert_as_alone(scenario(network=deaf, link={"connect_s": 5.0}), range(6))
+    failed = [run.failure for run in flights]
+    assert 0 < failed.count(None) < 6
+    assert {len(run.client) for run in flights if run.failure} == {0}
+
+
+def test_a_flight_longer_than_a_table_of_the_reference_is_as_alone() -> None:
+    """The table is filled anew for whoever comes first: 4096 steps and some."""
+    quiet = {"delay": "constant", "minimum_s": 0.0, "loss": 0.0}
+    flown = scenario(
+        duration=4.3,
+        control={"dt": 0.001, "horizon": 2},
+        network={"uplink": quiet, "downlink": quiet},
+        simulation={"compute_s": 0.0},
+    )
+    assert_as_alone(flown, (1, 2))
+
+
+def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
+    """Or the bytes sent would tell a run's company."""
+    sizes = {
+        len(encode(Heartbeat(vehicle, (BOOT_ID + opened) % 2**32, 86_400 * 10**9)))
+        for vehicle in (1, COMPANY_MAX)
+        for opened in (1, 100, 200, 100_000)
+    }
+    assert len(sizes) == 1
+
+
+def test_more_runs_than_share_a_server_are_flown_in_turn() -> None:
+    """The last of 101 is as good as the first."""
+    flown = scenario(duration=0.2)
+    flights = fly_batch(flown, range(COMPANY_MAX + 1))
+    assert len(flights) == COMPANY_MAX + 1
+    assert flights[-1].trace_hash() == fly(replace(flown, seed=COMPANY_MAX)).trace_hash()
+    assert fly_batch(flown, ()) == []
+
+
+def test_a_batch_can_be_broken_off() -> None:
+    """It tells the time, and asks whether to go on; what was flown is there."""
+    seconds: list[int] = []
+    flown = scenario(duration=60.0)
+    runs = fly_batch(
+        flown, range(3), on_second=seconds.append, stopped=lambda: len(seconds) >= 4
+    )
+    assert seconds == [1, 2, 3, 4]
+    assert 0 < max(len(run.client) for run in runs) < 80
