@@ -162,11 +162,9 @@ def _share(
     waiting = iter(tasks)
     under_way: set[Future[tuple[Done, float]]] = set()
     while True:
-        # A worker that is started by this must not hear Ctrl-C, not even before it can say so.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        for task in islice(waiting, UNDER_WAY_MAX - len(under_way)):
-            under_way.add(executor.submit(work, task))
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        with _deaf():
+            for task in islice(waiting, UNDER_WAY_MAX - len(under_way)):
+                under_way.add(executor.submit(work, task))
         if not under_way:
             return True
         ready, under_way = wait(under_way, POLL_S, FIRST_COMPLETED)
@@ -174,6 +172,16 @@ def _share(
             on_done(*future.result())
         if stopped():
             return False
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """A worker that is started within it never hears Ctrl-C, which is for the command alone."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def work(task: Task) -> tuple[Done, float]:
