@@ -1,12 +1,15 @@
-"""Pictures of flights."""
+"""Pictures of flights and of sweeps."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from lab.sweep import Axis
 from shared.command import CommandError
 from shared.config import Scenario
+from shared.model import Array
 from shared.record import Rows
 from shared.summary import position_error
 from sim.flight import Flight
@@ -96,3 +99,89 @@ def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
         axes.grid(alpha=0.3)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=130)
+
+
+UNITS = {"s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "ppm": "ppm"}
+"""Of a key, by what comes last in its name,"""
+OTHER_UNITS = {
+    "duration": "s",
+    "settle": "s",
+    "control.dt": "s",
+    "control.horizon": "steps",
+    "control.period": "steps",
+    "control.decay_rate": "1/s",
+    "model.u_max": "m/s",
+    "vehicle.wind": "m/s² per √s",
+}
+"""and of those that do not name it."""
+
+
+def label(key: str) -> str:
+    """A key of the scenario, with its unit where it has one."""
+    unit = OTHER_UNITS.get(key) or ("_" in key and UNITS.get(key.rsplit("_", 1)[1]))
+    return f"{key} [{unit}]" if unit else key
+
+
+def curve(path: Path, title: str, axis: Axis, name: str, *, means: Array, halves: Array) -> None:
+    """Draw what a sweep over one key gave.
+
+    Args:
+        path: of a file in one of FORMATS.
+        name: of what was measured, with its unit.
+        means: one each value, NaN for none; shape (values,).
+        halves: of their intervals; likewise.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    plane = figure.subplots()
+    places = _places(axis)
+    if _is_scale(axis):
+        plane.plot(places, means, "k.-")
+        plane.fill_between(places, means - halves, means + halves, color="0.8", label="95 %")
+    else:
+        plane.errorbar(places, means, halves, fmt="ko", capsize=4, label="95 %")
+        plane.set_xticks(places, list(map(str, axis.values)))
+        plane.margins(x=0.2)
+    plane.set_xlabel(label(axis.key))
+    plane.set_ylabel(name)
+    plane.legend(fontsize=8)
+    plane.grid(alpha=0.3)
+    plane.set_title(title, fontsize=10)
+    figure.savefig(path, dpi=130)
+
+
+def heat_map(path: Path, title: str, axes: tuple[Axis, Axis], name: str, *, means: Array) -> None:
+    """Draw what a sweep over two keys gave.
+
+    Args:
+        path: of a file in one of FORMATS.
+        axes: across and up.
+        name: of what was measured, with its unit.
+        means: NaN for none; shape (values of the first, values of the second).
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 5.0), layout="constrained")
+    plane = figure.subplots()
+    across, up = axes
+    mesh = plane.pcolormesh(_places(across), _places(up), means.T, shading="nearest")
+    for axis, set_ticks in ((across, plane.set_xticks), (up, plane.set_yticks)):
+        if not _is_scale(axis):
+            set_ticks(_places(axis), list(map(str, axis.values)))
+    plane.set_xlabel(label(across.key))
+    plane.set_ylabel(label(up.key))
+    figure.colorbar(mesh, label=name)
+    plane.set_title(title, fontsize=10)
+    figure.savefig(path, dpi=130)
+
+
+def _is_scale(axis: Axis) -> bool:
+    """Whether its values are numbers that rise, and not names."""
+    numbers = all(type(value) in (int, float) for value in axis.values)
+    return numbers and all(low < high for low, high in pairwise(axis.values))
+
+
+def _places(axis: Axis) -> Array:
+    """Where its values lie in a picture; shape (values,)."""
+    return np.array(axis.values if _is_scale(axis) else range(len(axis.values)), dtype=np.float64)

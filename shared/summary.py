@@ -66,7 +66,8 @@ def summarise(
         netem: rows of netem; all flows count.
     """
     error = position_error(scenario, client)
-    squares = (error[client["step"] * scenario.control.dt >= scenario.settle] ** 2).mean(axis=0)
+    settled = error[client["step"] * scenario.control.dt >= scenario.settle]
+    squares = (settled**2).mean(axis=0) if len(settled) else np.array([np.nan])
     rmse = [float(value) for value in np.sqrt(squares)] if np.isfinite(squares).all() else []
     age_ms = client["age_ns"][client["age_ns"] >= 0] / 1e6
     stale, missed = _last(client, "stale"), _last(client, "missed")
@@ -79,7 +80,7 @@ def summarise(
     return Summary(
         scenario=name,
         seed=scenario.seed,
-        duration_s=(_last(client, "step") + 1) * scenario.control.dt,
+        duration_s=(_last(client, "step") + 1) * scenario.control.dt if len(client) else 0.0,
         steps=len(client),
         rmse_x=rmse[0] if rmse else None,
         rmse_y=rmse[1] if rmse else None,

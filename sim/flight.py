@@ -38,7 +38,7 @@ from sim.world import Clock, World
 MIDNIGHT_NS = 86_400 * SECOND_NS
 """What the server's clock shows at the start, about: no stamp may become negative."""
 BOOT_ID = 2**63 + 2**31
-"""Of every endpoint: as long on the wire as one drawn by chance, and so are its sessions' numbers."""
+"""Of every endpoint: as long on the wire as a random one, and so are the sessions' numbers."""
 SERVER: Address = ("server", 0)
 COMPANY_MAX = 100
 """Runs that share a server. More would be no faster, and a vehicle's number takes one byte."""
@@ -80,7 +80,7 @@ def fly(
         on_second: called with the time flown [s], once a second of it.
         stopped: asked often; once it says so, the flight is broken off.
     """
-    (flight,) = _fly(scenario, (scenario.seed,), vehicles, stopwatch, on_second, stopped)
+    (flight,) = _fly(scenario, (scenario.seed,), on_second, stopped, vehicles, stopwatch)
     return flight
 
 
@@ -94,8 +94,8 @@ def fly_batch(
     """Fly a scenario once for each of these seeds, many times faster than one by one.
 
     Each flight is the one that `fly` makes of the scenario with that seed, to the last bit, but for
-    `figures`. Where the server takes longer than a step and so sleeps through some (which ones, is a
-    matter of when it began), runs are flown one by one.
+    `figures`. Where the server takes longer than a step and so sleeps through some (which ones
+    depends on when it began), runs are flown one by one.
 
     Args:
         seeds: no two alike; they take the place of the scenario's.
@@ -104,9 +104,7 @@ def fly_batch(
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
     company = COMPANY_MAX if in_time else 1
     groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
-    return [
-        flight for group in groups for flight in _fly(scenario, group, 1, None, on_second, stopped)
-    ]
+    return [flight for group in groups for flight in _fly(scenario, group, on_second, stopped)]
 
 
 class Run:
@@ -179,13 +177,13 @@ class Run:
         return Flight(client, server, netem, failure, figures)
 
 
-def _fly(
+def _fly(  # noqa: PLR0917
     scenario: Scenario,
     seeds: Sequence[int],
-    vehicles: int,
-    stopwatch: Stopwatch | None,
     on_second: Callable[[int], None],
     stopped: Callable[[], bool],
+    vehicles: int = 1,
+    stopwatch: Stopwatch | None = None,
 ) -> list[Flight]:
     world, sink = World(), io.BytesIO()
     server = Server(

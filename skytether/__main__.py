@@ -11,6 +11,7 @@ import server.__main__
 from shared import command, config
 from skytether.fleet import fleet
 from skytether.fly import fly
+from skytether.sweep import sweep
 
 USAGE = """usage: skytether COMMAND ...
 
@@ -19,6 +20,7 @@ reorders and loses their packets.
 
   fly [SCENARIO]        one flight, with everything it needs; the place to start
   fleet [SCENARIO]      many vehicles on one server, and what each costs it
+  sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
   scenarios             what can be flown
   server [SCENARIO]     one process by hand: plan for vehicles
   netem [SCENARIO]      one process by hand: be the network
@@ -40,6 +42,7 @@ def list_scenarios(argv: Sequence[str]) -> None:
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "fly": lambda argv: command.main(fly, argv, "fly"),
     "fleet": lambda argv: command.main(fleet, argv, "fleet"),
+    "sweep": lambda argv: command.main(sweep, argv, "sweep"),
     "scenarios": lambda argv: command.main(list_scenarios, argv, "skytether"),
     "server": server.__main__.main,
     "netem": netem.__main__.main,

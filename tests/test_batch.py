@@ -171,8 +171,6 @@ def test_a_batch_can_be_broken_off() -> None:
     """It tells the time, and asks whether to go on; what was flown is there."""
     seconds: list[int] = []
     flown = scenario(duration=60.0)
-    runs = fly_batch(
-        flown, range(3), on_second=seconds.append, stopped=lambda: len(seconds) >= 4
-    )
+    runs = fly_batch(flown, range(3), on_second=seconds.append, stopped=lambda: len(seconds) >= 4)
     assert seconds == [1, 2, 3, 4]
     assert 0 < max(len(run.client) for run in runs) < 80

@@ -36,10 +36,17 @@ def skytether(line: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "line", [line for line in COMMANDS if line.startswith(("skytether fl", "skytether scen"))]
+    "line",
+    [
+        line
+        for line in COMMANDS
+        if line.startswith(("skytether fl", "skytether sc", "skytether sw"))
+    ],
 )
 def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
-    """As written; over UDP a tenth as long, and a tenth as many."""
+    """As written; over UDP a tenth as long and as many, and a sweep with few and short flights."""
+    if "sweep" in line:
+        line += " --settle 0 --duration 1 --runs 2"
     if "--duration 20" in line:
         line = line.replace("--vehicles 50", "--vehicles 5") + " --settle 0 --duration 2"
     run = subprocess.run(skytether(line), cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -81,7 +88,8 @@ def test_documented_targets_exist(line: str) -> None:
 
 def test_every_documented_command_is_tested() -> None:
     """Here, or by make docker-test."""
-    known = ("make ", "skytether fly ", "skytether fleet ", "skytether scenarios")
+    known = ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
+    known += ("skytether scenarios",)
     known += ("docker compose up",)
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:

@@ -1,0 +1,509 @@
+"""Sweeps: what is flown, what is kept whatever happens, and what is said of it in the end."""
+
+import csv
+import importlib.util
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from lab import figures
+from lab.journal import Journal
+from lab.sweep import CHUNK, Axis, Done, Sweep, estimate, fly, parse_axis
+from shared import config
+from shared.config import ConfigError
+from shared.summary import summarise
+from sim import flight
+
+PATIENCE_S = 30.0
+
+SWEEP = [
+    *("sweep", "paper", "--duration", "5", "--settle", "1", "--runs", "60"),
+    *("--grid", "control.epsilon=1:3:2", "--grid", "control.trigger=paper,periodic"),
+]
+"""Four cells, three tasks each."""
+TASKS = 12
+TABLES = ("runs.csv", "cells.csv")
+
+PAPER = replace(config.load("paper"), duration=5.0, settle=1.0)
+
+
+# -- what is flown -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "values"),
+    [
+        ("control.epsilon=0.5:2:4", "control.epsilon", (0.5, 1.0, 1.5, 2.0)),
+        ("control.epsilon=8:0.5:2", "control.epsilon", (8.0, 0.5)),
+        ("control.horizon=20:40:3", "control.horizon", (20, 30, 40)),
+        ("control.epsilon=1,2.5", "control.epsilon", (1, 2.5)),
+        ("control.trigger=paper,always", "control.trigger", ("paper", "always")),
+        ('control.trigger="paper"', "control.trigger", ("paper",)),
+        ("control.input_reference=true,false", "control.input_reference", (True, False)),
+        ("model.tau_s=[0.8],[0.8, 0.9]", "model.tau_s", ([0.8], [0.8, 0.9])),
+        ("reference.file=a.csv, b/c.csv", "reference.file", ("a.csv", "b/c.csv")),
+    ],
+)
+def test_a_grid_is_read_as_it_is_meant(text: str, key: str, values: tuple[Any, ...]) -> None:
+    """Whole numbers stay whole, and what is written down is read again."""
+    axis = parse_axis(text)
+    assert axis == Axis(key, values)
+    assert list(map(type, axis.values)) == list(map(type, values))
+    assert parse_axis(str(axis)) == axis
+
+
+FORM = "expected KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        *(
+            (text, f"--grid: got {text!r}, {FORM}")
+            for text in (
+                *("control.epsilon", "control.epsilon=", "=1,2", "control.epsilon=1:2"),
+                *("control.epsilon=1:2:1", "control.epsilon=1:2:3.5", "control.epsilon=a:b:3"),
+                *("control.epsilon=0:inf:3", "control.epsilon=1,,2", "control.epsilon=[1,2"),
+            )
+        ),
+        ("seed=1,2", "--grid: got 'seed', expected another key: it counts the runs of a cell"),
+        (
+            "control.epsilon=1,2,1.0",
+            "--grid: control.epsilon: got 1 twice, expected values that differ",
+        ),
+    ],
+)
+def test_a_grid_that_is_none_is_refused(text: str, said: str) -> None:
+    """With what was given and what was expected."""
+    with pytest.raises(ConfigError) as refused:
+        parse_axis(text)
+    assert str(refused.value) == said
+
+
+@pytest.mark.parametrize(
+    ("grids", "said"),
+    [
+        (
+            ["control.epsilom=1,2"],
+            "paper with control.epsilom=1: control.epsilom: no such key; did you mean epsilon?",
+        ),
+        (["seed.x=1,2"], "--grid: seed.x: no such key"),
+        (
+            ["control.epsilon=1,2", "control.horizon=40,0"],
+            (
+                "paper with control.epsilon=1, control.horizon=0: "
+                "control.horizon: got 0, expected a whole number >= 1"
+            ),
+        ),
+        (
+            ["control.epsilon=1,2", "control.epsilon=3,4"],
+            "--grid: control.epsilon: got it twice, expected each key once",
+        ),
+    ],
+)
+def test_a_cell_that_cannot_be_flown_is_refused_before_any_is(grids: list[str], said: str) -> None:
+    """As a scenario would be, and with its values."""
+    with pytest.raises(ConfigError) as refused:
+        Sweep("paper", PAPER, list(map(parse_axis, grids)), 3)
+    assert str(refused.value) == said
+
+
+def test_seeds_end_where_a_scenarios_do() -> None:
+    """2³² - 1 is the last."""
+    last = replace(PAPER, seed=2**32 - 3)
+    assert next(Sweep("paper", last, [], 3).tasks()).seeds[-1] == 2**32 - 1
+    with pytest.raises(ConfigError, match="expected at most 4294967292 for 4 runs"):
+        Sweep("paper", last, [], 4)
+
+
+def test_a_sweep_is_every_combination_in_chunks_of_seeds() -> None:
+    """The last grid changes fastest; the last chunk holds what is left."""
+    axes = [parse_axis("control.epsilon=1,2"), parse_axis("control.trigger=paper,always")]
+    tasks = list(Sweep("paper", replace(PAPER, seed=7), axes, CHUNK + 5).tasks())
+    controls = [(t.scenario.control.epsilon, t.scenario.control.trigger) for t in tasks[::2]]
+    assert controls == [(1.0, "paper"), (1.0, "always"), (2.0, "paper"), (2.0, "always")]
+    assert [(task.cell, task.chunk) for task in tasks[:3]] == [(0, 0), (0, 1), (1, 0)]
+    assert tasks[2].seeds + tasks[3].seeds == tuple(range(7, 7 + CHUNK + 5))
+    assert len(tasks[0].seeds) == CHUNK
+
+
+def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
+    """In the order of their seeds."""
+    (task,) = Sweep("paper", PAPER, [parse_axis("control.trigger=periodic")], 3).tasks()
+    done = fly(task)
+    assert (done.cell, done.chunk) == (0, 0)
+    for seed, run in zip((1, 2, 3), done.runs, strict=True):
+        flown = replace(task.scenario, seed=seed)
+        alone = flight.fly(flown)
+        assert run == summarise(flown, "paper", alone.client, alone.server, alone.netem)
+
+
+def test_a_run_that_never_flew_has_no_error_and_spoils_no_mean() -> None:
+    """It is a row like any other, with nothing in it."""
+    deaf = replace(PAPER.network.uplink, loss=0.85)
+    scenario = replace(
+        PAPER,
+        duration=2.0,
+        network=replace(PAPER.network, uplink=deaf),
+        link=replace(PAPER.link, connect_s=5.0),
+    )
+    sweep = Sweep("paper", scenario, [], 6)
+    (task,) = sweep.tasks()
+    done = {(0, 0): fly(task)}
+    rows = list(csv.DictReader(sweep.runs_csv(done).splitlines()))
+    failed = [row for row in rows if row["steps"] == "0"]
+    assert 0 < len(failed) < 6
+    assert {(row["rmse_xy"], row["duration_s"]) for row in failed} == {("", "0.0")}
+    (cell,) = csv.DictReader(sweep.cells_csv(done).splitlines())
+    assert (cell["runs"], cell["flown"]) == ("6", str(6 - len(failed)))
+    errors = [float(row["rmse_xy"]) for row in rows if row["rmse_xy"]]
+    assert float(cell["rmse_xy"]) == pytest.approx(np.mean(errors))
+
+
+def test_the_interval_is_students() -> None:
+    """1, 2, 3, 4: mean 2.5, deviation 1.291, t = 3.182 with three degrees of freedom."""
+    run = summarise(PAPER, "paper", flight.fly(PAPER).client)
+    runs = [replace(run, stale=stale) for stale in (1, 2, 3, 4)]
+    mean, half = estimate(runs, "stale")
+    assert mean == 2.5
+    assert half == pytest.approx(3.1824 * 1.2910 / 2, rel=1e-4)
+    assert estimate(runs[:1], "stale") == (1.0, None)
+    assert estimate(runs, "rmse_z") == (None, None)
+
+
+def test_axes_of_pictures_have_units_where_these_are_known() -> None:
+    """From the name of the key, or from a list."""
+    labels = {key: figures.label(key) for key in LABELS}
+    assert labels == LABELS
+    table = config.to_table(PAPER)
+    for key in figures.OTHER_UNITS:
+        section: Any = table
+        for part in key.split("."):
+            section = section[part]
+
+
+LABELS = {
+    "control.decay_rate": "control.decay_rate [1/s]",
+    "network.uplink.minimum_s": "network.uplink.minimum_s [s]",
+    "vehicle.gust_mps2": "vehicle.gust_mps2 [m/s²]",
+    "control.epsilon": "control.epsilon",
+    "control.change_weight": "control.change_weight",
+    "model.axes": "model.axes",
+}
+
+
+# -- what is kept --------------------------------------------------------------------------------
+
+ONE = Sweep("paper", PAPER, [parse_axis("control.epsilon=1,2")], 3)
+OTHERS = {
+    "runs: got 4, expected 3": Sweep("paper", PAPER, ONE.axes, 4),
+    "name: got 'demo', expected 'paper'": Sweep("demo", PAPER, ONE.axes, 3),
+    "grid: got ['control.epsilon=1,3'], expected ['control.epsilon=1,2']": Sweep(
+        "paper", PAPER, [parse_axis("control.epsilon=1,3")], 3
+    ),
+    "control.decay_rate: got 2.0, expected 1.5": Sweep(
+        "paper", replace(PAPER, control=replace(PAPER.control, decay_rate=2.0)), ONE.axes, 3
+    ),
+    "network.uplink.loss: got 0.0, expected 0.1": Sweep(
+        "paper",
+        replace(
+            PAPER,
+            network=replace(PAPER.network, uplink=replace(PAPER.network.uplink, loss=0.0)),
+        ),
+        ONE.axes,
+        3,
+    ),
+}
+
+
+@pytest.mark.parametrize(("said", "other"), OTHERS.items(), ids=OTHERS)
+def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_path: Path) -> None:
+    """Naming the key, what was given and what the sweep began with."""
+    Journal(tmp_path, ONE, "1").close()
+    with pytest.raises(ConfigError) as refused:
+        Journal(tmp_path, other, "1")
+    assert str(refused.value) == (f"{tmp_path}: {said}, as the sweep there began; or another --out")
+
+
+def test_another_version_is_refused(tmp_path: Path) -> None:
+    """It may fly otherwise."""
+    Journal(tmp_path, ONE, "1").close()
+    with pytest.raises(ConfigError, match=r"version: got '2', expected '1'"):
+        Journal(tmp_path, ONE, "2")
+
+
+def test_two_sweeps_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    """The second is told; once the first is over, it may."""
+    told = pytest.raises(ConfigError, match="another sweep is writing there")
+    with closing(Journal(tmp_path, ONE, "1")), told:
+        Journal(tmp_path, ONE, "1")
+    Journal(tmp_path, ONE, "1").close()
+
+
+def test_results_without_settings_are_not_taken_for_ours(tmp_path: Path) -> None:
+    """Nobody knows what they are of."""
+    (tmp_path / "runs.jsonl").write_text("{}\n")
+    with pytest.raises(ConfigError, match=r"got runs.jsonl without sweep.toml, expected both"):
+        Journal(tmp_path, ONE, "1")
+
+
+def done(cell: int) -> Done:
+    """A task, done without flying."""
+    return Done(cell, 0, ())
+
+
+@pytest.mark.parametrize("cut", [1, 8, 20])
+def test_half_a_line_at_the_end_is_overwritten(cut: int, tmp_path: Path) -> None:
+    """A killed writer's last; everything before it is kept."""
+    with closing(Journal(tmp_path, ONE, "1")) as journal:
+        journal.append(done(0))
+        journal.append(done(1))
+    file = tmp_path / "runs.jsonl"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-cut])
+    with closing(Journal(tmp_path, ONE, "1")) as journal:
+        assert journal.done == {(0, 0): done(0)}
+        journal.append(done(1))
+    assert file.read_bytes() == whole
+    with closing(Journal(tmp_path, ONE, "1")) as journal:
+        assert journal.done == {(0, 0): done(0), (1, 0): done(1)}
+
+
+def test_a_line_that_is_no_task_is_named(tmp_path: Path) -> None:
+    """No kill leaves one behind: somebody has been there."""
+    with closing(Journal(tmp_path, ONE, "1")) as journal:
+        journal.append(done(0))
+    with (tmp_path / "runs.jsonl").open("ab") as file:
+        file.write(b"{}\n")
+    with pytest.raises(ConfigError, match=r"runs.jsonl: line 2 is no task that was done"):
+        Journal(tmp_path, ONE, "1")
+
+
+# -- the command ---------------------------------------------------------------------------------
+
+
+def command(*argv: str) -> list[str]:
+    """It, as this environment runs it."""
+    return [sys.executable, "-P", "-m", "skytether", *argv]
+
+
+def run(*argv: str) -> subprocess.CompletedProcess[str]:
+    """A command to its end."""
+    return subprocess.run(command(*argv), capture_output=True, text=True, timeout=60, check=False)
+
+
+def wait_for(what: Callable[[], bool]) -> None:
+    """Until it is so."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < end_s
+        time.sleep(0.005)
+
+
+def lines(out: Path) -> int:
+    """Tasks that are done in a folder."""
+    file = out / "runs.jsonl"
+    return file.read_bytes().count(b"\n") if file.exists() else 0
+
+
+def tables(out: Path) -> list[bytes]:
+    """The bytes of both."""
+    return [(out / name).read_bytes() for name in TABLES]
+
+
+def broken_off(number: signal.Signals, out: Path) -> subprocess.CompletedProcess[str]:
+    """A sweep with one worker, ended by a signal a few tasks after its start; its workers, too."""
+    with subprocess.Popen(
+        command(*SWEEP, "--out", str(out), "--workers", "1"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as sweep:
+        wait_for(lambda: lines(out) >= 2)
+        children = Path(f"/proc/{sweep.pid}/task/{sweep.pid}/children").read_text().split()
+        assert children
+        sweep.send_signal(number)
+        stdout, stderr = sweep.communicate(timeout=PATIENCE_S)
+    wait_for(lambda: not any(map(running, children)))
+    assert 2 <= lines(out) < TASKS
+    return subprocess.CompletedProcess(sweep.args, sweep.returncode, stdout, stderr)
+
+
+def running(pid: str) -> bool:
+    """Whether a process does anything any more."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the sweep, flown by two workers without any trouble."""
+    out = tmp_path_factory.mktemp("sweep") / "deep" / "whole"
+    done = run(*SWEEP, "--out", str(out), "--workers", "2")
+    assert done.returncode == 0, done.stderr
+    assert "vehicle-steps" in done.stdout
+    assert lines(out) == TASKS
+    return out
+
+
+def test_the_tables_hold_every_run_and_every_cell(whole: Path) -> None:
+    """In order, with the values of the grid first."""
+    runs, cells = (list(csv.DictReader((whole / name).read_text().splitlines())) for name in TABLES)
+    assert len(runs) == 4 * 60
+    assert [int(row["seed"]) for row in runs[60:120]] == list(range(1, 61))
+    assert {(row["control.epsilon"], row["control.trigger"]) for row in runs[60:120]} == {
+        ("1", "periodic")
+    }
+    assert {row["steps"] for row in runs} == {"100"}
+    assert [row["flown"] for row in cells] == ["60"] * 4
+    mean = np.mean([float(row["rmse_xy"]) for row in runs[60:120]])
+    assert float(cells[1]["rmse_xy"]) == pytest.approx(mean)
+    assert float(cells[1]["rmse_xy_ci95"]) < 0.2 * mean
+
+
+def test_two_keys_make_maps(whole: Path) -> None:
+    """One of the error, one of the events."""
+    for name in ("rmse_xy.png", "event_ratio.png"):
+        assert (whole / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_killed_sweep_goes_on_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
+    """SIGKILL half-way: its worker ends with it, and the rest gives the same bytes as ever."""
+    broken_off(signal.SIGKILL, tmp_path)
+    kept = (tmp_path / "runs.jsonl").read_bytes()
+    resumed = run(*SWEEP, "--out", str(tmp_path), "--workers", "1")
+    assert resumed.returncode == 0, resumed.stderr
+    assert (tmp_path / "runs.jsonl").read_bytes().startswith(kept.rpartition(b"\n")[0])
+    assert lines(tmp_path) == TASKS
+    assert tables(tmp_path) == tables(whole)
+
+
+def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path) -> None:
+    """Every line is whole, and it says how many runs they are."""
+    ended = broken_off(signal.SIGINT, tmp_path)
+    assert (ended.returncode, ended.stdout) == (130, "")
+    said = re.fullmatch(
+        r"sweep: interrupted with (\d+) of 240 runs done; the same command goes on from here\n",
+        ended.stderr,
+    )
+    assert said
+    kept = map(json.loads, (tmp_path / "runs.jsonl").read_text().splitlines())
+    assert sum(len(task["runs"]) for task in kept) == int(said[1])
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (["--runs", "0"], "--runs: got 0, expected 1 to 100000"),
+        (["--workers", "0"], "--workers: got 0, expected 1 to 1024"),
+        (
+            ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"],
+            "--workers: got --scheduler as well, which has its own",
+        ),
+        (["--grid", "control.epsilon"], f"--grid: got 'control.epsilon', {FORM}"),
+    ],
+)
+def test_an_impossible_sweep_is_refused(
+    argv: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line, before anything is written."""
+    from skytether.__main__ import main
+
+    assert main(["sweep", "paper", "--out", str(tmp_path / "out"), *argv]) == 2
+    assert capsys.readouterr().err.strip() == f"sweep: {line}"
+    assert not (tmp_path / "out").exists()
+
+
+# -- a cluster -----------------------------------------------------------------------------------
+
+needs_dask = pytest.mark.skipif(
+    importlib.util.find_spec("distributed") is None, reason="needs the extra `cluster`"
+)
+
+
+def dask(stack: ExitStack, *argv: str, folder: Path) -> subprocess.Popen[str]:
+    """A process of a cluster, ended with the stack."""
+    process = stack.enter_context(
+        subprocess.Popen(
+            [sys.executable, "-P", "-m", f"distributed.cli.dask_{argv[0]}", *argv[1:]],
+            cwd=folder,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    )
+    stack.callback(process.kill)
+    return process
+
+
+@needs_dask
+def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
+    """A scheduler and two workers, one of them killed on the way."""
+    with ExitStack() as stack:
+        scheduler = dask(
+            *(stack, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
+            folder=tmp_path,
+        )
+        assert scheduler.stderr is not None
+        at = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
+        workers = [
+            dask(
+                *(stack, "worker", at, "--nthreads", "1", "--no-nanny", "--no-dashboard"),
+                folder=tmp_path,
+            )
+            for _ in range(2)
+        ]
+        for worker in workers:
+            assert worker.stderr is not None
+            next(line for line in worker.stderr if "Registered to" in line)
+        out = tmp_path / "out"
+        sweep = stack.enter_context(
+            subprocess.Popen(
+                command(*SWEEP, "--out", str(out), "--scheduler", at),
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        )
+        wait_for(lambda: lines(out) >= 2)
+        workers[0].kill()
+        _, stderr = sweep.communicate(timeout=PATIENCE_S)
+        assert sweep.returncode == 0, stderr
+    assert tables(out) == tables(whole)
+
+
+@needs_dask
+def test_a_scheduler_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line."""
+    from skytether.__main__ import main
+
+    argv = ["sweep", "paper", "--runs", "1", "--out", str(tmp_path), "--scheduler", "nowhere"]
+    assert main(argv) == 1
+    said = "sweep: --scheduler: nowhere cannot be reached: missing port number in address 'nowhere'"
+    assert capsys.readouterr().err.strip() == said
+
+
+def test_without_dask_a_scheduler_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Saying what to install."""
+    from skytether.__main__ import main
+
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    argv = ["sweep", "paper", "--runs", "1", "--out", str(tmp_path), "--scheduler", "tcp://h:1"]
+    assert main(argv) == 2
+    said = "sweep: --scheduler: needs Dask: install skytether[cluster], here and on the workers"
+    assert capsys.readouterr().err.strip() == said
