@@ -44,9 +44,9 @@ class ModelConfig(Section, frozen=True):
 
     axes: Literal[2, 3] = 2
     """Fly in the plane or in space."""
-    tau_s: tuple[Positive, ...] = (0.855,)
+    tau_s: tuple[Positive, ...] = (0.84,)
     """Time constant of the velocity loop [s]: one for all axes, or one each."""
-    u_max: tuple[Positive, ...] = (1.8,)
+    u_max: tuple[Positive, ...] = (1.6,)
     """Largest desired velocity [m/s]: one for all axes, or one each."""
 
 
@@ -69,13 +69,13 @@ class ControlConfig(Section, frozen=True):
     """Tolerance ε of eq. (16)."""
     decay_rate: NonNegative = 1.5
     """Decay rate λ of eq. (16) [1/s]."""
-    state_weight: tuple[NonNegative, NonNegative] = (6.2, 11.65)
+    state_weight: tuple[NonNegative, NonNegative] = (7.1, 14.0)
     """Q of eq. (5), on the position and the velocity of every axis."""
-    terminal_weight: tuple[NonNegative, NonNegative] = (73.9, 594.0)
+    terminal_weight: tuple[NonNegative, NonNegative] = (73.0, 555.0)
     """P of eq. (5) and (16), on position and velocity."""
-    input_weight: Positive = 1.93
+    input_weight: Positive = 1.8
     """R of eq. (5)."""
-    change_weight: NonNegative = 0.033
+    change_weight: NonNegative = 0.03
     """S of eq. (9), on the change against the horizon before."""
     input_reference: bool = False
     """Let R weigh u - v_ref instead of u, so that it does not ask for standing still."""
@@ -86,7 +86,7 @@ class ReferenceConfig(Section, frozen=True):
 
     shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
     """What to fly."""
-    radius_m: Positive = 1.42
+    radius_m: Positive = 1.55
     """Half the width of circle, figure-eight and square [m]."""
     period_s: Positive = 27.5
     """Time for one round of them [s]."""

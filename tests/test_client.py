@@ -176,7 +176,7 @@ def test_an_input_is_flown_from_the_step_after_it_came() -> None:
     assert rows["in_force"].tolist() == [NO_HORIZON, 0, 0, 0]
     velocity = rows["state"][:, 0, 1]
     assert velocity[:2].tolist() == [0.0, 0.0]
-    assert velocity[2] == pytest.approx(1 - np.exp(-0.05 / 0.855), abs=1e-12)
+    assert velocity[2] == pytest.approx(1 - np.exp(-0.05 / 0.84), abs=1e-12)
     assert rows["age_ns"].tolist() == [-1, *(n * server.dt_ns for n in (1, 2, 3))]
 
 
@@ -191,7 +191,7 @@ def test_steps_slept_through_are_flown_with_the_old_input_and_counted() -> None:
     assert isinstance(late, Observation)
     assert late.step == 5
     assert server.client.missed == 3
-    tau, held_s = 0.855, 4 * 0.05
+    tau, held_s = 0.84, 4 * 0.05
     assert late.state[0, 1] == pytest.approx(1 - np.exp(-held_s / tau), abs=1e-12)
 
 

@@ -417,7 +417,7 @@ def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> Non
 
 def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
     """With one number an axis, and the step in nanoseconds."""
-    assert Scenario().terms() == (50_000_000, 40, 2, (0.855, 0.855), (1.8, 1.8))
+    assert Scenario().terms() == (50_000_000, 40, 2, (0.84, 0.84), (1.6, 1.6))
 
 
 @pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])
