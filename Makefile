@@ -7,7 +7,7 @@ BENCH_STAMP := .venv/.ready-to-bench
 COMPILE := $(BIN)/pip-compile --quiet --strip-extras --generate-hashes --allow-unsafe --no-header \
 	--no-emit-index-url --no-emit-trusted-host --no-emit-find-links
 
-.PHONY: setup demo test check format lock docker-test bench clean
+.PHONY: setup demo reproduce test check format lock docker-test bench clean
 
 setup: $(STAMP)  ## the environment alone
 
@@ -21,6 +21,9 @@ $(STAMP): requirements.lock requirements-dev.lock pyproject.toml
 demo: setup  ## fly the demonstration
 	$(BIN)/skytether fly demo --beside demo-no-compensation --figure demo.png
 	@echo "The flight is drawn in demo.png."
+
+reproduce: setup  ## the paper's table and figures, and more, in results/report.html (15 minutes)
+	$(BIN)/skytether reproduce --out results
 
 test: setup  ## everything but Docker, in under five minutes
 	$(BIN)/pytest -q -m "not docker"

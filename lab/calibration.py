@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cma
 import numpy as np
 
 from shared import config
@@ -59,15 +58,15 @@ class Free:
         """KEY=LOW:HIGH.
 
         Raises:
-            ValueError: it is none.
+            ConfigError: it is none.
         """
         key, _, bounds = text.partition("=")
         try:
             low, high = map(float, bounds.split(":"))
         except ValueError:
-            raise ValueError(f"got {text!r}, expected KEY=LOW:HIGH") from None
+            raise ConfigError(f"--free: got {text!r}, expected KEY=LOW:HIGH") from None
         if not 0.0 < low < high < np.inf:
-            raise ValueError(f"got the bounds {bounds}, expected 0 < LOW < HIGH")
+            raise ConfigError(f"--free: {key}: got the bounds {bounds}, expected 0 < LOW < HIGH")
         return cls(key, low, high)
 
     def of(self, table: Any) -> float:
@@ -111,12 +110,21 @@ class Search:
     def __init__(
         self, start: Scenario, free: Sequence[Free], *, population: int, sigma: float, seed: int
     ) -> None:
+        import cma  # takes half a second to import
+
         self._start = start
         self._free = free
         low, high = np.log([key.low for key in free]), np.log([key.high for key in free])
         self._low, self._range = low, high - low
         here = (np.log([key.of(_plain(start)) for key in free]) - low) / self._range
-        options = {"bounds": [0, 1], "popsize": population, "seed": seed, "verbose": -9}
+        rng = np.random.default_rng(seed)  # its own dice: numpy's global ones are anybody's
+        options = {
+            "bounds": [0, 1],
+            "popsize": population,
+            "verbose": -9,
+            "seed": np.nan,
+            "randn": lambda *shape: rng.standard_normal(shape),
+        }
         self._search = cma.CMAEvolutionStrategy(np.clip(here, 0.01, 0.99), sigma, options)
         self._points: list[Any] = []
 

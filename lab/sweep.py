@@ -10,7 +10,7 @@ import io
 import itertools
 import math
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,16 +31,25 @@ SEED_MAX = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One key of the scenario, and the values it takes."""
+    """One key of the scenario, and the values it takes.
+
+    Where one value is to change other keys, or several, `changes` has these for each value, and the
+    key and its values are but what they are called.
+    """
 
     key: str
     values: tuple[Any, ...]
+    changes: tuple[Mapping[str, Any], ...] = ()
 
     def __str__(self) -> str:
-        """As `parse_axis` reads it."""
-        return (
-            f"{self.key}={','.join(msgspec.json.encode(value).decode() for value in self.values)}"
-        )
+        """As `parse_axis` reads it; with what each value changes where that is something else."""
+        values = self.changes or self.values
+        return f"{self.key}={','.join(msgspec.json.encode(value).decode() for value in values)}"
+
+    def points(self) -> list[tuple[Any, Mapping[str, Any]]]:
+        """Each value, and the keys that it changes."""
+        changes = self.changes or [{self.key: value} for value in self.values]
+        return list(zip(self.values, changes, strict=True))
 
 
 def parse_axis(text: str) -> Axis:
@@ -150,24 +159,27 @@ class Sweep:
         if scenario.seed + runs - 1 > SEED_MAX:
             most = SEED_MAX - runs + 1
             raise ConfigError(f"seed: got {scenario.seed}, expected at most {most} for {runs} runs")
-        self.cells = list(itertools.product(*(axis.values for axis in axes)))
+        points = list(itertools.product(*(axis.points() for axis in axes)))
+        self.cells = [tuple(value for value, _ in cell) for cell in points]
         """The values of each, in the order of the axes."""
         self.chunks = -(-runs // CHUNK)
         """Of each cell."""
-        self._scenarios = [self._scenario(values) for values in self.cells]
+        self._scenarios = [
+            self._scenario({key: value for _, changes in cell for key, value in changes.items()})
+            for cell in points
+        ]
 
-    def _scenario(self, values: Sequence[Any]) -> Scenario:
+    def _scenario(self, changes: Mapping[str, Any]) -> Scenario:
         table = config.to_table(self.scenario)
-        for axis, value in zip(self.axes, values, strict=True):
-            *sections, key = axis.key.split(".")
+        for path, value in changes.items():
+            *sections, key = path.split(".")
             section = table
             for name in sections:
                 section = section.setdefault(name, {})
                 if not isinstance(section, dict):
-                    raise ConfigError(f"--grid: {axis.key}: no such key")
+                    raise ConfigError(f"--grid: {path}: no such key")
             section[key] = value
-        pairs = zip(self.axes, values, strict=True)
-        where = ", ".join(f"{axis.key}={value}" for axis, value in pairs)
+        where = ", ".join(f"{key}={value}" for key, value in changes.items())
         return config.check(table, f"{self.name} with {where}" if where else self.name)
 
     def tasks(self) -> Iterator[Task]:
@@ -178,6 +190,10 @@ class Sweep:
                 runs = range(chunk * CHUNK, min(self.runs, (chunk + 1) * CHUNK))
                 seeds = tuple(first + run for run in runs)
                 yield Task(cell, chunk, self.name, scenario, seeds)
+
+    def todo(self, done: Container[tuple[int, int]]) -> list[Task]:
+        """What is not done yet."""
+        return [task for task in self.tasks() if (task.cell, task.chunk) not in done]
 
     def settings(self) -> dict[str, Any]:
         """All that its results follow from, as plain values."""
@@ -196,7 +212,7 @@ class Sweep:
             for cell, values in enumerate(self.cells)
             for run in self.of_cell(done, cell)
         )
-        return _csv([*keys, *Summary.__struct_fields__], rows)
+        return to_csv([*keys, *Summary.__struct_fields__], rows)
 
     def cells_csv(self, done: Mapping[tuple[int, int], Done]) -> str:
         """A row for each cell: mean of each figure, and half the width of its 95 % interval."""
@@ -208,7 +224,11 @@ class Sweep:
             flown = sum(run.rmse_xy is not None for run in runs)
             means = [_plain(part) for figure in FIGURES for part in estimate(runs, figure)]
             rows.append([*values, len(runs), flown, *means])
-        return _csv([*keys, "runs", "flown", *names], rows)
+        return to_csv([*keys, "runs", "flown", *names], rows)
+
+    def scenario_of(self, *values: Any) -> Scenario:
+        """What a cell flies."""
+        return self._scenarios[self.cells.index(values)]
 
     def of_cell(self, done: Mapping[tuple[int, int], Done], cell: int) -> list[Summary]:
         """Its runs, by seed."""
@@ -224,11 +244,15 @@ FIGURES = (
 
 
 def estimate(runs: Iterable[Summary], figure: str) -> tuple[float | None, float | None]:
-    """Mean of a figure over the runs that have it, and half the width of its 95 % interval.
+    """Mean of a figure over the runs that have it, and half the width of its 95 % interval."""
+    return interval([value for run in runs if (value := getattr(run, figure)) is not None])
 
-    Student's t; the first is None where no run has it, the second where fewer than two have.
+
+def interval(values: Sequence[float]) -> tuple[float | None, float | None]:
+    """Mean of some values, and half the width of its 95 % interval.
+
+    Student's t; the first is None where there are no values, the second where fewer than two.
     """
-    values = [value for run in runs if (value := getattr(run, figure)) is not None]
     if not values:
         return None, None
     mean, n = float(np.mean(values)), len(values)
@@ -242,7 +266,8 @@ def _plain(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else value
 
 
-def _csv(header: list[str], rows: Iterable[list[Any]]) -> str:
+def to_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table as text."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(header)

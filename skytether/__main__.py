@@ -9,8 +9,10 @@ import client.__main__
 import netem.__main__
 import server.__main__
 from shared import command, config
+from skytether.calibrate import calibrate
 from skytether.fleet import fleet
 from skytether.fly import fly
+from skytether.reproduce import reproduce
 from skytether.sweep import sweep
 
 USAGE = """usage: skytether COMMAND ...
@@ -21,6 +23,8 @@ reorders and loses their packets.
   fly [SCENARIO]        one flight, with everything it needs; the place to start
   fleet [SCENARIO]      many vehicles on one server, and what each costs it
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
+  reproduce             the paper's table and figures, and more, as a report
+  calibrate [SCENARIO]  search for the numbers that the paper does not print
   scenarios             what can be flown
   server [SCENARIO]     one process by hand: plan for vehicles
   netem [SCENARIO]      one process by hand: be the network
@@ -43,6 +47,8 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "fly": lambda argv: command.main(fly, argv, "fly"),
     "fleet": lambda argv: command.main(fleet, argv, "fleet"),
     "sweep": lambda argv: command.main(sweep, argv, "sweep"),
+    "reproduce": lambda argv: command.main(reproduce, argv, "reproduce"),
+    "calibrate": lambda argv: command.main(calibrate, argv, "calibrate"),
     "scenarios": lambda argv: command.main(list_scenarios, argv, "skytether"),
     "server": server.__main__.main,
     "netem": netem.__main__.main,

@@ -1,10 +1,8 @@
 """`skytether calibrate`: search for the numbers that the paper does not print."""
 
 import json
-import multiprocessing
-import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -21,9 +19,12 @@ from lab.calibration import FREE, Free, Search, Values
 from shared import command
 from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import ConfigError, Scenario, to_toml
+from skytether import pool
+from skytether.pool import Scheduler, Workers
 
 BEST = "best.toml"
 LOG = "log.jsonl"
+POPULATION_MIN, POPULATION_MAX = 4, 1000
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,10 @@ class Options:
     """Points in a generation."""
     sigma: float = 0.1
     """First step, as a share of the range of each key."""
-    workers: int = len(os.sched_getaffinity(0))
-    """Processes that fly."""
+    workers: Workers = None
+    """Processes; one a core unless given."""
+    scheduler: Scheduler = None
+    """Use the workers of this Dask scheduler instead."""
     out: Path = Path("calibration")
     """Folder for the log of every point (log.jsonl) and for the best one (best.toml)."""
     config: ScenarioFlags = Scenario()
@@ -58,23 +61,29 @@ def calibrate(argv: Sequence[str]) -> None:
     command goes on where an interrupted one stopped.
     """
     options = command.parse(Options(), argv, "skytether calibrate", calibrate.__doc__)
-    for flag, most in (("runs", 1000), ("generations", 10**6), ("population", 1000)):
-        command.check_count(f"--{flag}", getattr(options, flag), most)
+    command.check_count("--runs", options.runs, 1000)
+    command.check_count("--generations", options.generations, 10**6)
+    if not POPULATION_MIN <= options.population <= POPULATION_MAX:
+        expected = f"expected {POPULATION_MIN} to {POPULATION_MAX}"
+        raise CommandError(f"--population: got {options.population}, {expected}", 2)
+    if not 0.0 < options.sigma <= 1.0:
+        raise CommandError(f"--sigma: got {options.sigma:g}, expected more than 0, at most 1", 2)
+    pool.check(options.workers, options.scheduler)
     try:
         free = [Free.parse(text) for text in options.free]
         calibration.check_free(free, options.config)
-    except (ValueError, ConfigError) as error:
+    except ConfigError as error:
         raise CommandError(str(error), command.CONFIGURATION) from None
     scenario = options.config
     search = Search(
         *(scenario, free), population=options.population, sigma=options.sigma, seed=scenario.seed
     )
-    seeds = range(scenario.seed, scenario.seed + options.runs)
+    fly = partial(calibration.fly_table, seeds=range(scenario.seed, scenario.seed + options.runs))
     log = _open(options)
     points = [point for generation in log for point in generation]
     with (
         command.interruptible() as interrupted,
-        ProcessPoolExecutor(options.workers, multiprocessing.get_context("spawn")) as pool,
+        pool.executors(options.workers, options.scheduler) as executor,
         (options.out / LOG).open("a") as file,
         _progress(options.generations) as show,
     ):
@@ -82,15 +91,20 @@ def calibrate(argv: Sequence[str]) -> None:
             proposed = search.ask()
             if generation < len(log):
                 flown = log[generation]
+                if [point["keys"] for point in flown] != list(map(search.values, proposed)):
+                    what = f"{options.out}: generation {generation + 1} was another search's"
+                    raise CommandError(f"{what}; give another --out", command.CONFIGURATION)
             else:
-                values = pool.map(partial(calibration.fly_table, seeds=seeds), proposed)
+                values: dict[Scenario, Values] = {}
+                if not pool.share(executor, fly, proposed, values.__setitem__, interrupted):
+                    break
                 flown = [
                     {
                         "keys": search.values(each),
-                        "values": value,
-                        "score": calibration.score(value),
+                        "values": values[each],
+                        "score": calibration.score(values[each]),
                     }
-                    for each, value in zip(proposed, values, strict=True)
+                    for each in proposed
                 ]
                 file.write(json.dumps(flown) + "\n")
                 file.flush()
@@ -98,8 +112,6 @@ def calibrate(argv: Sequence[str]) -> None:
             search.tell([point["score"] for point in flown])
             best = min(points, key=lambda point: point["score"])
             show(generation + 1, f"best {best['score']:.4f}")
-            if interrupted():
-                break
     _finish(options, free, points)
 
 
@@ -113,6 +125,7 @@ def _progress(generations: int) -> Iterator[Callable[[int, str], None]]:
         TimeRemainingColumn(),
         console=Console(stderr=True),
         transient=True,
+        disable=not sys.stderr.isatty(),
     ) as bar:
         task = bar.add_task("", total=generations)
         yield lambda done, text: bar.update(task, completed=done, description=text)
@@ -127,17 +140,15 @@ def _open(options: Options) -> list[list[dict[str, Any]]]:
         "population": options.population,
         "sigma": options.sigma,
     }
+    log = options.out / LOG
     try:
         options.out.mkdir(parents=True, exist_ok=True)
-        log = options.out / LOG
-        lines = log.read_text().splitlines(keepends=True) if log.exists() else []
-        whole = [line for line in lines if line.endswith("\n")]
-        if not whole:
-            whole = [json.dumps(settings) + "\n"]
-        log.write_text("".join(whole))
+        text = log.read_text() if log.exists() else ""
+        text = text[: text.rfind("\n") + 1] or json.dumps(settings) + "\n"
+        log.write_text(text)
     except OSError as error:
         raise CommandError(f"{options.out}: {error.strerror}") from None
-    before = json.loads(whole[0])
+    before, *generations = map(json.loads, text.splitlines())
     for key, value in json.loads(json.dumps(settings)).items():
         if before[key] != value:
             raise CommandError(
@@ -145,7 +156,7 @@ def _open(options: Options) -> list[list[dict[str, Any]]]:
                 "or give another --out",
                 command.CONFIGURATION,
             )
-    return [json.loads(line) for line in whole[1:]]
+    return generations
 
 
 def _finish(options: Options, free: Sequence[Free], points: list[dict[str, Any]]) -> None:

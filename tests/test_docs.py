@@ -40,13 +40,15 @@ def skytether(line: str) -> list[str]:
     [
         line
         for line in COMMANDS
-        if line.startswith(("skytether fl", "skytether sc", "skytether sw"))
+        if line.startswith(("skytether fl", "skytether sc", "skytether sw", "skytether ca"))
     ],
 )
 def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
-    """As written; over UDP a tenth as long and as many, and a sweep with few and short flights."""
+    """As written; over UDP a tenth as long and as many, and sweeps with few and short flights."""
     if "sweep" in line:
         line += " --settle 0 --duration 1 --runs 2"
+    if "calibrate" in line:
+        line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
     if "--duration 20" in line:
         line = line.replace("--vehicles 50", "--vehicles 5") + " --settle 0 --duration 2"
     run = subprocess.run(skytether(line), cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -89,7 +91,8 @@ def test_documented_targets_exist(line: str) -> None:
 def test_every_documented_command_is_tested() -> None:
     """Here, or by make docker-test."""
     known = ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
-    known += ("skytether scenarios",)
+    known += ("skytether scenarios", "skytether calibrate ")
+    known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("docker compose up",)
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:

@@ -1,0 +1,435 @@
+"""The figures of a report: drawn for print, each with the numbers that it draws and what they say.
+
+Sizes are those of a journal's columns, letters 8 points. Red and dashed is the reference, black the
+vehicle, as in the paper.
+"""
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import stats
+
+from lab.studies import EVENT, EVERY, NONE, PERIODIC, Cells, Flown, Study, periodic_wins
+from lab.sweep import estimate, to_csv
+from shared.config import ControlConfig, DirectionConfig, Scenario
+from shared.model import Array
+from shared.record import Rows
+from shared.summary import summarise
+from sim.flight import Flight
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COLUMN, PAGE = 3.5, 7.16
+"""Widths [inch]."""
+LETTERS: Any = {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 8}
+LETTERS |= {"axes.grid": True, "grid.alpha": 0.3}
+STYLES: Mapping[str, Mapping[str, Any]] = {
+    NONE: {"color": "0.5", "linestyle": ":", "marker": "s"},
+    EVERY: {"color": "black", "linestyle": "-", "marker": "o"},
+    EVENT: {"color": "#c1272d", "linestyle": "-", "marker": "^"},
+    PERIODIC: {"color": "#0072b2", "linestyle": "--", "marker": "v"},
+}
+"""Of the methods: apart without colour, too."""
+RATIO_LOG = 20.0
+"""Values that differ by more than this are drawn on a logarithmic scale."""
+
+Samples = Mapping[str, tuple[Scenario, Sequence[Flight]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure, ready to be written."""
+
+    name: str
+    """Of its files."""
+    title: str
+    says: str
+    """One or two sentences, with what the numbers come to."""
+    png: bytes
+    pdf: bytes
+    csv: str
+
+    def files(self) -> dict[str, bytes]:
+        """Content by suffix."""
+        return {".png": self.png, ".pdf": self.pdf, ".csv": self.csv.encode()}
+
+
+@contextmanager
+def _figure(width: float, height: float) -> "Iterator[Figure]":
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(LETTERS):
+        yield Figure(figsize=(width, height), layout="constrained")
+
+
+def _picture(  # noqa: PLR0917
+    figure: "Figure",
+    name: str,
+    title: str,
+    says: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+) -> Picture:
+    png, pdf = io.BytesIO(), io.BytesIO()
+    figure.savefig(png, format="png", dpi=220)
+    figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
+    return Picture(name, title, says, png.getvalue(), pdf.getvalue(), to_csv(header, rows))
+
+
+def delay(direction: DirectionConfig, delay_ms: Array) -> Picture:
+    """Fig. 2: the delay (17), and what netem really added.
+
+    Args:
+        delay_ms: a row each packet: how long it took over UDP, how long it was drawn to take.
+    """
+    took_ms, late_ms = delay_ms[:, 0], delay_ms[:, 0] - delay_ms[:, 1]
+    first_ms, slot_ms = direction.minimum_s * 1e3, direction.slot_s * 1e3
+    count = int(stats.poisson.ppf(0.9999, direction.slots_mean)) + 2
+    slots = np.arange(count)
+    lattice_ms, pdf = first_ms + slot_ms * slots, stats.poisson.pmf(slots, direction.slots_mean)
+    # A packet can be late, not early: what took up to a slot more than the lattice says is its.
+    nearest = np.floor((took_ms - first_ms) / slot_ms + 0.1)
+    share = np.array([np.mean(nearest == slot) for slot in slots])
+    fine_ms = np.arange(first_ms - slot_ms, lattice_ms[-1] + 1.0)
+    cdf = stats.poisson.cdf(np.floor((fine_ms - first_ms) / slot_ms + 1e-9), direction.slots_mean)
+    took_cdf = np.searchsorted(np.sort(took_ms), fine_ms, side="right") / len(took_ms)
+    with _figure(PAGE, 2.4) as figure:
+        left, right = figure.subplots(1, 2)
+        left.bar(lattice_ms, share, 0.7 * slot_ms, color="0.75", label="over UDP")
+        left.plot(lattice_ms, pdf, "r_", markersize=10, markeredgewidth=1.5, label="(17)")
+        left.set_ylabel("probability")
+        right.plot(fine_ms, took_cdf, "k-", linewidth=1.2, label="over UDP")
+        right.plot(fine_ms, cdf, "r--", linewidth=1.0, label="(17)")
+        right.set_ylabel("cumulative probability")
+        for axes in (left, right):
+            axes.set_xlabel("delay [ms]")
+            axes.legend()
+    p50, p99 = np.quantile(late_ms, (0.5, 0.99))
+    worst = np.max(np.abs(share - pdf))
+    says = (
+        f"The delay (17), as corrected (E1, E2), and what {len(took_ms)} packets met in netem over "
+        f"UDP on loopback: they came {p50:.2f} ms (median) and {p99:.2f} ms (p99) later than "
+        f"drawn, and no probability is off by more than {worst:.3f}."
+    )
+    at = dict(zip(lattice_ms.round(6).tolist(), zip(pdf, share, strict=True), strict=True))
+    rows = [
+        (ms, *at.get(round(ms, 6), (None, None)), theory, real)
+        for ms, theory, real in zip(fine_ms.tolist(), cdf, took_cdf, strict=True)
+    ]
+    header = ("delay_ms", "probability", "probability_udp", "cumulative", "cumulative_udp")
+    return _picture(figure, "fig2", "Fig. 2: network delay", says, header, rows)
+
+
+def paths(samples: Samples) -> Picture:
+    """Fig. 3: without and with compensation, a packet at every step."""
+    rmse, columns = [], []
+    with _figure(PAGE, 3.6) as figure:
+        planes = figure.subplots(1, 2, sharex=True, sharey=True)
+        for plane, letter, method in zip(planes, "ab", (NONE, EVERY), strict=True):
+            scenario, flights = samples[method]
+            rmse.append(summarise(scenario, method, flights[0].client).rmse_xy)
+            step, desired, position = _path(scenario, flights[0])
+            _draw_path(plane, desired, position)
+            plane.set_title(f"({letter}) {method}, a packet at every step")
+            columns += [desired, position]
+        planes[0].legend(loc="center")
+    says = (
+        f"One flight each, of the same seed. Without compensation the vehicle is {rmse[0]:.3f} m "
+        f"off (RMSE xy), with both compensators {rmse[1]:.3f} m."
+    )
+    header = ("step", "reference_x_m", "reference_y_m", "a_x_m", "a_y_m", "b_x_m", "b_y_m")
+    rows = np.column_stack([step, columns[0], columns[1], columns[3]]).tolist()
+    title = "Fig. 3: position without and with delay compensation"
+    return _picture(figure, "fig3", title, says, header, rows)
+
+
+def events(samples: Samples) -> Picture:
+    """Fig. 4: the event trigger's path, and its events beneath."""
+    scenario, flights = samples[EVENT]
+    flight, dt = flights[0], scenario.control.dt
+    step, desired, position = _path(scenario, flight)
+    sent = np.isin(step, flight.server["step"][flight.server["event"]])
+    with _figure(COLUMN, 4.4) as figure:
+        plane, below = figure.subplots(2, 1, height_ratios=(5, 1))
+        _draw_path(plane, desired, position)
+        plane.legend(loc="center")
+        below.vlines(step[sent] * dt, 0.0, 1.0, color="k", linewidth=0.5)
+        below.set_xlim(0.0, scenario.duration)
+        below.set_yticks([])
+        below.set_xlabel("time [s]")
+        below.set_ylabel("event")
+    rmse = summarise(scenario, EVENT, flight.client).rmse_xy
+    says = (
+        f"The event trigger (16), same seed: {rmse:.3f} m (RMSE xy) with a packet at "
+        f"{np.mean(flight.server['event']):.1%} of the steps."
+    )
+    header = ("step", "reference_x_m", "reference_y_m", "x_m", "y_m", "event")
+    rows = np.column_stack([step, desired, position, sent]).tolist()
+    title = "Fig. 4: position with the event trigger, and when it sent"
+    return _picture(figure, "fig4", title, says, header, rows)
+
+
+def _path(scenario: Scenario, flight: Flight) -> tuple[Array, Array, Array]:
+    """Steps, reference and position [m] of a flight; shapes (steps,), (steps, 2), (steps, 2)."""
+    step = flight.client["step"]
+    desired = scenario.make_reference()(step * scenario.control.dt)[:, :2, 0]
+    return step, desired, flight.client["state"][:, :2, 0]
+
+
+def _draw_path(plane: Any, desired: Array, position: Array) -> None:
+    plane.plot(*desired.T, "r--", linewidth=1.2, label="reference")
+    plane.plot(*position.T, "k-", linewidth=0.8, label="UAV")
+    plane.plot(*position[0], "ko", markersize=3, label="start")
+    plane.set_aspect("equal", adjustable="box")
+    plane.set_xlabel("x [m]")
+    plane.set_ylabel("y [m]")
+
+
+DECAY, EPSILON = "decay rate λ [1/s]", "tolerance ε"
+
+
+def maps(flown: Flown, here: ControlConfig) -> Picture:
+    """Fig. 5: RMSE and event ratio over λ × ε.
+
+    Args:
+        here: where the paper has flown.
+    """
+    decay, epsilon, rmse, ratio = _grid(flown)
+    with _figure(PAGE, 2.8) as figure:
+        panes = figure.subplots(1, 2)
+        names = ("RMSE xy [m]", "event ratio")
+        for plane, values, name in zip(panes, (rmse, ratio), names, strict=True):
+            mesh = plane.pcolormesh(decay, epsilon, values.T, shading="nearest")
+            plane.grid(visible=False)
+            plane.plot(here.decay_rate, here.epsilon, "wx", markeredgewidth=1.5)
+            plane.set_xlabel(DECAY)
+            plane.set_ylabel(EPSILON)
+            figure.colorbar(mesh, label=name)
+    ranks = stats.spearmanr(rmse.ravel(), ratio.ravel()).statistic
+    says = (
+        f"{len(flown)} cells; the cross is the paper's. More λ, more events: from "
+        f"{ratio[0].mean():.3f} at {decay[0]:g} to {ratio[-1].mean():.3f} at {decay[-1]:g} on "
+        f"average; more ε, fewer: from {ratio[:, 0].mean():.3f} to {ratio[:, -1].mean():.3f}. RMSE "
+        f"and event ratio have a rank correlation of {ranks:.2f}; the paper calls them inversely "
+        f"related."
+    )
+    header = ("decay_rate", "epsilon", *_MEANS)
+    title = "Fig. 5: control performance and event ratio over λ and ε"
+    return _picture(figure, "fig5", title, says, header, _map_rows(flown))
+
+
+_MEANS = ("rmse_xy", "rmse_xy_ci95", "event_ratio", "event_ratio_ci95")
+
+
+def _map_rows(flown: Flown) -> list[tuple[Any, ...]]:
+    return [
+        (*values, *estimate(runs, "rmse_xy"), *estimate(runs, "event_ratio"))
+        for values, runs in flown.items()
+    ]
+
+
+def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
+    """λ, ε, and mean RMSE and event ratio over both; shapes (λ,), (ε,), (λ, ε), (λ, ε)."""
+    decay, epsilon = (np.unique([values[axis] for values in flown]) for axis in (0, 1))
+    shape = (len(decay), len(epsilon))
+    rmse, ratio = (
+        np.array([estimate(runs, name)[0] for runs in flown.values()], dtype=np.float64)
+        for name in ("rmse_xy", "event_ratio")
+    )
+    return decay, epsilon, rmse.reshape(shape), ratio.reshape(shape)
+
+
+def pareto(flown: Flown, periodic: Flown) -> Picture:
+    """Fig. 5 as curves: RMSE against event ratio, and periodic sending beside it."""
+    decay, _, rmse, ratio = _grid(flown)
+    points = [
+        (steps, *estimate(runs, "event_ratio"), *estimate(runs, "rmse_xy"))
+        for (steps,), runs in periodic.items()
+    ]
+    rates, errors = np.array([(row[1], row[3]) for row in points], dtype=np.float64).T
+    with _figure(COLUMN, 3.0) as figure:
+        from matplotlib import colormaps
+
+        plane = figure.subplots()
+        colours = colormaps["autumn"](np.linspace(0.0, 0.7, len(decay)))
+        for value, x, y, colour in zip(decay, ratio, rmse, colours, strict=True):
+            ends = value in (decay[0], decay[-1])
+            label = f"(16), λ = {value:g} /s" if ends else None
+            plane.plot(x, y, "^-", color=colour, linewidth=0.8, markersize=3, label=label)
+        plane.plot(rates, errors, "v--", color="#0072b2", markersize=4, label="periodic")
+        plane.set_xscale("log")
+        plane.set_xlabel("event ratio")
+        plane.set_ylabel("RMSE xy [m]")
+        plane.legend()
+    order = np.argsort(rates)
+    within = (ratio >= rates.min()) & (ratio <= rates.max())
+    at_rate = np.interp(np.log(ratio), np.log(rates[order]), errors[order])
+    worse, compared = int(np.sum(within & (at_rate < rmse))), int(within.sum())
+    says = (
+        f"Below and to the left is better. At the same rate (interpolated), periodic sending has "
+        f"the smaller RMSE in {worse} of {compared} cells; the trigger's is "
+        f"{np.mean(rmse[within] / at_rate[within]):.2f} times it on average."
+    )
+    header = ("method", "decay_rate", "epsilon", "period", *_MEANS)
+    rows = [(EVENT, *row[:2], None, *row[2:]) for row in _map_rows(flown)]
+    rows += [("periodic", None, None, row[0], *row[3:], *row[1:3]) for row in points]
+    title = "Fig. 5 as curves: what a packet buys"
+    return _picture(figure, "fig5-pareto", title, says, header, rows)
+
+
+def curve(study: Study, cells: Cells) -> Picture:
+    """RMSE of all methods against one thing, with 95 % bands."""
+    methods = list(STYLES)
+    table = {
+        method: np.array(
+            [cells[value, method].estimate("rmse_xy") for value in study.axis.values], np.float64
+        )
+        for method in methods
+    }
+    places = np.array(study.axis.values)
+    with _figure(COLUMN, 3.2) as figure:
+        plane = figure.subplots()
+        for method in methods:
+            means, halves = table[method].T
+            halves = np.nan_to_num(halves)
+            plane.plot(places, means, **STYLES[method], linewidth=1.0, markersize=3.5, label=method)
+            colour = STYLES[method]["color"]
+            low = np.maximum(means - halves, 0.5 * means)  # a logarithmic scale has no 0
+            plane.fill_between(places, low, means + halves, color=colour, alpha=0.2, linewidth=0)
+        plane.axvline(study.here, color="0.6", linewidth=0.8)
+        means = np.concatenate([table[method][:, 0] for method in methods])
+        if np.nanmax(means) > RATIO_LOG * np.nanmin(means):
+            plane.set_yscale("log")
+        plane.set_xlabel(study.label)
+        plane.set_ylabel("RMSE xy [m]")
+        figure.legend(loc="outside upper center", ncols=2)
+    better, worse = against_periodic(study, cells)
+    n = len(study.axis.values)
+    failed = sum(not run.steps for cell in cells.values() for run in cell.runs)
+    says = (
+        f"The vertical line is the paper's network and vehicle; {study.runs} runs a point. "
+        f"Periodic sending at the event trigger's own rate flies better than it at {better} of {n} "
+        f"values and worse at {worse} (95 % intervals apart)."
+    )
+    if failed:
+        says += f" {failed} runs never got a session and count in no mean."
+    header = (study.name, "method", "period", "runs", "flown", *_MEANS)
+    rows = [
+        (
+            *(value, method, cell.period, len(cell.runs), sum(run.steps > 0 for run in cell.runs)),
+            *(*cell.estimate("rmse_xy"), *cell.estimate("event_ratio")),
+        )
+        for (value, method), cell in cells.items()
+    ]
+    title = f"RMSE against {study.label.partition(' [')[0]}"
+    return _picture(figure, f"rmse-{study.name}", title, says, header, rows)
+
+
+def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
+    """At how many values periodic sending is better than the trigger, and at how many worse."""
+    signs = [
+        periodic_wins(cells[value, EVENT], cells[value, PERIODIC]) for value in study.axis.values
+    ]
+    return signs.count(1), signs.count(-1)
+
+
+def estimates(samples: Samples) -> Picture:
+    """How far the server's estimate (13) is from the truth."""
+    shares = np.linspace(0.0, 1.0, 201)
+    errors = {
+        method: np.concatenate([_estimate_error(flight) for flight in flights])
+        for method, (_, flights) in samples.items()
+    }
+    quantiles = {method: np.quantile(error, shares, axis=0) for method, error in errors.items()}
+    with _figure(PAGE, 2.6) as figure:
+        panes = figure.subplots(1, 2, sharey=True)
+        for part, (plane, unit) in enumerate(zip(panes, ("m", "m/s"), strict=True)):
+            for method, values in quantiles.items():
+                style = {key: STYLES[method][key] for key in ("color", "linestyle")}
+                plane.plot(values[:, part], shares, **style, linewidth=1.2, label=method)
+            plane.set_xscale("log")
+            plane.set_xlabel(f"error of the estimated {('position', 'velocity')[part]} [{unit}]")
+        panes[0].set_ylabel("share of steps")
+        panes[1].legend()
+    medians = ", ".join(f"{np.median(error[:, 0]):.3f} m {name}" for name, error in errors.items())
+    says = (
+        f"‖x̂ − x‖ over {len(samples[EVENT][1])} flights each; median error of position: {medians}."
+    )
+    parts = ("position_m", "velocity_mps")
+    header = ("share", *(f"{method}: {part}" for method in quantiles for part in parts))
+    rows = np.column_stack([shares, *quantiles.values()]).tolist()
+    return _picture(figure, "estimate-error", "Error of the estimate", says, header, rows)
+
+
+def _estimate_error(flight: Flight) -> Array:
+    """‖x̂ − x‖ of position [m] and velocity [m/s], where both are known; shape (steps, 2)."""
+    _, ours, theirs = np.intersect1d(
+        flight.server["step"], flight.client["step"], return_indices=True
+    )
+    error = flight.server["estimate"][ours] - flight.client["state"][theirs]
+    norms: Array = np.linalg.norm(error, axis=1)
+    return norms
+
+
+def intervals(samples: Samples) -> Picture:
+    """How many steps lie between two packets of the event trigger."""
+    scenario, flights = samples[EVENT]
+    gaps = np.concatenate(
+        [np.diff(flight.server["step"][flight.server["event"]]) for flight in flights]
+    )
+    steps = np.arange(1, int(gaps.max()) + 1)
+    counts = np.array([np.sum(gaps == step) for step in steps])
+    regular = samples[PERIODIC][0].control.period
+    with _figure(COLUMN, 2.4) as figure:
+        plane = figure.subplots()
+        dt = scenario.control.dt
+        plane.bar(steps * dt, counts / len(gaps), 0.8 * dt, color="0.4", label="event trigger (16)")
+        plane.axvline(
+            regular * dt, color="#0072b2", linestyle="--", label=f"periodic, every {regular} steps"
+        )
+        plane.set_xlabel("time between two packets [s]")
+        plane.set_ylabel("share")
+        plane.legend()
+    says = (
+        f"{len(gaps)} intervals of {len(flights)} flights: {np.mean(gaps == 1):.0%} are a single "
+        f"step, the median is {np.median(gaps):g} steps, the longest {gaps.max()}."
+    )
+    rows = list(zip(steps.tolist(), (steps * dt).tolist(), counts.tolist(), strict=True))
+    title = "Time between two packets"
+    return _picture(figure, "intervals", title, says, ("steps", "seconds", "count"), rows)
+
+
+def solve_times(servers: Mapping[str, Rows], dt: float) -> Picture:
+    """How long both MPCs of a step took in the flights over UDP.
+
+    Args:
+        servers: rows of the server, by method.
+        dt: length of a step [s].
+    """
+    solve_ms = {
+        name: rows["solve_ns"][rows["solve_ns"] >= 0] / 1e6 for name, rows in servers.items()
+    }
+    everything = np.concatenate(list(solve_ms.values()))
+    edges = np.geomspace(max(1e-3, everything.min()), everything.max() * 1.01, 40)
+    counts = {name: np.histogram(values, edges)[0] for name, values in solve_ms.items()}
+    with _figure(COLUMN, 2.4) as figure:
+        plane = figure.subplots()
+        for name, values in counts.items():
+            plane.stairs(values, edges, color=STYLES[name]["color"], label=name)
+        plane.set_xscale("log")
+        plane.set_xlabel("both MPCs of a step [ms]")
+        plane.set_ylabel("steps")
+        plane.legend()
+    says = (
+        f"p50 {np.median(everything):.2f} ms, p99 {np.quantile(everything, 0.99):.2f} ms, longest "
+        f"{everything.max():.2f} ms, where a step has {dt * 1e3:g} ms."
+    )
+    rows = np.column_stack([edges[:-1], edges[1:], *counts.values()]).tolist()
+    header = ("from_ms", "to_ms", *counts)
+    return _picture(figure, "solve-times", "Solve times over UDP", says, header, rows)

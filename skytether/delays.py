@@ -1,0 +1,104 @@
+"""How long packets really take through netem, over UDP on loopback."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from netem.fate import fates
+from shared.config import Scenario, to_toml
+from shared.endpoint import MILLISECOND_NS
+from shared.model import Array
+from skytether.processes import started
+
+EVERY_S = 0.002
+"""Between packets."""
+BYTES = 350
+"""Of a packet: as long as a horizon."""
+LAST_S = 1.0
+"""How long the last packets are waited for, beyond the mean delay."""
+
+
+class _End(asyncio.DatagramProtocol):
+    """One end: notes when each packet came that the other end stamped and numbered."""
+
+    def __init__(self, answers: bool) -> None:
+        self._answers = answers
+        self._sent = 0
+        self.delays_ns: dict[int, int] = {}
+        """Of each packet that came, by its number."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Of asyncio."""
+        self.transport = transport
+
+    def send(self, peer: tuple[str, int]) -> None:
+        """The next packet."""
+        stamp = self._sent.to_bytes(8) + time.monotonic_ns().to_bytes(8)
+        self.transport.sendto(stamp.ljust(BYTES, b"."), peer)  # type: ignore[attr-defined]
+        self._sent += 1
+
+    def datagram_received(self, data: bytes, peer: tuple[str, int]) -> None:
+        """Of asyncio."""
+        now_ns = time.monotonic_ns()
+        number, sent_ns = int.from_bytes(data[:8]), int.from_bytes(data[8:16])
+        self.delays_ns[number] = now_ns - sent_ns
+        if self._answers:
+            self.send(peer)
+
+
+def measure(
+    scenario: Scenario, folder: Path, packets: int, on_second: Callable[[float], None]
+) -> Array:
+    """Send packets through netem, and as many back as come.
+
+    Args:
+        folder: for the scenario that netem is given.
+        packets: to be sent.
+        on_second: called with the time that it takes so far [s], often.
+
+    Returns:
+        A row each packet that came: how long it took, and how long it was drawn to take [ms].
+
+    Raises:
+        CommandError: netem failed.
+    """
+    file = folder / "scenario.toml"
+    file.write_bytes(to_toml(scenario))
+    return asyncio.run(_measure(scenario, file, packets, on_second))
+
+
+async def _measure(
+    scenario: Scenario, file: Path, packets: int, on_second: Callable[[float], None]
+) -> Array:
+    loop = asyncio.get_running_loop()
+    here = ("127.0.0.1", 0)
+    back, server = await loop.create_datagram_endpoint(lambda: _End(True), local_addr=here)
+    forth, client = await loop.create_datagram_endpoint(lambda: _End(False), local_addr=here)
+    host, port = back.get_extra_info("sockname")
+    arguments = (str(file), "--bind", "127.0.0.1:0", "--server", f"{host}:{port}")
+    try:
+        async with started("netem", *arguments) as netem:
+            began_s = loop.time()
+            for number in range(packets):
+                await asyncio.sleep(began_s + number * EVERY_S - loop.time())
+                client.send(netem.address)
+                on_second(loop.time() - began_s)
+            await asyncio.sleep(2.0 * scenario.network.uplink.mean_s + LAST_S)
+    finally:
+        back.close()
+        forth.close()
+    network, seed = scenario.network, scenario.seed
+    rows = []
+    for name, config, end in (
+        ("downlink", network.downlink, server),
+        ("uplink", network.uplink, client),
+    ):
+        # Packets enter in the order of their numbers: its fate is that of its number.
+        drawn = fates(config, seed, name, 0)
+        for number, fate in zip(range(packets), drawn, strict=False):
+            if number in end.delays_ns:
+                rows.append((end.delays_ns[number], fate.delay_ns))
+    return np.array(rows, dtype=np.float64).reshape(-1, 2) / MILLISECOND_NS

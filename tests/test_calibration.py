@@ -1,0 +1,195 @@
+"""The search for what the paper does not print: what it may change, how it is judged, its log."""
+
+import json
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from lab import calibration
+from lab.calibration import COLUMNS, TABLE_1, Free, Search
+from shared import config
+from shared.config import ConfigError
+from skytether.__main__ import main
+
+PAPER = config.load("paper")
+RADIUS = Free("reference.radius_m", 0.5, 5.0)
+LAG = Free("model.tau_s.0", 0.2, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("reference.radius_m", "got 'reference.radius_m', expected KEY=LOW:HIGH"),
+        ("reference.radius_m=1", "got 'reference.radius_m=1', expected KEY=LOW:HIGH"),
+        ("reference.radius_m=a:b", "got 'reference.radius_m=a:b', expected KEY=LOW:HIGH"),
+        ("reference.radius_m=1:2:3", "got 'reference.radius_m=1:2:3', expected KEY=LOW:HIGH"),
+        (
+            "reference.radius_m=2:1",
+            "reference.radius_m: got the bounds 2:1, expected 0 < LOW < HIGH",
+        ),
+        (
+            "reference.radius_m=0:1",
+            "reference.radius_m: got the bounds 0:1, expected 0 < LOW < HIGH",
+        ),
+        (
+            "reference.radius_m=1:inf",
+            "reference.radius_m: got the bounds 1:inf, expected 0 < LOW < HIGH",
+        ),
+    ],
+)
+def test_a_free_key_that_is_none_is_refused(text: str, said: str) -> None:
+    """With what was given and what was expected."""
+    with pytest.raises(ConfigError) as refused:
+        Free.parse(text)
+    assert str(refused.value) == f"--free: {said}"
+
+
+def test_a_free_key_is_read_as_it_is_meant() -> None:
+    """A number in a list goes by its place."""
+    assert Free.parse("model.tau_s.0=0.2:2") == LAG
+    assert calibration.put(PAPER, {LAG: 0.5, RADIUS: 2.0}) == replace(
+        PAPER,
+        model=replace(PAPER.model, tau_s=(0.5,)),
+        reference=replace(PAPER.reference, radius_m=2.0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("free", "said"),
+    [
+        (Free("reference.radius", 1.0, 2.0), "got reference.radius, expected the key of a number"),
+        (Free("model.tau_s.7", 1.0, 2.0), "got model.tau_s.7, expected the key of a number"),
+        (Free("control.trigger", 1.0, 2.0), "got control.trigger, expected the key of a number"),
+        (
+            Free("reference.radius_m", 3.0, 5.0),
+            "reference.radius_m: got the bounds 3 to 5, expected them to hold",
+        ),
+    ],
+)
+def test_what_cannot_be_searched_for_is_refused(free: Free, said: str) -> None:
+    """Before anything is flown."""
+    with pytest.raises(ConfigError) as refused:
+        calibration.check_free([free], PAPER)
+    assert str(refused.value).startswith(f"--free: {said}")
+
+
+def off_by(share: float) -> calibration.Values:
+    """The paper's own table, every entry larger by a share."""
+    return {
+        column: {name: value * (1.0 + share) for name, value in entries.items()}
+        for column, entries in TABLE_1.items()
+    }
+
+
+def test_the_score_is_the_squares_of_the_deviations_and_punishes_those_out_of_tolerance() -> None:
+    """Ten entries; the event ratio may be twice as far off as the others."""
+    assert calibration.score(TABLE_1) == 0.0
+    assert calibration.score(off_by(0.05)) == pytest.approx(10 * 0.05**2)
+    assert calibration.score(off_by(0.15)) == pytest.approx((9 * 10 + 1) * 0.15**2)
+    assert calibration.score(off_by(float("nan"))) == calibration.UNFLYABLE
+    assert calibration.is_admissible(off_by(-0.09))
+    assert not calibration.is_admissible(off_by(0.11))
+    assert set(COLUMNS) == set(TABLE_1)
+
+
+def test_a_search_begins_where_it_was_told_to() -> None:
+    """The first point is the scenario itself; all keep within their bounds."""
+    search = Search(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1)
+    first, *others = search.ask()
+    assert search.values(first) == pytest.approx(search.values(PAPER), rel=1e-3)
+    for other in others:
+        assert 0.5 <= other.reference.radius_m <= 5.0
+        assert 0.2 <= other.model.tau_s[0] <= 2.0
+
+
+def test_a_search_told_the_same_proposes_the_same() -> None:
+    """So that a log takes the place of flights."""
+    searches = [Search(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1) for _ in range(2)]
+    proposed = []
+    for search in searches:
+        for _ in range(3):
+            search.ask()
+            search.tell([3.0, 1.0, 2.0, 5.0, 4.0])
+        proposed.append(search.ask())
+    assert proposed[0] == proposed[1]
+
+
+ARGV = [
+    *("calibrate", "paper", "--free", "reference.radius_m=0.5:5", "model.tau_s.0=0.2:2"),
+    *("--duration", "3", "--settle", "0", "--runs", "2", "--population", "4", "--workers", "1"),
+]
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a search of two generations."""
+    out = tmp_path_factory.mktemp("search")
+    assert main([*ARGV, "--generations", "2", "--out", str(out)]) == 0
+    return out
+
+
+def test_the_best_point_of_all_is_kept(searched: Path) -> None:
+    """As a scenario that flies."""
+    _, *generations = map(json.loads, (searched / "log.jsonl").read_text().splitlines())
+    points = [point for generation in generations for point in generation]
+    assert len(points) == 8
+    best = min(points, key=lambda point: point["score"])
+    found = config.load(str(searched / "best.toml"))
+    assert found.reference.radius_m == best["keys"]["reference.radius_m"]
+    assert found.model.tau_s == (best["keys"]["model.tau_s.0"],)
+
+
+def test_a_search_goes_on_from_its_log_though_a_line_was_cut(
+    searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Killed while it wrote its second generation, it makes the same log to the last byte."""
+    whole = (searched / "log.jsonl").read_text()
+    (tmp_path / "log.jsonl").write_text(whole[: -len(whole.splitlines()[-1]) // 2])
+    assert main([*ARGV, "--generations", "2", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "log.jsonl").read_text() == whole
+    assert "of 8 points have every entry within tolerance" in capsys.readouterr().out
+
+
+def test_another_search_in_the_same_folder_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It would be told scores of other flights."""
+    argv = [*ARGV, "--out", str(tmp_path)]
+    (tmp_path / "log.jsonl").write_text(
+        json.dumps({"scenario": "", "free": [], "runs": 2, "population": 4, "sigma": 0.1}) + "\n"
+    )
+    assert main(argv) == 2
+    said = f"{tmp_path}: holds a search with another scenario; continue that one, or give another"
+    assert capsys.readouterr().err.strip() == f"calibrate: {said} --out"
+
+
+def test_a_log_that_does_not_fit_the_search_is_refused(
+    searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its scores belong to other points."""
+    settings, generation, _ = (searched / "log.jsonl").read_text().splitlines()
+    points = json.loads(generation)
+    points[2]["keys"]["reference.radius_m"] *= 1.1
+    (tmp_path / "log.jsonl").write_text(f"{settings}\n{json.dumps(points)}\n")
+    assert main([*ARGV, "--generations", "2", "--out", str(tmp_path)]) == 2
+    said = f"calibrate: {tmp_path}: generation 1 was another search's; give another --out"
+    assert capsys.readouterr().err.strip() == said
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--runs", "0"], "--runs: got 0, expected 1 to 1000"),
+        (["--population", "1"], "--population: got 1, expected 4 to 1000"),
+        (["--sigma", "0"], "--sigma: got 0, expected more than 0, at most 1"),
+        (["--free", "model.tau_s"], "--free: got 'model.tau_s', expected KEY=LOW:HIGH"),
+    ],
+)
+def test_an_impossible_search_is_refused(
+    argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line, before anything is written."""
+    assert main(["calibrate", "paper", "--out", str(tmp_path / "out"), *argv]) == 2
+    assert capsys.readouterr().err.strip() == f"calibrate: {said}"
+    assert not (tmp_path / "out").exists()
