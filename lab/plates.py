@@ -78,6 +78,7 @@ def _picture(  # noqa: PLR0917
 ) -> Picture:
     png, pdf = io.BytesIO(), io.BytesIO()
     figure.savefig(png, format="png", dpi=220)
+    figure.set_layout_engine("none")  # it lies as it should
     figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
     return Picture(name, title, says, png.getvalue(), pdf.getvalue(), to_csv(header, rows))
 

@@ -85,8 +85,8 @@ QUICK = Scale(
     cells=3,
     periods=(1, 5, 10, 20),
     duration=32.5,
-    real_s=6.0,
-    real_settle_s=2.0,
+    real_s=4.0,
+    real_settle_s=1.0,
     sample_runs=2,
     delay_packets=500,
 )
