@@ -8,8 +8,10 @@ so that, with the set of inputs at their bound given, a backward pass over 2 x 2
 in O(H), where a factorisation of 𝓗 takes O(H³). The forward pass finds the input v that each stage
 would choose for itself: beyond the bound it belongs into the set, within it belongs out. A set that
 finds itself again is the optimum. From the shifted horizon of the step before that takes one or two
-rounds. A set can wander in a circle instead (rarely: long steps, a tiny R); such a problem goes to
-DAQP, a dual active-set method, and its answer is believed once it meets the optimality conditions.
+rounds. A set can wander in a circle instead (long steps, a tiny R, corners of the reference); then
+only the input that is furthest on the wrong side changes it, a round for each. What even that does
+not end goes to DAQP, a dual active-set method, and its answer is believed once it meets the
+optimality conditions.
 """
 
 import daqp
@@ -20,8 +22,11 @@ from server.mpc import MPC
 from server.solver import NEAR, SolverFailed
 from shared.model import Array, Flags
 
-ROUNDS_MAX = 30
-"""Of the active set; seven have been the most on recorded flights."""
+ROUNDS_MAX = 8
+"""In which the whole set may change; five have been the most on recorded flights."""
+PIVOTS_MAX = 200
+"""Rounds after that, in which one input enters the set or leaves it."""
+SNAP = 1e-12
 RESIDUAL_MAX = 1e-7
 """Of the optimality conditions, relative to the gradient, for an answer of DAQP."""
 CYCLED, NOT_FINITE = -1, -2
@@ -52,7 +57,7 @@ class ExactSolver:
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
         """See `Solver`."""
         inputs, rounds, worst = _riccati_active_set(
-            *self._problem, gradient, guess, NEAR, ROUNDS_MAX
+            *self._problem, gradient, guess, NEAR, ROUNDS_MAX, PIVOTS_MAX
         )
         solved = np.ones(len(gradient), dtype=np.bool_)
         if worst > 0:
@@ -73,6 +78,8 @@ class ExactSolver:
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12
         )
+        # It may leave an input that is at its bound a rounding error inside.
+        answer = np.where(np.abs(answer) > bound - SNAP, np.copysign(bound, answer), answer)
         inputs: Array = np.clip(answer, -bound, bound)
         slope = hessian @ inputs + gradient
         # Optimal: no slope inside, and none back inside at a bound.
@@ -122,11 +129,11 @@ def _backward(stages, side, last, A, B, W, rho):  # type: ignore[no-untyped-def]
 
 @njit(
     "Tuple((f8[:,:,::1], i8[:,::1], i8))(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1],"
-    "f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8, i8)",
+    "f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8, i8, i8)",
     cache=True,
     error_model="numpy",
 )
-def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0912, PLR0917 - compiled
+def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0912, PLR0915, PLR0917 - compiled
     A: Array,
     B: Array,
     W: Array,
@@ -137,6 +144,7 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
     guess: Array,
     near: float,
     rounds_max: int,
+    pivots_max: int,
 ):
     """Inputs (n, axes, H), rounds taken (n, axes), and the worst of these (CYCLED, NOT_FINITE).
 
@@ -150,12 +158,13 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
         guess: inputs whose bounds are the first set; shape (n, axes, H).
         near: how much of the bound they must reach for that (an argument: numba would not notice
             that a constant of another module has changed).
-        rounds_max: after so many the set is given up.
+        rounds_max: after so many only one input at a time enters the set or leaves it.
+        pivots_max: after so many of those the set is given up.
     """
     n, axes, H = gradient.shape
     inputs = np.empty((n, axes, H))
     rounds = np.full((n, axes), CYCLED)
-    worst = rounds_max
+    worst = rounds_max + pivots_max
     side, own, stages = np.empty(H), np.empty(H), np.empty((H, 8))
     for vehicle in range(n):
         for axis in range(axes):
@@ -170,7 +179,8 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
                     last = i
                 total += g[i]
             stages[:] = free[axis]
-            for count in range(1, rounds_max + 1):
+            for count in range(1, rounds_max + pivots_max + 1):
+                singly = count > rounds_max
                 _backward(stages, side, last, A[axis], B[axis], W, rho)
                 # Backward: own is what the stage would choose for itself at x = 0.
                 q0, q1 = 0.0, 0.0
@@ -183,23 +193,31 @@ def _riccati_active_set(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
                         q0, q1 = q0 - row[K0] * d, q1 - row[K1] * d
                     else:
                         q0, q1 = q0 + row[S0] * side[i] * bound, q1 + row[S1] * side[i] * bound
-                # Forward: what each stage would choose for itself is its verdict on the set.
-                x0, x1, last = 0.0, 0.0, -1
+                # Forward: what each stage would choose for itself is its verdict on the set. Those
+                # that must leave the box are held back, unless only the worst may change.
+                x0, x1, last, most = 0.0, 0.0, -1, 0.0
                 for i in range(H):
                     row = stages[i]
                     v = own[i] - (row[K0] * x0 + row[K1] * x1)
                     verdict = 1.0 if v > bound else -1.0 if v < -bound else 0.0
-                    if side[i] != 0.0:
-                        v = side[i] * bound
-                    elif verdict != 0.0:
-                        v = verdict * bound
+                    held = side[i]
                     if verdict != side[i]:
-                        side[i], last = verdict, i
+                        if singly:
+                            wrong = abs(v) - bound if held == 0.0 else bound - v * held
+                            if wrong > most:
+                                most, last = wrong, i
+                        else:
+                            last, side[i] = i, verdict
+                            held = held if held != 0.0 else verdict
+                    if held != 0.0:
+                        v = held * bound
                     u[i] = v
                     x0, x1 = a00 * x0 + a01 * x1 + b0 * v, a10 * x0 + a11 * x1 + b1 * v
                 if last < 0:
                     rounds[vehicle, axis] = count
                     break
+                if singly:
+                    side[last] = 0.0 if side[last] != 0.0 else np.sign(u[last])
             if not np.isfinite(total + x0 + x1):
                 rounds[vehicle, axis] = NOT_FINITE
             worst = min(worst, rounds[vehicle, axis])
