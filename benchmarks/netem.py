@@ -284,7 +284,7 @@ def measure(options: Options) -> dict[str, Any]:
     seeds = range(1, options.runs + 1)
     runs = [measure_once(options, seed) for seed in progress(seeds, "netem")]
     return {
-        "options": {**asdict(options), "json": str(options.json)},
+        "options": {name: value for name, value in asdict(options).items() if name != "json"},
         "median": {name: median(getattr(run, name) for run in runs) for name in asdict(runs[0])},
         "runs": [asdict(run) for run in runs],
         "wake": {

@@ -51,6 +51,9 @@ SESSION_NS = 30 * SECOND_NS
 """A vehicle unheard for so long is forgotten."""
 REACH_S = 2.0
 """Observations older than this are no base for an estimate."""
+BLOCK = 128
+"""Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
+so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
 TOLD_MAX = 16
 """Vehicles that a report tells of one by one."""
 TICK_BIN_NS = MILLISECOND_NS // 20
@@ -126,6 +129,8 @@ class Server(Endpoint):
         """Those in use, rising."""
         self._opened = 0
         self._due_ns: int | None = None
+        self._expire_ns = 0
+        """When to look for vehicles that are gone."""
         self.missed = 0
         self.ticks = Histogram(TICK_BIN_NS)
         """How long each took, as far as the stopwatch runs."""
@@ -230,7 +235,9 @@ class Server(Endpoint):
         self.missed += late
         tick_ns = self._due_ns + late * self._dt_ns
         self._due_ns = tick_ns + self._dt_ns
-        self._expire(now_ns)
+        if now_ns >= self._expire_ns:
+            self._expire_ns = now_ns + SECOND_NS
+            self._expire(now_ns)
         if self._sessions:
             self._tick(tick_ns, now_ns)
         else:
@@ -254,8 +261,10 @@ class Server(Endpoint):
         able: Flags = (step > self._estimator.last_step[rows]) & self._estimator.within_reach(
             rows, step
         )
-        if able.any():
-            self._control(rows[able], step[able], now_ns)
+        able_rows, able_step = rows[able], step[able]
+        for first in range(0, len(able_rows), BLOCK):
+            block = slice(first, first + BLOCK)
+            self._control(able_rows[block], able_step[block], now_ns)
         for row in rows[now_ns - self._sent_ns[rows] >= self._heartbeat_ns].tolist():
             session = self._by_row[row]
             self._send(session, Heartbeat(session.vehicle, session.session, now_ns), now_ns)

@@ -56,10 +56,16 @@ class MPC:
         )
         return gradient
 
-    def predict(self, x: Array, u: Array) -> Array:
-        """x, then X(k) of eq. (7): the states at the stages 0 … H; shape (n, axes, H + 1, 2)."""
-        states: Array = _roll_out(self.model.A, self.model.B, x, u)
-        return states
+    def predict(self, x: Array, u: Array, states: Array, rows: Indices) -> None:
+        """x, then X(k) of eq. (7): the states at the stages 0 … H.
+
+        Args:
+            x: state at stage 0 [m, m/s]; shape (n, axes, 2).
+            u: inputs [m/s]; shape (n, axes, H).
+            states: where to put them; shape (some, axes, H + 1, 2).
+            rows: of each vehicle in there; shape (n,).
+        """
+        _roll_out(self.model.A, self.model.B, x, u, states, rows)
 
 
 def condense(model: Model, control: ControlConfig, *, change_weight: float) -> MPC:
@@ -110,25 +116,24 @@ def shift(inputs: Array, steps: Indices) -> Array:
 
 
 @njit(
-    "f8[:,:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,:,:], f8[:,:,::1])",
+    "(f8[:,:,::1], f8[:,::1], f8[:,:,:], f8[:,:,::1], f8[:,:,:,::1], i8[:])",
     cache=True,
     error_model="numpy",
 )
-def _roll_out(A, B, x, u):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    """Eq. (4) along a horizon: u of shape (n, axes, H) from x, shape (n, axes, 2)."""
+def _roll_out(A, B, x, u, states, rows):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    """Eq. (4) along a horizon, see `MPC.predict`."""
     n, axes, H = u.shape
-    states = np.empty((n, axes, H + 1, 2))
     for vehicle in range(n):
         for axis in range(axes):
             p, v = x[vehicle, axis, 0], x[vehicle, axis, 1]
-            states[vehicle, axis, 0, 0], states[vehicle, axis, 0, 1] = p, v
+            along = states[rows[vehicle], axis]
+            along[0, 0], along[0, 1] = p, v
             for i in range(H):
                 p, v = (
                     A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u[vehicle, axis, i],
                     A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u[vehicle, axis, i],
                 )
-                states[vehicle, axis, i + 1, 0], states[vehicle, axis, i + 1, 1] = p, v
-    return states
+                along[i + 1, 0], along[i + 1, 1] = p, v
 
 
 @njit(

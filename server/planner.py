@@ -74,9 +74,8 @@ class Successive:
             inputs[fresh], solved[fresh] = self._first_solver.solve(gradient, previous[fresh])
         self.solve_ns = self._stopwatch.lap("solve")
         # What is sent is float32: planning goes on with what the vehicle will really be told.
-        inputs = inputs.astype(np.float32).astype(np.float64)
-        self.inputs[rows] = inputs
-        self.states[rows] = self._mpc.predict(x, inputs)
+        self.inputs[rows] = inputs = inputs.astype(np.float32).astype(np.float64)
+        self._mpc.predict(x, inputs, self.states, rows)
         return solved
 
 
@@ -167,7 +166,8 @@ class Planner:
         led = self._generator.solve(rows, gap, fresh, planned, self._desired(step))
         trajectory = self._generator.states[rows]
         solved = led & self._tracker.solve(rows, gap, fresh, estimate, trajectory)
-        # A first plan that failed is no plan to go on from.
-        self._step[rows] = np.where(fresh & ~solved, -1, step)
+        self._step[rows] = step
+        if not solved.all():  # a first plan that failed is no plan to go on from
+            self._step[rows[fresh & ~solved]] = -1
         solve_ns = self._generator.solve_ns + self._tracker.solve_ns
         return Plan(self._tracker.inputs[rows], solved, solve_ns if self._stopwatch.runs else -1)

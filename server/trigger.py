@@ -47,16 +47,16 @@ class Trigger(Protocol):
         """These vehicles were sent a horizon: k_i ← k."""
 
 
-def planning_error(estimate: Array, planned: Array, terminal_weight: tuple[float, float]) -> Array:
+def planning_error(estimate: Array, planned: Array, terminal_weight: Array) -> Array:
     """V(k) of eq. (16); shape (n,)."""
-    return np.einsum("nap,p->n", (estimate - planned) ** 2, np.array(terminal_weight))
+    return ((estimate - planned) ** 2 @ terminal_weight).sum(axis=1)
 
 
 class Always:
     """A packet at every step."""
 
     def __init__(self, control: ControlConfig) -> None:
-        self._P = control.terminal_weight
+        self._P = np.array(control.terminal_weight)
 
     def test(
         self,
@@ -78,7 +78,7 @@ class Paper:
     """Eq. (16)."""
 
     def __init__(self, control: ControlConfig, capacity: int) -> None:
-        self._P = control.terminal_weight
+        self._P = np.array(control.terminal_weight)
         self._decay = control.decay_rate * control.dt
         self._epsilon = control.epsilon
         self._event_step = np.zeros(capacity, dtype=np.int64)

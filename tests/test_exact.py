@@ -84,22 +84,49 @@ def test_every_answer_is_optimal_and_within_its_box(
     assert residual(problem, inputs, gradient) < 1e-10
 
 
-def test_problems_that_cycle_are_solved_all_the_same() -> None:
-    """By DAQP, and as exactly."""
+@pytest.mark.parametrize(("pivots", "fewest", "most"), [(None, 0, 5), (0, 100, 600)])
+def test_problems_that_cycle_are_solved_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, pivots: int | None, fewest: int, most: int
+) -> None:
+    """One input at a time, and without that by DAQP; as exactly either way."""
+    if pivots is not None:
+        monkeypatch.setattr(exact, "PIVOTS_MAX", pivots)
     problem = mpc((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
     solver = ExactSolver(problem, U_MAX)
     inputs, solved = solver.solve(gradient, guess)
     assert solved.all()
-    assert solver.fallbacks > 10
+    assert fewest <= solver.fallbacks <= most
     assert (np.abs(inputs) <= U_MAX[:, None]).all()
-    assert residual(problem, inputs, gradient) < 1e-7
+    assert residual(problem, inputs, gradient) < 1e-10
+
+
+def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is right to rounding, and has a slope all the same: no reason to refuse the answer."""
+    monkeypatch.setattr(exact, "PIVOTS_MAX", 0)
+    dual = exact.daqp.solve
+
+    def nearly(*args: object, **keys: object) -> object:
+        answer, *rest = dual(*args, **keys)
+        return answer * (1.0 - 4e-16), *rest
+
+    monkeypatch.setattr(exact.daqp, "solve", nearly)
+    problem = mpc((0.4, 0.6), **ROUGH)
+    gradient, guess = problems(problem, 100, 3.0, seed=1)
+    solver = ExactSolver(problem, U_MAX)
+    inputs, solved = solver.solve(gradient, guess)
+    assert solved.all()
+    assert solver.fallbacks > 10
+    assert residual(problem, inputs, gradient) < 1e-10
 
 
 def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A wrong answer of DAQP is not believed: those vehicles keep their guess, others fly on."""
+    monkeypatch.setattr(exact, "PIVOTS_MAX", 0)
     problem = mpc((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
     right, _ = ExactSolver(problem, U_MAX).solve(gradient, guess)
@@ -157,10 +184,10 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     assert (np.abs(inputs) == 1.8).mean() > 0.5
     rounded = inputs.astype(np.float32).astype(np.float64)
     assert np.abs(rounded).max() < 1.8
-    again, rounds, _ = exact._riccati_active_set(*solver._problem, gradient, rounded, NEAR, 1)
+    again, rounds, _ = exact._riccati_active_set(*solver._problem, gradient, rounded, NEAR, 1, 0)
     assert (rounds == 1).all()
     np.testing.assert_array_equal(again, inputs)
-    _, rounds, _ = exact._riccati_active_set(*solver._problem, gradient, rounded, 1.0, 1)
+    _, rounds, _ = exact._riccati_active_set(*solver._problem, gradient, rounded, 1.0, 1, 0)
     assert (rounds == exact.CYCLED).any()
 
 

@@ -48,6 +48,15 @@ def printed_cost(
     return cost + (x - target[:, H]) ** 2 @ P
 
 
+def predict(mpc: MPC, x: Array, u: Array) -> Array:
+    """The states at the stages 0 … H, written into rows in another order; (n, axes, H + 1, 2)."""
+    n, axes, H = u.shape
+    states, rows = np.full((n + 2, axes, H + 1, 2), np.nan), np.arange(n, 0, -1)
+    mpc.predict(x, u, states, rows)
+    assert np.isnan(states[[0, -1]]).all()
+    return states[rows]
+
+
 def optimum(mpc: MPC, gradient: Array, u_max: Array) -> Array:
     """The bounded QPs of one vehicle by dense least squares: ½ ‖Lᵀu + L⁻¹g‖², 𝓗 = L Lᵀ."""
     answers = []
@@ -149,7 +158,7 @@ def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int
     model = discretise(rng.uniform(0.1, 3.0, axes), 0.05)
     mpc = condense(model, control(H), change_weight=0.0)
     x, _, u = situation(seed, H, axes)
-    predicted = mpc.predict(x[None], u[None])[0, :, 1:]
+    predicted = predict(mpc, x[None], u[None])[0, :, 1:]
     for stage in range(H):
         x = model.step(x, u[:, stage])
         np.testing.assert_allclose(predicted[:, stage], x, rtol=0, atol=1e-11)
@@ -220,12 +229,12 @@ def test_batch_has_the_gradients_of_its_singles(
         for some in zip(*(situation(seed + i, 20) for i in range(vehicles)), strict=True)
     )
     gradients = mpc.gradient(x, target, previous)
-    predictions = mpc.predict(x, previous)
+    predictions = predict(mpc, x, previous)
     for i in range(vehicles):
         one = slice(i, i + 1)
         single = mpc.gradient(x[one], target[one], previous[one])[0]
         np.testing.assert_allclose(gradients[i], single, rtol=0, atol=1e-10)
-        single = mpc.predict(x[one], previous[one])[0]
+        single = predict(mpc, x[one], previous[one])[0]
         np.testing.assert_allclose(predictions[i], single, rtol=0, atol=1e-12)
 
 

@@ -200,7 +200,8 @@ def test_plan_is_exactly_what_can_be_sent() -> None:
     plan = run(planner, 0, START)
     np.testing.assert_array_equal(plan.inputs, plan.inputs.astype(np.float32))
     mpc = condense(MODEL, SCENARIO.control, change_weight=0.0)
-    expected = mpc.predict(START[None], planner._generator.inputs)
+    expected = np.empty_like(planner._generator.states)
+    mpc.predict(START[None], planner._generator.inputs, expected, np.array([0]))
     np.testing.assert_array_equal(planner._generator.states, expected)
 
 

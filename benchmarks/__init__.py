@@ -1,0 +1,1 @@
+"""What Skytether costs, measured beside what others cost in the same run."""

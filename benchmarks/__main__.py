@@ -1,0 +1,93 @@
+"""Every benchmark, one after the other; the figures go into benchmarks/results.json and docs/.
+
+With --only, the figures of the others stay as they were.
+"""
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+import tyro
+
+from benchmarks import accuracy, netem, solvers, tick, wire
+from benchmarks.harness import CONSOLE, Table, machine, refresh
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmarks" / "results.json"
+DOCUMENT = ROOT / "docs" / "performance.md"
+Section = Literal["netem", "solvers", "tick", "wire", "accuracy"]
+SECTIONS: dict[Section, ModuleType] = {
+    "netem": netem,
+    "solvers": solvers,
+    "tick": tick,
+    "wire": wire,
+    "accuracy": accuracy,
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Of a run."""
+
+    only: tuple[Section, ...] = tuple(SECTIONS)
+    """Which to run."""
+    quick: bool = False
+    """A look at all of them in under a minute; nothing is written."""
+
+
+def main() -> int:
+    """Entry point; the exit code."""
+    options = tyro.cli(Options, description=__doc__)
+    for name in options.only:
+        section = SECTIONS[name]
+        CONSOLE.rule(name)
+        figures = section.measure(section.QUICK if options.quick else section.FULL)
+        for title, table in section.tables(figures).items():
+            table.show(title)
+        if not options.quick:
+            write({name: {"machine": machine(), **figures}})
+    return 0
+
+
+def write(
+    results: Mapping[str, Any],
+    file: Path = RESULTS,
+    document: Path = DOCUMENT,
+    figure: Path = tick.FIGURE,
+) -> None:
+    """Put new figures beside those of other sections, and all into the document."""
+    known = {**(json.loads(file.read_text()) if file.exists() else {}), **results}
+    merged = {name: known[name] for name in SECTIONS if name in known}
+    file.write_text(json.dumps(merged, indent=1) + "\n")
+    if "tick" in results:
+        tick.draw(results["tick"], figure)
+    tables = {"machine": machines(merged), "packages": packages(merged)}
+    for name, figures in merged.items():
+        tables |= SECTIONS[name].tables(figures)
+    document.write_text(refresh(document.read_text(), tables))
+
+
+def machines(results: Mapping[str, Any]) -> Table:
+    """What each section was measured on, and how late that machine woke meanwhile."""
+    rows = []
+    for name, figures in results.items():
+        on, wake = figures["machine"], figures.get("wake")
+        late = [f"{wake[share]:.2f}" for share in wake] if wake else ["", "", ""]
+        where = f"{on['cores']} x {on['cpu']}, Python {on['python']}"
+        rows.append([name, where, on["commit"] or "", on["date"], *late])
+    headings = ["measured", "on", "commit", "date", "wakes late, p50 [ms]", "p99", "max"]
+    return Table(headings, rows)
+
+
+def packages(results: Mapping[str, Any]) -> Table:
+    """Their versions, where the solvers were measured; without solvers there are none."""
+    versions = results.get("solvers", {"machine": {"packages": {}}})["machine"]["packages"]
+    return Table(["package", "version"], [list(pair) for pair in versions.items()])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

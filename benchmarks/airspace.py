@@ -1,0 +1,137 @@
+"""Vehicles that fly what a server plans for them, without a network: the server's work alone.
+
+A state is heard of some steps late, as over the paper's network, so that the estimator has as much
+to do as there. The vehicles are spread along the reference and flown by the model, with noise.
+"""
+
+from collections import deque
+
+import numpy as np
+
+from server.controller import Server
+from server.planner import Plan, Planner
+from server.solver import NEAR
+from shared.config import Scenario
+from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
+from shared.model import Array, Indices, discretise
+from shared.protocol import NO_HORIZON, Hello, Observation, Welcome, decode, encode
+from shared.stopwatch import Stopwatch
+
+NOISE = np.array([0.001, 0.01])
+"""Of a step, on position [m] and velocity [m/s]."""
+DELAY_S = 0.44
+"""Of an observation: the mean of the paper's network."""
+AHEAD_NS = 10 * SECOND_NS
+"""Vehicle's clock minus the server's."""
+START_NS = 20 * SECOND_NS
+"""On the server's clock, the first tick."""
+PERIOD_S = 27.5
+"""Over which the vehicles are spread along the reference."""
+
+
+class Vehicles:
+    """n vehicles on their way.
+
+    Args:
+        scenario: what they fly.
+        count: n.
+    """
+
+    def __init__(self, scenario: Scenario, count: int) -> None:
+        self._rng = np.random.default_rng(1)
+        self._model = discretise(scenario.true_tau_s, scenario.control.dt)
+        spread = round(PERIOD_S / scenario.control.dt)
+        self.step: Indices = self._rng.integers(spread, 2 * spread, count)
+        """k of each; shape (n,)."""
+        self.x: Array = scenario.make_reference()(self.step * scenario.control.dt)
+        """shape (n, axes, 2)."""
+
+    def fly(self, u: Array) -> None:
+        """One step with these inputs [m/s]; shape (n, axes)."""
+        noise = self._rng.standard_normal(self.x.shape) * NOISE
+        self.x = self._model.step(self.x, u) + noise
+        self.step = self.step + 1
+
+
+class PlannedFleet:
+    """A planner, and vehicles whose states it knows."""
+
+    def __init__(self, scenario: Scenario, count: int, stopwatch: Stopwatch) -> None:
+        model = discretise(scenario.tau_s, scenario.control.dt)
+        self.planner = Planner(scenario, model, count, stopwatch)
+        self.vehicles = Vehicles(scenario, count)
+        self._rows = np.arange(count)
+        self._plan: Plan | None = None
+
+    def prepare(self) -> None:
+        """The step before is flown."""
+        if self._plan is not None:
+            self.vehicles.fly(self._plan.inputs[:, :, 0])
+        step, x = self.vehicles.step, self.vehicles.x
+        self._given = (self._rows, step, x, *self.planner.planned(self._rows, step, x))
+
+    def plan(self) -> None:
+        """Plan for all."""
+        self._plan = self.planner.plan(*self._given)
+
+    def active(self, u_max: Array) -> float:
+        """Share of the axis problems that have an input at its bound [u_max: (axes,)]."""
+        mpcs = (self.planner._generator, self.planner._tracker)
+        at_bound = [np.abs(mpc.inputs) >= NEAR * u_max[:, None] for mpc in mpcs]
+        return float(np.mean([some.any(axis=2).mean() for some in at_bound]))
+
+
+class Airspace:
+    """A server, and vehicles in session with it.
+
+    Args:
+        scenario: what they fly; it must be told to send at every step.
+        count: how many.
+        stopwatch: the server's.
+    """
+
+    def __init__(self, scenario: Scenario, count: int, stopwatch: Stopwatch | None = None) -> None:
+        self.server = Server(scenario, boot_id=1, room=count, stopwatch=stopwatch)
+        self._vehicles = Vehicles(scenario, count)
+        self._dt_ns = scenario.dt_ns
+        self._late = round(DELAY_S / scenario.control.dt)
+        """Steps that an observation is old."""
+        self._past = deque([self._vehicles.x] * (self._late + 1), maxlen=self._late + 1)
+        self._due_ns = START_NS
+        self._sessions = [self._open(number, scenario) for number in range(1, count + 1)]
+
+    def _open(self, vehicle: int, scenario: Scenario) -> tuple[int, int, Address]:
+        address: Address = ("127.0.0.1", 1024 + vehicle)
+        hello = Datagram(encode(Hello(vehicle, 1, scenario.terms())), address)
+        self.server.receive(hello, now_ns=self._due_ns - self._dt_ns)
+        (answer,) = self.server.outbox()
+        welcome = decode(answer.payload, scenario.terms())
+        assert isinstance(welcome, Welcome)
+        return vehicle, welcome.session, address
+
+    def _observe(self) -> None:
+        """Every vehicle is heard of, late."""
+        now_ns, late_ns = self._due_ns - MILLISECOND_NS, self._late * self._dt_ns
+        stamp_ns, echo_ns = self._due_ns + AHEAD_NS - late_ns, now_ns - 2 * late_ns
+        step = (self._vehicles.step - self._late).tolist()
+        for (vehicle, session, address), k, x in zip(
+            self._sessions, step, self._past[0], strict=True
+        ):
+            stamps = (stamp_ns, NO_HORIZON, echo_ns, echo_ns + late_ns + AHEAD_NS)
+            observation = Observation(vehicle, session, k, *stamps, x)
+            self.server.receive(Datagram(encode(observation), address), now_ns=now_ns)
+
+    def wake(self) -> None:
+        """The server's tick."""
+        self.server.wake(now_ns=self._due_ns)
+
+    def prepare(self) -> None:
+        """The step before is flown, and the vehicles are heard of."""
+        sent = len(self.server.outbox())
+        if sent:
+            assert sent == len(self._sessions), "a vehicle was sent no horizon"
+            planned = self.server._planner._tracker.inputs
+            self._vehicles.fly(planned[:sent, :, 0])
+            self._past.append(self._vehicles.x)
+            self._due_ns += self._dt_ns
+        self._observe()

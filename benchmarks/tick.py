@@ -1,0 +1,319 @@
+"""What a whole tick costs: of one vehicle, of fleets, and of more and more vehicles."""
+
+import gc
+import time
+import tracemalloc
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks import solvers
+from benchmarks.airspace import Airspace, PlannedFleet
+from benchmarks.contestants import Tuning
+from benchmarks.harness import (
+    HOT,
+    PACED,
+    Lateness,
+    Pace,
+    Table,
+    figures_us,
+    interleave,
+    progress,
+    quantile_ms,
+    ratios,
+    times,
+    us,
+    without_gc,
+)
+from benchmarks.problems import derive, listening, record, solving
+from shared.config import Scenario
+from shared.stopwatch import Stopwatch
+
+PERIOD_MS = 20.0
+"""Δt of all flights here [ms]."""
+TARGET_TICK, TARGET_FLEET, TARGET_P99_MS = 5.0, 100.0, 20.0
+FIGURE = Path(__file__).parent.parent / "docs" / "scaling.png"
+SETTLE = 50
+"""Ticks before any counts: the vehicles start on the reference, where they will not stay."""
+STAGES = ("estimate", "plan", "solve")
+"""Of the stopwatch, that the target is about."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How much to measure."""
+
+    hot: int = 1000
+    paced: int = 500
+    tuning: int = 60
+    fleet: int = 1000
+    """Vehicles planned for at once,"""
+    fleet_ticks: int = 100
+    fleet_sample: int = 20
+    """and how many of them OSQP plans for."""
+    crowd: int = 2500
+    crowd_ticks: int = 400
+    scale: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+    scale_ticks: int = 50
+
+
+FULL = Counts()
+QUICK = Counts(100, 40, 10, 200, 10, 5, 500, 20, (1, 2, 5, 10, 20, 50, 100, 200), 10)
+
+
+def mixes() -> dict[str, Scenario]:
+    """Bounds that are active never, rarely, and in half of the axis problems."""
+    control = {"dt": 0.02, "horizon": 50}
+
+    def square(period_s: float, u_max: float) -> Scenario:
+        reference = {"shape": "square", "period_s": period_s}
+        model = {"u_max": [u_max]}
+        return derive("paper-every-step", control=control, reference=reference, model=model)
+
+    circle = derive("paper-every-step", control=control)
+    return {"never": circle, "rarely": square(10.8, 1.8), "half": square(4.0, 1.5)}
+
+
+def measure(counts: Counts) -> dict[str, Any]:
+    """All of it."""
+    lateness = Lateness()
+    flights = solvers.flights()
+    tunings = {
+        name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
+        for name, scenario in flights.items()
+    }
+    single = {
+        name: _single(name, scenario, tunings[name], counts, lateness)
+        for name, scenario in flights.items()
+    }
+    fleets = {
+        name: _fleet(name, scenario, tunings["saturated" if name == "half" else "smooth"], counts)
+        for name, scenario in mixes().items()
+    }
+    half = mixes()["half"]
+    return {
+        "single": single,
+        "fleets": fleets,
+        "crowd": _crowd(half, counts, lateness),
+        "scaling": _scaling(half, counts, lateness),
+        "memory": {"bytes_per_vehicle": _bytes_per_vehicle(half)},
+        "tuned": {name: str(tuning) for name, tuning in tunings.items()},
+        "counts": {"fleet": counts.fleet, "crowd": counts.crowd},
+        "wake": lateness.figures(),
+    }
+
+
+def _single(
+    name: str, scenario: Scenario, tuned: Tuning, counts: Counts, lateness: Lateness
+) -> dict[str, Any]:
+    """From a decoded observation to a packed horizon, one vehicle; two servers side by side."""
+    ours = Airspace(scenario, 1)
+    with solving(tuned.make):
+        theirs = Airspace(scenario, 1)
+    spaces = {"ours": ours, "osqp": theirs}
+    result: dict[str, Any] = {}
+    for pace, count in ((HOT, counts.hot), (PACED, counts.paced)):
+        figures = {
+            key: figures_us(durations)
+            for key, durations in interleave(
+                {key: lambda _, space=space: space.wake() for key, space in spaces.items()},
+                count,
+                pace,
+                lateness,
+                f"one vehicle, {name}",
+                prepare={key: space.prepare for key, space in spaces.items()},
+            ).items()
+        }
+        result["hot" if pace is HOT else "paced"] = {
+            **figures,
+            "ratio": ratios(figures["osqp"], figures["ours"]),
+        }
+    return result
+
+
+def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: Counts) -> dict[str, Any]:
+    """All in one batch, then some of the same problems one after the other by OSQP."""
+    stopwatch = Stopwatch(time.process_time_ns)
+    with listening() as listeners:
+        fleet = PlannedFleet(scenario, counts.fleet, stopwatch)
+    generator, _, tracker, _ = listeners
+    sample = range(0, counts.fleet, max(1, counts.fleet // counts.fleet_sample))
+    mpc, u_max = generator.mpc, scenario.u_max
+    # Each of them has its own, and keeps its own warm start.
+    others = [[tuned.make(mpc, u_max) for _ in range(2)] for _ in sample]
+    plan_ns, solve_ns, theirs_ns, active = [], [], [], []
+    with without_gc():
+        for tick in progress(range(counts.fleet_ticks + SETTLE), f"fleet, {name}"):
+            fleet.prepare()
+            before_ns, start_ns = stopwatch.spent_ns["solve"], time.process_time_ns()
+            fleet.plan()
+            ended_ns = time.process_time_ns()
+            spent_ns = stopwatch.spent_ns["solve"] - before_ns
+            asked = [listener.asked[-1] for listener in (generator, tracker)]
+            for listener in listeners:
+                listener.asked.clear()
+            if tick < SETTLE:
+                continue
+            single_ns = []
+            for row, pair in zip(sample, others, strict=True):
+                problems = [tuple(each[row : row + 1] for each in pairs) for pairs in asked]
+                begun_ns = time.process_time_ns()
+                for solver, problem in zip(pair, problems, strict=True):
+                    solver.solve(*problem)
+                single_ns.append(time.process_time_ns() - begun_ns)
+            plan_ns.append(ended_ns - start_ns)
+            solve_ns.append(spent_ns)
+            theirs_ns.append(float(np.mean(single_ns)))
+            active.append(fleet.active(u_max))
+    ours = {
+        "plan": figures_us(plan_ns, per=counts.fleet),
+        "solve": figures_us(solve_ns, per=counts.fleet),
+    }
+    theirs = figures_us(theirs_ns)
+    return {
+        "active": float(np.mean(active)),
+        **ours,
+        "osqp": theirs,
+        "ratio": {key: ratios(theirs, figures) for key, figures in ours.items()},
+    }
+
+
+def _crowd(scenario: Scenario, counts: Counts, lateness: Lateness) -> dict[str, Any]:
+    """A whole server's tick of many saturated vehicles, by stage [ms]."""
+    space = Airspace(scenario, counts.crowd, Stopwatch(time.process_time_ns))
+    spent = space.server.stopwatch.spent_ns
+    laps: dict[str, list[int]] = {}
+    wall_ns = []
+    with without_gc():
+        for tick in progress(range(counts.crowd_ticks + SETTLE), f"{counts.crowd} vehicles"):
+            spent.clear()
+            space.prepare()
+            lateness.sleep(PACED.pause_s)
+            start_ns = time.perf_counter_ns()
+            space.wake()
+            took_ns = time.perf_counter_ns() - start_ns
+            if tick >= SETTLE:
+                wall_ns.append(took_ns)
+                for stage, stage_ns in spent.items():
+                    laps.setdefault(stage, []).append(stage_ns)
+    received = np.sum([laps.pop(stage) for stage in ("decode", "observe")], axis=0)
+    target = np.sum([laps[stage] for stage in STAGES], axis=0)
+    tick_ns = np.sum(list(laps.values()), axis=0)
+    durations: dict[str, Any] = {
+        "receive": received,
+        **laps,
+        " + ".join(STAGES): target,
+        "tick": tick_ns,
+        "tick, by the clock on the wall": wall_ns,
+    }
+    shares = {"p50_ms": 0.5, "p99_ms": 0.99}
+    return {
+        stage: {name: quantile_ms(taken, share) for name, share in shares.items()}
+        for stage, taken in durations.items()
+    }
+
+
+def _scaling(scenario: Scenario, counts: Counts, lateness: Lateness) -> dict[str, float]:
+    """Median CPU time of a tick [ms], by the number of vehicles."""
+    spaces = {count: Airspace(scenario, count) for count in counts.scale}
+    spent = interleave(
+        {str(count): lambda _, space=space: space.wake() for count, space in spaces.items()},
+        counts.scale_ticks,
+        Pace(turn=10, pause_s=HOT.pause_s),
+        lateness,
+        "more and more vehicles",
+        prepare={str(count): space.prepare for count, space in spaces.items()},
+    )
+    return {count: figures_us(durations)["p50_us"] / 1000.0 for count, durations in spent.items()}
+
+
+def _bytes_per_vehicle(scenario: Scenario) -> float:
+    """How much more a server with room for more vehicles, all in session, takes up."""
+    few, many = (_server_bytes(scenario, count) for count in (100, 300))
+    return (many - few) / 200
+
+
+def _server_bytes(scenario: Scenario, count: int) -> int:
+    tracemalloc.start()
+    space = Airspace(scenario, count)
+    for _ in range(3):
+        space.prepare()
+        space.wake()
+    space.server.outbox()
+    gc.collect()
+    with_it, _ = tracemalloc.get_traced_memory()
+    del space.server
+    gc.collect()
+    without, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return with_it - without
+
+
+def draw(result: Mapping[str, Any], file: Path = FIGURE) -> None:
+    """Tick time over vehicles, both on logarithmic axes, with a line of slope 1."""
+    counts = [int(count) for count in result["scaling"]]
+    ticks_ms = list(result["scaling"].values())
+    figure = Figure(figsize=(7.0, 4.5), dpi=150, layout="constrained")
+    axes = figure.add_subplot()
+    axes.loglog(counts, ticks_ms, "o-", color="#0072b2", label="one tick, measured (median)")
+    least_ms = min(tick_ms / count for tick_ms, count in zip(ticks_ms, counts, strict=True))
+    proportional = [least_ms * count for count in counts]
+    label = f"{1000.0 * least_ms:.1f} µs a vehicle (slope 1)"
+    axes.loglog(counts, proportional, "--", color="#555555", label=label)
+    axes.axhline(PERIOD_MS, color="#d55e00", linewidth=1.0, label=f"Δt = {PERIOD_MS:g} ms")
+    axes.set_xlabel("vehicles in one batch")
+    axes.set_ylabel("CPU time of a tick [ms]")
+    axes.set_xticks(counts, [f"{count}" for count in counts])
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
+    axes.grid(visible=True, alpha=0.3)
+    axes.legend()
+    figure.savefig(file)
+
+
+def tables(result: Mapping[str, Any]) -> dict[str, Table]:
+    """One vehicle, the fleets, and the crowd."""
+    shown = {"tick-single": _single_table(result["single"])}
+    rows = []
+    for name, figures in result["fleets"].items():
+        row = [f"{name} ({figures['active']:.0%})"]
+        row += [us(figures[key]["p50_us"]) for key in ("plan", "solve", "osqp")]
+        row += [times(figures["ratio"][key]["p50"], TARGET_FLEET) for key in ("plan", "solve")]
+        rows.append(row)
+    headings = ["bounds active", "ours, planning [µs]", "of it solving", "tuned OSQP, solving"]
+    headings += ["OSQP / planning", "OSQP / solving"]
+    shown["tick-fleet"] = Table(headings, rows)
+    rows = [
+        [stage, f"{figures['p50_ms']:.2f}", f"{figures['p99_ms']:.2f}"]
+        for stage, figures in result["crowd"].items()
+    ]
+    for row in rows:
+        if row[0] == " + ".join(STAGES):
+            row[2] += f" (< {TARGET_P99_MS:g})"
+    shown["tick-crowd"] = Table([f"{result['counts']['crowd']} vehicles [ms]", "p50", "p99"], rows)
+    scaling = [
+        [count, f"{ms:.3f}", us(1000.0 * ms / int(count))]
+        for count, ms in result["scaling"].items()
+    ]
+    shown["tick-scaling"] = Table(["vehicles", "tick [ms]", "per vehicle [µs]"], scaling)
+    kilobytes = result["memory"]["bytes_per_vehicle"] / 1000.0
+    shown["tick-memory"] = Table(
+        ["", "kB"], [["a server's memory for each vehicle", f"{kilobytes:.1f}"]]
+    )
+    return shown
+
+
+def _single_table(single: Mapping[str, Any]) -> Table:
+    rows = []
+    for flight, paces in single.items():
+        for pace, figures in paces.items():
+            row = [f"{flight}, {pace}"]
+            for key in ("ours", "osqp"):
+                row += [us(figures[key][f"{share}_us"]) for share in ("p50", "p99")]
+            rows.append([*row, *(times(figures["ratio"][s], TARGET_TICK) for s in ("p50", "p99"))])
+    headings = ["one tick [µs]", "ours p50", "p99", "tuned OSQP p50", "p99", "ratio p50", "p99"]
+    return Table(headings, rows)
