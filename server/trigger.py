@@ -104,7 +104,7 @@ class Periodic:
     """A packet every so many steps, counted from the last one that was sent."""
 
     def __init__(self, control: ControlConfig, capacity: int) -> None:
-        self._P = control.terminal_weight
+        self._P = np.array(control.terminal_weight)
         self._period = control.period
         self._sent_step = np.zeros(capacity, dtype=np.int64)
 

@@ -2,18 +2,11 @@
 
 import difflib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import metadata
+from pkgutil import resolve_name
 
-import client.__main__
-import netem.__main__
-import server.__main__
 from shared import command, config
-from skytether.calibrate import calibrate
-from skytether.fleet import fleet
-from skytether.fly import fly
-from skytether.reproduce import reproduce
-from skytether.sweep import sweep
 
 USAGE = """usage: skytether COMMAND ...
 
@@ -36,24 +29,25 @@ Each has a --help of its own. `skytether fly demo` flies a demonstration."""
 def list_scenarios(argv: Sequence[str]) -> None:
     """Print the scenarios that come with Skytether, a line each."""
     if argv:
-        raise command.CommandError(f"scenarios: got {argv[0]!r}, expected nothing", 2)
+        raise command.CommandError(f"got {argv[0]!r}, expected nothing", 2)
     names = config.names()
     width = max(map(len, names))
     for name in names:
         print(f"{name:{width}}  {config.load(name).title}")
 
 
-COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
-    "fly": lambda argv: command.main(fly, argv, "fly"),
-    "fleet": lambda argv: command.main(fleet, argv, "fleet"),
-    "sweep": lambda argv: command.main(sweep, argv, "sweep"),
-    "reproduce": lambda argv: command.main(reproduce, argv, "reproduce"),
-    "calibrate": lambda argv: command.main(calibrate, argv, "calibrate"),
-    "scenarios": lambda argv: command.main(list_scenarios, argv, "skytether"),
-    "server": server.__main__.main,
-    "netem": netem.__main__.main,
-    "client": client.__main__.main,
+COMMANDS = {
+    "fly": "skytether.fly:fly",
+    "fleet": "skytether.fleet:fleet",
+    "sweep": "skytether.sweep:sweep",
+    "reproduce": "skytether.reproduce:reproduce",
+    "calibrate": "skytether.calibrate:calibrate",
+    "scenarios": "skytether.__main__:list_scenarios",
+    "server": "server.__main__:serve",
+    "netem": "netem.__main__:emulate",
+    "client": "client.__main__:fly",
 }
+"""Imported when called for: a network need not wait for what a server compiles."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -71,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
         print(f"skytether: no command {name!r}; {hint}", file=sys.stderr)
         return command.CONFIGURATION
-    return COMMANDS[name](rest)
+    return command.main(resolve_name(COMMANDS[name]), rest, name)
 
 
 if __name__ == "__main__":

@@ -123,7 +123,7 @@ def start() -> Iterator[Callable[..., Process]]:
             1,
             "netem: cannot find nobody.invalid: Name or service not known",
         ),
-        (["scenarios", "paper"], 2, "skytether: scenarios: got 'paper', expected nothing"),
+        (["scenarios", "paper"], 2, "scenarios: got 'paper', expected nothing"),
     ],
 )
 def test_a_mistake_is_one_clear_line(

