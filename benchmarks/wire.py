@@ -43,7 +43,7 @@ def messages(terms: Terms) -> list[Message]:
     return [
         Hello(1, 2**60, terms),
         Welcome(1, session, 2**60, 2**60, now_ns, terms),
-        Observation(1, session, step, now_ns, step - 1, now_ns, now_ns, state),
+        Observation(1, session, step, now_ns, step - 20, step - 10, now_ns, now_ns, state),
         Horizon(1, session, step, now_ns, now_ns, inputs),
         Heartbeat(1, session, now_ns),
     ]

@@ -2,13 +2,13 @@
 
     [version, type, vehicle, ...]
 
-| type | message     | sent by | fields after `vehicle`                                        |
-|------|-------------|---------|---------------------------------------------------------------|
-| 1    | HELLO       | client  | boot_id, terms                                                |
-| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, terms            |
-| 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, server_ns, received_ns, state |
-| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs                 |
-| 5    | HEARTBEAT   | server  | session, server_ns                                            |
+| type | message     | sent by | fields after `vehicle`                                               |
+|------|-------------|---------|----------------------------------------------------------------------|
+| 1    | HELLO       | client  | boot_id, terms                                                       |
+| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, terms                   |
+| 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns, received_ns, state |
+| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs                        |
+| 5    | HEARTBEAT   | server  | session, server_ns                                                   |
 
 `docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
 Those that control uses are the client's; `server_ns` is the server's own, which the client only
@@ -96,7 +96,9 @@ class Observation(NamedTuple):
     stamp_ns: int
     """When the state was sampled [client clock]."""
     in_force: int
-    """Step that the horizon in force was made for, or NO_HORIZON."""
+    """Step that the horizon in force was made for, or NO_HORIZON,"""
+    since: int
+    """and the first step that was flown with it."""
     server_ns: int
     """Newest `server_ns` seen, echoed,"""
     received_ns: int
@@ -202,7 +204,7 @@ _TERMS = (_STAMP, range(1, INPUTS_MAX + 1), range(1, AXES_MAX + 1), _positive, _
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),
     (Welcome, (_U16, _U32, _U64, _U64, _STAMP, _terms)),
-    (Observation, (_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STAMP, _STAMP, _state)),
+    (Observation, (_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP, _state)),
     (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs)),
     (Heartbeat, (_U16, _U32, _STAMP)),
 )
