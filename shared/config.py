@@ -111,10 +111,16 @@ class VehicleConfig(Section, frozen=True):
     """How fast `brake` takes the desired velocity to zero [m/s²]."""
     tau_s: tuple[Positive, ...] = ()
     """True time constant [s], where it differs from the model's; one for all axes, or one each."""
+    gain: Positive = 1.0
+    """The velocity that it settles at, over the one that it was told."""
+    dead_time_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
+    """How much later an input takes effect [s]."""
     start_m: tuple[float, ...] = ()
     """Where the flight starts, at rest [m]; left out: at the reference's start."""
     wind: NonNegative = 0.0
     """White acceleration [m/s² per √s]."""
+    steady_wind_mps: tuple[float, ...] = ()
+    """The velocity that steady wind adds in the long run [m/s], of each axis; left out: none."""
     gust_mps2: NonNegative = 0.0
     """Strength of gusts [m/s²]; 0 for none."""
     gust_every_s: Positive = 10.0
@@ -412,8 +418,12 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
     ):
         if len(values) not in (1, axes):
             yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
-    if len(vehicle.start_m) not in (0, axes):
-        yield "vehicle.start_m", list(vehicle.start_m), f"{axes} numbers with model.axes = {axes}"
+    for key, values in (
+        ("vehicle.start_m", vehicle.start_m),
+        ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
+    ):
+        if len(values) not in (0, axes):
+            yield key, list(values), f"{axes} numbers with model.axes = {axes}"
     if control.horizon * axes > INPUTS_MAX:
         most = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
         yield "control.horizon", control.horizon, most

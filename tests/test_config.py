@@ -80,6 +80,11 @@ WRONG = {
         "network.uplink.minimum_s = -0.1",
         "network.uplink.minimum_s: got -0.1, expected a number >= 0.0",
     ),
+    "no gain": ("vehicle.gain = 0.0", "vehicle.gain: got 0.0, expected a number > 0.0"),
+    "a dead time that fills the memory": (
+        "vehicle.dead_time_s = 11.0",
+        "vehicle.dead_time_s: got 11.0, expected a number <= 10.0",
+    ),
     "no duration": ("duration = 0.0", "duration: got 0.0, expected a number > 0.0"),
     "a negative seed": ("seed = -1", "seed: got -1, expected a whole number >= 0"),
     "a seed of more than 32 bits": (
@@ -126,6 +131,10 @@ WRONG = {
     "a start in space for a flight in the plane": (
         "vehicle.start_m = [0.0, 0.0, 1.0]",
         "vehicle.start_m: got [0.0, 0.0, 1.0], expected 2 numbers with model.axes = 2",
+    ),
+    "a steady wind along a single axis": (
+        "vehicle.steady_wind_mps = [0.5]",
+        "vehicle.steady_wind_mps: got [0.5], expected 2 numbers with model.axes = 2",
     ),
     "a horizon shorter than the uplink's delay": (
         "control.horizon = 4\ncontrol.dt = 0.1",
