@@ -5,8 +5,8 @@
                                                    white acceleration
 
 Every part is discretised exactly. A constant acceleration a acts like the input τ a. Where the dead
-time ends within a step, the input changes once in it, and the answer to two steps of the input is
-the sum of those to each. The covariance of the white part over a step has a closed form.
+time is no whole number of steps, the input changes once within each, and the two inputs share B of
+eq. (4). The covariance of the white part over a step has a closed form.
 """
 
 from collections import deque

@@ -59,6 +59,8 @@ class ControlConfig(Section, frozen=True):
     """Steps planned ahead, H."""
     scheme: Literal["paper", "none"] = "paper"
     """Delay compensation at both ends: eq. (11) and (13), or none."""
+    delay_bound: Duration | Literal["auto"] = "auto"
+    """A horizon that comes is in force at most so long after it was made [s]; auto: as was seen."""
     trigger: Literal["paper", "always", "periodic"] = "paper"
     """When a horizon is sent: eq. (16), at every step, or every `period` steps."""
     period: Annotated[int, Meta(ge=1, le=1_000_000)] = 10
@@ -386,13 +388,20 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
         prefix = f"{path}." if path else ""
         hint = _hint(unknown[1], list(section.__struct_fields__))
         return f"{prefix}{unknown[1]}: no such key{hint}"
-    if what.startswith("Invalid enum value"):
-        choices = " or ".join(repr(choice) for choice in typing.get_args(section))
-        return f"{path}: got {given!r}, expected {choices}"
+    if what.startswith("Invalid enum value") or " | " in what:
+        return f"{path}: got {given!r}, expected {_choices(section)}"
     expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
     for theirs, ours in _PLAIN.items():
         expected = re.sub(rf"^{theirs}\b", ours, expected)
     return f"{path or 'the scenario'}: got {given!r}, expected {expected}"
+
+
+def _choices(kind: Any) -> str:
+    """What a value may be: the words of a Literal, or one of several types."""
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        return " or ".join(map(repr, parts))
+    return " or ".join(map(_choices, parts)) if parts else _PLAIN[kind.__name__]
 
 
 def _infinite(value: object, key: str = "") -> typing.Iterator[tuple[str, object, str]]:
@@ -433,6 +442,9 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
             f"horizon · dt (now {covered_s:g} s) to cover the uplink's mean delay, {delay_s:g} s"
         )
         yield "control.horizon", control.horizon, cover
+    bound_s = control.delay_bound
+    if bound_s != "auto" and bound_s >= covered_s - 1e-9:
+        yield "control.delay_bound", bound_s, f"less than horizon · dt = {covered_s:g} s"
     if scenario.settle >= scenario.duration:
         yield "settle", scenario.settle, f"less than the duration of {scenario.duration:g} s"
     link = scenario.link
