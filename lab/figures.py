@@ -108,6 +108,7 @@ OTHER_UNITS = {
     "settle": "s",
     "control.dt": "s",
     "control.horizon": "steps",
+    "control.delay_bound": "s",
     "control.period": "steps",
     "control.decay_rate": "1/s",
     "model.u_max": "m/s",

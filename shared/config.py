@@ -59,6 +59,8 @@ class ControlConfig(Section, frozen=True):
     """Steps planned ahead, H."""
     scheme: Literal["paper", "none"] = "paper"
     """Delay compensation at both ends: eq. (11) and (13), or none."""
+    delay_bound: Duration | Literal["auto"] = "auto"
+    """A horizon that comes is in force at most so long after it was made [s]; auto: as was seen."""
     trigger: Literal["paper", "always", "periodic"] = "paper"
     """When a horizon is sent: eq. (16), at every step, or every `period` steps."""
     period: Annotated[int, Meta(ge=1, le=1_000_000)] = 10
@@ -111,10 +113,16 @@ class VehicleConfig(Section, frozen=True):
     """How fast `brake` takes the desired velocity to zero [m/s²]."""
     tau_s: tuple[Positive, ...] = ()
     """True time constant [s], where it differs from the model's; one for all axes, or one each."""
+    gain: Positive = 1.0
+    """The velocity that it settles at, over the one that it was told."""
+    dead_time_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
+    """How much later an input takes effect [s]."""
     start_m: tuple[float, ...] = ()
     """Where the flight starts, at rest [m]; left out: at the reference's start."""
     wind: NonNegative = 0.0
     """White acceleration [m/s² per √s]."""
+    steady_wind_mps: tuple[float, ...] = ()
+    """The velocity that steady wind adds in the long run [m/s], of each axis; left out: none."""
     gust_mps2: NonNegative = 0.0
     """Strength of gusts [m/s²]; 0 for none."""
     gust_every_s: Positive = 10.0
@@ -380,13 +388,20 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
         prefix = f"{path}." if path else ""
         hint = _hint(unknown[1], list(section.__struct_fields__))
         return f"{prefix}{unknown[1]}: no such key{hint}"
-    if what.startswith("Invalid enum value"):
-        choices = " or ".join(repr(choice) for choice in typing.get_args(section))
-        return f"{path}: got {given!r}, expected {choices}"
+    if what.startswith("Invalid enum value") or " | " in what:
+        return f"{path}: got {given!r}, expected {_choices(section)}"
     expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
     for theirs, ours in _PLAIN.items():
         expected = re.sub(rf"^{theirs}\b", ours, expected)
     return f"{path or 'the scenario'}: got {given!r}, expected {expected}"
+
+
+def _choices(kind: Any) -> str:
+    """What a value may be: the words of a Literal, or one of several types."""
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        return " or ".join(map(repr, parts))
+    return " or ".join(map(_choices, parts)) if parts else _PLAIN[kind.__name__]
 
 
 def _infinite(value: object, key: str = "") -> typing.Iterator[tuple[str, object, str]]:
@@ -412,8 +427,12 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
     ):
         if len(values) not in (1, axes):
             yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
-    if len(vehicle.start_m) not in (0, axes):
-        yield "vehicle.start_m", list(vehicle.start_m), f"{axes} numbers with model.axes = {axes}"
+    for key, values in (
+        ("vehicle.start_m", vehicle.start_m),
+        ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
+    ):
+        if len(values) not in (0, axes):
+            yield key, list(values), f"{axes} numbers with model.axes = {axes}"
     if control.horizon * axes > INPUTS_MAX:
         most = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
         yield "control.horizon", control.horizon, most
@@ -423,6 +442,9 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
             f"horizon · dt (now {covered_s:g} s) to cover the uplink's mean delay, {delay_s:g} s"
         )
         yield "control.horizon", control.horizon, cover
+    bound_s = control.delay_bound
+    if bound_s != "auto" and bound_s >= covered_s - 1e-9:
+        yield "control.delay_bound", bound_s, f"less than horizon · dt = {covered_s:g} s"
     if scenario.settle >= scenario.duration:
         yield "settle", scenario.settle, f"less than the duration of {scenario.duration:g} s"
     link = scenario.link
