@@ -2,6 +2,7 @@
 
     u* = u(min(k, k_h + H - 1) | k_h)        k_h: the step that the horizon was made for
 
+With committed inputs at its head a horizon is that much longer, and read in the same way.
 The horizon of the newest generation wins, in whatever order they arrive (E11).
 """
 
@@ -55,10 +56,10 @@ class Compensator:
             return np.zeros(len(self._bound))
         if not self._compensate:
             return self._inputs[0].copy()
-        stage = step - self.in_force
-        if stage >= self._H and self._brakes:
-            return self._braked(stage - self._H + 1)
-        return self._inputs[min(max(stage, 0), self._H - 1)].copy()
+        stage, length = step - self.in_force, len(self._inputs)
+        if stage >= length and self._brakes:
+            return self._braked(stage - length + 1)
+        return self._inputs[min(max(stage, 0), length - 1)].copy()
 
     def _braked(self, steps: int) -> Array:
         """The last input, slowed down for `steps` at a constant rate, straight ahead."""

@@ -112,7 +112,7 @@ class Server(Endpoint):
         self._clock = ClockMap(room, self._dt_ns)
         reach = max(1, round(REACH_S / control.dt))
         self._scheme: Scheme = (
-            Replay(scenario, model, room, reach)
+            Replay(scenario, model, room, reach, self._clock)
             if control.scheme == "committed"
             else Estimator(model, room, reach, compensate=control.scheme == "paper")
         )
@@ -322,15 +322,16 @@ class Server(Endpoint):
 
             verdict = self._trigger.test(replace(situation, cost_gap=cost_gap))
         event = verdict.surely & plan.solved
-        horizons = foresight.horizons(plan.inputs)
-        self._scheme.remember(rows, step, horizons, event)  # (12)
         sent = np.flatnonzero(event)
+        horizons, lengths = foresight.horizons(plan.inputs), foresight.ahead + self._terms.horizon
+        self._scheme.remember(rows, step, horizons, lengths, sent)  # (12)
         self._trigger.sent(rows[sent], step[sent], verdict.error[sent])
         stopwatch.lap("plan")
-        for i, row, k in zip(sent.tolist(), rows[sent].tolist(), step[sent].tolist(), strict=True):
-            session = self._by_row[row]
+        of_each = (sent, rows[sent], step[sent], lengths[sent])
+        for i, row, k, length in zip(*map(np.ndarray.tolist, of_each), strict=True):
+            session, inputs = self._by_row[row], horizons[i, :, :length]
             horizon = Horizon(
-                session.vehicle, session.session, k, now_ns, session.observed_ns, horizons[i]
+                session.vehicle, session.session, k, now_ns, session.observed_ns, inputs
             )
             self._send(session, horizon, now_ns)
         self.counts["events"] += len(sent)

@@ -44,7 +44,7 @@ class Foresight:
             inputs: [m/s]; shape (n, axes, H).
 
         Returns:
-            float32; shape (n, axes, H).
+            float32, d + H for each vehicle; shape (n, axes, largest d + H).
         """
         horizons: Array = _join(self.committed, self.ahead, inputs)
         return horizons
@@ -79,12 +79,17 @@ class Scheme(Protocol):
     def foresee(self, rows: Indices, step: Indices) -> Foresight:
         """The vehicles in `rows` at their steps k, all within reach."""
 
-    def remember(self, rows: Indices, step: Indices, horizons: Array, sent: Flags) -> None:
-        """What was computed for the steps from k on, as it is sent, and which of it was.
+    def remember(  # noqa: PLR0917 - what was computed, and what became of it
+        self, rows: Indices, step: Indices, horizons: Array, lengths: Indices, sent: Indices
+    ) -> None:
+        """What was computed for the steps from k on, and which of it is sent.
 
         Args:
-            horizons: [m/s], float32; shape (n, axes, H).
-            sent: shape (n,).
+            rows: the vehicles; shape (n,).
+            step: k of each; shape (n,).
+            horizons: [m/s], float32; shape (n, axes, at least the largest length).
+            lengths: inputs that each has; shape (n,).
+            sent: which of the n are sent.
         """
 
 
@@ -151,7 +156,14 @@ class Estimator:
         nothing, here = self._nothing[:n], np.zeros(n, dtype=np.int64)
         return Foresight(estimate, here, estimate, nothing, nothing, np.zeros(estimate.shape[:2]))
 
-    def remember(self, rows: Indices, step: Indices, horizons: Array, sent: Flags) -> None:  # noqa: ARG002
+    def remember(  # noqa: PLR0917
+        self,
+        rows: Indices,
+        step: Indices,
+        horizons: Array,
+        lengths: Indices,  # noqa: ARG002 - the first input is all that (12) asks for
+        sent: Indices,  # noqa: ARG002
+    ) -> None:
         """û(k) ← u(k|k), eq. (12), whether sent or not (E12).
 
         Steps before at which nothing was computed flew on with the input of before them.
@@ -199,12 +211,12 @@ def _write_down(inputs, last_step, rows, steps, new):  # type: ignore[no-untyped
 @njit("f4[:,:,::1](f8[:,:,::1], i8[:], f8[:,:,::1])", cache=True)
 def _join(committed, ahead, inputs):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
     n, axes, H = inputs.shape
-    horizons = np.empty((n, axes, H), dtype=np.float32)
+    horizons = np.zeros((n, axes, H + (ahead.max() if n else 0)), dtype=np.float32)
     for i in range(n):
         d = ahead[i]
         for axis in range(axes):
             for stage in range(d):
                 horizons[i, axis, stage] = committed[i, axis, stage]
-            for stage in range(d, H):
-                horizons[i, axis, stage] = inputs[i, axis, stage - d]
+            for stage in range(H):
+                horizons[i, axis, d + stage] = inputs[i, axis, stage]
     return horizons

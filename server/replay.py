@@ -21,11 +21,16 @@ from collections import Counter
 import numpy as np
 from numba import njit
 
+from server.clock import ClockMap
 from server.delay import DelayBound
 from server.estimator import Foresight
 from shared.config import Scenario
 from shared.model import Array, Flags, Indices, Model
-from shared.protocol import NO_HORIZON, Observation
+from shared.protocol import INPUTS_MAX, NO_HORIZON, Observation
+
+
+MARGIN = 2
+"""Steps on top of half a round trip, until a horizon has been acknowledged."""
 
 
 class Replay:
@@ -34,11 +39,14 @@ class Replay:
     Args:
         model: eq. (4).
         reach: an observation more steps old than this gives no estimate.
+        clock: knows half of the smallest round trip, which is a first guess at the delay bound.
     """
 
-    def __init__(self, scenario: Scenario, model: Model, capacity: int, reach: int) -> None:
+    def __init__(  # noqa: PLR0917 - all that is fixed
+        self, scenario: Scenario, model: Model, capacity: int, reach: int, clock: ClockMap
+    ) -> None:
         control, vehicle, axes = scenario.control, scenario.vehicle, len(model.B)
-        H = control.horizon
+        H = self._H = control.horizon
         self.plans_always = False
         self.counts: Counter[str] = Counter()
         self._model = model
@@ -48,7 +56,13 @@ class Replay:
         self._brake_per_step = vehicle.brake_mps2 * control.dt if brakes else 0.0
         observer_s = control.observer_s
         self._observer_decay = float(np.exp(-control.dt / observer_s)) if observer_s else 1.0
-        self.delay_bound = DelayBound(capacity, control.dt, H - 1, control.delay_bound)
+        given = control.delay_bound
+        fixed_s = None if given == "auto" else given
+        most = min(H, INPUTS_MAX // axes - H)
+        self._delay_bound = DelayBound(capacity, control.dt, most, fixed_s)
+        self._dt_ns = scenario.dt_ns
+        self._clock = clock
+        self._begun = np.zeros(capacity, dtype=np.bool_)
         self.observed_step = np.full(capacity, -1, dtype=np.int64)
         """Step of the newest observation, or -1; shape (capacity,)."""
         self._state = np.zeros((capacity, axes, 2))
@@ -64,8 +78,10 @@ class Replay:
         room = reach + H
         self._stamps = np.zeros((capacity, room), dtype=np.int64)
         """Steps of the horizons sent, a ring;"""
-        self._horizons = np.zeros((capacity, room, axes, H), dtype=np.float32)
-        """what they told; and"""
+        self._horizons = np.zeros((capacity, room, axes, 2 * H), dtype=np.float32)
+        """what they told,"""
+        self._lengths = np.zeros((capacity, room), dtype=np.int64)
+        """for how many steps; and"""
         self._sent = np.zeros(capacity, dtype=np.int64)
         """how many there were."""
         self._judged = np.zeros(capacity, dtype=np.int64)
@@ -77,7 +93,8 @@ class Replay:
         self._disturbance[row] = 0.0
         self._acknowledged[row] = NO_HORIZON
         self._sent[row] = self._judged[row] = 0
-        self.delay_bound.forget(row)
+        self._begun[row] = False
+        self._delay_bound.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
@@ -96,41 +113,48 @@ class Replay:
     def foresee(self, rows: Indices, step: Indices) -> Foresight:
         """See `Scheme`: planning starts at k + d."""
         self._listen(rows)
-        ahead = self.delay_bound.steps(rows)
+        ahead = self._delay_bound.steps(rows)
         estimate, start, committed, held, lost = _replay(
             *(self._model.A, self._model.B, self._u_max, self._brake_per_step),
             *(self._state, self.observed_step, self._in_force, self._judged, self._disturbance),
-            *(self._stamps, self._horizons, self._sent, rows, step, ahead),
+            *(self._stamps, self._horizons, self._lengths, self._sent, rows, step, ahead, self._H),
         )
         self.counts["horizons lost"] += lost
         disturbance = self._disturbance[rows]
         return Foresight(estimate, ahead, start, committed, held, disturbance)
 
-    def remember(self, rows: Indices, step: Indices, horizons: Array, sent: Flags) -> None:
+    def remember(  # noqa: PLR0917 - what was computed, and what became of it
+        self, rows: Indices, step: Indices, horizons: Array, lengths: Indices, sent: Indices
+    ) -> None:
         """See `Scheme`; only what was sent counts."""
-        rows, step, horizons = rows[sent], step[sent], horizons[sent]
+        rows, step, horizons, lengths = rows[sent], step[sent], horizons[sent], lengths[sent]
         slot = self._sent[rows] % self._stamps.shape[1]
-        self._stamps[rows, slot] = step
-        self._horizons[rows, slot] = horizons
+        self._stamps[rows, slot], self._lengths[rows, slot] = step, lengths
+        self._horizons[rows, slot, :, : horizons.shape[2]] = horizons
         self._sent[rows] += 1
 
     def _listen(self, rows: Indices) -> None:
         """What observations have come with since the last time: delays, and a disturbance."""
+        begin = rows[~self._begun[rows]]
+        if len(begin):
+            self._begun[begin] = True
+            half_trip = -(-self._clock.bound_ns(begin) // self._dt_ns)
+            self._delay_bound.begin(begin, half_trip + MARGIN)
         in_force = self._in_force[rows]
         told = rows[(in_force != self._acknowledged[rows]) & (self._sent[rows] > 0)]
         if len(told):
             oldest = np.maximum(self._sent[told] - self._stamps.shape[1], 0)
             ours = self._stamps[told, oldest % self._stamps.shape[1]] <= self._in_force[told]
             known = told[ours]
-            self.delay_bound.acknowledged(known, self._since[known] - self._in_force[known])
+            self._delay_bound.acknowledged(known, self._since[known] - self._in_force[known])
             self._acknowledged[told] = self._in_force[told]
         if self._observer_decay < 1.0:
             _follow_disturbance(
                 *(self._model.A, self._model.B, self._u_max, self._brake_per_step),
                 *(self._base_velocity, self._base_step, self._base_in_force),
                 *(self._state, self.observed_step, self._in_force, self._since),
-                *(self._stamps, self._horizons, self._sent, self._disturbance),
-                *(rows, self.delay_bound.steps(rows), self._reach, self._observer_decay),
+                *(self._stamps, self._horizons, self._lengths, self._sent, self._disturbance),
+                *(rows, self._delay_bound.steps(rows), self._reach, self._observer_decay),
             )
 
 
@@ -161,34 +185,33 @@ def _first_after(stamps, sent, row, stamp):  # type: ignore[no-untyped-def]  # n
 
 
 @njit(
-    "f8(i8[:,::1], f4[:,:,:,::1], i8, i8, i8, i8, f8, f8[::1], f8)",
+    "f8(i8[:,::1], f4[:,:,:,::1], i8[:,::1], i8, i8, i8, i8, f8, f8[::1], f8)",
     cache=True,
     error_model="numpy",
 )
-def _command(stamps, horizons, row, number, axis, step, v, u_max, brake):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+def _command(stamps, horizons, lengths, row, number, axis, step, v, u_max, brake):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """What `client.compensator` flies at a step with a horizon; v is the velocity there."""
     if number == HOVERS:
         return 0.0
     if number == UNKNOWN:
         return v  # as good a guess as any: it flies on
-    room, axes, H = horizons.shape[1], horizons.shape[2], horizons.shape[3]
-    slot = number % room
-    stage = step - stamps[row, slot]
-    u = min(max(float(horizons[row, slot, axis, min(stage, H - 1)]), -u_max[axis]), u_max[axis])
-    if stage < H or brake == 0.0:
+    axes, slot = horizons.shape[2], number % horizons.shape[1]
+    stage, end = step - stamps[row, slot], lengths[row, slot] - 1
+    u = min(max(float(horizons[row, slot, axis, min(stage, end)]), -u_max[axis]), u_max[axis])
+    if stage <= end or brake == 0.0:
         return u
     squares = 0.0
     for other in range(axes):
-        last = horizons[row, slot, other, H - 1]
-        squares += min(max(float(last), -u_max[other]), u_max[other]) ** 2
+        last = min(max(float(horizons[row, slot, other, end]), -u_max[other]), u_max[other])
+        squares += last**2
     speed = np.sqrt(squares)
-    return u * (max(0.0, speed - (stage - H + 1) * brake) / speed) if speed > 0.0 else 0.0
+    return u * (max(0.0, speed - (stage - end) * brake) / speed) if speed > 0.0 else 0.0
 
 
 @njit(
     "Tuple((f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], i8))("
     "f8[:,:,::1], f8[:,::1], f8[::1], f8, f8[:,:,::1], i8[::1], i8[::1], i8[::1], f8[:,::1],"
-    "i8[:,::1], f4[:,:,:,::1], i8[::1], i8[:], i8[:], i8[:])",
+    "i8[:,::1], f4[:,:,:,::1], i8[:,::1], i8[::1], i8[:], i8[:], i8[:], i8)",
     cache=True,
     error_model="numpy",
 )
@@ -204,13 +227,15 @@ def _replay(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
     disturbance: Array,
     stamps: Indices,
     horizons: Array,
+    lengths: Indices,
     sent: Indices,
     rows: Indices,
     steps: Indices,
     ahead: Indices,
+    H: int,
 ):
     """See `Replay.foresee`: x̂(k), x̂(k+d), committed and held inputs, and newly lost horizons."""
-    n, axes, room, H = len(rows), len(A), horizons.shape[1], horizons.shape[3]
+    n, axes, room = len(rows), len(A), horizons.shape[1]
     estimate, start = np.empty((n, axes, 2)), np.empty((n, axes, 2))
     committed, held = np.zeros((n, axes, H)), np.empty((n, axes, H))
     lost = 0
@@ -233,7 +258,7 @@ def _replay(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
                     estimate[i, axis, 0], estimate[i, axis, 1] = p, v
                 if step == k + d:
                     start[i, axis, 0], start[i, axis, 1] = p, v
-                u = _command(stamps, horizons, row, number, axis, step, v, u_max, brake)
+                u = _command(stamps, horizons, lengths, row, number, axis, step, v, u_max, brake)
                 if step >= k + d:
                     held[i, axis, step - k - d] = u
                     continue
@@ -249,7 +274,8 @@ def _replay(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
 
 @njit(
     "(f8[:,:,::1], f8[:,::1], f8[::1], f8, f8[:,::1], i8[::1], i8[::1], f8[:,:,::1], i8[::1],"
-    "i8[::1], i8[::1], i8[:,::1], f4[:,:,:,::1], i8[::1], f8[:,::1], i8[:], i8[:], i8, f8)",
+    "i8[::1], i8[::1], i8[:,::1], f4[:,:,:,::1], i8[:,::1], i8[::1], f8[:,::1], i8[:], i8[:], i8,"
+    "f8)",
     cache=True,
     error_model="numpy",
 )
@@ -267,6 +293,7 @@ def _follow_disturbance(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
     since: Indices,
     stamps: Indices,
     horizons: Array,
+    lengths: Indices,
     sent: Indices,
     disturbance: Array,
     rows: Indices,
@@ -292,7 +319,7 @@ def _follow_disturbance(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
                     number, following = following, following + 1
                 if step >= since[row]:
                     number = after
-                u = _command(stamps, horizons, row, number, axis, step, v, u_max, brake)
+                u = _command(stamps, horizons, lengths, row, number, axis, step, v, u_max, brake)
                 v = A[axis, 1, 1] * v + B[axis, 1] * (u + disturbance[row, axis])
             if known:
                 # A change of w changes the velocity after m steps by 1 - a^m of it.

@@ -108,7 +108,7 @@ class Observation(NamedTuple):
 
 
 class Horizon(NamedTuple):
-    """The control horizon U(k) of eq. (8)."""
+    """The control horizon U(k) of eq. (8), after the committed inputs where there are any."""
 
     vehicle: int
     session: int
@@ -118,7 +118,7 @@ class Horizon(NamedTuple):
     observed_ns: int
     """Stamp of the observation it was computed from, echoed [client clock]."""
     inputs: NDArray[np.float32]
-    """Desired velocity [m/s]; shape (axes, H)."""
+    """Desired velocity [m/s]; shape (axes, d + H), with d, 0 … H, committed ones first."""
 
 
 class Heartbeat(NamedTuple):
@@ -167,14 +167,14 @@ def _positive(value: object, _: Terms) -> tuple[float, ...]:
 
 
 def _state(value: object, ours: Terms) -> NDArray[np.float64]:
-    state = _array(value, _FLOAT64, (ours.axes, 2))
+    state = _array(value, _FLOAT64, ours.axes, (2, 2))
     if not all(map(math.isfinite, state.ravel().tolist())):
         raise ProtocolError("not finite")
     return state
 
 
 def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
-    inputs = _array(value, _FLOAT32, (ours.axes, ours.horizon))
+    inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, 2 * ours.horizon))
     largest = np.abs(inputs).max(axis=1).tolist()  # NaN where there is one
     if not all(map(math.isfinite, largest)):
         raise ProtocolError("not finite")
@@ -184,10 +184,16 @@ def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
     return inputs
 
 
-def _array(value: object, dtype: np.dtype[Any], shape: tuple[int, int]) -> NDArray[Any]:
-    if type(value) is not bytes or len(value) != shape[0] * shape[1] * dtype.itemsize:
+def _array(
+    value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]
+) -> NDArray[Any]:
+    """Of each axis at least and at most so many numbers."""
+    if type(value) is not bytes:
         raise ProtocolError("shape")
-    return np.ndarray(shape, dtype, value)
+    count, rest = divmod(len(value), axes * dtype.itemsize)
+    if rest or not counts[0] <= count <= counts[1]:
+        raise ProtocolError("shape")
+    return np.ndarray((axes, count), dtype, value)
 
 
 _FLOAT32 = np.dtype("<f4")
