@@ -20,7 +20,7 @@ import numpy as np
 from server.clock import ClockMap
 from server.estimator import Estimator
 from server.planner import Planner
-from server.trigger import make_trigger
+from server.trigger import Situation, make_trigger
 from shared.config import Scenario
 from shared.endpoint import (
     MILLISECOND_NS,
@@ -277,11 +277,11 @@ class Server(Endpoint):
         estimate = self._estimator.estimate(rows, step)  # (13)
         stopwatch.lap("estimate")
         planned, fresh = self._planner.planned(rows, step, estimate)
-        verdict = self._trigger.test(rows, step, estimate, planned, fresh)  # (16)
+        verdict = self._trigger.test(Situation(rows, step, fresh, estimate, planned))  # (16)
         stopwatch.lap("trigger")
         plan = self._planner.plan(rows, step, estimate, planned, fresh)  # (14), (15)
         self._estimator.remember(rows, step, plan.inputs[:, :, 0])  # (12)
-        event = verdict.event & plan.solved
+        event = verdict.surely & plan.solved
         sent = np.flatnonzero(event)
         self._trigger.sent(rows[sent], step[sent], verdict.error[sent])
         stopwatch.lap("plan")

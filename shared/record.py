@@ -43,8 +43,8 @@ def server_columns(axes: int) -> np.dtype[np.void]:
             ("planned", "<f8", (axes, 2)),  # x_p(k|k-1)
             ("input", "<f8", (axes,)),  # û(k)
             ("observed_step", "<i8"),  # of the observation behind x̂
-            ("error", "<f8"),  # V(k)
-            ("threshold", "<f8"),  # S(k)
+            ("error", "<f8"),  # V(k), or what the trigger compares instead
+            ("threshold", "<f8"),  # S(k), or what it compares that with
             ("event", "?"),
             ("solved", "?"),
             ("solve_ns", "<i8"),  # both MPCs, all vehicles of the tick; -1 where not measured
