@@ -96,11 +96,27 @@ WRONG = {
     # Not one of the choices.
     "a scheme that is none": (
         'control.scheme = "papr"',
-        "control.scheme: got 'papr', expected 'paper' or 'none'",
+        "control.scheme: got 'papr', expected 'committed' or 'paper' or 'none'",
     ),
     "a trigger nobody knows": (
         'control.trigger = "often"',
-        "control.trigger: got 'often', expected 'paper' or 'always' or 'periodic'",
+        (
+            "control.trigger: got 'often', expected a policy; there are always, periodic, paper, "
+            "cost_gap, deviation, heartbeat, budget"
+        ),
+    ),
+    "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),
+    "a trigger for another scheme": (
+        'control.trigger = "cost_gap"',
+        "control.scheme: got 'paper', expected 'committed' with the trigger cost_gap",
+    ),
+    "a negative cost": (
+        "control.cost_gap = -1.0",
+        "control.cost_gap: got -1.0, expected a number >= 0.0",
+    ),
+    "a negative distance": (
+        "control.deviation_m = -1.0",
+        "control.deviation_m: got -1.0, expected a number >= 0.0",
     ),
     "no period": ("control.period = 0", "control.period: got 0, expected a whole number >= 1"),
     "a delay bound that is none": (
