@@ -83,9 +83,7 @@ class MPC:
         Returns:
             of all axes; shape (n,).
         """
-        cost: Array = _cost(
-            self.model.A, self.model.B, self.weights, self.input_weights, change
-        )
+        cost: Array = _cost(self.model.A, self.model.B, self.weights, self.input_weights, change)
         return cost
 
 

@@ -184,9 +184,7 @@ def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
     return inputs
 
 
-def _array(
-    value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]
-) -> NDArray[Any]:
+def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
     """Of each axis at least and at most so many numbers."""
     if type(value) is not bytes:
         raise ProtocolError("shape")

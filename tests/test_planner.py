@@ -291,7 +291,9 @@ def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> 
         alone = run(neighbour, step, estimates[1])
         estimates[0, 0, 0] = np.nan if step == 1 else estimates[0, 0, 0]
         planned, fresh = planner.planned(rows, np.full(2, step), estimates)
-        plans.append(planner.plan(rows, np.full(2, step), estimates, planned, fresh, np.zeros((2, 2))))
+        plans.append(
+            planner.plan(rows, np.full(2, step), estimates, planned, fresh, np.zeros((2, 2)))
+        )
         np.testing.assert_array_equal(plans[-1].inputs[1], alone.inputs[0])
     assert [plan.solved.tolist() for plan in plans] == [[True, True], [False, True], [True, True]]
     shifted = shift(plans[0].inputs, np.array([1, 1]))
