@@ -1,9 +1,11 @@
 """When a horizon is worth a packet: policies against numbers worked out by hand, and combined."""
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import astuple, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,9 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server.trigger import POLICIES, Combined, Situation, Trigger, Verdict, make_trigger
+from shared import config
 from shared.config import ControlConfig
 from shared.model import Array, Flags, Indices
 from shared.policy import SIGNATURES
+from sim.flight import fly
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -518,3 +522,25 @@ def only(situation: Situation, i: int) -> Situation:
         *(situation.estimate[one], situation.planned[one]),
         *(lambda: deviation_m()[one], lambda: cost_gap()[one]),
     )
+
+
+def test_documented_trigger_flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example of docs/triggers.md, as it stands there, alone and combined."""
+    for table in (POLICIES, SIGNATURES):
+        monkeypatch.setitem(table, "slip", None)  # taken out again in the end
+    text = (Path(__file__).parent.parent / "docs" / "triggers.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(example, {})
+    slip = trigger_of("slip(0.5)")
+    estimate = PLANNED + np.array([[[9.0, 0.3], [9.0, 0.5]]])
+    verdict = ask(slip, 3, estimate)
+    assert verdict.surely.tolist() == [True]
+    assert verdict.error == pytest.approx([math.hypot(0.3, 0.5)])
+    control = {"trigger": "slip(0.1) & budget(4, 1) | heartbeat(1)"}
+    flown = config.check({"duration": 10.0, "control": control}, "test")
+    server = fly(flown).server
+    sent_s = server["step"][server["event"]] * flown.control.dt
+    assert len(sent_s) > 10
+    assert np.diff(sent_s).max() <= 1.0 + 1e-9
+    with pytest.raises(config.ConfigError, match=r"slip\(mps\) with 0 <= mps"):
+        config.check({"control": {"trigger": "slip(-1)"}}, "test")
