@@ -145,8 +145,8 @@ class Periodic:
 
 def heartbeat(control: ControlConfig, capacity: int, seconds: float) -> Periodic:
     """No silence is longer than so many seconds, or a step where that is longer."""
-    whole = int(seconds / control.dt + 1e-9)  # as much as floating point may take from 0.35 / 0.05
-    return Periodic(control, capacity, max(1, whole))
+    steps = int(seconds / control.dt + 1e-9)  # as much as floating point may take from 0.35 / 0.05
+    return Periodic(control, capacity, steps)
 
 
 class Budget:

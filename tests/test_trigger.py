@@ -1,9 +1,11 @@
 """When a horizon is worth a packet: policies against numbers worked out by hand, and combined."""
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import astuple, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -12,10 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.trigger import POLICIES, Situation, Trigger, Verdict, make_trigger
+from server.trigger import POLICIES, Combined, Situation, Trigger, Verdict, make_trigger
+from shared import config
 from shared.config import ControlConfig
 from shared.model import Array, Flags, Indices
 from shared.policy import SIGNATURES
+from sim.flight import fly
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -327,6 +331,7 @@ def test_cost_gap_may_fire_until_it_is_known() -> None:
     """Then it is a cost above the threshold."""
     for text in ("cost_gap(0.01)", "cost_gap"):
         trigger = trigger_of(text)
+        assert trigger.test(facing(1, fresh=True)).surely.tolist() == [True]
         verdict = trigger.test(facing(1))
         assert (verdict.surely.tolist(), verdict.perhaps.tolist()) == ([False], [True])
         assert np.isnan(verdict.error).all()
@@ -377,6 +382,35 @@ def test_each_policy_is_told_its_own_error_when_a_packet_goes_out() -> None:
             *(off_by(error), PLANNED, None, lambda: np.zeros(1)),
         )
         assert trigger.test(later).surely.tolist() == [event]
+
+
+class Listener:
+    """A trigger whose error is its own, and which keeps what it is told."""
+
+    def __init__(self, error: float, *, compares: bool) -> None:
+        self.compares = compares
+        self.told: list[float] = []
+        self._error = error
+
+    def test(self, situation: Situation) -> Verdict:
+        """Fires."""
+        figure = np.full(len(situation.rows), self._error)
+        return Verdict(figure > 0.0, figure > 0.0, figure, figure)
+
+    def sent(self, rows: Indices, step: Indices, error: Array) -> None:  # noqa: ARG002
+        """Keeps it."""
+        self.told += error.tolist()
+
+
+@pytest.mark.parametrize("compares", [(True, True), (False, True), (True, False), (False, False)])
+def test_each_side_is_told_its_own_error_whichever_is_recorded(compares: tuple[bool, bool]) -> None:
+    """And only of the vehicles that were sent to."""
+    left, right = (Listener(5.0 + i, compares=compares[i]) for i in range(2))
+    both = Combined(np.logical_and, left, right, 3)
+    verdict = both.test(facing(3))
+    assert verdict.error.tolist() == [6.0 if compares == (False, True) else 5.0] * 3
+    both.sent(np.array([2, 0]), np.array([50, 50]), verdict.error[:2])
+    assert (left.told, right.told) == ([5.0, 5.0], [6.0, 6.0])
 
 
 def test_scenario_names_its_trigger() -> None:
@@ -488,3 +522,25 @@ def only(situation: Situation, i: int) -> Situation:
         *(situation.estimate[one], situation.planned[one]),
         *(lambda: deviation_m()[one], lambda: cost_gap()[one]),
     )
+
+
+def test_documented_trigger_flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example of docs/triggers.md, as it stands there, alone and combined."""
+    for table in (POLICIES, SIGNATURES):
+        monkeypatch.setitem(table, "slip", None)  # taken out again in the end
+    text = (Path(__file__).parent.parent / "docs" / "triggers.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(example, {})
+    slip = trigger_of("slip(0.5)")
+    estimate = PLANNED + np.array([[[9.0, 0.3], [9.0, 0.5]]])
+    verdict = ask(slip, 3, estimate)
+    assert verdict.surely.tolist() == [True]
+    assert verdict.error == pytest.approx([math.hypot(0.3, 0.5)])
+    control = {"trigger": "slip(0.1) & budget(4, 1) | heartbeat(1)"}
+    flown = config.check({"duration": 10.0, "control": control}, "test")
+    server = fly(flown).server
+    sent_s = server["step"][server["event"]] * flown.control.dt
+    assert len(sent_s) > 10
+    assert np.diff(sent_s).max() <= 1.0 + 1e-9
+    with pytest.raises(config.ConfigError, match=r"slip\(mps\) with 0 <= mps"):
+        config.check({"control": {"trigger": "slip(-1)"}}, "test")
