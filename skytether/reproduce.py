@@ -20,6 +20,8 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import tyro
+from rich.console import Console
+from rich.table import Table
 
 from lab import report, studies
 from lab.journal import Journal
@@ -94,8 +96,18 @@ def reproduce(argv: Sequence[str]) -> None:
         raise CommandError(str(error), command.CONFIGURATION) from None
     except OSError as error:
         raise CommandError(f"{error.filename or options.out}: {error.strerror or error}") from None
+    _show(drawn.tables[0])
     print(f"{options.out / 'report.html'}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
+
+
+def _show(table: report.Table) -> None:
+    shown = Table(title=table.title, title_justify="left")
+    for heading in table.heading:
+        shown.add_column(heading)
+    for row in table.rows:
+        shown.add_row(*map(str, row))
+    Console().print(shown)
 
 
 def _measure(options: Options, scenario: Scenario, scale: Scale) -> tuple[Measured, int]:
