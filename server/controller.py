@@ -21,6 +21,7 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from server.clock import ClockMap
 from server.estimator import Estimator, Foresight, Scheme
@@ -345,7 +346,7 @@ class Server(Endpoint):
         situation: Situation,
         foresight: Foresight,
         verdict: Verdict,
-        input_: Array,
+        input_: Array | NDArray[np.float32],
         event: Flags | bool = False,
         solved: Flags | bool = True,
         solve_ns: int = -1,

@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from shared.model import Array, Flags, Indices, Model
 from shared.protocol import Observation
@@ -37,7 +38,7 @@ class Foresight:
     disturbance: Array
     """ŵ, an input that nobody gave [m/s]; shape (n, axes)."""
 
-    def horizons(self, inputs: Array) -> Array:
+    def horizons(self, inputs: Array) -> NDArray[np.float32]:
         """What to send, from k on: the committed inputs, then planned ones from k + d on.
 
         Args:
@@ -46,10 +47,10 @@ class Foresight:
         Returns:
             float32, d + H for each vehicle; shape (n, axes, largest d + H).
         """
-        horizons: Array = _join(self.committed, self.ahead, inputs)
+        horizons: NDArray[np.float32] = _join(self.committed, self.ahead, inputs)
         return horizons
 
-    def of(self, some: Flags) -> "Foresight":
+    def of(self, some: Indices) -> "Foresight":
         """Of some of the vehicles."""
         return Foresight(
             *(self.estimate[some], self.ahead[some], self.start[some]),
@@ -79,8 +80,13 @@ class Scheme(Protocol):
     def foresee(self, rows: Indices, step: Indices) -> Foresight:
         """The vehicles in `rows` at their steps k, all within reach."""
 
-    def remember(  # noqa: PLR0917 - what was computed, and what became of it
-        self, rows: Indices, step: Indices, horizons: Array, lengths: Indices, sent: Indices
+    def remember(
+        self,
+        rows: Indices,
+        step: Indices,
+        horizons: NDArray[np.float32],
+        lengths: Indices,
+        sent: Indices,
     ) -> None:
         """What was computed for the steps from k on, and which of it is sent.
 
@@ -156,11 +162,11 @@ class Estimator:
         nothing, here = self._nothing[:n], np.zeros(n, dtype=np.int64)
         return Foresight(estimate, here, estimate, nothing, nothing, np.zeros(estimate.shape[:2]))
 
-    def remember(  # noqa: PLR0917
+    def remember(
         self,
         rows: Indices,
         step: Indices,
-        horizons: Array,
+        horizons: NDArray[np.float32],
         lengths: Indices,  # noqa: ARG002 - the first input is all that (12) asks for
         sent: Indices,  # noqa: ARG002
     ) -> None:

@@ -60,9 +60,7 @@ class MPC:
         )
         return gradient
 
-    def predict(  # noqa: PLR0917 - all there is to say of a prediction
-        self, x: Array, u: Array, disturbance: Array, states: Array, rows: Indices
-    ) -> None:
+    def predict(self, x: Array, u: Array, disturbance: Array, states: Array, rows: Indices) -> None:
         """x, then X(k) of eq. (7): the states at the stages 0 … H.
 
         Args:

@@ -203,7 +203,7 @@ class Planner:
         """
         return self._tracker.mpc.cost(held - self._tracker.inputs[rows])
 
-    def deviation_m(  # noqa: PLR0917 - the plan, and what is flown instead
+    def deviation_m(
         self, rows: Indices, step: Indices, estimate: Array, held: Array, disturbance: Array
     ) -> Array:
         """How far `held` leads away from the generator's last plan, at most, as far as that goes.

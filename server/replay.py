@@ -20,14 +20,14 @@ from collections import Counter
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from server.clock import ClockMap
 from server.delay import DelayBound
 from server.estimator import Foresight
 from shared.config import Scenario
-from shared.model import Array, Flags, Indices, Model
+from shared.model import Flags, Indices, Model
 from shared.protocol import INPUTS_MAX, NO_HORIZON, Observation
-
 
 MARGIN = 2
 """Steps on top of half a round trip, until a horizon has been acknowledged."""
@@ -42,18 +42,17 @@ class Replay:
         clock: knows half of the smallest round trip, which is a first guess at the delay bound.
     """
 
-    def __init__(  # noqa: PLR0917 - all that is fixed
+    def __init__(
         self, scenario: Scenario, model: Model, capacity: int, reach: int, clock: ClockMap
     ) -> None:
         control, vehicle, axes = scenario.control, scenario.vehicle, len(model.B)
         H = self._H = control.horizon
         self.plans_always = False
         self.counts: Counter[str] = Counter()
-        self._model = model
         self._reach = reach
-        self._u_max = scenario.u_max
-        brakes = vehicle.exhausted == "brake"
-        self._brake_per_step = vehicle.brake_mps2 * control.dt if brakes else 0.0
+        brake_mps2 = vehicle.brake_mps2 if vehicle.exhausted == "brake" else 0.0
+        self._flies = (model.A, model.B, scenario.u_max, brake_mps2 * control.dt)
+        """A and B, and what `client.compensator` makes of a horizon."""
         observer_s = control.observer_s
         self._observer_decay = float(np.exp(-control.dt / observer_s)) if observer_s else 1.0
         given = control.delay_bound
@@ -68,22 +67,23 @@ class Replay:
         self._state = np.zeros((capacity, axes, 2))
         self._in_force = np.full(capacity, NO_HORIZON, dtype=np.int64)
         self._since = np.zeros(capacity, dtype=np.int64)
+        self._seen = (self._state, self.observed_step, self._in_force, self._since)
+        """The newest observation."""
         self._acknowledged = np.full(capacity, NO_HORIZON, dtype=np.int64)
         """The horizon that was last seen to have come into force."""
-        self._base_step = np.full(capacity, -1, dtype=np.int64)
-        """The observation before, from which the disturbance observer starts: -1 for none."""
-        self._base_velocity = np.zeros((capacity, axes))
-        self._base_in_force = np.full(capacity, NO_HORIZON, dtype=np.int64)
-        self._disturbance = np.zeros((capacity, axes))
         room = reach + H
         self._stamps = np.zeros((capacity, room), dtype=np.int64)
-        """Steps of the horizons sent, a ring;"""
         self._horizons = np.zeros((capacity, room, axes, 2 * H), dtype=np.float32)
-        """what they told,"""
         self._lengths = np.zeros((capacity, room), dtype=np.int64)
-        """for how many steps; and"""
         self._sent = np.zeros(capacity, dtype=np.int64)
-        """how many there were."""
+        self._told = (self._stamps, self._horizons, self._lengths, self._sent)
+        """Horizons that were sent, a ring: step, inputs, how many; and how many horizons so far."""
+        self._base_step = np.full(capacity, -1, dtype=np.int64)
+        base_velocity = np.zeros((capacity, axes))
+        base_in_force = np.full(capacity, NO_HORIZON, dtype=np.int64)
+        self._base = (base_velocity, self._base_step, base_in_force)
+        """The observation before, from which the disturbance observer starts; step -1 for none."""
+        self._disturbance = np.zeros((capacity, axes))
         self._judged = np.zeros(capacity, dtype=np.int64)
         """Horizons of up to this step have been seen in force, or lost, or overtaken."""
 
@@ -115,16 +115,20 @@ class Replay:
         self._listen(rows)
         ahead = self._delay_bound.steps(rows)
         estimate, start, committed, held, lost = _replay(
-            *(self._model.A, self._model.B, self._u_max, self._brake_per_step),
-            *(self._state, self.observed_step, self._in_force, self._judged, self._disturbance),
-            *(self._stamps, self._horizons, self._lengths, self._sent, rows, step, ahead, self._H),
+            *(self._flies, self._told, self._seen, self._judged, self._disturbance),
+            *(rows, step, ahead, self._H),
         )
         self.counts["horizons lost"] += lost
         disturbance = self._disturbance[rows]
         return Foresight(estimate, ahead, start, committed, held, disturbance)
 
-    def remember(  # noqa: PLR0917 - what was computed, and what became of it
-        self, rows: Indices, step: Indices, horizons: Array, lengths: Indices, sent: Indices
+    def remember(
+        self,
+        rows: Indices,
+        step: Indices,
+        horizons: NDArray[np.float32],
+        lengths: Indices,
+        sent: Indices,
     ) -> None:
         """See `Scheme`; only what was sent counts."""
         rows, step, horizons, lengths = rows[sent], step[sent], horizons[sent], lengths[sent]
@@ -149,15 +153,16 @@ class Replay:
             self._delay_bound.acknowledged(known, self._since[known] - self._in_force[known])
             self._acknowledged[told] = self._in_force[told]
         if self._observer_decay < 1.0:
-            _follow_disturbance(
-                *(self._model.A, self._model.B, self._u_max, self._brake_per_step),
-                *(self._base_velocity, self._base_step, self._base_in_force),
-                *(self._state, self.observed_step, self._in_force, self._since),
-                *(self._stamps, self._horizons, self._lengths, self._sent, self._disturbance),
+            _observe_disturbance(
+                *(self._flies, self._told, self._seen, self._base, self._disturbance),
                 *(rows, self._delay_bound.steps(rows), self._reach, self._observer_decay),
             )
 
 
+FLIES = "Tuple((f8[:,:,::1], f8[:,::1], f8[::1], f8))"
+TOLD = "Tuple((i8[:,::1], f4[:,:,:,::1], i8[:,::1], i8[::1]))"
+SEEN = "Tuple((f8[:,:,::1], i8[::1], i8[::1], i8[::1]))"
+"""Of the kernels: `Replay._flies`, `_told` and `_seen`."""
 HOVERS, UNKNOWN = -1, -2
 """In place of the number of a horizon: none yet; one that was sent in an earlier life of ours."""
 
@@ -184,17 +189,15 @@ def _first_after(stamps, sent, row, stamp):  # type: ignore[no-untyped-def]  # n
     return number
 
 
-@njit(
-    "f8(i8[:,::1], f4[:,:,:,::1], i8[:,::1], i8, i8, i8, i8, f8, f8[::1], f8)",
-    cache=True,
-    error_model="numpy",
-)
-def _command(stamps, horizons, lengths, row, number, axis, step, v, u_max, brake):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+@njit(f"f8({TOLD}, {FLIES}, i8, i8, i8, i8, f8)", cache=True, error_model="numpy")
+def _command(told, flies, row, number, axis, step, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """What `client.compensator` flies at a step with a horizon; v is the velocity there."""
     if number == HOVERS:
         return 0.0
     if number == UNKNOWN:
         return v  # as good a guess as any: it flies on
+    stamps, horizons, lengths, _ = told
+    _, _, u_max, brake = flies
     axes, slot = horizons.shape[2], number % horizons.shape[1]
     stage, end = step - stamps[row, slot], lengths[row, slot] - 1
     u = min(max(float(horizons[row, slot, axis, min(stage, end)]), -u_max[axis]), u_max[axis])
@@ -209,33 +212,17 @@ def _command(stamps, horizons, lengths, row, number, axis, step, v, u_max, brake
 
 
 @njit(
-    "Tuple((f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], i8))("
-    "f8[:,:,::1], f8[:,::1], f8[::1], f8, f8[:,:,::1], i8[::1], i8[::1], i8[::1], f8[:,::1],"
-    "i8[:,::1], f4[:,:,:,::1], i8[:,::1], i8[::1], i8[:], i8[:], i8[:], i8)",
+    f"Tuple((f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], i8))({FLIES}, {TOLD}, {SEEN},"
+    "i8[::1], f8[:,::1], i8[:], i8[:], i8[:], i8)",
     cache=True,
     error_model="numpy",
 )
-def _replay(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
-    A: Array,
-    B: Array,
-    u_max: Array,
-    brake: float,
-    state: Array,
-    observed_step: Indices,
-    in_force: Indices,
-    judged: Indices,
-    disturbance: Array,
-    stamps: Indices,
-    horizons: Array,
-    lengths: Indices,
-    sent: Indices,
-    rows: Indices,
-    steps: Indices,
-    ahead: Indices,
-    H: int,
-):
+def _replay(flies, told, seen, judged, disturbance, rows, steps, ahead, H):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """See `Replay.foresee`: x̂(k), x̂(k+d), committed and held inputs, and newly lost horizons."""
-    n, axes, room = len(rows), len(A), horizons.shape[1]
+    A, B, _, _ = flies
+    stamps, _, _, sent = told
+    state, observed_step, in_force, _ = seen
+    n, axes, room = len(rows), len(A), stamps.shape[1]
     estimate, start = np.empty((n, axes, 2)), np.empty((n, axes, 2))
     committed, held = np.zeros((n, axes, H)), np.empty((n, axes, H))
     lost = 0
@@ -258,7 +245,7 @@ def _replay(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
                     estimate[i, axis, 0], estimate[i, axis, 1] = p, v
                 if step == k + d:
                     start[i, axis, 0], start[i, axis, 1] = p, v
-                u = _command(stamps, horizons, lengths, row, number, axis, step, v, u_max, brake)
+                u = _command(told, flies, row, number, axis, step, v)
                 if step >= k + d:
                     held[i, axis, step - k - d] = u
                     continue
@@ -273,36 +260,18 @@ def _replay(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
 
 
 @njit(
-    "(f8[:,:,::1], f8[:,::1], f8[::1], f8, f8[:,::1], i8[::1], i8[::1], f8[:,:,::1], i8[::1],"
-    "i8[::1], i8[::1], i8[:,::1], f4[:,:,:,::1], i8[:,::1], i8[::1], f8[:,::1], i8[:], i8[:], i8,"
-    "f8)",
+    f"({FLIES}, {TOLD}, {SEEN}, Tuple((f8[:,::1], i8[::1], i8[::1])), f8[:,::1], i8[:], i8[:],"
+    "i8, f8)",
     cache=True,
     error_model="numpy",
 )
-def _follow_disturbance(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR0917 - compiled
-    A: Array,
-    B: Array,
-    u_max: Array,
-    brake: float,
-    base_velocity: Array,
-    base_step: Indices,
-    base_in_force: Indices,
-    state: Array,
-    observed_step: Indices,
-    in_force: Indices,
-    since: Indices,
-    stamps: Indices,
-    horizons: Array,
-    lengths: Indices,
-    sent: Indices,
-    disturbance: Array,
-    rows: Indices,
-    ahead: Indices,
-    reach: int,
-    decay: float,
-):
+def _observe_disturbance(flies, told, seen, base, disturbance, rows, ahead, reach, decay):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """Disturbance observer: from the observation before to the newest, where there is a new one."""
-    axes, room = len(A), horizons.shape[1]
+    A, B, u_max, _ = flies
+    stamps, _, _, sent = told
+    state, observed_step, in_force, since = seen
+    base_velocity, base_step, base_in_force = base
+    axes, room = len(A), stamps.shape[1]
     for i in range(len(rows)):
         row, d = rows[i], ahead[i]
         begin, end = base_step[row], observed_step[row]
@@ -310,7 +279,7 @@ def _follow_disturbance(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
             continue
         before = _number(stamps, sent, row, base_in_force[row])
         after = _number(stamps, sent, row, in_force[row])
-        known = before != UNKNOWN and after != UNKNOWN and 0 <= begin and end - begin <= reach
+        known = min(before, after) > UNKNOWN and begin >= 0 and end - begin <= reach
         for axis in range(axes):
             v, number = base_velocity[row, axis], before
             following = _first_after(stamps, sent, row, max(base_in_force[row], begin - d))
@@ -319,7 +288,7 @@ def _follow_disturbance(  # type: ignore[no-untyped-def]  # noqa: ANN202, PLR091
                     number, following = following, following + 1
                 if step >= since[row]:
                     number = after
-                u = _command(stamps, horizons, lengths, row, number, axis, step, v, u_max, brake)
+                u = _command(told, flies, row, number, axis, step, v)
                 v = A[axis, 1, 1] * v + B[axis, 1] * (u + disturbance[row, axis])
             if known:
                 # A change of w changes the velocity after m steps by 1 - a^m of it.

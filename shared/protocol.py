@@ -2,13 +2,14 @@
 
     [version, type, vehicle, ...]
 
-| type | message     | sent by | fields after `vehicle`                                               |
-|------|-------------|---------|----------------------------------------------------------------------|
-| 1    | HELLO       | client  | boot_id, terms                                                       |
-| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, terms                   |
-| 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns, received_ns, state |
-| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs                        |
-| 5    | HEARTBEAT   | server  | session, server_ns                                                   |
+| type | message     | sent by | fields after `vehicle`                                     |
+|------|-------------|---------|------------------------------------------------------------|
+| 1    | HELLO       | client  | boot_id, terms                                             |
+| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, terms         |
+| 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
+|      |             |         | received_ns, state                                         |
+| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs              |
+| 5    | HEARTBEAT   | server  | session, server_ns                                         |
 
 `docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
 Those that control uses are the client's; `server_ns` is the server's own, which the client only
