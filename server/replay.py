@@ -224,7 +224,7 @@ def _replay(flies, told, seen, judged, disturbance, rows, steps, ahead, H):  # t
     state, observed_step, in_force, _ = seen
     n, axes, room = len(rows), len(A), stamps.shape[1]
     estimate, start = np.empty((n, axes, 2)), np.empty((n, axes, 2))
-    committed, held = np.zeros((n, axes, H)), np.empty((n, axes, H))
+    committed, held = np.zeros((n, axes, H)), np.zeros((n, axes, H))
     lost = 0
     for i in range(n):
         row, k, d = rows[i], steps[i], ahead[i]
@@ -241,9 +241,10 @@ def _replay(flies, told, seen, judged, disturbance, rows, steps, ahead, H):  # t
             for step in range(observed, k + d + H):
                 while following < sent[row] and stamps[row, following % room] + d <= step:
                     number, following = following, following + 1
-                if step == k:
+                # An observation from ahead of k, where clocks disagree, is taken as it is.
+                if step == max(k, observed):
                     estimate[i, axis, 0], estimate[i, axis, 1] = p, v
-                if step == k + d:
+                if step == max(k + d, observed):
                     start[i, axis, 0], start[i, axis, 1] = p, v
                 u = _command(told, flies, row, number, axis, step, v)
                 if step >= k + d:

@@ -119,7 +119,7 @@ def test_estimate_keeps_its_own_copy_of_the_state() -> None:
 
 def test_missed_steps_are_remembered_too() -> None:
     """After steps 0, 1 and 5 the steps 2 … 4 were flown with û(1)."""
-    u = np.array([[1.0, -1.0], [2.0, 0.5], [0.3, 0.7]])
+    u = np.array([[1.0, -1.0], [2.0, 0.5], [0.25, 0.75]])
     estimator = make()
     remember(estimator, u[:2])
     remember(estimator, u[2:], start=5)
@@ -213,8 +213,8 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
     here, there = estimator.estimate(both, np.array([3, 501]))
     np.testing.assert_allclose(here, flown(x, np.zeros((3, 2))), rtol=0, atol=1e-13)
     np.testing.assert_allclose(there, flown(x, np.ones((1, 2))), rtol=0, atol=1e-13)
-    remember(estimator, np.array([[0.5, 0.7]]))
-    expected = flown(x, np.array([[0.5, 0.7]]))
+    remember(estimator, np.array([[0.5, 0.75]]))
+    expected = flown(x, np.array([[0.5, 0.75]]))
     np.testing.assert_allclose(estimate(estimator, 1), expected, rtol=0, atol=1e-13)
 
 
@@ -229,13 +229,13 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
     step = rng.integers(0, 50, vehicles)
     for _ in range(30):
         step += rng.integers(1, 4, vehicles)
-        u = rng.normal(size=(vehicles, 2))
+        u = rng.normal(size=(vehicles, 2)).astype(np.float32)
         together.remember(rows, step, horizons(u), *SENT)
         for i, single in enumerate(singles):
             single.remember(ROW, step[[i]], horizons(u[[i]]), *SENT)
     for i, (row, single) in enumerate(zip(rows, singles, strict=True)):
         x, observed = rng.normal(size=(2, 2)), int(step[i] + 1 - rng.integers(0, REACH + 1))
-        together.observe(int(row), observed, x)
+        together.observe(int(row), seen(observed, x))
         single.observe(0, seen(observed, x))
     expected = [estimate(single, int(k) + 1) for single, k in zip(singles, step, strict=True)]
     np.testing.assert_allclose(together.estimate(rows, step + 1), expected, rtol=0, atol=1e-13)

@@ -50,13 +50,17 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Welcome, u16, u32, u64, u64, stamp, terms()),
     st.builds(
         Observation,
-        *(u16, u32, step, stamp, st.integers(NO_HORIZON, 2**40), stamp, stamp),
+        *(u16, u32, step, stamp, st.integers(NO_HORIZON, 2**40), step, stamp, stamp),
         arrays("<f8", (2, 2), elements=st.floats(allow_nan=False, allow_infinity=False)),
     ),
     st.builds(
         Horizon,
         *(u16, u32, step, stamp, stamp),
-        arrays("<f4", (2, 40), elements=st.floats(-1.75, 1.75, width=32)),
+        arrays(
+            "<f4",
+            st.tuples(st.just(2), st.integers(40, 80)),
+            elements=st.floats(-1.75, 1.75, width=32),
+        ),
     ),
     st.builds(Heartbeat, u16, u32, stamp),
 )
@@ -92,8 +96,10 @@ def test_documented_sizes_are_the_real_ones() -> None:
     state = np.zeros((2, 2))
     stamp_ns, session = 3 * 10**14, 2**31
     assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs))) == 353
+    committed = np.zeros((2, 51), np.float32)
+    assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, committed))) == 353 + 11 * 8
     observation = Observation(1, session, 500, stamp_ns, 480, 490, stamp_ns, stamp_ns, state)
-    assert len(encode(observation)) == 76
+    assert len(encode(observation)) == 79
     assert len(encode(Heartbeat(1, session, stamp_ns))) == 18
 
 
@@ -124,12 +130,14 @@ HELLO = Hello(1, 99, TERMS)
         (OBSERVATION, 5, -1, "field"),
         (OBSERVATION, 5, 2**63, "field"),
         (OBSERVATION, 6, -2, "field"),
-        (OBSERVATION, 9, b"", "shape"),
-        (OBSERVATION, 9, [1.0, 2.0, 3.0, 4.0], "shape"),
-        (OBSERVATION, 9, np.array([1, 2, 3, math.nan]).tobytes(), "not finite"),
-        (OBSERVATION, 9, np.array([1, 2, 3, math.inf]).tobytes(), "not finite"),
+        (OBSERVATION, 7, -1, "field"),
+        (OBSERVATION, 10, b"", "shape"),
+        (OBSERVATION, 10, [1.0, 2.0, 3.0, 4.0], "shape"),
+        (OBSERVATION, 10, np.array([1, 2, 3, math.nan]).tobytes(), "not finite"),
+        (OBSERVATION, 10, np.array([1, 2, 3, math.inf]).tobytes(), "not finite"),
         (HORIZON, 7, np.zeros(79, np.float32).tobytes(), "shape"),
-        (HORIZON, 7, np.zeros(80, np.float64).tobytes(), "shape"),
+        (HORIZON, 7, np.zeros(81, np.float32).tobytes(), "shape"),
+        (HORIZON, 7, np.zeros(162, np.float32).tobytes(), "shape"),
         (HORIZON, 7, np.full(80, np.nan, np.float32).tobytes(), "not finite"),
         (HORIZON, 7, np.full(80, 1.81, np.float32).tobytes(), "input out of range"),
         (HORIZON, 7, np.full(80, -1.81, np.float32).tobytes(), "input out of range"),

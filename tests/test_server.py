@@ -74,7 +74,7 @@ class Vehicles:
         """An observation that took no time: both clocks run alike, a day apart."""
         stamp_ns = self.now_ns + DAY_NS
         observation = Observation(
-            *(welcome.vehicle, welcome.session, step, stamp_ns, NO_HORIZON),
+            *(welcome.vehicle, welcome.session, step, stamp_ns, NO_HORIZON, 0),
             *(self.now_ns, stamp_ns, np.array(state)),
         )
         assert self.say(observation, sender) == []

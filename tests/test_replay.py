@@ -1,0 +1,359 @@
+"""The committed scheme: the server knows what the vehicle flies, and where that leads it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from client.compensator import Compensator
+from server.clock import ClockMap
+from server.planner import Planner
+from server.replay import Replay
+from shared import config
+from shared.config import Scenario
+from shared.model import Array, Indices, discretise
+from shared.protocol import NO_HORIZON, Horizon, Observation
+from shared.record import UPLINK
+from shared.summary import summarise
+from sim.flight import Flight, fly, fly_batch
+
+quick = settings(max_examples=60, deadline=None)
+
+H, BOUND = 6, 4
+ROW = np.array([0])
+HORIZON_BYTES = 300
+"""More than a heartbeat has."""
+
+
+def scenario(name: str = "paper", **changes: Any) -> Scenario:
+    """A packaged scenario under the committed scheme, with some keys changed."""
+    table = config.to_table(config.load(name))
+    changes = {"control": {}, **changes}
+    changes["control"] = {"scheme": "committed", **changes["control"]}
+    for key, value in changes.items():
+        table[key] = table[key] | value if isinstance(value, dict) else value
+    return config.check(table, "test")
+
+
+def lossy(loss: float, down: float = 0.1) -> dict[str, Any]:
+    """The paper's network, with other losses."""
+    return {"uplink": {"loss": loss}, "downlink": {"loss": down}}
+
+
+# -- by hand -------------------------------------------------------------------------------------
+
+
+def small(exhausted: str = "brake", **control: Any) -> Scenario:
+    """Six stages of 0.1 s, of which a delay takes up to four."""
+    return scenario(
+        model={"tau_s": [0.81, 0.3], "u_max": [1.8, 0.9]},
+        control={"dt": 0.1, "horizon": H, "delay_bound": 0.1 * BOUND, **control},
+        vehicle={"exhausted": exhausted, "brake_mps2": 2.0},
+    )
+
+
+def make(flown: Scenario, *, reach: int = 40) -> Replay:
+    """Room for one vehicle."""
+    model = discretise(flown.tau_s, flown.control.dt)
+    return Replay(flown, model, 1, reach, ClockMap(1, flown.dt_ns))
+
+
+def see(replay: Replay, step: int, state: Array, in_force: int, since: int = 0) -> bool:
+    """An observation comes."""
+    return replay.observe(0, Observation(1, 1, step, 0, in_force, since, 0, 0, state))
+
+
+def send(replay: Replay, step: int, inputs: Array) -> None:
+    """A horizon of any length is sent [inputs: (axes, length)]."""
+    horizons, length = inputs.astype(np.float32)[None], np.array([inputs.shape[1]])
+    replay.remember(ROW, np.array([step]), horizons, length, np.array([0]))
+
+
+def plans(seed: int, *lengths: int) -> list[Array]:
+    """Inputs, some of them as float32 has the bound: a little beyond it."""
+    rng = np.random.default_rng(seed)
+    bound = np.array([1.8, 0.9])[:, None]
+    return [(rng.uniform(-1.3, 1.3, (2, n)) * bound).clip(-bound, bound) for n in lengths]
+
+
+@quick
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(H, 2 * H),
+    st.integers(0, 30),
+    st.sampled_from(["hold", "brake"]),
+)
+def test_a_horizon_is_replayed_as_the_vehicle_flies_it(
+    seed: int, length: int, age: int, exhausted: str
+) -> None:
+    """To the last bit: clipped, held or braked at its end."""
+    flown = small(exhausted)
+    (inputs,) = plans(seed, length)
+    vehicle, replay = Compensator(flown), make(flown)
+    vehicle.offer(Horizon(1, 1, 100, 0, 0, inputs.astype(np.float32)), 100)
+    send(replay, 100, inputs)
+    see(replay, 100 + age, np.ones((2, 2)), 100)
+    seen = replay.foresee(ROW, np.array([100 + age]))
+    assert seen.ahead.tolist() == [BOUND]
+    flies = [vehicle.choose(100 + age + i) for i in range(BOUND + H)]
+    told = np.concatenate([seen.committed[0, :, :BOUND], seen.held[0]], axis=1)
+    np.testing.assert_array_equal(told.T, flies)
+
+
+def test_a_horizon_in_flight_is_in_force_when_it_had_its_time() -> None:
+    """The one before is flown until then, and the state rolled on accordingly."""
+    flown = small()
+    model = discretise(flown.tau_s, flown.control.dt)
+    old, new = plans(1, 2 * H, H)
+    replay, x = make(flown), np.array([[1.0, 0.2], [-1.0, 0.1]])
+    send(replay, 100, old)
+    send(replay, 103, new)
+    see(replay, 104, x, 100)
+    seen = replay.foresee(ROW, np.array([106]))
+    for u in old[:, 4:6].T:  # of steps 104 and 105
+        x = model.step(x, np.float64(np.float32(u)))
+    np.testing.assert_allclose(seen.estimate[0], x, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(old[:, 6]))
+    np.testing.assert_array_equal(seen.committed[0, :, 1], np.float32(new[:, 4]))
+
+
+def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:
+    """It is counted once, and what it told is forgotten, until it comes after all."""
+    old, lost, late = plans(2, 2 * H, H, H)
+    replay = make(small())
+    send(replay, 100, old)
+    send(replay, 102, lost)
+    send(replay, 103, late)
+    see(replay, 106, np.zeros((2, 2)), 100)
+    seen = replay.foresee(ROW, np.array([106]))
+    np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(old[:, 6]))
+    np.testing.assert_array_equal(seen.committed[0, :, 1], np.float32(late[:, 4]))
+    assert replay.counts["horizons lost"] == 1
+    replay.foresee(ROW, np.array([107]))
+    assert replay.counts["horizons lost"] == 1
+    see(replay, 108, np.zeros((2, 2)), 103, 108)
+    seen = replay.foresee(ROW, np.array([108]))
+    np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(late[:, 5]))
+    assert replay.counts["horizons lost"] == 1
+
+
+def test_a_vehicle_without_a_horizon_hovers() -> None:
+    """It comes to rest."""
+    replay = make(small())
+    see(replay, 5, np.array([[0.0, 1.0], [0.0, 0.0]]), NO_HORIZON)
+    seen = replay.foresee(ROW, np.array([40]))
+    assert not seen.committed.any()
+    assert 0.0 <= seen.estimate[0, 0, 1] < 0.02
+
+
+def test_a_horizon_of_an_earlier_life_is_taken_for_flying_on() -> None:
+    """What it told is not known; the velocity is."""
+    replay = make(small())
+    see(replay, 50, np.array([[0.0, 1.0], [0.0, -0.5]]), 45)
+    seen = replay.foresee(ROW, np.array([60]))
+    np.testing.assert_allclose(seen.estimate[0, :, 1], [1.0, -0.5], atol=1e-12)
+    np.testing.assert_allclose(seen.estimate[0, :, 0], [1.0, -0.5], atol=1e-12)
+
+
+def test_the_newest_observation_counts() -> None:
+    """E11, and for how long it does."""
+    replay = make(small(), reach=10)
+    x = np.zeros((2, 2))
+    kept = [see(replay, step, x + step, NO_HORIZON) for step in (5, 3, 7, 7)]
+    assert kept == [True, False, True, False]
+    within = [replay.within_reach(ROW, np.array([step]))[0] for step in (7, 17, 18)]
+    assert within == [True, True, False]
+    replay.forget(0)
+    assert not replay.within_reach(ROW, np.array([7]))[0]
+
+
+def test_many_horizons_are_kept_and_no_more() -> None:
+    """The ring turns; one that has fallen out is not known any more."""
+    replay = make(small(), reach=10)
+    sent = plans(3, *[H] * 40)
+    for step, inputs in enumerate(sent):
+        send(replay, step, inputs)
+    see(replay, 40, np.zeros((2, 2)), 36)
+    seen = replay.foresee(ROW, np.array([40]))
+    np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(sent[36][:, 4]))
+    replay = make(small(), reach=10)
+    for step, inputs in enumerate(sent):
+        send(replay, step, inputs)
+    see(replay, 41, np.ones((2, 2)), 2)
+    seen = replay.foresee(ROW, np.array([41]))
+    np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(sent[38][:, 3]) * 0 + 1.0)
+
+
+# -- in flight -----------------------------------------------------------------------------------
+
+
+def estimate_error(flight: Flight) -> Array:
+    """|x̂ - x| at every tick whose step was flown, the largest of all axes [m, m/s]."""
+    true = {int(row["step"]): row["state"] for row in flight.client}
+    known = [row for row in flight.server if int(row["step"]) in true]
+    return np.array([np.abs(row["estimate"] - true[int(row["step"])]).max() for row in known])
+
+
+def settled(flight: Flight, bound: int) -> Array:
+    """Ticks at which every horizon has arrived, or is known not to have."""
+    sent = flight.server["step"][flight.server["event"]]
+    last = np.array([sent[sent < step].max(initial=-1) for step in flight.server["step"]])
+    return flight.server["observed_step"] >= last + bound
+
+
+@pytest.fixture(scope="module")
+def sparse() -> tuple[Scenario, Flight]:
+    """A horizon in three seconds, of which a third is lost."""
+    flown = scenario(
+        control={"trigger": "periodic(60)", "delay_bound": 0.8, "horizon": 70},
+        network=lossy(0.33),
+        duration=60.0,
+    )
+    return flown, fly(flown)
+
+
+def test_the_estimate_is_exact_once_every_horizon_has_arrived_or_is_known_lost(
+    sparse: tuple[Scenario, Flight], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without noise, to 1e-9; without acknowledgements it is not."""
+    flown, flight = sparse
+    certain = settled(flight, 16)
+    assert certain.sum() > 300
+    assert flight.figures["server"]["counts"]["horizons lost"] > 3
+    assert estimate_error(flight)[certain].max() <= 1e-9
+    assert estimate_error(flight).max() > 1e-3  # of others it cannot be
+
+    observe = Replay.observe
+
+    def believe(self: Replay, row: int, observation: Observation) -> bool:
+        """All that was sent has arrived."""
+        old = self._stamps[0][(self._stamps[0] + 9 <= observation.step) & (self._stamps[0] > 0)]
+        newest = int(old.max(initial=observation.in_force))
+        return observe(self, row, observation._replace(in_force=newest))
+
+    monkeypatch.setattr(Replay, "observe", believe)
+    blind = fly(flown)
+    assert estimate_error(blind)[settled(blind, 16)].max() > 1e-3
+
+
+def test_a_packet_at_every_step_hides_what_is_lost() -> None:
+    """Each begins with the same committed inputs, so the state is known whatever arrives."""
+    flown = scenario(control={"trigger": "always", "delay_bound": 0.8}, duration=20.0)
+    flight = fly(flown)
+    assert flight.netem["lost"].sum() > 50
+    assert estimate_error(flight)[40:].max() <= 1e-9
+
+
+def test_every_lost_horizon_is_counted(sparse: tuple[Scenario, Flight]) -> None:
+    """As many as netem has lost, but for those too young to be known."""
+    _, flight = sparse
+    netem = flight.netem[flight.netem["direction"] == UPLINK]
+    horizons = netem[netem["bytes"] > HORIZON_BYTES]
+    old = horizons[horizons["arrived_ns"] < horizons["arrived_ns"].max() - 2_000_000_000]
+    counted = flight.figures["server"]["counts"]["horizons lost"]
+    assert old["lost"].sum() <= counted <= horizons["lost"].sum()
+
+
+TIGHT = {
+    "state_weight": [10.0, 0.01],
+    "terminal_weight": [10.0, 1.0],
+    "input_weight": 1e-3,
+    "change_weight": 0.0,
+}
+"""What a scheme can afford that knows where the vehicle is; S = 0."""
+
+
+FIRM = {
+    "state_weight": [7.1, 1.0],
+    "terminal_weight": [50.0, 20.0],
+    "input_weight": 0.01,
+    "change_weight": 0.0,
+}
+"""Less so, for wind."""
+
+
+def rmse(flown: Scenario, flight: Flight) -> float:
+    """RMSE xy [m]."""
+    error = summarise(flown, "test", flight.client).rmse_xy
+    assert error is not None
+    return error
+
+
+def test_it_is_stable_without_the_s_term_where_the_papers_scheme_is_not() -> None:
+    """The same weights, network and seed."""
+    errors = {}
+    for scheme in ("paper", "committed"):
+        flown = scenario(control={"scheme": scheme, "trigger": "always", **TIGHT}, duration=40.0)
+        errors[scheme] = rmse(flown, fly(flown))
+    assert errors["committed"] < 0.002
+    assert errors["paper"] > 0.5
+
+
+def test_most_horizons_are_not_even_planned_with_a_trigger_that_needs_no_plan(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Periodic sending plans when it sends; the cost gap has to know each plan."""
+    planned = 0
+    plan = Planner.plan
+
+    def count(self: Planner, rows: Indices, *given: Any) -> Any:
+        nonlocal planned
+        planned += len(rows)
+        return plan(self, rows, *given)
+
+    monkeypatch.setattr(Planner, "plan", count)
+    spent = {}
+    for trigger in ("periodic(10)", "cost_gap", "cost_gap & budget(1, 1)"):
+        planned = 0
+        flight = fly(scenario(control={"trigger": trigger}, duration=20.0))
+        spent[trigger] = planned / len(flight.server)
+        assert len(flight.server) > 350
+    assert spent["periodic(10)"] == pytest.approx(0.1, abs=0.02)
+    assert spent["cost_gap"] == 1.0
+    assert spent["cost_gap & budget(1, 1)"] < 0.5
+
+
+@pytest.mark.parametrize(
+    "vehicle",
+    [{"steady_wind_mps": [0.3, -0.2]}, {"steady_wind_mps": [0.3, -0.2], "gain": 0.8}],
+    ids=["steady wind", "and a wrong gain"],
+)
+def test_the_disturbance_observer_leaves_no_offset(vehicle: dict[str, Any]) -> None:
+    """Hovering in constant wind, in the last ten seconds, whatever R; without it there is one."""
+    offsets = {}
+    for observer_s in (0.0, 4.0):
+        control = {"trigger": "cost_gap & periodic(2)", "observer_s": observer_s}
+        reference = {"shape": "hover", "points_m": [[0.0, 0.0]]}
+        flown = scenario(control=control, reference=reference, vehicle=vehicle, duration=60.0)
+        flight = fly(flown)
+        offsets[observer_s] = np.abs(flight.client["state"][-200:, :, 0].mean(axis=0)).max()
+    assert offsets[0.0] > 0.05
+    assert offsets[4.0] < 0.005
+
+
+def test_a_mean_loss_of_half_each_way_is_flown_through() -> None:
+    """With the cost gap, under twice the error at a loss of 0.1."""
+    errors = {}
+    for loss in (0.1, 0.5):
+        control = {"trigger": "cost_gap", "cost_gap": 0.5, **FIRM}
+        flown = scenario(
+            control=control, network=lossy(loss, loss), vehicle={"wind": 0.1}, settle=5.0
+        )
+        errors[loss] = np.mean([rmse(flown, flight) for flight in fly_batch(flown, range(1, 9))])
+    assert errors[0.5] < 2.0 * errors[0.1]
+
+
+def test_the_vehicle_says_which_horizon_it_flies_and_since_when() -> None:
+    """A horizon in force at a step was first flown at `since`; the delay bound lies above that."""
+    flown = scenario(control={"trigger": "always"}, duration=20.0)
+    flight = fly(flown)
+    client = flight.client[flight.client["in_force"] >= 0]
+    first = {}
+    for row in client:
+        first.setdefault(int(row["in_force"]), int(row["step"]))
+    delays = np.array([since - stamp for stamp, since in first.items()])
+    ahead = flight.server["ahead"][100:]
+    assert ahead.min() >= np.quantile(delays, 0.9)
+    assert ahead.max() <= delays.max() + 2
