@@ -126,15 +126,18 @@ class Done(msgspec.Struct, frozen=True):
 
 def fly(task: Task) -> Done:
     """All runs of a task, in virtual time."""
-    flights = fly_batch(task.scenario, task.seeds)
-    runs = tuple(
+    return Done(task.cell, task.chunk, summaries(task.name, task.scenario, task.seeds))
+
+
+def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> tuple[Summary, ...]:
+    """What a scenario of some name gives, seed by seed, in virtual time."""
+    return tuple(
         summarise(
-            msgspec.structs.replace(task.scenario, seed=seed),
-            *(task.name, flight.client, flight.server, flight.netem),
+            msgspec.structs.replace(scenario, seed=seed),
+            *(name, flight.client, flight.server, flight.netem),
         )
-        for seed, flight in zip(task.seeds, flights, strict=True)
+        for seed, flight in zip(seeds, fly_batch(scenario, seeds), strict=True)
     )
-    return Done(task.cell, task.chunk, runs)
 
 
 class Sweep:
