@@ -1,4 +1,4 @@
-"""The report of a reproduction: tables, figures, what they say, in one page that opens offline."""
+"""Reports: tables, figures, what they say, in a page that opens offline; and the reproduction's."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -27,6 +27,12 @@ from shared.config import Scenario
 from shared.model import Array
 from shared.summary import summarise
 from sim.flight import Flight
+
+TITLE = "Efficient networked UAV control using event-triggered predictive control, reproduced"
+ABOUT = (
+    "Jang, Son, Yoo, Kim, Johansson (2019), flown with Skytether: the same endpoints in virtual "
+    "time and over UDP."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +75,8 @@ class Table:
 class Drawn:
     """What the report shows."""
 
+    title: str
+    about: str
     tables: Sequence[Table]
     pictures: Sequence[Picture]
     verdict: str
@@ -94,7 +102,7 @@ def draw(measured: Measured) -> Drawn:
         plates.solve_times(servers, scenario.control.dt),
     ]
     tables = [paper_table(entries, columns), traffic_table(columns), real_table(measured)]
-    return Drawn(tables, pictures, verdict(entries, columns))
+    return Drawn(TITLE, ABOUT, tables, pictures, verdict(entries, columns))
 
 
 def paper_table(entries: Sequence[Entry], columns: Mapping[str, Cell]) -> Table:
