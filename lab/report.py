@@ -110,8 +110,8 @@ def paper_table(entries: Sequence[Entry], columns: Mapping[str, Cell]) -> Table:
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     rows = [
         (
-            *(entry.column, entry.entry, _text(entry.paper, ".4f"), _text(entry.here, ".4f")),
-            *(_text(entry.ci95, ".4f"), _text(entry.deviation, "+.1%")),
+            *(entry.column, entry.entry, as_text(entry.paper, ".4f"), as_text(entry.here, ".4f")),
+            *(as_text(entry.ci95, ".4f"), as_text(entry.deviation, "+.1%")),
         )
         for entry in entries
     ]
@@ -139,7 +139,7 @@ def traffic_table(columns: Mapping[str, Cell]) -> Table:
         [[method, *(part for pair in pairs for part in pair)] for method, pairs in found.items()],
     )
     rows = [
-        (method, *(f"{_text(mean, ',.0f')} ± {_text(half, ',.0f')}" for mean, half in pairs))
+        (method, *(f"{as_text(mean, ',.0f')} ± {as_text(half, ',.0f')}" for mean, half in pairs))
         for method, pairs in found.items()
     ]
     share = [
@@ -182,7 +182,7 @@ def real_table(measured: Measured) -> Table:
             )
         )
     specs = ("", *[".4f"] * 6, ".3f", ".3f", ".2f", ".2f", "d", ".2f")
-    shown = [[_text(value, spec) for value, spec in zip(row, specs, strict=True)] for row in rows]
+    shown = [[as_text(value, spec) for value, spec in zip(row, specs, strict=True)] for row in rows]
     says = (
         f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
         f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
@@ -218,7 +218,8 @@ def _rmse(cell: Cell) -> float:
     return float("nan") if mean is None else mean
 
 
-def _text(value: Any, spec: str) -> str:
+def as_text(value: Any, spec: str) -> str:
+    """A number as a table shows it, and a dash for none."""
     return "–" if value is None else format(value, spec)
 
 

@@ -174,14 +174,7 @@ class Sweep:
 
     def _scenario(self, changes: Mapping[str, Any]) -> Scenario:
         table = config.to_table(self.scenario)
-        for path, value in changes.items():
-            *sections, key = path.split(".")
-            section = table
-            for name in sections:
-                section = section.setdefault(name, {})
-                if not isinstance(section, dict):
-                    raise ConfigError(f"--grid: {path}: no such key")
-            section[key] = value
+        lay(changes, table)
         where = ", ".join(f"{key}={value}" for key, value in changes.items())
         return config.check(table, f"{self.name} with {where}" if where else self.name)
 
@@ -236,6 +229,22 @@ class Sweep:
     def of_cell(self, done: Mapping[tuple[int, int], Done], cell: int) -> list[Summary]:
         """Its runs, by seed."""
         return [run for chunk in range(self.chunks) for run in done[cell, chunk].runs]
+
+
+def lay(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
+    """Put values where their keys say, as in `control.epsilon`.
+
+    Raises:
+        ConfigError: there cannot be such a key.
+    """
+    for path, value in changes.items():
+        *sections, key = path.split(".")
+        section = table
+        for name in sections:
+            section = section.setdefault(name, {})
+            if not isinstance(section, dict):
+                raise ConfigError(f"--grid: {path}: no such key")
+        section[key] = value
 
 
 FIGURES = (

@@ -27,6 +27,8 @@ from skytether.pool import Scheduler, Workers
 
 BEST = "best.toml"
 LOG = "log.jsonl"
+SIGMA = 0.1
+"""First step of a search unless another is asked for, as a share of the range of each key."""
 POPULATION_MIN, POPULATION_MAX = 4, 1000
 
 
@@ -50,7 +52,7 @@ class Options:
     """How long to search; an existing search goes on until it has so many."""
     population: int = 10
     """Points in a generation."""
-    sigma: float = 0.1
+    sigma: float = SIGMA
     """First step, as a share of the range of each key."""
     workers: Workers = None
     """Processes; one a core unless given."""
