@@ -164,7 +164,12 @@ def _problems(task: Task) -> Iterator[tuple[MPC, Array, Array, Array]]:
         0.0, task.scale * np.sqrt(task.dt_s), (task.count, axes, task.horizon + 1, 2)
     )
     guess = np.clip(rng.normal(0.0, 1.0, (task.count, axes, task.horizon)), -bound, bound)
-    yield mpc, scenario.u_max, mpc.gradient(x, np.cumsum(drift, axis=2), guess), guess
+    yield (
+        mpc,
+        scenario.u_max,
+        mpc.gradient(x, np.cumsum(drift, axis=2), guess, np.zeros(x.shape[:2])),
+        guess,
+    )
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:

@@ -68,7 +68,8 @@ class PlannedFleet:
         if self._plan is not None:
             self.vehicles.fly(self._plan.inputs[:, :, 0])
         step, x = self.vehicles.step, self.vehicles.x
-        self._given = (self._rows, step, x, *self.planner.planned(self._rows, step, x))
+        planned = self.planner.planned(self._rows, step, x)
+        self._given = (self._rows, step, x, *planned, np.zeros(x.shape[:2]))
 
     def plan(self) -> None:
         """Plan for all."""
@@ -117,7 +118,7 @@ class Airspace:
         for (vehicle, session, address), k, x in zip(
             self._sessions, step, self._past[0], strict=True
         ):
-            stamps = (stamp_ns, NO_HORIZON, echo_ns, echo_ns + late_ns + AHEAD_NS)
+            stamps = (stamp_ns, NO_HORIZON, 0, echo_ns, echo_ns + late_ns + AHEAD_NS)
             observation = Observation(vehicle, session, k, *stamps, x)
             self.server.receive(Datagram(encode(observation), address), now_ns=now_ns)
 

@@ -37,13 +37,13 @@ def messages(terms: Terms) -> list[Message]:
     """One of each type, with numbers as large as those of a real flight."""
     rng = np.random.default_rng(1)
     now_ns = 86_400 * 10**9 + 123_456_789
-    inputs = rng.uniform(-1.8, 1.8, (terms.axes, terms.horizon)).astype(np.float32)
+    inputs = rng.uniform(-1.0, 1.0, (terms.axes, terms.horizon)).astype(np.float32)
     state = rng.normal(0.0, 1.0, (terms.axes, 2))
     session, step = 2**31, 5000
     return [
         Hello(1, 2**60, terms),
         Welcome(1, session, 2**60, 2**60, now_ns, terms),
-        Observation(1, session, step, now_ns, step - 1, now_ns, now_ns, state),
+        Observation(1, session, step, now_ns, step - 20, step - 10, now_ns, now_ns, state),
         Horizon(1, session, step, now_ns, now_ns, inputs),
         Heartbeat(1, session, now_ns),
     ]

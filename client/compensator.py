@@ -2,6 +2,7 @@
 
     u* = u(min(k, k_h + H - 1) | k_h)        k_h: the step that the horizon was made for
 
+With committed inputs at its head a horizon is that much longer, and read in the same way.
 The horizon of the newest generation wins, in whatever order they arrive (E11).
 """
 
@@ -17,13 +18,16 @@ class Compensator:
 
     def __init__(self, scenario: Scenario) -> None:
         self._H = scenario.control.horizon
-        self._compensate = scenario.control.scheme == "paper"
+        self._compensate = scenario.control.scheme != "none"
         self._brakes = scenario.vehicle.exhausted == "brake"
         self._brake_per_step = scenario.vehicle.brake_mps2 * scenario.control.dt
         self._bound = scenario.u_max[:, None]
         self._inputs: Array = np.zeros((self._H, scenario.model.axes))
         self.in_force = NO_HORIZON
         """k_h, or NO_HORIZON: then the vehicle hovers."""
+        self.since = 0
+        """The first step that it was chosen for."""
+        self._new = False
         self.observed_ns = -1
         """Stamp of the observation that the horizon was computed from [client clock]."""
         self.stale = 0
@@ -40,20 +44,22 @@ class Compensator:
         if horizon.step <= self.in_force:
             self.stale += 1
             return
-        self.in_force = horizon.step
+        self.in_force, self._new = horizon.step, True
         self.observed_ns = horizon.observed_ns
         self._inputs = horizon.inputs.clip(-self._bound, self._bound).T
 
     def choose(self, step: int) -> Array:
         """u* for `step` [m/s]; shape (axes,)."""
+        if self._new:
+            self.since, self._new = step, False
         if self.in_force == NO_HORIZON:
             return np.zeros(len(self._bound))
         if not self._compensate:
             return self._inputs[0].copy()
-        stage = step - self.in_force
-        if stage >= self._H and self._brakes:
-            return self._braked(stage - self._H + 1)
-        return self._inputs[min(max(stage, 0), self._H - 1)].copy()
+        stage, length = step - self.in_force, len(self._inputs)
+        if stage >= length and self._brakes:
+            return self._braked(stage - length + 1)
+        return self._inputs[min(max(stage, 0), length - 1)].copy()
 
     def _braked(self, steps: int) -> Array:
         """The last input, slowed down for `steps` at a constant rate, straight ahead."""

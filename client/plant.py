@@ -1,16 +1,21 @@
 """What flies. `Plant` is all the client knows of it; here it is the paper's model with wind.
 
-    v̇ = (u - v) / τ + a        a: gusts [m/s²], constant over a step, plus white acceleration
+    v̇(t) = (g u(t - θ) + w - v(t)) / τ + a      g: gain, θ: dead time [s], w: steady wind [m/s],
+                                                a: gusts [m/s²], constant over a step, plus
+                                                   white acceleration
 
-A constant acceleration a acts like the input τ a, so a step with gusts stays exact. The white part
-is discretised exactly too: its covariance over a step has a closed form.
+Every part is discretised exactly. A constant acceleration a acts like the input τ a. Where the dead
+time is no whole number of steps, the input changes once within each, and the two inputs share B of
+eq. (4). The covariance of the white part over a step has a closed form.
 """
 
+from collections import deque
 from typing import Protocol
 
 import numpy as np
 
 from shared.config import Scenario
+from shared.endpoint import SECOND_NS, seconds_to_ns
 from shared.model import Array, discretise
 
 
@@ -25,7 +30,7 @@ class Plant(Protocol):
 
 
 class FirstOrderPlant:
-    """Eq. (1), with the true time constants, wind and gusts of a scenario.
+    """Eq. (1), with the true time constants, gain, dead time, wind and gusts of a scenario.
 
     Args:
         rng: chance of wind and gusts, for this vehicle alone.
@@ -35,13 +40,24 @@ class FirstOrderPlant:
         vehicle, dt, tau = scenario.vehicle, scenario.control.dt, scenario.true_tau_s
         # Plain numbers, of each axis: numpy costs more than it saves on so few.
         model = discretise(tau, dt)
-        self._tau, self._A, self._B = tau.tolist(), model.A.tolist(), model.B.tolist()
+        self._A, self._B = model.A.tolist(), model.B.tolist()
+        self._gain = vehicle.gain
+        whole, rest_ns = divmod(seconds_to_ns(vehicle.dead_time_s), scenario.dt_ns)
+        self._commands = deque([[0.0] * len(tau)] * (whole + 2), whole + 2)
+        """On their way: the first was flown before, the second is due now [m/s]."""
+        after = discretise(tau, dt - rest_ns / SECOND_NS)
+        self._B_before = (model.B - after.B).tolist() if rest_ns else []
+        """The part of B that is still the input's flown before."""
         self._rng = rng
         self._wind = (vehicle.wind * white_acceleration(tau, dt)).tolist() if vehicle.wind else []
         self._gust_mps2 = vehicle.gust_mps2
         self._gust_end_chance = float(-np.expm1(-dt / vehicle.gust_s))
         self._gust_start_chance = float(-np.expm1(-dt / vehicle.gust_every_s))
-        self._gust = [0.0] * len(tau)
+        self._gusty = False
+        self._tau = tau
+        self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(tau)))
+        self._push = self._steady_mps.tolist()
+        """w + τ a, gusts included [m/s]."""
         start = scenario.vehicle.start_m or scenario.make_reference()(np.zeros(()))[:, 0]
         self._x = [(float(position), 0.0) for position in start]
 
@@ -52,10 +68,15 @@ class FirstOrderPlant:
     def advance(self, command: Array) -> None:
         """See `Plant`."""
         self._blow()
-        for i, u in enumerate(command.tolist()):
+        self._commands.append(command.tolist())
+        before, due = self._commands[0], self._commands[1]
+        for i, u in enumerate(due):
             (p, v), A, B = self._x[i], self._A[i], self._B[i]
-            w = u + self._tau[i] * self._gust[i]
+            w = self._gain * u + self._push[i]
             self._x[i] = (p + A[0][1] * v + B[0] * w, A[1][1] * v + B[1] * w)
+        for i, L in enumerate(self._B_before):
+            (p, v), w = self._x[i], self._gain * (before[i] - due[i])
+            self._x[i] = (p + L[0] * w, v + L[1] * w)
         if self._wind:
             for i, (n, m) in enumerate(self._rng.standard_normal((len(self._x), 2)).tolist()):
                 (p, v), L = self._x[i], self._wind[i]
@@ -66,12 +87,15 @@ class FirstOrderPlant:
         if self._gust_mps2 == 0.0:
             return
         chance = self._rng.random()
-        if any(self._gust):
+        if self._gusty:
             if chance < self._gust_end_chance:
-                self._gust = [0.0] * len(self._gust)
+                self._gusty = False
+                self._push = self._steady_mps.tolist()
         elif chance < self._gust_start_chance:
-            way = self._rng.standard_normal(len(self._gust))
-            self._gust = (self._gust_mps2 * way / np.linalg.norm(way)).tolist()
+            self._gusty = True
+            way = self._rng.standard_normal(len(self._tau))
+            gust_mps2 = self._gust_mps2 * way / np.linalg.norm(way)
+            self._push = (self._steady_mps + self._tau * gust_mps2).tolist()
 
 
 def white_acceleration(tau_s: Array, dt_s: float) -> Array:

@@ -177,6 +177,7 @@ class Client(Endpoint):
                 present,
                 stamp_ns,
                 self._compensator.in_force,
+                self._compensator.since,
                 *self._echo,
                 state,
             )

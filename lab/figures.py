@@ -3,13 +3,14 @@
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lab.sweep import Axis
 from shared.command import CommandError
 from shared.config import Scenario
-from shared.model import Array
+from shared.model import Array, Indices
 from shared.record import Rows
 from shared.summary import position_error
 from sim.flight import Flight
@@ -44,9 +45,8 @@ def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
     )
     for (title, (scenario, flight)), (plane, events) in zip(flown.items(), grid.T, strict=True):
         dt = scenario.control.dt
-        desired = scenario.make_reference()(flight.client["step"] * dt)[..., 0]
         position = flight.client["state"][..., 0]
-        plane.plot(desired[:, 0], desired[:, 1], "r--", label="reference")
+        draw_reference(plane, scenario, flight.client["step"])
         plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
         plane.plot(position[0, 0], position[0, 1], "ko", markersize=4, label="start")
         plane.set_title(title, fontsize=10)
@@ -62,6 +62,14 @@ def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
     grid[0, 0].legend(loc="upper right", fontsize=8)
     grid[1, 0].set_ylabel("sent")
     figure.savefig(path, dpi=130)
+
+
+def draw_reference(plane: Any, scenario: Scenario, step: Indices) -> None:
+    """Red and dashed, over these steps; one round of what goes round, for dashes to stay dashes."""
+    time_s = step * scenario.control.dt
+    if scenario.reference.shape in ("circle", "figure-eight", "square"):
+        time_s = time_s[time_s - time_s[:1] <= scenario.reference.period_s]
+    plane.plot(*scenario.make_reference()(time_s)[:, :2, 0].T, "r--", label="reference")
 
 
 def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
@@ -80,8 +88,7 @@ def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
         plane.plot(
             *rows["state"][:, :2, 0].T, "k-", linewidth=0.6, alpha=max(0.05, 1 / len(flights))
         )
-    desired = scenario.make_reference()(np.unique(client["step"]) * scenario.control.dt)
-    plane.plot(*desired[:, :2, 0].T, "r--", label="reference")
+    draw_reference(plane, scenario, np.unique(client["step"]))
     plane.set_aspect("equal", adjustable="datalim")
     plane.set_xlabel("x [m]")
     plane.set_ylabel("y [m]")
@@ -108,6 +115,7 @@ OTHER_UNITS = {
     "settle": "s",
     "control.dt": "s",
     "control.horizon": "steps",
+    "control.delay_bound": "s",
     "control.period": "steps",
     "control.decay_rate": "1/s",
     "model.u_max": "m/s",

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
+from lab.figures import draw_reference
 from lab.studies import EVENT, EVERY, NONE, PERIODIC, Cells, Flown, Study, periodic_wins
 from lab.sweep import estimate, to_csv
 from shared.config import ControlConfig, DirectionConfig, Scenario
-from shared.model import Array
+from shared.model import Array, Indices
 from shared.record import Rows
 from shared.summary import summarise
 from sim.flight import Flight
@@ -130,13 +131,13 @@ def delay(direction: DirectionConfig, delay_ms: Array) -> Picture:
 def paths(samples: Samples) -> Picture:
     """Fig. 3: without and with compensation, a packet at every step."""
     rmse, columns = [], []
-    with _figure(PAGE, 3.6) as figure:
+    with _figure(PAGE, 3.9) as figure:
         planes = figure.subplots(1, 2, sharex=True, sharey=True)
         for plane, letter, method in zip(planes, "ab", (NONE, EVERY), strict=True):
             scenario, flights = samples[method]
             rmse.append(summarise(scenario, method, flights[0].client).rmse_xy)
             step, desired, position = _path(scenario, flights[0])
-            _draw_path(plane, desired, position)
+            _draw_path(plane, scenario, step, position)
             plane.set_title(f"({letter}) {method}, a packet at every step")
             columns += [desired, position]
         planes[0].legend(loc="center")
@@ -158,7 +159,7 @@ def events(samples: Samples) -> Picture:
     sent = np.isin(step, flight.server["step"][flight.server["event"]])
     with _figure(COLUMN, 4.4) as figure:
         plane, below = figure.subplots(2, 1, height_ratios=(5, 1))
-        _draw_path(plane, desired, position)
+        _draw_path(plane, scenario, step, position)
         plane.legend(loc="center")
         below.vlines(step[sent] * dt, 0.0, 1.0, color="k", linewidth=0.5)
         below.set_xlim(0.0, scenario.duration)
@@ -176,15 +177,15 @@ def events(samples: Samples) -> Picture:
     return _picture(figure, "fig4", title, says, header, rows)
 
 
-def _path(scenario: Scenario, flight: Flight) -> tuple[Array, Array, Array]:
+def _path(scenario: Scenario, flight: Flight) -> tuple[Indices, Array, Array]:
     """Steps, reference and position [m] of a flight; shapes (steps,), (steps, 2), (steps, 2)."""
     step = flight.client["step"]
     desired = scenario.make_reference()(step * scenario.control.dt)[:, :2, 0]
     return step, desired, flight.client["state"][:, :2, 0]
 
 
-def _draw_path(plane: Any, desired: Array, position: Array) -> None:
-    plane.plot(*desired.T, "r--", linewidth=1.2, label="reference")
+def _draw_path(plane: Any, scenario: Scenario, step: Indices, position: Array) -> None:
+    draw_reference(plane, scenario, step)
     plane.plot(*position.T, "k-", linewidth=0.8, label="UAV")
     plane.plot(*position[0], "ko", markersize=3, label="start")
     plane.set_aspect("equal", adjustable="box")
@@ -265,6 +266,7 @@ def pareto(flown: Flown, periodic: Flown) -> Picture:
             plane.plot(x, y, "^-", color=colour, linewidth=0.8, markersize=3, label=label)
         plane.plot(rates, errors, "v--", color="#0072b2", markersize=4, label="periodic")
         plane.set_xscale("log")
+        plane.set_yscale("log")
         plane.set_xlabel("event ratio")
         plane.set_ylabel("RMSE xy [m]")
         plane.legend()

@@ -2,25 +2,32 @@
 
 A tick goes, for all vehicles in one batch, through
 
-    which step is it aboard (`clock`) → x̂(k) (`estimator`) → event? (`trigger`)
-    → X_p(k), U(k) (`planner`) → û(k) remembered → a packet where there is an event.
+    which step is it aboard (`clock`) → x̂(k), x̂(k+d) (`replay` or `estimator`) → event? (`trigger`)
+    → X_p(k+d), U(k+d) (`planner`) → event? → a packet where there is one, remembered.
+
+The trigger is asked twice: nothing is planned for a vehicle that it would send nothing in any case,
+and what depends on the new plan is asked once there is one. With the paper's schemes d is 0, and
+every vehicle is planned for at every step.
 
 Ticks lie on the server's own grid of Δt with absolute deadlines; a tick whose time has passed is
 skipped and counted, never caught up with.
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from heapq import heappop, heappush
 from itertools import islice
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from server.clock import ClockMap
-from server.estimator import Estimator
+from server.estimator import Estimator, Foresight, Scheme
 from server.planner import Planner
-from server.trigger import make_trigger
+from server.replay import Replay
+from server.trigger import Situation, Verdict, make_trigger
 from shared.config import Scenario
 from shared.endpoint import (
     MILLISECOND_NS,
@@ -31,7 +38,7 @@ from shared.endpoint import (
     seconds_to_ns,
 )
 from shared.histogram import Histogram
-from shared.model import Flags, Indices, discretise
+from shared.model import Array, Flags, Indices, discretise
 from shared.protocol import (
     Heartbeat,
     Hello,
@@ -104,11 +111,11 @@ class Server(Endpoint):
         self._recorder = recorder
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, self._dt_ns)
-        self._estimator = Estimator(
-            model,
-            room,
-            reach=max(1, round(REACH_S / control.dt)),
-            compensate=control.scheme == "paper",
+        reach = max(1, round(REACH_S / control.dt))
+        self._scheme: Scheme = (
+            Replay(scenario, model, room, reach, self._clock)
+            if control.scheme == "committed"
+            else Estimator(model, room, reach, compensate=control.scheme == "paper")
         )
         self._planner = Planner(scenario, model, room, self.stopwatch)
         self._trigger = make_trigger(control, room)
@@ -118,6 +125,8 @@ class Server(Endpoint):
         self._heard_ns = np.zeros(room, dtype=np.int64)
         self._sent_ns = np.zeros(room, dtype=np.int64)
         self._stale = np.zeros(room, dtype=np.int64)
+        self._last_step = np.full(room, -1, dtype=np.int64)
+        """The step of each that was ticked last, or -1."""
         self._sessions: dict[int, Session] = {}
         """By vehicle."""
         self._welcomed: dict[int, Session] = {}
@@ -192,7 +201,7 @@ class Server(Endpoint):
             observation.received_ns - observation.server_ns,
             now_ns=now_ns,
         )
-        if not self._estimator.observe(row, observation.step, observation.state):
+        if not self._scheme.observe(row, observation):
             self._stale[row] += 1
             return
         session.address = address
@@ -215,7 +224,8 @@ class Server(Endpoint):
         self._sent_ns[row] = now_ns
         self._stale[row] = 0
         self._clock.forget(row)
-        self._estimator.forget(row)
+        self._last_step[row] = -1
+        self._scheme.forget(row)
         self._planner.forget(row)
         host, port = session.address
         self._news.append(f"vehicle {session.vehicle} flies, from {host}:{port}")
@@ -258,9 +268,7 @@ class Server(Endpoint):
         before_ns = self.stopwatch.spent_ns.total()
         rows = self._rows
         step = (tick_ns + self._clock.offset_ns(rows) - self._epoch_ns[rows]) // self._dt_ns
-        able: Flags = (step > self._estimator.last_step[rows]) & self._estimator.within_reach(
-            rows, step
-        )
+        able: Flags = (step > self._last_step[rows]) & self._scheme.within_reach(rows, step)
         able_rows, able_step = rows[able], step[able]
         for first in range(0, len(able_rows), BLOCK):
             block = slice(first, first + BLOCK)
@@ -273,60 +281,112 @@ class Server(Endpoint):
 
     def _control(self, rows: Indices, step: Indices, now_ns: int) -> None:
         """Algorithms 1 and 2 of the paper, for the vehicles in `rows` at their steps k."""
-        stopwatch = self.stopwatch
-        estimate = self._estimator.estimate(rows, step)  # (13)
-        stopwatch.lap("estimate")
-        planned, fresh = self._planner.planned(rows, step, estimate)
-        verdict = self._trigger.test(rows, step, estimate, planned, fresh)  # (16)
-        stopwatch.lap("trigger")
-        plan = self._planner.plan(rows, step, estimate, planned, fresh)  # (14), (15)
-        self._estimator.remember(rows, step, plan.inputs[:, :, 0])  # (12)
-        event = verdict.event & plan.solved
+        foresight = self._scheme.foresee(rows, step)  # (13)
+        self._last_step[rows] = step
+        self.counts["steps"] += len(rows)
+        self.stopwatch.lap("estimate")
+        start = step + foresight.ahead
+        planned, fresh = self._planner.planned(rows, start, foresight.start)
+
+        @cache
+        def deviation_m() -> Array:
+            return self._planner.deviation_m(
+                rows, start, foresight.start, foresight.held, foresight.disturbance
+            )
+
+        situation = Situation(rows, step, fresh, foresight.start, planned, deviation_m)
+        verdict = self._trigger.test(situation)  # (16)
+        self.stopwatch.lap("trigger")
+        asked = verdict.perhaps | self._scheme.plans_always
+        if asked.all():
+            self._plan(situation, foresight, verdict, now_ns)
+            return
+        some, others = np.flatnonzero(asked), np.flatnonzero(~asked)
+        idle = foresight.of(others)
+        self._record(situation.of(others), idle, verdict.of(others), idle.committed[:, :, 0])
+        if len(some):
+            self._plan(situation.of(some), foresight.of(some), verdict.of(some), now_ns)
+
+    def _plan(
+        self, situation: Situation, foresight: Foresight, verdict: Verdict, now_ns: int
+    ) -> None:
+        """Plan for vehicles that the trigger asks it for, and send what it wants sent."""
+        stopwatch, rows, step = self.stopwatch, situation.rows, situation.step
+        plan = self._planner.plan(  # (14), (15)
+            *(rows, step + foresight.ahead, foresight.start),
+            *(situation.planned, situation.fresh, foresight.disturbance),
+        )
+        if (verdict.perhaps != verdict.surely).any():
+
+            def cost_gap() -> Array:
+                return self._planner.cost_gap(rows, foresight.held)
+
+            verdict = self._trigger.test(replace(situation, cost_gap=cost_gap))
+        event = verdict.surely & plan.solved
         sent = np.flatnonzero(event)
+        horizons, lengths = foresight.horizons(plan.inputs), foresight.ahead + self._terms.horizon
+        self._scheme.remember(rows, step, horizons, lengths, sent)  # (12)
         self._trigger.sent(rows[sent], step[sent], verdict.error[sent])
         stopwatch.lap("plan")
-        inputs = plan.inputs.astype(np.float32)
-        for i, row, k in zip(sent.tolist(), rows[sent].tolist(), step[sent].tolist(), strict=True):
-            session = self._by_row[row]
+        of_each = (sent, rows[sent], step[sent], lengths[sent])
+        for i, row, k, length in zip(*map(np.ndarray.tolist, of_each), strict=True):
+            session, inputs = self._by_row[row], horizons[i, :, :length]
             horizon = Horizon(
-                session.vehicle, session.session, k, now_ns, session.observed_ns, inputs[i]
+                session.vehicle, session.session, k, now_ns, session.observed_ns, inputs
             )
             self._send(session, horizon, now_ns)
-        self.counts["steps"] += len(rows)
         self.counts["events"] += len(sent)
         self.counts["unsolved"] += len(rows) - int(plan.solved.sum())
         stopwatch.lap("encode")
+        now = horizons[:, :, 0]
+        self._record(situation, foresight, verdict, now, event, plan.solved, plan.solve_ns)
+
+    def _record(  # noqa: PLR0917 - all that was found out
+        self,
+        situation: Situation,
+        foresight: Foresight,
+        verdict: Verdict,
+        input_: Array | NDArray[np.float32],
+        event: Flags | bool = False,
+        solved: Flags | bool = True,
+        solve_ns: int = -1,
+    ) -> None:
         if self._recorder is None:
             return
+        rows = situation.rows
         self._recorder.append(
             len(rows),
             vehicle=self._vehicle[rows],
-            step=step,
-            estimate=estimate,
-            planned=planned,
-            input=plan.inputs[:, :, 0],
-            observed_step=self._estimator.observed_step[rows],
+            step=situation.step,
+            estimate=foresight.estimate,
+            ahead=foresight.ahead,
+            planned=situation.planned,
+            input=input_,
+            observed_step=self._scheme.observed_step[rows],
             error=verdict.error,
             threshold=verdict.threshold,
             event=event,
-            solved=plan.solved,
-            solve_ns=plan.solve_ns,
+            solved=solved,
+            solve_ns=solve_ns,
             stale=self._stale[rows],
             missed=self.missed,
         )
-        stopwatch.lap("record")
+        self.stopwatch.lap("record")
 
     def _send(self, session: Session, message: Horizon | Heartbeat, now_ns: int) -> None:
         self._sent_ns[session.row] = now_ns
         self._out.append(Datagram(encode(message), session.address))
 
+    def _counted(self) -> Counter[str]:
+        return Counter({**self.counts, **self._scheme.counts})
+
     def report(self) -> str:
         """See `Endpoint`."""
-        counts = ", ".join(f"{value} {name}" for name, value in sorted(self.counts.items()))
+        counts = ", ".join(f"{value} {name}" for name, value in sorted(self._counted().items()))
         here = f"{len(self._sessions)} in session, {self.missed} ticks missed"
         lines = [f"{here}, {counts or 'no steps'}"]
         for session in islice(self._sessions.values(), TOLD_MAX):
-            step = self._estimator.last_step[session.row]
+            step = self._last_step[session.row]
             bound_ms = self._clock.bound_ns(np.array([session.row]))[0] / MILLISECOND_NS
             lines.append(f"vehicle {session.vehicle}: step {step}, clock within {bound_ms:.1f} ms")
         if len(self._sessions) > TOLD_MAX:
@@ -341,5 +401,5 @@ class Server(Endpoint):
             "tick_ms_p50": self.ticks.quantile_ms(0.5),
             "tick_ms_p99": self.ticks.quantile_ms(0.99),
             "spent_ns": dict(self.stopwatch.spent_ns),
-            "counts": dict(self.counts),
+            "counts": dict(self._counted()),
         }

@@ -4,16 +4,103 @@
 
 û is the history (12) of the first inputs the server computed, whether sent or not (E12). The sum is
 not formed: one step of (4) after the other says the same.
+
+This is the scheme "paper", and "none", which takes the newest observation for the present.
+`server.replay` is the other.
 """
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from shared.model import Array, Flags, Indices, Model
+from shared.protocol import Observation
+
+
+@dataclass(frozen=True, slots=True)
+class Foresight:
+    """What is known of n vehicles at their steps k, before anything is planned."""
+
+    estimate: Array
+    """x̂(k); shape (n, axes, 2)."""
+    ahead: Indices
+    """d: planning starts at k + d; shape (n,)."""
+    start: Array
+    """x̂(k+d); shape (n, axes, 2)."""
+    committed: Array
+    """Inputs of k … k+d-1, the first d of the last axis [m/s]; shape (n, axes, H)."""
+    held: Array
+    """Inputs from k+d on, if nothing more were sent [m/s]; shape (n, axes, H)."""
+    disturbance: Array
+    """ŵ, an input that nobody gave [m/s]; shape (n, axes)."""
+
+    def horizons(self, inputs: Array) -> NDArray[np.float32]:
+        """What to send, from k on: the committed inputs, then planned ones from k + d on.
+
+        Args:
+            inputs: [m/s]; shape (n, axes, H).
+
+        Returns:
+            float32, d + H for each vehicle; shape (n, axes, largest d + H).
+        """
+        horizons: NDArray[np.float32] = _join(self.committed, self.ahead, inputs)
+        return horizons
+
+    def of(self, some: Indices) -> "Foresight":
+        """Of some of the vehicles."""
+        return Foresight(
+            *(self.estimate[some], self.ahead[some], self.start[some]),
+            *(self.committed[some], self.held[some], self.disturbance[some]),
+        )
+
+
+class Scheme(Protocol):
+    """What becomes of observations and of horizons that were sent."""
+
+    observed_step: Indices
+    """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
+    plans_always: bool
+    """Whether it has to know what was planned at every step, sent or not."""
+    counts: Counter[str]
+    """What there is to tell of it."""
+
+    def forget(self, row: int) -> None:
+        """A new vehicle in this row."""
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """Keep it, unless a newer one is known (E11); whether it was kept."""
+
+    def within_reach(self, rows: Indices, step: Indices) -> Flags:
+        """Which vehicles have been observed, recently enough for an estimate; shape (n,)."""
+
+    def foresee(self, rows: Indices, step: Indices) -> Foresight:
+        """The vehicles in `rows` at their steps k, all within reach."""
+
+    def remember(
+        self,
+        rows: Indices,
+        step: Indices,
+        horizons: NDArray[np.float32],
+        lengths: Indices,
+        sent: Indices,
+    ) -> None:
+        """What was computed for the steps from k on, and which of it is sent.
+
+        Args:
+            rows: the vehicles; shape (n,).
+            step: k of each; shape (n,).
+            horizons: [m/s], float32; shape (n, axes, at least the largest length).
+            lengths: inputs that each has; shape (n,).
+            sent: which of the n are sent.
+        """
 
 
 class Estimator:
-    """Observations and inputs of up to `capacity` vehicles.
+    """The paper's `Scheme`: observations and inputs of up to `capacity` vehicles.
 
     Args:
         model: eq. (4).
@@ -23,6 +110,8 @@ class Estimator:
 
     def __init__(self, model: Model, capacity: int, reach: int, *, compensate: bool) -> None:
         axes = len(model.B)
+        self.plans_always = True
+        self.counts: Counter[str] = Counter()
         self._model = model
         self._reach = reach
         self._compensate = compensate
@@ -31,21 +120,22 @@ class Estimator:
         self._state = np.zeros((capacity, axes, 2))
         self._inputs = np.zeros((capacity, axes, reach))
         """û, a ring over the steps: zero, hovering, where nothing was computed."""
-        self.last_step = np.full(capacity, -1, dtype=np.int64)
-        """The step whose û was computed last, or -1; shape (capacity,)."""
+        self._last_step = np.full(capacity, -1, dtype=np.int64)
+        """The step whose û was computed last, or -1."""
+        self._nothing = np.zeros((capacity, axes, 0))
 
     def forget(self, row: int) -> None:
         """A new vehicle in this row."""
         self.observed_step[row] = -1
         self._inputs[row] = 0.0
-        self.last_step[row] = -1
+        self._last_step[row] = -1
 
-    def observe(self, row: int, step: int, state: Array) -> bool:
-        """Keep x(step), unless a newer one is known (E11); whether it was kept."""
-        if step <= self.observed_step[row]:
+    def observe(self, row: int, observation: Observation) -> bool:
+        """See `Scheme`."""
+        if observation.step <= self.observed_step[row]:
             return False
-        self.observed_step[row] = step
-        self._state[row] = state
+        self.observed_step[row] = observation.step
+        self._state[row] = observation.state
         return True
 
     def age(self, rows: Indices, step: Indices) -> Indices:
@@ -53,7 +143,7 @@ class Estimator:
         return np.maximum(step - self.observed_step[rows], 0)
 
     def within_reach(self, rows: Indices, step: Indices) -> Flags:
-        """Which vehicles have been observed, recently enough for an estimate; shape (n,)."""
+        """See `Scheme`."""
         return (self.observed_step[rows] >= 0) & (self.age(rows, step) <= self._reach)
 
     def estimate(self, rows: Indices, step: Indices) -> Array:
@@ -62,16 +152,29 @@ class Estimator:
             return self._state[rows]
         estimate: Array = _fly_on(
             *(self._model.A, self._model.B, self._state, self.observed_step),
-            *(self._inputs, self.last_step, rows, step),
+            *(self._inputs, self._last_step, rows, step),
         )
         return estimate
 
-    def remember(self, rows: Indices, step: Indices, inputs: Array) -> None:
-        """û(k) ← u(k|k), eq. (12); inputs of shape (n, axes).
+    def foresee(self, rows: Indices, step: Indices) -> Foresight:
+        """See `Scheme`: planning starts at k, from x̂(k)."""
+        estimate, n = self.estimate(rows, step), len(rows)
+        nothing, here = self._nothing[:n], np.zeros(n, dtype=np.int64)
+        return Foresight(estimate, here, estimate, nothing, nothing, np.zeros(estimate.shape[:2]))
+
+    def remember(
+        self,
+        rows: Indices,
+        step: Indices,
+        horizons: NDArray[np.float32],
+        lengths: Indices,  # noqa: ARG002 - the first input is all that (12) asks for
+        sent: Indices,  # noqa: ARG002
+    ) -> None:
+        """û(k) ← u(k|k), eq. (12), whether sent or not (E12).
 
         Steps before at which nothing was computed flew on with the input of before them.
         """
-        _write_down(self._inputs, self.last_step, rows, step, inputs)
+        _write_down(self._inputs, self._last_step, rows, step, horizons)
 
 
 @njit(
@@ -96,15 +199,30 @@ def _fly_on(A, B, state, observed_step, inputs, last_step, rows, steps):  # type
     return estimate
 
 
-@njit("(f8[:,:,::1], i8[::1], i8[:], i8[:], f8[:,:])", cache=True)
+@njit("(f8[:,:,::1], i8[::1], i8[:], i8[:], f4[:,:,:])", cache=True)
 def _write_down(inputs, last_step, rows, steps, new):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
     reach = inputs.shape[2]
     for i in range(len(rows)):
         row, step, last = rows[i], steps[i], last_step[rows[i]]
         if last >= 0:
-            for axis in range(len(new[i])):
+            for axis in range(new.shape[1]):
                 held = inputs[row, axis, last % reach]
                 for missed in range(max(last + 1, step - reach + 1), step):
                     inputs[row, axis, missed % reach] = held
-        inputs[row, :, step % reach] = new[i]
+        for axis in range(new.shape[1]):
+            inputs[row, axis, step % reach] = new[i, axis, 0]
         last_step[row] = step
+
+
+@njit("f4[:,:,::1](f8[:,:,::1], i8[:], f8[:,:,::1])", cache=True)
+def _join(committed, ahead, inputs):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    n, axes, H = inputs.shape
+    horizons = np.zeros((n, axes, H + (ahead.max() if n else 0)), dtype=np.float32)
+    for i in range(n):
+        d = ahead[i]
+        for axis in range(axes):
+            for stage in range(d):
+                horizons[i, axis, stage] = committed[i, axis, stage]
+            for stage in range(H):
+                horizons[i, axis, d + stage] = inputs[i, axis, stage]
+    return horizons

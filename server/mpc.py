@@ -32,6 +32,8 @@ class MPC:
     """W, diagonal; shape (H, 2)."""
     input_weights: Array
     """R + S, of all that weighs the input itself; shape (H,)."""
+    input_weight: float
+    """R."""
     target_weight: float
     """R where the input has a target of its own (E7), else 0."""
     change_weights: Array
@@ -39,33 +41,48 @@ class MPC:
     hessian: Array
     """𝓗; shape (axes, H, H)."""
 
-    def gradient(self, x: Array, target: Array, previous: Array) -> Array:
+    def gradient(self, x: Array, target: Array, previous: Array, disturbance: Array) -> Array:
         """g of the QP.
 
         Args:
             x: state at stage 0 [m, m/s]; shape (n, axes, 2).
             target: desired states at the stages 0 … H [m, m/s]; shape (n, axes, H + 1, 2).
             previous: u(k+i|k-1) of the S-term [m/s]; shape (n, axes, H).
+            disturbance: what is added to every input on its way [m/s]; R weighs the sum; shape
+                (n, axes).
 
         Returns:
             shape (n, axes, H).
         """
         gradient: Array = _gradient(
-            *(self.model.A, self.model.B, self.weights, self.target_weight, self.change_weights),
-            *(x, target, previous),
+            *(self.model.A, self.model.B, self.weights, self.input_weight, self.target_weight),
+            *(self.change_weights, x, target, previous, disturbance),
         )
         return gradient
 
-    def predict(self, x: Array, u: Array, states: Array, rows: Indices) -> None:
+    def predict(self, x: Array, u: Array, disturbance: Array, states: Array, rows: Indices) -> None:
         """x, then X(k) of eq. (7): the states at the stages 0 … H.
 
         Args:
             x: state at stage 0 [m, m/s]; shape (n, axes, 2).
             u: inputs [m/s]; shape (n, axes, H).
+            disturbance: see `gradient`.
             states: where to put them; shape (some, axes, H + 1, 2).
             rows: of each vehicle in there; shape (n,).
         """
-        _roll_out(self.model.A, self.model.B, x, u, states, rows)
+        _roll_out(self.model.A, self.model.B, x, u, disturbance, states, rows)
+
+    def cost(self, change: Array) -> Array:
+        """ΔUᵀ 𝓗 ΔU: by how much, doubled, a change of the optimal inputs costs more.
+
+        Args:
+            change: ΔU of each axis [m/s]; shape (n, axes, H).
+
+        Returns:
+            of all axes; shape (n,).
+        """
+        cost: Array = _cost(self.model.A, self.model.B, self.weights, self.input_weights, change)
+        return cost
 
 
 def condense(model: Model, control: ControlConfig, *, change_weight: float) -> MPC:
@@ -90,7 +107,10 @@ def condense(model: Model, control: ControlConfig, *, change_weight: float) -> M
     input_weights = control.input_weight + change_weights
     hessian += np.diag(input_weights)
     target_weight = control.input_weight if control.input_reference else 0.0
-    return MPC(model, weights, input_weights, target_weight, change_weights, hessian)
+    return MPC(
+        *(model, weights, input_weights, control.input_weight, target_weight),
+        *(change_weights, hessian),
+    )
 
 
 @njit("f8[:,:,::1](f8[:,:,::1], i8[:])", cache=True)
@@ -116,11 +136,11 @@ def shift(inputs: Array, steps: Indices) -> Array:
 
 
 @njit(
-    "(f8[:,:,::1], f8[:,::1], f8[:,:,:], f8[:,:,::1], f8[:,:,:,::1], i8[:])",
+    "(f8[:,:,::1], f8[:,::1], f8[:,:,:], f8[:,:,::1], f8[:,:], f8[:,:,:,::1], i8[:])",
     cache=True,
     error_model="numpy",
 )
-def _roll_out(A, B, x, u, states, rows):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+def _roll_out(A, B, x, u, w, states, rows):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """Eq. (4) along a horizon, see `MPC.predict`."""
     n, axes, H = u.shape
     for vehicle in range(n):
@@ -129,28 +149,29 @@ def _roll_out(A, B, x, u, states, rows):  # type: ignore[no-untyped-def]  # noqa
             along = states[rows[vehicle], axis]
             along[0, 0], along[0, 1] = p, v
             for i in range(H):
+                command = u[vehicle, axis, i] + w[vehicle, axis]
                 p, v = (
-                    A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u[vehicle, axis, i],
-                    A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u[vehicle, axis, i],
+                    A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * command,
+                    A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * command,
                 )
                 along[i + 1, 0], along[i + 1, 1] = p, v
 
 
 @njit(
-    "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,::1], f8, f8[::1], f8[:,:,:], f8[:,:,:,:],"
-    "f8[:,:,::1])",
+    "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,::1], f8, f8, f8[::1], f8[:,:,:], f8[:,:,:,:],"
+    "f8[:,:,::1], f8[:,:])",
     cache=True,
     error_model="numpy",
 )
-def _gradient(A, B, W, R, S, x, target, previous):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+def _gradient(A, B, W, R, T, S, x, target, previous, w):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """ΓᵀW (Φ x - target) by the adjoint of (4), from stage H back to 0, less R and S terms.
 
     Args:
         A, B: shape (axes, 2, 2) and (axes, 2).
         W: shape (H, 2).
-        R: weight of the input's own target.
+        R, T: weights of the input, and of its own target.
         S: shape (H,).
-        x, target, previous: see `MPC.gradient`.
+        x, target, previous, w: see `MPC.gradient`.
     """
     n, axes, H = previous.shape
     gradient, drift = np.empty((n, axes, H)), np.empty((H, 2))
@@ -158,14 +179,37 @@ def _gradient(A, B, W, R, S, x, target, previous):  # type: ignore[no-untyped-de
         for axis in range(axes):
             a00, a01, a10, a11 = A[axis, 0, 0], A[axis, 0, 1], A[axis, 1, 0], A[axis, 1, 1]
             b0, b1 = B[axis, 0], B[axis, 1]
-            p, v = x[vehicle, axis, 0], x[vehicle, axis, 1]
+            p, v, added = x[vehicle, axis, 0], x[vehicle, axis, 1], w[vehicle, axis]
             for i in range(H):
-                p, v = a00 * p + a01 * v, a10 * p + a11 * v
+                p, v = a00 * p + a01 * v + b0 * added, a10 * p + a11 * v + b1 * added
                 drift[i, 0] = W[i, 0] * (p - target[vehicle, axis, i + 1, 0])
                 drift[i, 1] = W[i, 1] * (v - target[vehicle, axis, i + 1, 1])
             l0, l1 = 0.0, 0.0
             for i in range(H - 1, -1, -1):
                 l0, l1 = a00 * l0 + a10 * l1 + drift[i, 0], a01 * l0 + a11 * l1 + drift[i, 1]
-                toward = S[i] * previous[vehicle, axis, i] + R * target[vehicle, axis, i, 1]
+                toward = S[i] * previous[vehicle, axis, i] + T * target[vehicle, axis, i, 1]
+                toward -= R * added
                 gradient[vehicle, axis, i] = b0 * l0 + b1 * l1 - toward
     return gradient
+
+
+@njit(
+    "f8[::1](f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1])",
+    cache=True,
+    error_model="numpy",
+)
+def _cost(A, B, W, rho, change):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    """See `MPC.cost`: what the change does to the states, rolled out from none."""
+    n, axes, H = change.shape
+    cost = np.zeros(n)
+    for vehicle in range(n):
+        for axis in range(axes):
+            p, v = 0.0, 0.0
+            for i in range(H):
+                u = change[vehicle, axis, i]
+                p, v = (
+                    A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u,
+                    A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u,
+                )
+                cost[vehicle] += W[i, 0] * p * p + W[i, 1] * v * v + rho[i] * u * u
+    return cost

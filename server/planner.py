@@ -37,8 +37,8 @@ class Successive:
     ) -> None:
         control, axes, H = scenario.control, len(model.B), scenario.control.horizon
         self._stopwatch = stopwatch
-        self._mpc = condense(model, control, change_weight=control.change_weight)
-        self._solver = make_solver(control, self._mpc, scenario.u_max)
+        self.mpc = condense(model, control, change_weight=control.change_weight)
+        self._solver = make_solver(control, self.mpc, scenario.u_max)
         # Without a horizon before there is no S-term (E8), which is another Hessian.
         self._first = condense(model, control, change_weight=0.0)
         self._first_solver = make_solver(control, self._first, scenario.u_max)
@@ -49,7 +49,15 @@ class Successive:
         self.solve_ns = 0
         """How long solving took last, where the stopwatch runs."""
 
-    def solve(self, rows: Indices, gap: Indices, fresh: Flags, x: Array, target: Array) -> Flags:
+    def solve(  # noqa: PLR0917 - all that a plan starts from
+        self,
+        rows: Indices,
+        gap: Indices,
+        fresh: Flags,
+        x: Array,
+        target: Array,
+        disturbance: Array,
+    ) -> Flags:
         """{X(k), U(k)} ← MPC, eq. (10), into `states` and `inputs`.
 
         Args:
@@ -58,6 +66,7 @@ class Successive:
             fresh: which of them start anew; shape (n,).
             x: state at stage 0; shape (n, axes, 2).
             target: desired states at the stages 0 … H; shape (n, axes, H + 1, 2).
+            disturbance: see `MPC.gradient`; shape (n, axes).
 
         Returns:
             which were solved; the others go on with their horizon of before, shifted.
@@ -66,16 +75,18 @@ class Successive:
         anew = fresh.any()
         if anew:
             previous[fresh] = 0.0
-        gradient = self._mpc.gradient(x, target, previous)
+        gradient = self.mpc.gradient(x, target, previous, disturbance)
         self._stopwatch.lap("plan")
         inputs, solved = self._solver.solve(gradient, previous)
         if anew:
-            gradient = self._first.gradient(x[fresh], target[fresh], previous[fresh])
+            gradient = self._first.gradient(
+                x[fresh], target[fresh], previous[fresh], disturbance[fresh]
+            )
             inputs[fresh], solved[fresh] = self._first_solver.solve(gradient, previous[fresh])
         self.solve_ns = self._stopwatch.lap("solve")
         # What is sent is float32: planning goes on with what the vehicle will really be told.
         self.inputs[rows] = inputs = inputs.astype(np.float32).astype(np.float64)
-        self._mpc.predict(x, inputs, self.states, rows)
+        self.mpc.predict(x, inputs, disturbance, self.states, rows)
         return solved
 
 
@@ -151,23 +162,65 @@ class Planner:
         planned[fresh] = estimate[fresh]
         return planned, fresh
 
-    def plan(
-        self, rows: Indices, step: Indices, estimate: Array, planned: Array, fresh: Flags
+    def plan(  # noqa: PLR0917 - all that a plan starts from
+        self,
+        rows: Indices,
+        step: Indices,
+        estimate: Array,
+        planned: Array,
+        fresh: Flags,
+        disturbance: Array,
     ) -> Plan:
         """Eq. (14), then (15).
 
         Args:
             rows: the vehicles; shape (n,).
-            step: k of each, later than at its last plan; shape (n,).
-            estimate: x̂(k); shape (n, axes, 2).
-            planned: x_p(k|k-1), and `fresh`: from `planned`.
+            step: where each plan starts, later than the last one, or there; shape (n,).
+            estimate: x̂ at that step; shape (n, axes, 2).
+            planned: x_p there, and `fresh`: from `planned`.
+            disturbance: see `MPC.gradient`; shape (n, axes).
         """
         gap = step - self._step[rows]
-        led = self._generator.solve(rows, gap, fresh, planned, self._desired(step))
+        calm = np.zeros_like(disturbance)  # the generator plans for no vehicle in particular
+        led = self._generator.solve(rows, gap, fresh, planned, self._desired(step), calm)
         trajectory = self._generator.states[rows]
-        solved = led & self._tracker.solve(rows, gap, fresh, estimate, trajectory)
+        solved = led & self._tracker.solve(rows, gap, fresh, estimate, trajectory, disturbance)
         self._step[rows] = step
         if not solved.all():  # a first plan that failed is no plan to go on from
             self._step[rows[fresh & ~solved]] = -1
         solve_ns = self._generator.solve_ns + self._tracker.solve_ns
         return Plan(self._tracker.inputs[rows], solved, solve_ns if self._stopwatch.runs else -1)
+
+    def cost_gap(self, rows: Indices, held: Array) -> Array:
+        """(U_old - U)ᵀ 𝓗 (U_old - U): what it costs to fly `held` instead of the plan just made.
+
+        Args:
+            rows: the vehicles; shape (n,).
+            held: U_old; shape (n, axes, H).
+
+        Returns:
+            shape (n,).
+        """
+        return self._tracker.mpc.cost(held - self._tracker.inputs[rows])
+
+    def deviation_m(
+        self, rows: Indices, step: Indices, estimate: Array, held: Array, disturbance: Array
+    ) -> Array:
+        """How far `held` leads away from the generator's last plan, at most, as far as that goes.
+
+        Args:
+            rows, step, estimate, disturbance: see `plan`.
+            held: inputs from `step` on; shape (n, axes, H).
+
+        Returns:
+            distance [m]; shape (n,).
+        """
+        n, axes, H = held.shape
+        states = np.empty((n, axes, H + 1, 2))
+        self._tracker.mpc.predict(estimate, held, disturbance, states, np.arange(n))
+        gap = step - self._step[rows]
+        stage = np.arange(H + 1) + gap[:, None]
+        plan = self._generator.states[rows[:, None], :, np.minimum(stage, H), 0].transpose(0, 2, 1)
+        distance = np.linalg.norm(states[..., 0] - plan, axis=1)
+        largest: Array = np.where(stage <= H, distance, 0.0).max(axis=1)
+        return largest

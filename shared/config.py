@@ -4,7 +4,6 @@ A scenario may say `extends = "other"` (a scenario's name, or a file beside it) 
 what differs. `skytether scenarios` lists those that come with Skytether.
 """
 
-import difflib
 import math
 import re
 import tomllib
@@ -21,8 +20,10 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from shared import policy
 from shared import reference as shapes
 from shared.endpoint import seconds_to_ns
+from shared.hint import hint
 from shared.protocol import INPUTS_MAX, Terms
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -57,18 +58,26 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
     """Steps planned ahead, H."""
-    scheme: Literal["paper", "none"] = "paper"
-    """Delay compensation at both ends: eq. (11) and (13), or none."""
-    trigger: Literal["paper", "always", "periodic"] = "paper"
-    """When a horizon is sent: eq. (16), at every step, or every `period` steps."""
-    period: Annotated[int, Meta(ge=1, le=1_000_000)] = 10
-    """Steps from one horizon to the next of the periodic trigger."""
+    scheme: Literal["committed", "paper", "none"] = "paper"
+    """Delay compensation at both ends: committed inputs, eq. (11) and (13), or none."""
+    delay_bound: Duration | Literal["auto"] = "auto"
+    """A horizon that comes is in force at most so long after it was made [s]; auto: as was seen."""
+    observer_s: NonNegative = 0.0
+    """How soon steady wind and a wrong gain are learned, as a time constant [s]; 0: never."""
+    trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "paper"
+    """When a horizon is sent: policies that combine with & and |, as in docs/triggers.md."""
+    period: Annotated[int, Meta(ge=1, le=policy.PERIOD_MAX)] = 10
+    """Steps from one horizon to the next of the policy `periodic`."""
     solver: Literal["exact", "osqp"] = "exact"
     """What solves (9): Riccati active set, exact and fast, or OSQP, the reference."""
     epsilon: NonNegative = 3.6
     """Tolerance ε of eq. (16)."""
     decay_rate: NonNegative = 1.5
     """Decay rate λ of eq. (16) [1/s]."""
+    cost_gap: NonNegative = 0.01
+    """Cost of flying on with what was sent, above which the policy `cost_gap` sends."""
+    deviation_m: NonNegative = 0.05
+    """Distance from the plan, above which the policy `deviation` sends [m]."""
     state_weight: tuple[NonNegative, NonNegative] = (7.1, 14.0)
     """Q of eq. (5), on the position and the velocity of every axis."""
     terminal_weight: tuple[NonNegative, NonNegative] = (73.0, 555.0)
@@ -111,10 +120,16 @@ class VehicleConfig(Section, frozen=True):
     """How fast `brake` takes the desired velocity to zero [m/s²]."""
     tau_s: tuple[Positive, ...] = ()
     """True time constant [s], where it differs from the model's; one for all axes, or one each."""
+    gain: Positive = 1.0
+    """The velocity that it settles at, over the one that it was told."""
+    dead_time_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
+    """How much later an input takes effect [s]."""
     start_m: tuple[float, ...] = ()
     """Where the flight starts, at rest [m]; left out: at the reference's start."""
     wind: NonNegative = 0.0
     """White acceleration [m/s² per √s]."""
+    steady_wind_mps: tuple[float, ...] = ()
+    """The velocity that steady wind adds in the long run [m/s], of each axis; left out: none."""
     gust_mps2: NonNegative = 0.0
     """Strength of gusts [m/s²]; 0 for none."""
     gust_every_s: Positive = 10.0
@@ -311,7 +326,7 @@ def _read(name: str, seen: Mapping[Path, str] = MappingProxyType({})) -> dict[st
     elif name in (*names(), *names(COMPARED)):
         path = Path(str(resources.files("scenarios") / f"{name}.toml"))
     else:
-        raise ConfigError(f"{name}: no such scenario{_hint(name, names())}")
+        raise ConfigError(f"{name}: no such scenario; {hint(name, names())}")
     try:
         path = path.resolve()
         content = path.read_bytes()
@@ -349,11 +364,6 @@ def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _hint(given: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(given, known, n=1)
-    return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known)}"
-
-
 _PLAIN = {
     "float": "a number",
     "int": "a whole number",
@@ -382,15 +392,22 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
         section = typing.get_type_hints(section).get(key, section)
     if unknown:
         prefix = f"{path}." if path else ""
-        hint = _hint(unknown[1], list(section.__struct_fields__))
-        return f"{prefix}{unknown[1]}: no such key{hint}"
-    if what.startswith("Invalid enum value"):
-        choices = " or ".join(repr(choice) for choice in typing.get_args(section))
-        return f"{path}: got {given!r}, expected {choices}"
+        known = hint(unknown[1], section.__struct_fields__)
+        return f"{prefix}{unknown[1]}: no such key; {known}"
+    if what.startswith("Invalid enum value") or " | " in what:
+        return f"{path}: got {given!r}, expected {_choices(section)}"
     expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
     for theirs, ours in _PLAIN.items():
         expected = re.sub(rf"^{theirs}\b", ours, expected)
     return f"{path or 'the scenario'}: got {given!r}, expected {expected}"
+
+
+def _choices(kind: Any) -> str:
+    """What a value may be: the words of a Literal, or one of several types."""
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        return " or ".join(map(repr, parts))
+    return " or ".join(map(_choices, parts)) if parts else _PLAIN[kind.__name__]
 
 
 def _infinite(value: object, key: str = "") -> typing.Iterator[tuple[str, object, str]]:
@@ -416,8 +433,12 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
     ):
         if len(values) not in (1, axes):
             yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
-    if len(vehicle.start_m) not in (0, axes):
-        yield "vehicle.start_m", list(vehicle.start_m), f"{axes} numbers with model.axes = {axes}"
+    for key, values in (
+        ("vehicle.start_m", vehicle.start_m),
+        ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
+    ):
+        if len(values) not in (0, axes):
+            yield key, list(values), f"{axes} numbers with model.axes = {axes}"
     if control.horizon * axes > INPUTS_MAX:
         most = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
         yield "control.horizon", control.horizon, most
@@ -427,12 +448,28 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
             f"horizon · dt (now {covered_s:g} s) to cover the uplink's mean delay, {delay_s:g} s"
         )
         yield "control.horizon", control.horizon, cover
+    bound_s = control.delay_bound
+    if bound_s != "auto" and bound_s >= covered_s - 1e-9:
+        yield "control.delay_bound", bound_s, f"less than horizon · dt = {covered_s:g} s"
     if scenario.settle >= scenario.duration:
         yield "settle", scenario.settle, f"less than the duration of {scenario.duration:g} s"
     link = scenario.link
     if link.timeout_s <= link.heartbeat_s:
         yield "link.timeout_s", link.timeout_s, f"more than link.heartbeat_s = {link.heartbeat_s:g}"
+    yield from _no_trigger(control)
     yield from _no_reference(scenario)
+
+
+def _no_trigger(control: ControlConfig) -> typing.Iterator[tuple[str, object, str]]:
+    """Why there can be no such trigger: key, given, expected."""
+    try:
+        trigger = policy.parse(control.trigger)
+    except policy.PolicyError as error:
+        yield "control.trigger", repr(error.given), error.expected
+        return
+    for name in (part.name for part in policy.policies(trigger)):
+        if policy.SIGNATURES[name].committed and control.scheme != "committed":
+            yield "control.scheme", repr(control.scheme), f"'committed' with the trigger {name}"
 
 
 def _no_reference(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:

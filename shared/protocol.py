@@ -2,13 +2,14 @@
 
     [version, type, vehicle, ...]
 
-| type | message     | sent by | fields after `vehicle`                                        |
-|------|-------------|---------|---------------------------------------------------------------|
-| 1    | HELLO       | client  | boot_id, terms                                                |
-| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, terms            |
-| 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, server_ns, received_ns, state |
-| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs                 |
-| 5    | HEARTBEAT   | server  | session, server_ns                                            |
+| type | message     | sent by | fields after `vehicle`                                     |
+|------|-------------|---------|------------------------------------------------------------|
+| 1    | HELLO       | client  | boot_id, terms                                             |
+| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, terms         |
+| 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
+|      |             |         | received_ns, state                                         |
+| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs              |
+| 5    | HEARTBEAT   | server  | session, server_ns                                         |
 
 `docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
 Those that control uses are the client's; `server_ns` is the server's own, which the client only
@@ -96,7 +97,9 @@ class Observation(NamedTuple):
     stamp_ns: int
     """When the state was sampled [client clock]."""
     in_force: int
-    """Step that the horizon in force was made for, or NO_HORIZON."""
+    """Step that the horizon in force was made for, or NO_HORIZON,"""
+    since: int
+    """and the first step that was flown with it."""
     server_ns: int
     """Newest `server_ns` seen, echoed,"""
     received_ns: int
@@ -106,7 +109,7 @@ class Observation(NamedTuple):
 
 
 class Horizon(NamedTuple):
-    """The control horizon U(k) of eq. (8)."""
+    """The control horizon U(k) of eq. (8), after the committed inputs where there are any."""
 
     vehicle: int
     session: int
@@ -116,7 +119,7 @@ class Horizon(NamedTuple):
     observed_ns: int
     """Stamp of the observation it was computed from, echoed [client clock]."""
     inputs: NDArray[np.float32]
-    """Desired velocity [m/s]; shape (axes, H)."""
+    """Desired velocity [m/s]; shape (axes, d + H), with d, 0 … H, committed ones first."""
 
 
 class Heartbeat(NamedTuple):
@@ -165,14 +168,14 @@ def _positive(value: object, _: Terms) -> tuple[float, ...]:
 
 
 def _state(value: object, ours: Terms) -> NDArray[np.float64]:
-    state = _array(value, _FLOAT64, (ours.axes, 2))
+    state = _array(value, _FLOAT64, ours.axes, (2, 2))
     if not all(map(math.isfinite, state.ravel().tolist())):
         raise ProtocolError("not finite")
     return state
 
 
 def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
-    inputs = _array(value, _FLOAT32, (ours.axes, ours.horizon))
+    inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, 2 * ours.horizon))
     largest = np.abs(inputs).max(axis=1).tolist()  # NaN where there is one
     if not all(map(math.isfinite, largest)):
         raise ProtocolError("not finite")
@@ -182,10 +185,14 @@ def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
     return inputs
 
 
-def _array(value: object, dtype: np.dtype[Any], shape: tuple[int, int]) -> NDArray[Any]:
-    if type(value) is not bytes or len(value) != shape[0] * shape[1] * dtype.itemsize:
+def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
+    """Of each axis at least and at most so many numbers."""
+    if type(value) is not bytes:
         raise ProtocolError("shape")
-    return np.ndarray(shape, dtype, value)
+    count, rest = divmod(len(value), axes * dtype.itemsize)
+    if rest or not counts[0] <= count <= counts[1]:
+        raise ProtocolError("shape")
+    return np.ndarray((axes, count), dtype, value)
 
 
 _FLOAT32 = np.dtype("<f4")
@@ -202,7 +209,7 @@ _TERMS = (_STAMP, range(1, INPUTS_MAX + 1), range(1, AXES_MAX + 1), _positive, _
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),
     (Welcome, (_U16, _U32, _U64, _U64, _STAMP, _terms)),
-    (Observation, (_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STAMP, _STAMP, _state)),
+    (Observation, (_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP, _state)),
     (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs)),
     (Heartbeat, (_U16, _U32, _STAMP)),
 )

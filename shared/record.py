@@ -40,11 +40,12 @@ def server_columns(axes: int) -> np.dtype[np.void]:
             ("vehicle", "<u2"),
             ("step", "<i8"),
             ("estimate", "<f8", (axes, 2)),  # x̂(k)
-            ("planned", "<f8", (axes, 2)),  # x_p(k|k-1)
-            ("input", "<f8", (axes,)),  # û(k)
+            ("ahead", "<i8"),  # d: planning starts at k + d
+            ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
+            ("input", "<f8", (axes,)),  # û(k), or the committed input of k
             ("observed_step", "<i8"),  # of the observation behind x̂
-            ("error", "<f8"),  # V(k)
-            ("threshold", "<f8"),  # S(k)
+            ("error", "<f8"),  # V(k), or what the trigger compares instead
+            ("threshold", "<f8"),  # S(k), or what it compares that with
             ("event", "?"),
             ("solved", "?"),
             ("solve_ns", "<i8"),  # both MPCs, all vehicles of the tick; -1 where not measured

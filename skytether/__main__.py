@@ -1,12 +1,12 @@
 """The front door: the `skytether` command."""
 
-import difflib
 import sys
 from collections.abc import Sequence
 from importlib import metadata
 from pkgutil import resolve_name
 
 from shared import command, config
+from shared.hint import hint
 
 USAGE = """usage: skytether COMMAND ...
 
@@ -63,9 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"skytether {metadata.version('skytether')}")
         return 0
     if name not in COMMANDS:
-        close = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
-        print(f"skytether: no command {name!r}; {hint}", file=sys.stderr)
+        print(f"skytether: no command {name!r}; {hint(name, COMMANDS)}", file=sys.stderr)
         return command.CONFIGURATION
     return command.main(resolve_name(COMMANDS[name]), rest, name)
 

@@ -8,13 +8,10 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import Annotated
 
-import rich.table
 import tyro
-from rich.text import Text
 
 from lab import calibration, comparison, contenders
 from lab.contenders import CONTENDERS, PACKETS, PLANT, SEARCH_SEED, Plan, Scale
-from lab.report import Table
 from shared import command, config
 from shared.command import CommandError
 from shared.config import ConfigError
@@ -96,19 +93,10 @@ def _compare(options: Options, scale: Scale, call: Call) -> None:
     drawn = comparison.draw(results, scale.runs)
     page.write(options.out, drawn, config.load(PLANT), call, flyers.spent.runs)
     for table in drawn.tables:
-        _print(table)
+        page.show(table)
     runs = flyers.spent.runs
     print(f"{options.out / page.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
-
-
-def _print(table: Table) -> None:
-    shown = rich.table.Table(title=table.title, title_justify="left")
-    for number, heading in enumerate(table.heading):
-        shown.add_column(Text(heading), justify="right" if number > 1 else "left", no_wrap=True)
-    for row in table.rows:
-        shown.add_row(*map(Text, row))
-    command.show(shown)
 
 
 def _tune(options: Options, scale: Scale) -> None:

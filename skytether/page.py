@@ -14,8 +14,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import rich.table
+from rich.text import Text
+
 from lab import report
-from lab.report import Drawn
+from lab.report import Drawn, Table
+from shared import command
 from shared.config import Scenario
 
 PAGE = "report.html"
@@ -76,6 +80,16 @@ def write(out: Path, drawn: Drawn, scenario: Scenario, call: Call, runs: int) ->
         file.write(json.dumps(call.facts(runs)) + "\n")
     calls = [json.loads(line) for line in (out / CALLS).read_text().splitlines()]
     (out / PAGE).write_text(report.html(drawn, scenario, calls))
+
+
+def show(table: Table) -> None:
+    """Print a table of a report."""
+    shown = rich.table.Table(title=table.title, title_justify="left")
+    for heading in table.heading:
+        shown.add_column(Text(heading), no_wrap=True)
+    for row in table.rows:
+        shown.add_row(*map(Text, row))
+    command.show(shown)
 
 
 def _processor() -> str:

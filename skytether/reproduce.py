@@ -72,6 +72,7 @@ def reproduce(argv: Sequence[str]) -> None:
         raise CommandError(str(error), command.CONFIGURATION) from None
     except OSError as error:
         raise CommandError(f"{error.filename or options.out}: {error.strerror or error}") from None
+    page.show(drawn.tables[0])
     print(f"{options.out / page.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
 

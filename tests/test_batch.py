@@ -52,7 +52,9 @@ scenarios = st.fixed_dictionaries(
             {
                 "dt": st.sampled_from([0.05, 0.03]),
                 "scheme": st.sampled_from(["paper", "none"]),
-                "trigger": st.sampled_from(["paper", "always", "periodic"]),
+                "trigger": st.sampled_from(
+                    ["paper", "always", "periodic", "paper & budget(5, 2) | heartbeat(0.3)"]
+                ),
                 "epsilon": st.sampled_from([0.01, 0.5]),
                 "solver": st.sampled_from(["exact", "exact", "exact", "osqp"]),
             }

@@ -16,7 +16,9 @@ import pytest
 
 import skytether.__main__
 from shared import config
+from shared.command import parse
 from shared.record import client_columns
+from skytether.fly import Options
 
 PATIENCE_S = 30.0
 """How long a test waits for something before it gives up."""
@@ -135,7 +137,15 @@ def test_a_mistake_is_one_clear_line(
     assert said.err.splitlines() == [line]
 
 
-@pytest.mark.parametrize("argv", [["--control.dt", "soon"], ["--control.triger", "x"], ["more"]])
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--control.dt", "soon"],
+        ["--control.triger", "x"],
+        ["more"],
+        ["--control.delay-bound", "fast"],
+    ],
+)
 def test_a_wrong_flag_is_explained(argv: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     """Exit code 2, the flag named, and where to read more."""
     with pytest.raises(SystemExit) as exit_:
@@ -251,6 +261,15 @@ def test_flags_lie_over_the_scenario(tmp_path: Path) -> None:
         ratios.append(json.loads(file.read_text())["event_ratio"])
     assert ratios[0] == 1.0
     assert ratios[1] < 0.8
+
+
+@pytest.mark.parametrize(("given", "bound"), [("0.55", 0.55), ("auto", "auto")])
+def test_a_flag_may_be_a_number_or_a_word(given: str, bound: float | str, tmp_path: Path) -> None:
+    """Over a scenario that has another."""
+    file = tmp_path / "mine.toml"
+    file.write_text('extends = "demo"\ncontrol.delay_bound = 0.5')
+    options = parse(Options(), [str(file), "--control.delay-bound", given], "fly", None)
+    assert options.config.control.delay_bound == bound
 
 
 def test_a_real_flight_with_one_command(tmp_path: Path) -> None:

@@ -80,6 +80,11 @@ WRONG = {
         "network.uplink.minimum_s = -0.1",
         "network.uplink.minimum_s: got -0.1, expected a number >= 0.0",
     ),
+    "no gain": ("vehicle.gain = 0.0", "vehicle.gain: got 0.0, expected a number > 0.0"),
+    "a dead time that fills the memory": (
+        "vehicle.dead_time_s = 11.0",
+        "vehicle.dead_time_s: got 11.0, expected a number <= 10.0",
+    ),
     "no duration": ("duration = 0.0", "duration: got 0.0, expected a number > 0.0"),
     "a negative seed": ("seed = -1", "seed: got -1, expected a whole number >= 0"),
     "a seed of more than 32 bits": (
@@ -91,13 +96,41 @@ WRONG = {
     # Not one of the choices.
     "a scheme that is none": (
         'control.scheme = "papr"',
-        "control.scheme: got 'papr', expected 'paper' or 'none'",
+        "control.scheme: got 'papr', expected 'committed' or 'paper' or 'none'",
     ),
     "a trigger nobody knows": (
         'control.trigger = "often"',
-        "control.trigger: got 'often', expected 'paper' or 'always' or 'periodic'",
+        (
+            "control.trigger: got 'often', expected a policy; there are always, periodic, paper, "
+            "cost_gap, deviation, heartbeat, budget"
+        ),
+    ),
+    "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),
+    "a trigger for another scheme": (
+        'control.trigger = "cost_gap"',
+        "control.scheme: got 'paper', expected 'committed' with the trigger cost_gap",
+    ),
+    "a negative cost": (
+        "control.cost_gap = -1.0",
+        "control.cost_gap: got -1.0, expected a number >= 0.0",
+    ),
+    "a negative distance": (
+        "control.deviation_m = -1.0",
+        "control.deviation_m: got -1.0, expected a number >= 0.0",
     ),
     "no period": ("control.period = 0", "control.period: got 0, expected a whole number >= 1"),
+    "a delay bound that is none": (
+        'control.delay_bound = "fast"',
+        "control.delay_bound: got 'fast', expected a number or 'auto'",
+    ),
+    "yes or no for a delay bound": (
+        "control.delay_bound = true",
+        "control.delay_bound: got True, expected a number or 'auto'",
+    ),
+    "a negative delay bound": (
+        "control.delay_bound = -0.1",
+        "control.delay_bound: got -0.1, expected a number >= 0.0",
+    ),
     "a shape that is none": (
         'reference.shape = "ring"',
         (
@@ -127,12 +160,20 @@ WRONG = {
         "vehicle.start_m = [0.0, 0.0, 1.0]",
         "vehicle.start_m: got [0.0, 0.0, 1.0], expected 2 numbers with model.axes = 2",
     ),
+    "a steady wind along a single axis": (
+        "vehicle.steady_wind_mps = [0.5]",
+        "vehicle.steady_wind_mps: got [0.5], expected 2 numbers with model.axes = 2",
+    ),
     "a horizon shorter than the uplink's delay": (
         "control.horizon = 4\ncontrol.dt = 0.1",
         (
             "control.horizon: got 4, expected horizon · dt (now 0.4 s) to cover "
             "the uplink's mean delay, 0.44 s"
         ),
+    ),
+    "a delay bound that leaves nothing to plan": (
+        "control.delay_bound = 3",
+        "control.delay_bound: got 3.0, expected less than horizon · dt = 2 s",
     ),
     "a horizon in space that fits no datagram": (
         "model.axes = 3\ncontrol.horizon = 97",
@@ -232,6 +273,24 @@ def test_a_horizon_that_just_covers_the_delay_is_right(horizon: int, dt: float) 
     """Whatever floating point makes of 40 · 0.011 s = 0.44 s."""
     table = {"control": {"horizon": horizon, "dt": dt}}
     assert config.check(table, "mine.toml").control.horizon == horizon
+
+
+@pytest.mark.parametrize("bound", [0.55, "auto"])
+def test_a_delay_bound_is_a_time_or_seen(bound: float | str, tmp_path: Path) -> None:
+    """Either survives being written and read."""
+    scenario = config.check({"control": {"delay_bound": bound}}, "mine.toml")
+    assert scenario.control.delay_bound == bound
+    path = tmp_path / "copy.toml"
+    path.write_bytes(config.to_toml(scenario))
+    assert config.load(str(path)) == scenario
+
+
+def test_a_delay_bound_of_the_whole_horizon_is_refused() -> None:
+    """Whatever floating point makes of 40 · 0.011 s = 0.44 s."""
+    control = {"horizon": 40, "dt": 0.011}
+    assert config.check({"control": control | {"delay_bound": 0.43}}, "mine.toml")
+    with pytest.raises(ConfigError, match=r"less than horizon · dt = 0\.44 s"):
+        config.check({"control": control | {"delay_bound": 0.44}}, "mine.toml")
 
 
 def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:

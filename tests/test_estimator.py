@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from server.estimator import Estimator
 from shared.model import Array, discretise
+from shared.protocol import NO_HORIZON, Observation
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -15,15 +16,29 @@ MODEL = discretise(np.array([0.81, 0.3]), 0.05)
 ROW = np.array([0])
 
 
+SENT = np.array([3]), np.array([0])
+"""Length of a horizon, and which were sent; neither is asked for."""
+
+
+def seen(step: int, state: Array) -> Observation:
+    """Of the one vehicle."""
+    return Observation(1, 1, step, 0, NO_HORIZON, 0, 0, 0, state)
+
+
 def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
     """An estimator over twelve steps."""
     return Estimator(MODEL, capacity, REACH, compensate=compensate)
 
 
+def horizons(inputs: Array) -> Array:
+    """That begin with these inputs of shape (n, axes)."""
+    return np.repeat(inputs.astype(np.float32)[:, :, None], 3, axis=2)
+
+
 def remember(estimator: Estimator, inputs: Array, *, start: int = 0) -> None:
     """û(start), û(start + 1), … of the one vehicle; inputs of shape (steps, axes)."""
     for step, u in enumerate(inputs, start):
-        estimator.remember(ROW, np.array([step]), u[None])
+        estimator.remember(ROW, np.array([step]), horizons(u[None]), *SENT)
 
 
 def estimate(estimator: Estimator, step: int) -> Array:
@@ -43,9 +58,10 @@ def flown(x: Array, inputs: Array) -> Array:
 def test_estimate_is_the_observation_flown_on(age: int, now: int) -> None:
     """(13) for τ = 0 … reach, wherever the ring of inputs stands."""
     rng = np.random.default_rng(age)
-    inputs, x = rng.normal(size=(now, 2)), rng.normal(size=(2, 2))
+    inputs = rng.normal(size=(now, 2)).astype(np.float32).astype(np.float64)
+    x = rng.normal(size=(2, 2))
     estimator = make()
-    estimator.observe(0, now - age, x)
+    estimator.observe(0, seen(now - age, x))
     remember(estimator, inputs)
     assert estimator.age(ROW, np.array([now])).tolist() == [age]
     assert estimator.within_reach(ROW, np.array([now])).tolist() == [True]
@@ -56,7 +72,7 @@ def test_estimate_is_the_observation_flown_on(age: int, now: int) -> None:
 def test_input_of_the_present_step_does_not_count_yet() -> None:
     """û(k) acts from k on; x̂(k) is before it."""
     estimator = make()
-    estimator.observe(0, 8, np.ones((2, 2)))
+    estimator.observe(0, seen(8, np.ones((2, 2))))
     remember(estimator, np.zeros((10, 2)))
     before = estimate(estimator, 10)
     remember(estimator, np.full((1, 2), 9.0), start=10)
@@ -67,7 +83,7 @@ def test_vehicle_hovers_before_anything_was_computed() -> None:
     """û = 0: the observed velocity dies away with τ."""
     estimator = make()
     x = np.array([[1.0, 2.0], [3.0, -4.0]])
-    estimator.observe(0, 0, x)
+    estimator.observe(0, seen(0, x))
     expected = flown(x, np.zeros((5, 2)))
     np.testing.assert_allclose(estimate(estimator, 5), expected, rtol=0, atol=1e-13)
 
@@ -76,7 +92,7 @@ def test_newest_observation_wins_after_reordering() -> None:
     """E11: what comes late is refused and says so, as is a duplicate."""
     estimator = make()
     states = {step: np.full((2, 2), float(step)) for step in (3, 5, 7)}
-    kept = [estimator.observe(0, step, states[step]) for step in (5, 3, 7, 7, 5)]
+    kept = [estimator.observe(0, seen(step, states[step])) for step in (5, 3, 7, 7, 5)]
     assert kept == [True, False, True, False, False]
     assert estimator.observed_step.tolist() == [7]
     np.testing.assert_allclose(estimate(estimator, 7), states[7])
@@ -88,14 +104,14 @@ def test_order_of_arrival_does_not_matter(order: list[int]) -> None:
     """Once all have arrived."""
     estimator = make()
     for step in order:
-        estimator.observe(0, step, np.full((2, 2), float(step)))
+        estimator.observe(0, seen(step, np.full((2, 2), float(step))))
     np.testing.assert_array_equal(estimate(estimator, 5), np.full((2, 2), 5.0))
 
 
 def test_estimate_keeps_its_own_copy_of_the_state() -> None:
     """Whatever the caller does to its array afterwards."""
     estimator, x = make(compensate=False), np.ones((2, 2))
-    estimator.observe(0, 0, x)
+    estimator.observe(0, seen(0, x))
     x[:] = 9.0
     estimate(estimator, 0)[:] = 9.0
     np.testing.assert_array_equal(estimate(estimator, 0), np.ones((2, 2)))
@@ -107,7 +123,7 @@ def test_missed_steps_are_remembered_too() -> None:
     estimator = make()
     remember(estimator, u[:2])
     remember(estimator, u[2:], start=5)
-    estimator.observe(0, 0, np.zeros((2, 2)))
+    estimator.observe(0, seen(0, np.zeros((2, 2))))
     expected = flown(np.zeros((2, 2)), u[[0, 1, 1, 1, 1, 2]])
     np.testing.assert_allclose(estimate(estimator, 6), expected, rtol=0, atol=1e-13)
 
@@ -117,7 +133,7 @@ def test_gap_longer_than_the_ring_overwrites_all_of_it() -> None:
     estimator = make()
     remember(estimator, np.full((20, 2), 7.0))
     remember(estimator, np.array([[0.5, -0.5]]), start=10**12)
-    estimator.observe(0, 10**12 + 1 - REACH, np.zeros((2, 2)))
+    estimator.observe(0, seen(10**12 + 1 - REACH, np.zeros((2, 2))))
     held = np.concatenate([np.full((REACH - 1, 2), 7.0), [[0.5, -0.5]]])
     expected = flown(np.zeros((2, 2)), held)
     np.testing.assert_allclose(estimate(estimator, 10**12 + 1), expected, rtol=0, atol=1e-13)
@@ -131,7 +147,7 @@ def test_estimate_right_after_a_gap_knows_no_input_of_a_ring_ago() -> None:
     estimator = make()
     old, new = np.full((15, 2), 7.0), np.full((6, 2), 0.5)
     remember(estimator, np.concatenate([old, new]))
-    estimator.observe(0, 20, np.zeros((2, 2)))
+    estimator.observe(0, seen(20, np.zeros((2, 2))))
     expected = flown(np.zeros((2, 2)), np.tile([0.5, 0.5], (3, 1)))
     np.testing.assert_allclose(estimate(estimator, 23), expected, rtol=0, atol=1e-13)
 
@@ -142,7 +158,7 @@ def test_asking_for_estimates_changes_no_later_one() -> None:
     for estimator in (asked, silent):
         remember(estimator, np.full((15, 2), 7.0))
         remember(estimator, np.array([[0.5, -0.5]]), start=15)
-        estimator.observe(0, 14, np.ones((2, 2)))
+        estimator.observe(0, seen(14, np.ones((2, 2))))
     for step in (16, 17, 17, 19):
         estimate(asked, step)
     for estimator in (asked, silent):
@@ -156,7 +172,7 @@ def test_asking_for_estimates_changes_no_later_one() -> None:
 def test_old_observations_are_out_of_reach(observed: int, now: int, *, within: bool) -> None:
     """Twelve steps are bridged, thirteen are not; one from ahead of us is as good as new."""
     estimator = make()
-    estimator.observe(0, observed, np.zeros((2, 2)))
+    estimator.observe(0, seen(observed, np.zeros((2, 2))))
     assert estimator.within_reach(ROW, np.array([now])).tolist() == [within]
 
 
@@ -170,7 +186,7 @@ def test_observation_from_ahead_is_taken_as_it_is() -> None:
     estimator = make()
     remember(estimator, np.ones((10, 2)))
     x = np.array([[1.0, 2.0], [3.0, 4.0]])
-    estimator.observe(0, 11, x)
+    estimator.observe(0, seen(11, x))
     np.testing.assert_array_equal(estimate(estimator, 10), x)
 
 
@@ -178,7 +194,7 @@ def test_without_compensation_the_observation_is_the_estimate() -> None:
     """However old it is, and whatever was flown since."""
     estimator = make(compensate=False)
     x = np.array([[1.0, 2.0], [3.0, 4.0]])
-    estimator.observe(0, 0, x)
+    estimator.observe(0, seen(0, x))
     remember(estimator, np.ones((10, 2)))
     np.testing.assert_array_equal(estimate(estimator, 10), x)
 
@@ -188,12 +204,12 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
     estimator = make(2)
     both, x = np.array([0, 1]), np.array([[1.0, 2.0], [3.0, 4.0]])
     for row in both:
-        estimator.observe(row, 500, x)
+        estimator.observe(row, seen(500, x))
     for step in range(480, 501):
-        estimator.remember(both, np.full(2, step), np.ones((2, 2)))
+        estimator.remember(both, np.full(2, step), horizons(np.ones((2, 2))), *SENT)
     estimator.forget(0)
     assert estimator.within_reach(both, np.array([501, 501])).tolist() == [False, True]
-    assert estimator.observe(0, 0, x)
+    assert estimator.observe(0, seen(0, x))
     here, there = estimator.estimate(both, np.array([3, 501]))
     np.testing.assert_allclose(here, flown(x, np.zeros((3, 2))), rtol=0, atol=1e-13)
     np.testing.assert_allclose(there, flown(x, np.ones((1, 2))), rtol=0, atol=1e-13)
@@ -214,12 +230,12 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
     for _ in range(30):
         step += rng.integers(1, 4, vehicles)
         u = rng.normal(size=(vehicles, 2))
-        together.remember(rows, step, u)
+        together.remember(rows, step, horizons(u), *SENT)
         for i, single in enumerate(singles):
-            single.remember(ROW, step[[i]], u[[i]])
+            single.remember(ROW, step[[i]], horizons(u[[i]]), *SENT)
     for i, (row, single) in enumerate(zip(rows, singles, strict=True)):
         x, observed = rng.normal(size=(2, 2)), int(step[i] + 1 - rng.integers(0, REACH + 1))
         together.observe(int(row), observed, x)
-        single.observe(0, observed, x)
+        single.observe(0, seen(observed, x))
     expected = [estimate(single, int(k) + 1) for single, k in zip(singles, step, strict=True)]
     np.testing.assert_allclose(together.estimate(rows, step + 1), expected, rtol=0, atol=1e-13)

@@ -37,7 +37,7 @@ def problems(problem: MPC, count: int, scale: float, seed: int) -> tuple[Array, 
     x = rng.normal(0.0, scale, (count, axes, 2))
     target = np.cumsum(rng.normal(0.0, 0.2 * scale, (count, axes, H + 1, 2)), axis=2)
     guess = np.clip(rng.normal(0.0, 1.0, (count, axes, H)), -U_MAX[:, None], U_MAX[:, None])
-    return problem.gradient(x, target, guess), guess
+    return problem.gradient(x, target, guess, np.zeros(x.shape[:2])), guess
 
 
 def residual(problem: MPC, inputs: Array, gradient: Array) -> float:

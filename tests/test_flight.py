@@ -10,6 +10,7 @@ import pytest
 
 from shared import config
 from shared.config import Scenario
+from shared.model import Array
 from shared.record import DOWNLINK, UPLINK
 from shared.summary import Summary, summarise
 from sim.flight import Flight, fly
@@ -196,3 +197,21 @@ def test_wind_and_gusts_push_but_do_not_break() -> None:
     assert calm_m is not None
     assert windy_m is not None
     assert calm_m < windy_m < 2.0
+
+
+def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
+    """5 packets/s and a burst of 2; at most 1 s without one. Eq. (16) alone keeps neither."""
+
+    def sent_s(trigger: str) -> Array:
+        flown = scenario("paper", duration=20.0, control={"trigger": trigger})
+        server = fly(flown).server
+        return server["step"][server["event"]] * flown.control.dt
+
+    def most(sent_s: Array) -> float:
+        """Packets in any window, less 5/s of its length."""
+        n, i = np.arange(len(sent_s)), np.tril_indices(len(sent_s))
+        return ((n[:, None] - n + 1) - 5.0 * (sent_s[:, None] - sent_s))[i].max()
+
+    alone = sent_s("paper")
+    assert most(sent_s("paper & budget(5, 2)")) <= 2.0 + 1e-9 < 4.0 < most(alone)
+    assert np.diff(sent_s("paper | heartbeat(1)")).max() <= 1.0 + 1e-9 < np.diff(alone).max()

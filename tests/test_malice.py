@@ -27,7 +27,7 @@ def hostile(rng: random.Random) -> Iterator[bytes]:
         encode(message)
         for message in (
             Welcome(1, 7, 5, 3, 10, TERMS),
-            Observation(1, 7, 5, 10, 4, 8, 9, np.zeros((2, 2))),
+            Observation(1, 7, 5, 10, 4, 4, 8, 9, np.zeros((2, 2))),
             Horizon(1, 7, 5, 10, 9, inputs),
             Heartbeat(1, 7, 10),
         )

@@ -22,6 +22,9 @@ TWO_TAUS = discretise(np.array([0.81, 0.3]), 0.05)
 U_MAX = np.array([1.8, 1.0])
 
 
+CALM = np.zeros((1, 2))
+
+
 def control(H: int, **keys: object) -> ControlConfig:
     """Weights of the paper's scenario over H steps, some of them changed."""
     return ControlConfig(horizon=H, **keys)
@@ -52,7 +55,7 @@ def predict(mpc: MPC, x: Array, u: Array) -> Array:
     """The states at the stages 0 … H, written into rows in another order; (n, axes, H + 1, 2)."""
     n, axes, H = u.shape
     states, rows = np.full((n + 2, axes, H + 1, 2), np.nan), np.arange(n, 0, -1)
-    mpc.predict(x, u, states, rows)
+    mpc.predict(x, u, np.zeros(x.shape[:2]), states, rows)
     assert np.isnan(states[[0, -1]]).all()
     return states[rows]
 
@@ -97,7 +100,7 @@ def test_qp_is_the_printed_cost(H: int, change_weight: float, input_reference: b
     still = half_cost(np.zeros(H))
     for i in range(H):
         slope = 0.5 * (half_cost(unit[i]) - half_cost(-unit[i]))
-        gradient = mpc.gradient(x[None], target[None], previous[None])[0, :, i]
+        gradient = mpc.gradient(x[None], target[None], previous[None], CALM)[0, :, i]
         np.testing.assert_allclose(gradient, slope, rtol=1e-9, atol=1e-9)
         for j in range(H):
             bend = half_cost(unit[i] + unit[j]) - half_cost(unit[i]) - half_cost(unit[j]) + still
@@ -122,7 +125,7 @@ def test_qp_ranks_any_two_plans_as_the_printed_cost(
     mpc = condense(TWO_TAUS, weights, change_weight=S)
     x, target, previous = situation(seed, H)
     one, other = rng.normal(size=(2, 2, H))
-    g = mpc.gradient(x[None], target[None], previous[None])[0]
+    g = mpc.gradient(x[None], target[None], previous[None], CALM)[0]
     values, costs = [], []
     for u in (one, other):
         values.append(0.5 * np.einsum("ak,akl,al->a", u, mpc.hessian, u) + (g * u).sum(axis=1))
@@ -146,7 +149,7 @@ def test_last_input_of_the_horizon_before_changes_nothing() -> None:
     x, target, previous = situation(1, 5)
     other = previous.copy()
     other[:, -1] = 99.0
-    one, two = (mpc.gradient(x[None], target[None], u[None]) for u in (previous, other))
+    one, two = (mpc.gradient(x[None], target[None], u[None], CALM) for u in (previous, other))
     np.testing.assert_array_equal(one, two)
 
 
@@ -183,7 +186,7 @@ def test_solver_finds_the_optimum(
     x, target, previous = situation(H, H, size=size)
     target = np.cumsum(target, axis=1) / np.sqrt(H)
     previous = np.clip(previous, -U_MAX[:, None], U_MAX[:, None])
-    gradient = mpc.gradient(x[None], target[None], previous[None])
+    gradient = mpc.gradient(x[None], target[None], previous[None], CALM)
     u, solved = OsqpSolver(mpc.hessian, U_MAX).solve(gradient, previous[None])
     best = optimum(mpc, gradient[0], U_MAX)
     at_bound = np.abs(best) == U_MAX[:, None]
@@ -196,7 +199,7 @@ def test_vehicle_that_is_where_it_shall_be_stays() -> None:
     """At rest on a resting target the best input is none at all."""
     mpc = condense(TWO_TAUS, control(40), change_weight=0.033)
     x = np.array([[[1.5, 0.0], [-2.0, 0.0]]])
-    gradient = mpc.gradient(x, np.repeat(x[:, :, None], 41, axis=2), np.zeros((1, 2, 40)))
+    gradient = mpc.gradient(x, np.repeat(x[:, :, None], 41, axis=2), np.zeros((1, 2, 40)), CALM)
     u, _ = OsqpSolver(mpc.hessian, U_MAX).solve(gradient, np.zeros((1, 2, 40)))
     np.testing.assert_allclose(u, 0.0, atol=1e-9)
 
@@ -210,7 +213,7 @@ def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:
     first = {}
     for reference in (False, True):
         mpc = condense(TWO_TAUS, control(40, input_reference=reference), change_weight=0.0)
-        gradient = mpc.gradient(target[:, :, 0], target, still)
+        gradient = mpc.gradient(target[:, :, 0], target, still, CALM)
         u, _ = OsqpSolver(mpc.hessian, U_MAX).solve(gradient, still)
         first[reference] = u[0]
     np.testing.assert_allclose(first[True], np.tile(v[:, None], 40), atol=1e-7)
@@ -228,11 +231,12 @@ def test_batch_has_the_gradients_of_its_singles(
         np.stack(some)
         for some in zip(*(situation(seed + i, 20) for i in range(vehicles)), strict=True)
     )
-    gradients = mpc.gradient(x, target, previous)
+    wind = np.random.default_rng(seed).normal(size=(vehicles, 2))
+    gradients = mpc.gradient(x, target, previous, wind)
     predictions = predict(mpc, x, previous)
     for i in range(vehicles):
         one = slice(i, i + 1)
-        single = mpc.gradient(x[one], target[one], previous[one])[0]
+        single = mpc.gradient(x[one], target[one], previous[one], wind[one])[0]
         np.testing.assert_allclose(gradients[i], single, rtol=0, atol=1e-10)
         single = predict(mpc, x[one], previous[one])[0]
         np.testing.assert_allclose(predictions[i], single, rtol=0, atol=1e-12)

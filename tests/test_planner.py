@@ -31,6 +31,9 @@ START = np.array([[1.2, 0.3], [-0.4, 0.8]])
 """Beside the circle, and moving."""
 
 
+CALM = np.zeros((1, 2))
+
+
 def make(capacity: int = 1, scenario: Scenario = SCENARIO) -> Planner:
     """A planner that has not planned yet."""
     return Planner(scenario, MODEL, capacity, Stopwatch())
@@ -40,7 +43,7 @@ def run(planner: Planner, step: int, estimate: Array, *, row: int = 0) -> Plan:
     """The plan of one vehicle at one step."""
     rows, steps = np.array([row]), np.array([step])
     planned, fresh = planner.planned(rows, steps, estimate[None])
-    return planner.plan(rows, steps, estimate[None], planned, fresh)
+    return planner.plan(rows, steps, estimate[None], planned, fresh, CALM)
 
 
 def start_of(planner: Planner, step: int, estimate: Array = START) -> tuple[Array, bool]:
@@ -88,7 +91,7 @@ class OnPaper:
     ) -> Array:
         mpc = condense(MODEL, SCENARIO.control, change_weight=change_weight)
         previous = shift(before[None], np.array([gap]))
-        gradient = mpc.gradient(x[None], target[None], previous)[0]
+        gradient = mpc.gradient(x[None], target[None], previous, CALM)[0]
         answers = []
         for hessian, g, bound in zip(mpc.hessian, gradient, SCENARIO.u_max, strict=True):
             L = np.linalg.cholesky(hessian)
@@ -123,7 +126,7 @@ def test_first_plan_has_no_change_term() -> None:
 
     def best(change_weight: float) -> Array:
         mpc = condense(MODEL, SCENARIO.control, change_weight=change_weight)
-        gradient = mpc.gradient(START[None], target, still)
+        gradient = mpc.gradient(START[None], target, still, CALM)
         return OsqpSolver(mpc.hessian, SCENARIO.u_max).solve(gradient, still)[0]
 
     planner = make()
@@ -201,7 +204,7 @@ def test_plan_is_exactly_what_can_be_sent() -> None:
     np.testing.assert_array_equal(plan.inputs, plan.inputs.astype(np.float32))
     mpc = condense(MODEL, SCENARIO.control, change_weight=0.0)
     expected = np.empty_like(planner._generator.states)
-    mpc.predict(START[None], planner._generator.inputs, expected, np.array([0]))
+    mpc.predict(START[None], planner._generator.inputs, CALM, expected, np.array([0]))
     np.testing.assert_array_equal(planner._generator.states, expected)
 
 
@@ -212,7 +215,9 @@ def test_batch_is_planned_as_its_singles() -> None:
     for steps in ([0, 100, 7], [1, 103, 7 + H], [2, 104, 9 + 3 * H]):
         estimates = np.stack([elsewhere(step) for step in steps])
         planned, fresh = together.planned(rows, np.array(steps), estimates)
-        plan = together.plan(rows, np.array(steps), estimates, planned, fresh)
+        plan = together.plan(
+            rows, np.array(steps), estimates, planned, fresh, np.zeros((len(rows), 2))
+        )
         for i, single in enumerate(singles):
             alone = run(single, steps[i], estimates[i])
             np.testing.assert_array_equal(plan.inputs[i], alone.inputs[0])
@@ -286,7 +291,9 @@ def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> 
         alone = run(neighbour, step, estimates[1])
         estimates[0, 0, 0] = np.nan if step == 1 else estimates[0, 0, 0]
         planned, fresh = planner.planned(rows, np.full(2, step), estimates)
-        plans.append(planner.plan(rows, np.full(2, step), estimates, planned, fresh))
+        plans.append(
+            planner.plan(rows, np.full(2, step), estimates, planned, fresh, np.zeros((2, 2)))
+        )
         np.testing.assert_array_equal(plans[-1].inputs[1], alone.inputs[0])
     assert [plan.solved.tolist() for plan in plans] == [[True, True], [False, True], [True, True]]
     shifted = shift(plans[0].inputs, np.array([1, 1]))

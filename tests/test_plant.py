@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
@@ -58,12 +60,73 @@ def test_without_wind_the_plant_is_the_model() -> None:
 
 def test_true_time_constant_may_differ_from_the_model_s() -> None:
     """The vehicle flies with its own τ, one for all axes or one each."""
-    for given, true in (([1.0], [1.0, 1.0]), ([1.0, 0.2], [1.0, 0.2])):
-        flown = plant(tau_s=given)
+    for told, true in (([1.0], [1.0, 1.0]), ([1.0, 0.2], [1.0, 0.2])):
+        flown = plant(tau_s=told)
         model, x = discretise(np.array(true), 0.05), flown.state()
         for command, state in zip(COMMANDS, flight(flown), strict=True):
             x = model.step(x, command)
             np.testing.assert_array_equal(state, x)
+
+
+def test_gain_scales_what_it_is_told() -> None:
+    """To the last bit; its own velocity is not scaled."""
+    flown = plant(gain=1.25)
+    model, x = discretise(np.array([0.81, 0.3]), 0.05), flown.state()
+    for command, state in zip(COMMANDS, flight(flown), strict=True):
+        x = model.step(x, 1.25 * command)
+        np.testing.assert_array_equal(state, x)
+
+
+def test_steady_wind_adds_its_velocity_in_the_long_run() -> None:
+    """Like an input of its own, on each axis: v̇ = (u + w - v)/τ."""
+    flown, w = plant(steady_wind_mps=[0.3, -0.2]), np.array([0.3, -0.2])
+    model, x = discretise(np.array([0.81, 0.3]), 0.05), flown.state()
+    for command, state in zip(COMMANDS, flight(flown), strict=True):
+        x = model.step(x, command + w)
+        np.testing.assert_array_equal(state, x)
+    u = np.array([0.5, -1.0])
+    np.testing.assert_allclose(flight(flown, np.tile(u, (600, 1)))[-1, :, 1], u + w, atol=1e-12)
+
+
+@pytest.mark.parametrize("steps", [1, 3, 200])
+def test_dead_time_of_whole_steps_only_shifts(steps: int) -> None:
+    """To the last bit; until then it hovers."""
+    late = flight(plant(dead_time_s=steps * 0.05), np.concatenate([COMMANDS, np.zeros((200, 2))]))
+    prompt = flight(plant())
+    np.testing.assert_array_equal(late[:steps], np.tile(plant().state(), (steps, 1, 1)))
+    np.testing.assert_array_equal(late[steps : steps + len(prompt)], prompt)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 500_000_000), st.floats(0.5, 2.0))
+def test_dead_time_is_exact_within_a_step(dead_time_ns: int, gain: float) -> None:
+    """As flown in pieces that end wherever the input changes."""
+    tau, w = np.array([0.81, 0.3]), np.array([0.1, 0.0])
+    flown = plant(dead_time_s=dead_time_ns / 1e9, gain=gain, steady_wind_mps=w.tolist())
+    x = flown.state()
+    whole, rest_ns = divmod(dead_time_ns, 50_000_000)
+    pieces = [discretise(tau, length_ns / 1e9) for length_ns in (rest_ns, 50_000_000 - rest_ns)]
+    due = np.concatenate([np.zeros((whole + 1, 2)), COMMANDS])
+    for k, state in enumerate(flight(flown)):
+        for piece, command in zip(pieces, due[k : k + 2], strict=True):
+            x = piece.step(x, gain * command + w)
+        np.testing.assert_allclose(state, x, rtol=0, atol=1e-12)
+
+
+def test_a_part_of_a_step_is_not_rounded_away() -> None:
+    """Ablation: the nearest dead time of whole steps flies more than 1 cm aside."""
+    early, right = (flight(plant(dead_time_s=dead_time_s)) for dead_time_s in (0.2, 0.22))
+    assert np.abs(early - right)[:, :, 0].max() > 0.01
+
+
+def test_wind_is_never_late() -> None:
+    """Dead time is the input's alone."""
+    late, prompt = (
+        plant(1, dead_time_s=dead_time_s, steady_wind_mps=[0.3, 0.0], wind=0.2, gust_mps2=1.0)
+        for dead_time_s in (5.0, 0.0)
+    )
+    calm = np.zeros((50, 2))
+    np.testing.assert_array_equal(flight(late, calm), flight(prompt, calm))
 
 
 def test_flight_starts_at_rest_at_the_start_of_the_reference() -> None:
@@ -120,6 +183,19 @@ def test_steady_gust_is_integrated_exactly() -> None:
         pushed, _ = quad_vec(lambda s, A=rate[axis]: expm(A * s)[:, 1], 0.0, dt, epsrel=1e-12)
         expected = expm(rate[axis] * dt) @ before[axis] + pushed * acceleration[axis]
         np.testing.assert_allclose(after[axis], expected, rtol=0, atol=1e-10)
+
+
+def test_gust_comes_on_top_of_steady_wind_and_gain() -> None:
+    """It settles at g u + w + τ a, and back at g u + w."""
+    u, w, tau = np.array([0.5, -1.0]), np.array([0.3, -0.2]), np.array([0.81, 0.3])
+    flown = plant(
+        gain=0.8, steady_wind_mps=[0.3, -0.2], gust_mps2=2.0, gust_every_s=500.0, gust_s=500.0
+    )
+    velocity = flight(flown, np.tile(u, (200_000, 1)))[:, :, 1]
+    beyond = np.linalg.norm((velocity - 0.8 * u - w) / tau, axis=1)
+    calm, blowing = (np.abs(beyond - strength) < 1e-9 for strength in (0.0, 2.0))
+    assert calm.mean() + blowing.mean() > 0.95
+    assert min(calm.mean(), blowing.mean()) > 0.1
 
 
 def test_gusts_come_and_go_as_often_as_stated() -> None:

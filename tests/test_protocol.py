@@ -92,7 +92,7 @@ def test_documented_sizes_are_the_real_ones() -> None:
     state = np.zeros((2, 2))
     stamp_ns, session = 3 * 10**14, 2**31
     assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs))) == 353
-    observation = Observation(1, session, 500, stamp_ns, 480, stamp_ns, stamp_ns, state)
+    observation = Observation(1, session, 500, stamp_ns, 480, 490, stamp_ns, stamp_ns, state)
     assert len(encode(observation)) == 76
     assert len(encode(Heartbeat(1, session, stamp_ns))) == 18
 
@@ -103,7 +103,7 @@ def body(message: Message) -> list[object]:
     return fields
 
 
-OBSERVATION = Observation(1, 7, 5, 10, 4, 8, 9, np.array([[1.0, 2.0], [3.0, 4.0]]))
+OBSERVATION = Observation(1, 7, 5, 10, 4, 5, 8, 9, np.array([[1.0, 2.0], [3.0, 4.0]]))
 HORIZON = Horizon(1, 7, 5, 10, 9, np.full((2, 40), 0.5, np.float32))
 HELLO = Hello(1, 99, TERMS)
 

@@ -1,0 +1,252 @@
+"""The delay bound: above what was seen recently, at rest where the network is."""
+
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.fate import fates
+from server import delay
+from server.delay import DelayBound
+from shared.config import DirectionConfig
+from shared.endpoint import seconds_to_ns
+
+quick = settings(max_examples=100, deadline=None)
+
+MOST = 39
+ROW = np.array([0])
+
+
+def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
+    """d after each sample of one vehicle."""
+    bound, steps = DelayBound(1, 0.05, most, None), []
+    bound.begin(ROW, np.array([first]))
+    for sample in delays:
+        bound.acknowledged(ROW, np.array([sample]))
+        steps += bound.steps(ROW).tolist()
+    return steps
+
+
+# -- a bound that is given ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fixed_s", "dt_s", "steps"),
+    [
+        (0.55, 0.05, 11),  # 0.55 / 0.05 is more than 11 in floating point
+        (0.44, 0.02, 22),
+        (0.07, 0.01, 7),
+        (0.551, 0.05, 12),
+        (0.001, 0.05, 1),
+        (0.0, 0.05, 1),
+        (1.99, 0.05, MOST),
+    ],
+)
+def test_a_given_bound_is_rounded_up_to_steps(fixed_s: float, dt_s: float, steps: int) -> None:
+    """From 1 to the most there is room for, and whatever is guessed or seen."""
+    bound, rows = DelayBound(3, dt_s, MOST, fixed_s), np.arange(3)
+    assert bound.steps(rows).tolist() == [steps] * 3
+    bound.begin(rows, np.array([5, 20, 90]))
+    for _ in range(50):
+        bound.acknowledged(rows, np.array([1, 30, 90]))
+    bound.forget(1)
+    assert bound.steps(rows).tolist() == [steps] * 3
+
+
+# -- a bound that is estimated --------------------------------------------------------------------
+
+
+def test_before_any_sample_it_is_the_guess() -> None:
+    """Within 1 and the most."""
+    bound = DelayBound(4, 0.05, MOST, None)
+    bound.begin(np.array([3, 0, 1]), np.array([11, 0, 90]))
+    assert bound.steps(np.arange(4)).tolist() == [1, MOST, 1, 11]
+
+
+def test_it_rises_at_once_and_no_further_than_most() -> None:
+    """Also for a delay that no horizon has room for."""
+    assert known([9, 10, 14, 50]) == [9, 10, 14, MOST]
+
+
+def test_a_guess_too_high_is_left_step_by_step_once_it_is_known_to_be() -> None:
+    """After the 16 newest, as after a sample."""
+    assert known([9] * 22, first=14) == [14] * 15 + [13, 12, 11, 10] + [9] * 3
+
+
+LONE = [11] * 128 + [30] + [11] * 40
+
+
+def test_a_lone_late_horizon_is_left_behind_step_by_step() -> None:
+    """It holds for as long as it is recent."""
+    assert known(LONE)[128:] == [30] * 16 + list(range(29, 10, -1)) + [11] * 6
+
+
+def test_a_few_of_a_hundred_are_no_lone_one() -> None:
+    """They hold until the ring has forgotten all but one."""
+    delays = [11] * 128 + [30] * 3 + [11] * 200
+    steps = known(delays)[130:]
+    assert steps[:127] == [30] * 127
+    assert steps[127:147] == [*range(29, 10, -1), 11]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "delays"),
+    [("RECENT", 1, LONE), ("LATE", 1.0, [11] * 128 + [30] * 3 + [11] * 200)],
+)
+def test_either_reason_to_stay_is_needed(
+    name: str, value: float, delays: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ablation: without it, d falls soon after a late horizon, into the next one."""
+    guarded = known(delays)
+    monkeypatch.setattr(delay, name, value)
+    bare = known(delays)
+    assert sum(guarded) > sum(bare) + 200
+    assert all(slow >= fast for slow, fast in zip(guarded, bare, strict=True))
+
+
+SAMPLES = st.lists(
+    st.one_of(st.integers(8, 13), st.integers(-5, 60)) | st.just(2**40), min_size=1, max_size=400
+)
+
+
+@quick
+@given(SAMPLES, st.integers(1, MOST))
+def test_it_is_what_the_samples_say(delays: list[int], first: int) -> None:
+    """As the definition says it, one sample after the other."""
+    d, expected = first, []
+    for count, sample in enumerate(delays, 1):
+        d = max(d, min(sample, MOST))
+        newest = np.array(delays[max(0, count - 128) : count])
+        rare = np.mean(newest >= d) <= 0.01
+        if d > 1 and count >= 16 and rare and max(newest[-16:]) < d:
+            d -= 1
+        expected.append(d)
+    assert known(delays, first) == expected
+
+
+@quick
+@given(SAMPLES, st.integers(1, MOST))
+def test_it_is_never_below_what_was_seen_recently(delays: list[int], most: int) -> None:
+    """Nor beyond the most, nor below 1; it falls by one at most, and rises to a sample alone."""
+    steps = known(delays, most=most)
+    for count, d in enumerate(steps, 1):
+        assert min(max(delays[max(0, count - 16) : count]), most) <= d <= most
+        assert d >= 1
+    for (before, after), sample in zip(pairwise(steps), delays[1:], strict=True):
+        assert after >= before - 1
+        assert after <= before or after == min(sample, most)
+
+
+def test_every_vehicle_has_a_bound_of_its_own() -> None:
+    """A batch equals its singles, in whatever order and however many of them are heard."""
+    rng, vehicles = np.random.default_rng(2), 6
+    bound, rows = DelayBound(vehicles, 0.05, MOST, None), np.arange(vehicles)
+    bound.begin(rows, np.full(vehicles, 12))
+    heard: list[list[int]] = [[] for _ in rows]
+    for _ in range(500):
+        some = rng.permutation(vehicles)[: rng.integers(vehicles + 1)]
+        delays = 8 + some + rng.poisson(0.5, len(some))
+        bound.acknowledged(some, delays)
+        for row, sample in zip(some.tolist(), delays.tolist(), strict=True):
+            heard[row].append(sample)
+    expected = [known(delays, first=12)[-1] for delays in heard]
+    assert bound.steps(rows).tolist() == expected
+    assert len(set(expected)) > 1
+
+
+def test_a_vehicle_that_is_forgotten_begins_anew() -> None:
+    """And its neighbour does not."""
+    bound, rows = DelayBound(2, 0.05, MOST, None), np.arange(2)
+    for _ in range(200):
+        bound.acknowledged(rows, np.array([30, 30]))
+    bound.forget(0)
+    assert bound.steps(rows).tolist() == [1, 30]
+    bound.begin(ROW, np.array([14]))
+    for _ in range(20):
+        bound.acknowledged(ROW, np.array([9]))
+    assert bound.steps(rows).tolist() == [9, 30]
+
+
+# -- on a network ---------------------------------------------------------------------------------
+
+SECONDS = 60.0
+
+
+def flown(
+    dt_s: float, period: int, seed: int, minima_s: tuple[float, ...] = (0.4,)
+) -> tuple[list[int], float]:
+    """d at every step of a flight on the paper's uplink, and the share in force later than it.
+
+    Args:
+        period: steps from a horizon to the next.
+        minima_s: smallest delay in each of as many equal parts of the flight [s].
+    """
+    dt_ns, steps = seconds_to_ns(dt_s), round(SECONDS / dt_s)
+    packets = [
+        islice(fates(DirectionConfig(minimum_s=minimum_s), seed, "uplink", 0), steps)
+        for minimum_s in minima_s
+    ]
+    arrivals: dict[int, list[int]] = {}
+    for made, *part in zip(range(0, steps, period), *packets, strict=False):
+        fate = part[made * len(minima_s) // steps]
+        if not fate.lost:
+            arrivals.setdefault(made - (-fate.delay_ns // dt_ns), []).append(made)
+    bound = DelayBound(1, dt_s, round(2.0 / dt_s) - 1, None)
+    bound.begin(ROW, np.array([round(0.4 / dt_s) + 2]))
+    in_force, bounds, late = -1, [], []
+    for step in range(steps):
+        made = max(arrivals.get(step, [-1]))
+        if made > in_force:
+            in_force = made
+            late.append(step - made > bounds[made])
+            bound.acknowledged(ROW, np.array([step - made]))
+        bounds += bound.steps(ROW).tolist()
+    return bounds, float(np.mean(late))
+
+
+FLIGHTS = {
+    (0.05, 1): (10, 11, 8, 0.01),
+    (0.05, 10): (10, 12, 4, 0.03),
+    (0.02, 1): (22, 25, 30, 0.012),
+    (0.02, 10): (25, 29, 12, 0.03),
+}
+"""Δt [s], period: the smallest and largest d of the last half, changes, share that is late."""
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("dt_s", "period"), FLIGHTS)
+def test_on_the_papers_network_it_is_at_rest(dt_s: float, period: int, seed: int) -> None:
+    """From the mean delay, 0.44 s, to 0.6 s; lower where most of the late are overtaken."""
+    steps, late = flown(dt_s, period, seed)
+    least, most, changes, share = FLIGHTS[dt_s, period]
+    half = steps[len(steps) // 2 :]
+    assert least <= min(half) <= max(half) <= most
+    assert np.count_nonzero(np.diff(steps)) <= changes
+    assert late <= share
+
+
+def test_without_its_memory_it_chatters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation: five times the changes, and five times the late."""
+    steps, late = flown(0.02, 1, seed=0)
+    monkeypatch.setattr(delay, "RECENT", 1)
+    monkeypatch.setattr(delay, "LATE", 1.0)
+    bare_steps, bare_late = flown(0.02, 1, seed=0)
+    changes, bare = (np.count_nonzero(np.diff(d)) for d in (steps, bare_steps))
+    assert bare > 5 * changes
+    assert bare_late > 5 * late
+
+
+@pytest.mark.parametrize(("dt_s", "settled_s"), [(0.05, 15.0), (0.02, 10.0)])
+def test_it_follows_a_network_that_jumps_up_and_down(dt_s: float, settled_s: float) -> None:
+    """Up with the first horizon that comes; down within SAMPLES of them, in single steps."""
+    steps, _ = flown(dt_s, 1, seed=1, minima_s=(0.4, 0.8, 0.4))
+    third = len(steps) // 3
+    d_s = np.array(steps) * dt_s
+    after_s = np.arange(third) * dt_s
+    assert (d_s[third - round(1 / dt_s) : third] < 0.61).all()
+    assert (d_s[third : 2 * third][after_s > 1.0] >= 0.84).all()
+    assert (d_s[third : 2 * third] <= 1.05).all()
+    assert (d_s[2 * third :][after_s > settled_s] < 0.61).all()
+    assert np.diff(steps).min() == -1

@@ -1,0 +1,202 @@
+"""shared.policy: a text is a trigger, or it is refused in one line; nothing in it is ever run."""
+
+import string
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from shared import config, policy
+from shared.config import ConfigError
+from shared.policy import SIGNATURES, TEXT_MAX, Combination, Policy, policies
+
+FORM = "policies such as 'paper & budget(5, 2) | heartbeat(1)'"
+PAPER, ALWAYS = Policy("paper", ()), Policy("always", ())
+BUDGET, HEARTBEAT = Policy("budget", (5, 2)), Policy("heartbeat", (0.5,))
+
+READ = {
+    "paper": PAPER,
+    " paper()\n": PAPER,
+    "((paper))": PAPER,
+    "budget(5, 2)": BUDGET,
+    "heartbeat( 5e-1 )": HEARTBEAT,
+    "paper(.5, 2.)": Policy("paper", (0.5, 2.0)),
+    "paper & always": Combination("&", PAPER, ALWAYS),
+    "paper|\n always": Combination("|", PAPER, ALWAYS),
+    # & binds tighter than |, and both from the left.
+    "paper & budget(5, 2) | heartbeat(0.5)": Combination(
+        "|", Combination("&", PAPER, BUDGET), HEARTBEAT
+    ),
+    "heartbeat(0.5) | paper & budget(5, 2)": Combination(
+        "|", HEARTBEAT, Combination("&", PAPER, BUDGET)
+    ),
+    "(heartbeat(0.5) | paper) & budget(5, 2)": Combination(
+        "&", Combination("|", HEARTBEAT, PAPER), BUDGET
+    ),
+    "paper | always | paper": Combination("|", Combination("|", PAPER, ALWAYS), PAPER),
+}
+
+PERIODIC = "periodic or periodic(N) with 1 <= N <= 1000000 (whole)"
+BOUNDED = "budget(packets_per_s, burst) with 0.001 <= packets_per_s <= 1000000 and "
+BOUNDED += "1 <= burst <= 1000000"
+REFUSED = {
+    # No expression of policies.
+    "": ("", FORM),
+    "paper &": ("paper &", FORM),
+    "(paper": ("(paper", FORM),
+    "paper always": ("paper always", FORM),
+    "paper and always": ("paper and always", FORM),
+    "always & (not paper)": ("not paper", FORM),
+    "always & (lambda: paper)": ("always & (lambda: paper)", FORM),
+    "paper - 3": ("paper - 3", FORM),
+    "paper -3": ("paper - 3", FORM),
+    "3": ("3", FORM),
+    "None": ("None", FORM),
+    "(paper, always)": ("(paper, always)", FORM),
+    "paper(1, 2)(3)": ("paper(1, 2)(3)", FORM),
+    "1or 2": ("1or 2", FORM),
+    "paper.test": ("paper.test", FORM),
+    "paper[0]": ("paper[0]", FORM),
+    "paper # always": ("paper # always", FORM),
+    "paper(*always)": ("paper(*always)", FORM),
+    "budget(packets_per_s=5, burst=2)": ("budget(packets_per_s=5, burst=2)", FORM),
+    "\N{FULLWIDTH LATIN SMALL LETTER P}aper": ("\N{FULLWIDTH LATIN SMALL LETTER P}aper", FORM),
+    # No such policy.
+    "perodic(3)": ("perodic(3)", "a policy; did you mean periodic?"),
+    "paper | cost_gab": ("cost_gab", "a policy; did you mean cost_gap?"),
+    "print(1)": (
+        "print(1)",
+        f"a policy; there are {', '.join(SIGNATURES)}",
+    ),
+    # Not its arguments.
+    "always(1)": ("always(1)", "always"),
+    "periodic(3, 4)": ("periodic(3, 4)", PERIODIC),
+    "periodic(0)": ("periodic(0)", PERIODIC),
+    "periodic(2.5)": ("periodic(2.5)", PERIODIC),
+    "periodic(True)": ("periodic(True)", PERIODIC),
+    "periodic(1000001)": ("periodic(1000001)", PERIODIC),
+    "periodic(paper)": ("periodic(paper)", PERIODIC),
+    "paper & budget": ("budget", BOUNDED),
+    "budget(5)": ("budget(5)", BOUNDED),
+    "budget(0, 2)": ("budget(0, 2)", BOUNDED),
+    "budget(5, 0.9)": ("budget(5, 0.9)", BOUNDED),
+    "heartbeat()": ("heartbeat()", "heartbeat(seconds) with 0.001 <= seconds <= 3600"),
+    "cost_gap(-1)": ("cost_gap(-1)", "cost_gap or cost_gap(c) with 0 <= c"),
+    "deviation(1e999)": ("deviation(1e309)", "deviation or deviation(metres) with 0 <= metres"),
+    "paper(3.6)": (
+        "paper(3.6)",
+        "paper or paper(epsilon, decay_rate) with 0 <= epsilon and 0 <= decay_rate",
+    ),
+}
+"""What is no trigger: the part that is said to be wrong, and what would be right."""
+
+
+def refusal(text: str) -> str:
+    """What is said of a scenario with this trigger."""
+    with pytest.raises(ConfigError) as caught:
+        config.check({"control": {"trigger": text}}, "mine")
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(("text", "read"), READ.items(), ids=READ)
+def test_what_is_written_is_read(text: str, read: policy.Expression) -> None:
+    """Names, numbers, &, | and parentheses, as Python reads them."""
+    assert policy.parse(text) == read
+    assert config.check({"control": {"trigger": text}}, "mine").control.trigger == text
+
+
+@pytest.mark.parametrize(("text", "said"), REFUSED.items(), ids=REFUSED)
+def test_what_is_no_trigger_is_refused_in_one_line(text: str, said: tuple[str, str]) -> None:
+    """With the part that is wrong, and what was expected."""
+    assert refusal(text) == f"mine: control.trigger: got {said[0]!r}, expected {said[1]}"
+
+
+def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
+    """However deep it is."""
+    deep = "(" * 97 + "always" + ")" * 97
+    assert len(deep) == TEXT_MAX
+    assert policy.parse(deep) == ALWAYS
+    assert refusal(deep + " ").endswith(" ', expected a text of length <= 200")
+    longest = " | ".join(["paper"] * 25)
+    assert list(policies(policy.parse(longest))) == [PAPER] * 25
+
+
+@pytest.mark.parametrize("name", [name for name in SIGNATURES if SIGNATURES[name].committed])
+def test_what_compares_committed_inputs_needs_their_scheme(name: str) -> None:
+    """Deep in an expression, too."""
+    text = f"heartbeat(1) | {name}(1) & budget(5, 2)"
+    assert refusal(text) == (
+        f"mine: control.scheme: got 'paper', expected 'committed' with the trigger {name}"
+    )
+    config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
+
+
+words = st.sampled_from(
+    [
+        *SIGNATURES,
+        *" &|(),.-",
+        "1",
+        "0.5",
+        "7e",
+        "1_0",
+        "0x1",
+        "lambda",
+        "if",
+        "else",
+        "None",
+        "f()",
+    ]
+)
+
+
+@settings(max_examples=1000, deadline=None)
+@given(
+    st.text(max_size=60)
+    | st.text(string.printable, max_size=60)
+    | st.lists(words, max_size=40).map("".join)
+    | st.lists(words, max_size=40).map(" ".join)
+)
+@example("(" * 200)
+@example("paper(" * 33)
+@example("-" * 200)
+@example("always\0")
+@example("\ud800")
+@example("[" * 100 + "]" * 100)
+def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
+    """Nothing else: no other error, no warning of Python's, and nothing happens."""
+    said, found = "", []
+    try:
+        config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
+        found = list(policies(policy.parse(text)))
+    except ConfigError as error:
+        said = str(error)
+    assert bool(found) != said.startswith("mine: control.trigger: got ")
+    assert len(said.splitlines()) == (not found)
+    assert all(SIGNATURES[one.name].takes(one.values) for one in found)
+
+
+def test_nothing_written_is_ever_run() -> None:
+    """A call that would end the process is a name that nobody knows."""
+    assert "there are always" in refusal("exit(1)")
+    assert refusal("__import__('os')._exit(1)").endswith(FORM)
+
+
+trees = st.recursive(
+    st.sampled_from([PAPER, ALWAYS, BUDGET, HEARTBEAT]),
+    lambda tree: st.builds(Combination, st.sampled_from("&|"), tree, tree),
+    max_leaves=5,
+)
+
+
+def written(tree: policy.Expression) -> str:
+    """With every parenthesis."""
+    if isinstance(tree, Policy):
+        values = ", ".join(map(repr, tree.values))
+        return f"{tree.name}({values})"
+    return f"({written(tree.left)} {tree.operator} {written(tree.right)})"
+
+
+@given(trees)
+def test_every_combination_can_be_written(tree: policy.Expression) -> None:
+    """And is read as it was meant."""
+    assert policy.parse(written(tree)) == tree
