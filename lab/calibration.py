@@ -121,8 +121,8 @@ def is_admissible(values: Values) -> bool:
 
 WEIGHTS = (
     Free("control.state_weight.1", 1e-4, 1e4),
-    Free("control.terminal_weight.0", 1e-3, 1e5),
-    Free("control.terminal_weight.1", 1e-3, 1e5),
+    Free("control.terminal_weight.0", 1e-2, 1e6),
+    Free("control.terminal_weight.1", 1e-2, 1e6),
     Free("control.input_weight", 1e-4, 1e4),
     Free("control.change_weight", 1e-4, 1e4),
 )

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from lab import plates
-from lab.contenders import CONTENDERS, PACKETS, Case, Flying, Plan
+from lab.contenders import CASES, CONTENDERS, PACKETS, Case, Flying, Plan
 from lab.plates import Picture
 from lab.report import Drawn, Table, as_text
 from lab.sweep import Done, interval, to_csv
@@ -29,7 +29,17 @@ class Claim:
     """By case; where it has none, it is told and not asked for."""
 
 
-CLAIMS = (Claim("paper-event", "paper-periodic"),)
+NAMES = tuple(case.name for case in CASES)
+WINDY = ("wind-0.1", "wind-0.3", "gusts")
+CLAIMS = (
+    Claim(
+        *("committed-gap", "paper-every-step", PACKETS),
+        {**dict.fromkeys(NAMES, 0.75), "quiet": 0.2},
+    ),
+    Claim("committed-gap", "paper-event", at_most=dict.fromkeys(NAMES, 0.35)),
+    Claim("committed-gap", "committed-periodic", at_most=dict.fromkeys(WINDY, 0.9)),
+    Claim("paper-event", "paper-periodic"),
+)
 
 
 RMSE, SHARE, PACKETS_UP, BYTES = FIGURES = (

@@ -40,19 +40,27 @@ class Contender:
     """and what it is multiplied with for a curve."""
 
 
-NEAR = (1 / 16, 1 / 4, 1 / 2, 1, 2, 4, 16)
+NEAR = (1 / 16, 1 / 4, 1 / 2, 1, 5 / 4, 2, 8)
 """Factors of a quadratic threshold."""
 PERIODS = (0.1, 0.2, 0.5, 1, 1.5, 2, 4)
 """Factors of ten steps."""
+PERIODIC = {"trigger": "periodic", "period": 10}
+COMMITTED = {"scheme": "committed", "observer_s": 2.0}
+"""How soon the observer learns is searched for, too, and may come out as hardly ever."""
+GAP = COMMITTED | {"trigger": "cost_gap", "cost_gap": 1.0}
 
 CONTENDERS = (
     Contender("paper-every-step", "paper, every step", {"trigger": "always"}),
     Contender("paper-event", "paper, eq. (16)", {"trigger": "paper"}, "epsilon", NEAR),
+    Contender("paper-periodic", "paper, periodic", PERIODIC, "period", PERIODS),
+    Contender("committed-every-step", "committed, every step", COMMITTED | {"trigger": "always"}),
+    Contender("committed-periodic", "committed, periodic", COMMITTED | PERIODIC, "period", PERIODS),
+    Contender("committed-gap", "committed, cost gap", GAP, "cost_gap", NEAR),
     Contender(
-        "paper-periodic",
-        "paper, periodic",
-        {"trigger": "periodic", "period": 10},
-        *("period", PERIODS),
+        "committed-budget",
+        "committed, cost gap, ≤ 5 packets/s",
+        GAP | {"trigger": "cost_gap & budget(5, 2)"},
+        *("cost_gap", NEAR),
     ),
 )
 
