@@ -5,7 +5,6 @@ what came out how good it is: the smaller the score, the better.
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -14,7 +13,7 @@ import numpy as np
 
 from lab import sweep
 from lab.search import Free, plain
-from shared import config
+from shared import config, policy
 from shared.config import Scenario
 from shared.summary import Summary
 
@@ -132,7 +131,7 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "cost_gap": (Free("control.cost_gap", 1e-6, 1e3),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
 }
-"""Of the triggers whose rate depends on what they see."""
+"""Of the policies that look at the flight, so that weights and thresholds decide what they send."""
 SCHEME_KEYS: Mapping[str, Sequence[Free]] = {
     "committed": (Free("control.observer_s", 0.05, 50.0),),
 }
@@ -141,9 +140,9 @@ HERE = "here"
 
 
 def trigger_keys(trigger: str) -> Sequence[Free]:
-    """The keys of a trigger, as in `cost_gap & budget(5, 2)`; `paper(3.6, 1.5)` takes none."""
-    names = dict.fromkeys(re.findall(r"\b[a-z_]+\b(?!\s*\()", trigger))
-    return [key for name in names for key in TRIGGER_KEYS.get(name, ())]
+    """The keys of the policies in a trigger; one that is told its numbers has none."""
+    bare = (each.name for each in policy.policies(policy.parse(trigger)) if not each.values)
+    return [key for name in dict.fromkeys(bare) for key in TRIGGER_KEYS.get(name, ())]
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +179,8 @@ class Rmse:
 
     def _binds(self) -> bool:
         """Whether the share of packets follows from what is flown."""
-        return bool(trigger_keys(self.scenario.control.trigger))
+        named = policy.policies(policy.parse(self.scenario.control.trigger))
+        return any(each.name in TRIGGER_KEYS for each in named)
 
 
 ObjectiveName = Literal["table1", "rmse"]

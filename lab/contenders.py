@@ -188,8 +188,9 @@ def flying(contender: Contender, tuned: Scenario, scale: Scale) -> list[Flying]:
     if not key:
         return [Flying(contender, None, True, keys)]
     here = getattr(tuned.control, key)
-    # Of a whole number of steps there is no half.
-    values = {type(here)(round(here * factor, 9)) for factor in contender.factors[:: scale.every]}
+    values = {here * factor for factor in contender.factors[:: scale.every]}
+    if isinstance(here, int):  # steps
+        values = {max(1, round(value)) for value in values}
     return [
         Flying(contender, value, value == here, {**keys, f"control.{key}": value})
         for value in sorted(values)

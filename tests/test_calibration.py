@@ -114,6 +114,9 @@ def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
     assert event.score(flew(0.1, 0.2, 0.2)) == pytest.approx(0.8)
     assert every.score(flew(0.1, 1.0, 1.0)) == 0.1
     assert every.score(flew(float("nan"), 1.0, 1.0)) == UNFLYABLE
+    told, clock = weighs("paper(3.6, 1.5) & budget(5, 2)"), weighs("periodic(2) | heartbeat(1)")
+    assert told.score(flew(0.1, 0.2, 0.2)) == pytest.approx(0.8)
+    assert clock.score(flew(0.1, 0.5, 0.5)) == 0.1
 
 
 def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> None:
@@ -127,6 +130,9 @@ def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> 
     assert {key.key for key in weighs("paper").free()} == weights | own
     off = replace(PAPER, control=replace(PAPER.control, trigger="always", change_weight=0.0))
     assert {key.key for key in Rmse(off, 0.1).free()} == weights - {"control.change_weight"}
+    learns = replace(off.control, scheme="committed", observer_s=2.0, change_weight=0.1)
+    committed = Rmse(replace(off, control=learns), 0.1)
+    assert {key.key for key in committed.free()} == weights | {"control.observer_s"}
 
 
 @pytest.mark.parametrize(
