@@ -164,7 +164,7 @@ def draw(results: Results, runs: int) -> Drawn:
     asked = [each.holds for each in judged if each.holds is not None]
     verdict = (
         f"{sum(asked)} of the {len(asked)} ratios that are asked for hold with all of their 95 % "
-        f"interval."
+        "interval."
     )
     tables = [contenders_table(results, runs), ratios_table(judged), weights_table(results)]
     pictures = [curves(case, flown) for case, flown in results]
@@ -186,8 +186,7 @@ def tuned(flown: Sequence[Flown]) -> list[Flown]:
 
 def contenders_table(results: Results, runs: int) -> Table:
     """What each came to in each case."""
-    header = ["case", "contender", "threshold", "runs", "flown"]
-    header += [name for figure in FIGURES for name in (figure, f"{figure}_ci95")]
+    header = ("case", "contender", *_HEADER)
     rows, lines = [], []
     specs = (".4f", ".1%", ".2f", ",.0f")
     for case, flown in results:
@@ -208,6 +207,12 @@ def contenders_table(results: Results, runs: int) -> Table:
         says += f" {failed} runs never got a session and count in no mean."
     heading = ("case", "contender", "RMSE xy [m]", "steps sent", "packets up /s", "bytes /s")
     return Table("contenders", "Contenders", says, to_csv(header, rows), heading, lines)
+
+
+_HEADER = (
+    *("threshold", "runs", "flown"),
+    *(name for figure in FIGURES for name in (figure, f"{figure}_ci95")),
+)
 
 
 def _row(each: Flown) -> list[Any]:
@@ -281,19 +286,14 @@ def weights_table(results: Results) -> Table:
 
 
 def _weights(value: Any) -> str:
-    if value is None:
-        return ""
-    return (
-        ", ".join(f"{part:.4g}" for part in value)
-        if isinstance(value, tuple | list)
-        else (f"{value:.4g}")
-    )
+    """A number, or several, and nothing for none."""
+    parts = () if value is None else np.atleast_1d(value)
+    return ", ".join(f"{part:.4g}" for part in parts)
 
 
 def curves(case: Case, flown: Sequence[Flown]) -> Picture:
     """What a packet buys in a case."""
-    header = ["contender", "tuned", "threshold", "runs", "flown"]
-    header += [name for figure in FIGURES for name in (figure, f"{figure}_ci95")]
+    header = ("contender", "tuned", *_HEADER)
     rows = [[each.what.contender.name, each.what.tuned, *_row(each)] for each in flown]
     drawn = {
         contender.title: [each for each in flown if each.what.contender == contender]

@@ -396,6 +396,7 @@ class Bought:
 
 COLOURS = ("0.5", "#c1272d", "#e69f00", "black", "#56b4e9", "#0072b2", "#009e73")
 MARKERS = "sov^D<P"
+"""Of the curves of `trade`, in order; apart without colour, too."""
 
 
 def trade(  # noqa: PLR0917
@@ -407,7 +408,7 @@ def trade(  # noqa: PLR0917
     rows: Sequence[Sequence[Any]],
 ) -> Picture:
     """RMSE over what it costs, in packets and in bytes, with 95 % bands."""
-    with _figure(PAGE, 3.6) as figure:
+    with _figure(PAGE, 3.9) as figure:
         panes = figure.subplots(1, 2, sharey=True)
         for (label, points), colour, marker in zip(
             curves.items(), COLOURS[: len(curves)], MARKERS[: len(curves)], strict=True
@@ -440,7 +441,7 @@ def trade(  # noqa: PLR0917
             plane.set_xlabel(label)
         panes[0].set_ylabel("RMSE xy [m]")
         handles, labels = panes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=4)
+        figure.legend(handles, labels, loc="outside upper center", ncols=3)
     return _picture(figure, name, title, says, header, rows)
 
 
