@@ -1,21 +1,21 @@
-"""Numbers that the paper does not print, searched for: flown until they give its Table 1.
+"""What a search is after: the paper's Table 1, or the smallest error at a share of packets.
 
-The free keys of a scenario live on logarithmic scales between bounds. CMA-ES proposes a generation
-of points, each is flown with the same seeds in all columns of the table, and the squares of how far
-the entries are off, relatively, are what it is told. A search is a function of its settings and of
-what it was told: told the same again, from a log, it goes on where it was broken off.
+An objective flies a point of a search, a scenario, with the same seeds as every other, and says of
+what came out how good it is: the smaller the score, the better.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal, Protocol
 
 import numpy as np
 
-from shared import config
-from shared.config import ConfigError, Scenario
-from shared.summary import summarise
-from sim.flight import fly_batch
+from lab import sweep
+from lab.search import Free, plain
+from shared import config, policy
+from shared.config import Scenario
+from shared.summary import Summary
 
 COLUMNS: Mapping[str, Mapping[str, str]] = {
     "no compensation": {"scheme": "none", "trigger": "always"},
@@ -38,52 +38,24 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
 
 TOLERANCE = 0.1
 """Relative, of every entry; for the event ratio twice that."""
-UNFLYABLE = 1e3
+UNFLYABLE = 1e9
 """Score of a point that no flight survives."""
 
 Values = Mapping[str, Mapping[str, float]]
-"""Entries of the table, by column and name."""
+"""Figures of a point, by column and name."""
 
 
-@dataclass(frozen=True, slots=True)
-class Free:
-    """One key of a scenario, as in `control.state_weight.0`, and the bounds of its value."""
+class Objective(Protocol):
+    """What is searched for."""
 
-    key: str
-    low: float
-    high: float
+    def free(self) -> Sequence[Free]:
+        """Keys to change unless others are asked for."""
 
-    @classmethod
-    def parse(cls, text: str) -> "Free":
-        """KEY=LOW:HIGH.
+    def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
+        """The figures of a point; runs in a worker."""
 
-        Raises:
-            ConfigError: it is none.
-        """
-        key, _, bounds = text.partition("=")
-        try:
-            low, high = map(float, bounds.split(":"))
-        except ValueError:
-            raise ConfigError(f"--free: got {text!r}, expected KEY=LOW:HIGH") from None
-        if not 0.0 < low < high < np.inf:
-            raise ConfigError(f"--free: {key}: got the bounds {bounds}, expected 0 < LOW < HIGH")
-        return cls(key, low, high)
-
-    def of(self, table: Any) -> float:
-        """Its value in the table of a scenario."""
-        for name in self._path():
-            table = table[name]
-        return float(table)
-
-    def put(self, table: Any, value: float) -> None:
-        """Change its value in the table of a scenario."""
-        *path, last = self._path()
-        for name in path:
-            table = table[name]
-        table[last] = value
-
-    def _path(self) -> list[str | int]:
-        return [int(name) if name.isdigit() else name for name in self.key.split(".")]
+    def score(self, values: Values) -> float:
+        """How far they are from what is searched for."""
 
 
 FREE = (
@@ -100,82 +72,31 @@ FREE = (
 """What is searched for unless something else is asked for (E4)."""
 
 
-class Search:
-    """CMA-ES over free keys, from the values of a scenario.
+@dataclass(frozen=True, slots=True)
+class Table1:
+    """Every entry of Table 1 as the paper has it."""
 
-    Args:
-        sigma: first step, as a share of the (logarithmic) range of each key.
-    """
+    def free(self) -> Sequence[Free]:
+        """See `Objective`."""
+        return FREE
 
-    def __init__(
-        self, start: Scenario, free: Sequence[Free], *, population: int, sigma: float, seed: int
-    ) -> None:
-        import cma  # takes half a second to import
+    def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
+        """All columns: means over seeds."""
+        values: dict[str, dict[str, float]] = {}
+        for column, changes in COLUMNS.items():
+            table = plain(scenario)
+            table["control"] |= changes
+            runs = sweep.summaries(column, config.check(table, column), seeds)
+            values[column] = {name: _mean(runs, name) for name in TABLE_1[column]}
+        return values
 
-        self._start = start
-        self._free = free
-        low, high = np.log([key.low for key in free]), np.log([key.high for key in free])
-        self._low, self._range = low, high - low
-        here = (np.log([key.of(_plain(start)) for key in free]) - low) / self._range
-        rng = np.random.default_rng(seed)  # its own dice: numpy's global ones are anybody's
-        options = {
-            "bounds": [0, 1],
-            "popsize": population,
-            "verbose": -9,
-            "seed": np.nan,
-            "randn": lambda *shape: rng.standard_normal(shape),
-        }
-        self._search = cma.CMAEvolutionStrategy(np.clip(here, 0.01, 0.99), sigma, options)
-        self._points: list[Any] = []
-
-    def ask(self) -> list[Scenario]:
-        """The next generation; the first begins with the start itself."""
-        first = self._search.countiter == 0
-        self._points = self._search.ask()
-        if first:
-            self._points[0] = self._search.x0.copy()
-        return [self._scenario(point) for point in self._points]
-
-    def tell(self, scores: Sequence[float]) -> None:
-        """How each of them did."""
-        self._search.tell(self._points, scores)
-
-    def _scenario(self, point: Any) -> Scenario:
-        values = np.exp(self._low + self._range * point)
-        # Rounded, so that people can read the file, before it is flown.
-        return put(
-            self._start,
-            {key: float(f"{value:.4g}") for key, value in zip(self._free, values, strict=True)},
-        )
-
-    def values(self, scenario: Scenario) -> dict[str, float]:
-        """The free keys of a scenario."""
-        return {key.key: key.of(_plain(scenario)) for key in self._free}
-
-
-def put(scenario: Scenario, values: Mapping[Free, float]) -> Scenario:
-    """A scenario with other values of some keys."""
-    table = _plain(scenario)
-    for key, value in values.items():
-        key.put(table, value)
-    return config.check(table, "calibration")
-
-
-def fly_table(scenario: Scenario, seeds: Sequence[int]) -> Values:
-    """Table 1 as a scenario flies it: means over seeds."""
-    values: dict[str, dict[str, float]] = {}
-    for column, changes in COLUMNS.items():
-        table = _plain(scenario)
-        table["control"] |= changes
-        flown = config.check(table, column)
-        runs = [
-            summarise(flown, column, flight.client, flight.server, flight.netem)
-            for flight in fly_batch(flown, seeds)
-        ]
-        values[column] = {
-            name: float(np.mean([getattr(run, name) for run in runs])) for name in TABLE_1[column]
-        }
-    return values
+    def score(self, values: Values) -> float:
+        """Squares of all deviations; of an entry out of tolerance ten times as much."""
+        off = deviations(values)
+        if not np.isfinite(list(off.values())).all():
+            return UNFLYABLE
+        weights = [1.0 if within(name, value) else 10.0 for (_, name), value in off.items()]
+        return float(np.dot(weights, np.square(list(off.values()))))
 
 
 def deviations(values: Values) -> dict[tuple[str, str], float]:
@@ -185,15 +106,6 @@ def deviations(values: Values) -> dict[tuple[str, str], float]:
         for column, targets in TABLE_1.items()
         for name, target in targets.items()
     }
-
-
-def score(values: Values) -> float:
-    """Sum of the squares of the deviations; an entry out of tolerance weighs ten times as much."""
-    off = deviations(values)
-    if not np.isfinite(list(off.values())).all():
-        return UNFLYABLE
-    weights = [1.0 if within(name, value) else 10.0 for (_, name), value in off.items()]
-    return float(np.dot(weights, np.square(list(off.values()))))
 
 
 def within(name: str, deviation: float) -> bool:
@@ -206,30 +118,80 @@ def is_admissible(values: Values) -> bool:
     return all(within(name, value) for (_, name), value in deviations(values).items())
 
 
-def check_free(free: Sequence[Free], start: Scenario) -> None:
-    """Refuse keys that cannot be searched for.
+WEIGHTS = (
+    Free("control.state_weight.1", 1e-4, 1e4),
+    Free("control.terminal_weight.0", 1e-2, 1e6),
+    Free("control.terminal_weight.1", 1e-2, 1e6),
+    Free("control.input_weight", 1e-4, 1e4),
+    Free("control.change_weight", 1e-4, 1e4),
+)
+"""Only ratios matter: the weight on the position stays what it is."""
+TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
+    "paper": (Free("control.epsilon", 1e-4, 1e4), Free("control.decay_rate", 1e-2, 1e2)),
+    "cost_gap": (Free("control.cost_gap", 1e-6, 1e3),),
+    "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
+}
+"""Of the policies that look at the flight, so that weights and thresholds decide what they send."""
+SCHEME_KEYS: Mapping[str, Sequence[Free]] = {
+    "committed": (Free("control.observer_s", 0.05, 50.0),),
+}
+HERE = "here"
+"""The one column of a point that is flown as it is."""
 
-    Raises:
-        ConfigError: with the key, and what is there.
+
+def trigger_keys(trigger: str) -> Sequence[Free]:
+    """The keys of the policies in a trigger; one that is told its numbers has none."""
+    bare = (each.name for each in policy.policies(policy.parse(trigger)) if not each.values)
+    return [key for name in dict.fromkeys(bare) for key in TRIGGER_KEYS.get(name, ())]
+
+
+@dataclass(frozen=True, slots=True)
+class Rmse:
+    """The smallest RMSE xy, where the trigger has a say at no more than a share of packets.
+
+    Args:
+        scenario: what is flown, but for the keys that are searched for.
+        packets: most steps that may send, as a share.
     """
-    for key in free:
-        try:
-            value = key.of(_plain(start))
-        except (KeyError, IndexError, TypeError, ValueError):
-            raise ConfigError(
-                f"--free: got {key.key}, expected the key of a number, as in model.tau_s.0"
-            ) from None
-        if not key.low <= value <= key.high:
-            raise ConfigError(
-                f"--free: {key.key}: got the bounds {key.low:g} to {key.high:g}, "
-                f"expected them to hold {value:g}, where the search starts"
-            )
+
+    scenario: Scenario
+    packets: float
+
+    def free(self) -> Sequence[Free]:
+        """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
+        control, table = self.scenario.control, plain(self.scenario)
+        keys = [*WEIGHTS, *trigger_keys(control.trigger), *SCHEME_KEYS.get(control.scheme, ())]
+        return [key for key in keys if key.of(table) > 0.0]
+
+    def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
+        """Means over seeds, and how large the share of packets may be with others (95 %)."""
+        runs = sweep.summaries(HERE, scenario, seeds)
+        values = {name: _mean(runs, name) for name in ("rmse_xy", "event_ratio")}
+        _, half = sweep.estimate(runs, "event_ratio")
+        return {HERE: values | {"event_ratio_most": values["event_ratio"] + (half or 0.0)}}
+
+    def score(self, values: Values) -> float:
+        """RMSE xy [m], times the cube of how many times too many packets there may be."""
+        here = values[HERE]
+        over = here["event_ratio_most"] / self.packets if self._binds() else 1.0
+        score = here["rmse_xy"] * max(1.0, over) ** 3
+        return score if math.isfinite(score) else UNFLYABLE
+
+    def _binds(self) -> bool:
+        """Whether the share of packets follows from what is flown."""
+        named = policy.policies(policy.parse(self.scenario.control.trigger))
+        return any(each.name in TRIGGER_KEYS for each in named)
 
 
-def _plain(table: Any) -> Any:
-    """A table whose parts may be changed, of a scenario or of such a table."""
-    if isinstance(table, Scenario):
-        table = config.to_table(table)
-    if isinstance(table, Mapping):
-        return {name: _plain(value) for name, value in table.items()}
-    return [_plain(value) for value in table] if isinstance(table, list | tuple) else table
+ObjectiveName = Literal["table1", "rmse"]
+
+
+def objective(name: ObjectiveName, scenario: Scenario, packets: float) -> Objective:
+    """The objective of a name, see `Rmse` for the rest."""
+    return Rmse(scenario, packets) if name == "rmse" else Table1()
+
+
+def _mean(runs: Sequence[Summary], name: str) -> float:
+    """Mean of a figure; not a number where a run has none, for it did not fly."""
+    values = [getattr(run, name) for run in runs]
+    return math.nan if None in values else float(np.mean(values))

@@ -380,6 +380,71 @@ def _estimate_error(flight: Flight) -> Array:
     return norms
 
 
+@dataclass(frozen=True, slots=True)
+class Bought:
+    """What packets bought: a point of `trade`."""
+
+    packets_per_s: float
+    """Up."""
+    bytes_per_s: float
+    """Both ways."""
+    rmse_m: float | None
+    rmse_half_m: float | None
+    """Half the width of its 95 % interval."""
+    tuned: bool
+
+
+COLOURS = ("0.5", "#c1272d", "#e69f00", "black", "#56b4e9", "#0072b2", "#009e73")
+MARKERS = "sov^D<P"
+"""Of the curves of `trade`, in order; apart without colour, too."""
+
+
+def trade(  # noqa: PLR0917
+    name: str,
+    title: str,
+    says: str,
+    curves: Mapping[str, Sequence[Bought]],
+    header: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+) -> Picture:
+    """RMSE over what it costs, in packets and in bytes, with 95 % bands."""
+    with _figure(PAGE, 3.9) as figure:
+        panes = figure.subplots(1, 2, sharey=True)
+        for (label, points), colour, marker in zip(
+            curves.items(), COLOURS[: len(curves)], MARKERS[: len(curves)], strict=True
+        ):
+            flown = [point for point in points if point.rmse_m]
+            rmse, half = (
+                np.array([(point.rmse_m, point.rmse_half_m or 0.0) for point in flown], np.float64)
+                .reshape(-1, 2)
+                .T
+            )
+            large = [point.tuned for point in flown]
+            for plane, cost in zip(
+                panes,
+                (
+                    np.array([point.packets_per_s for point in flown]),
+                    np.array([point.bytes_per_s for point in flown]),
+                ),
+                strict=True,
+            ):
+                style: Any = {"color": colour, "marker": marker, "linestyle": "none"}
+                plane.plot(cost, rmse, color=colour, linewidth=0.8)
+                plane.plot(cost, rmse, **style, markersize=2.5)
+                plane.plot(cost[large], rmse[large], **style, markersize=6, label=label)
+                low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic scale has no 0
+                plane.fill_between(cost, low, rmse + half, color=colour, alpha=0.2, linewidth=0)
+                plane.errorbar(cost, rmse, [rmse - low, half], fmt="none", color=colour, lw=0.6)
+        for plane, label in zip(panes, ("packets up /s", "bytes /s, both ways"), strict=True):
+            plane.set_xscale("log")
+            plane.set_yscale("log")
+            plane.set_xlabel(label)
+        panes[0].set_ylabel("RMSE xy [m]")
+        handles, labels = panes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=3)
+    return _picture(figure, name, title, says, header, rows)
+
+
 def intervals(samples: Samples) -> Picture:
     """How many steps lie between two packets of the event trigger."""
     scenario, flights = samples[EVENT]

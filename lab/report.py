@@ -1,4 +1,4 @@
-"""The report of a reproduction: tables, figures, what they say, in one page that opens offline."""
+"""Reports: tables, figures, what they say, in a page that opens offline; and the reproduction's."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -27,6 +27,12 @@ from shared.config import Scenario
 from shared.model import Array
 from shared.summary import summarise
 from sim.flight import Flight
+
+TITLE = "Efficient networked UAV control using event-triggered predictive control, reproduced"
+ABOUT = (
+    "Jang, Son, Yoo, Kim, Johansson (2019), flown with Skytether: the same endpoints in virtual "
+    "time and over UDP."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +75,8 @@ class Table:
 class Drawn:
     """What the report shows."""
 
+    title: str
+    about: str
     tables: Sequence[Table]
     pictures: Sequence[Picture]
     verdict: str
@@ -94,7 +102,7 @@ def draw(measured: Measured) -> Drawn:
         plates.solve_times(servers, scenario.control.dt),
     ]
     tables = [paper_table(entries, columns), traffic_table(columns), real_table(measured)]
-    return Drawn(tables, pictures, verdict(entries, columns))
+    return Drawn(TITLE, ABOUT, tables, pictures, verdict(entries, columns))
 
 
 def paper_table(entries: Sequence[Entry], columns: Mapping[str, Cell]) -> Table:
@@ -102,8 +110,8 @@ def paper_table(entries: Sequence[Entry], columns: Mapping[str, Cell]) -> Table:
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     rows = [
         (
-            *(entry.column, entry.entry, _text(entry.paper, ".4f"), _text(entry.here, ".4f")),
-            *(_text(entry.ci95, ".4f"), _text(entry.deviation, "+.1%")),
+            *(entry.column, entry.entry, as_text(entry.paper, ".4f"), as_text(entry.here, ".4f")),
+            *(as_text(entry.ci95, ".4f"), as_text(entry.deviation, "+.1%")),
         )
         for entry in entries
     ]
@@ -131,7 +139,7 @@ def traffic_table(columns: Mapping[str, Cell]) -> Table:
         [[method, *(part for pair in pairs for part in pair)] for method, pairs in found.items()],
     )
     rows = [
-        (method, *(f"{_text(mean, ',.0f')} ± {_text(half, ',.0f')}" for mean, half in pairs))
+        (method, *(f"{as_text(mean, ',.0f')} ± {as_text(half, ',.0f')}" for mean, half in pairs))
         for method, pairs in found.items()
     ]
     share = [
@@ -174,7 +182,7 @@ def real_table(measured: Measured) -> Table:
             )
         )
     specs = ("", *[".4f"] * 6, ".3f", ".3f", ".2f", ".2f", "d", ".2f")
-    shown = [[_text(value, spec) for value, spec in zip(row, specs, strict=True)] for row in rows]
+    shown = [[as_text(value, spec) for value, spec in zip(row, specs, strict=True)] for row in rows]
     says = (
         f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
         f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
@@ -210,7 +218,8 @@ def _rmse(cell: Cell) -> float:
     return float("nan") if mean is None else mean
 
 
-def _text(value: Any, spec: str) -> str:
+def as_text(value: Any, spec: str) -> str:
+    """A number as a table shows it, and a dash for none."""
     return "–" if value is None else format(value, spec)
 
 

@@ -126,15 +126,18 @@ class Done(msgspec.Struct, frozen=True):
 
 def fly(task: Task) -> Done:
     """All runs of a task, in virtual time."""
-    flights = fly_batch(task.scenario, task.seeds)
-    runs = tuple(
+    return Done(task.cell, task.chunk, summaries(task.name, task.scenario, task.seeds))
+
+
+def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> tuple[Summary, ...]:
+    """What a scenario of some name gives, seed by seed, in virtual time."""
+    return tuple(
         summarise(
-            msgspec.structs.replace(task.scenario, seed=seed),
-            *(task.name, flight.client, flight.server, flight.netem),
+            msgspec.structs.replace(scenario, seed=seed),
+            *(name, flight.client, flight.server, flight.netem),
         )
-        for seed, flight in zip(task.seeds, flights, strict=True)
+        for seed, flight in zip(seeds, fly_batch(scenario, seeds), strict=True)
     )
-    return Done(task.cell, task.chunk, runs)
 
 
 class Sweep:
@@ -171,14 +174,7 @@ class Sweep:
 
     def _scenario(self, changes: Mapping[str, Any]) -> Scenario:
         table = config.to_table(self.scenario)
-        for path, value in changes.items():
-            *sections, key = path.split(".")
-            section = table
-            for name in sections:
-                section = section.setdefault(name, {})
-                if not isinstance(section, dict):
-                    raise ConfigError(f"--grid: {path}: no such key")
-            section[key] = value
+        lay(changes, table)
         where = ", ".join(f"{key}={value}" for key, value in changes.items())
         return config.check(table, f"{self.name} with {where}" if where else self.name)
 
@@ -233,6 +229,22 @@ class Sweep:
     def of_cell(self, done: Mapping[tuple[int, int], Done], cell: int) -> list[Summary]:
         """Its runs, by seed."""
         return [run for chunk in range(self.chunks) for run in done[cell, chunk].runs]
+
+
+def lay(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
+    """Put values where their keys say, as in `control.epsilon`.
+
+    Raises:
+        ConfigError: there cannot be such a key.
+    """
+    for path, value in changes.items():
+        *sections, key = path.split(".")
+        section = table
+        for name in sections:
+            section = section.setdefault(name, {})
+            if not isinstance(section, dict):
+                raise ConfigError(f"--grid: {path}: no such key")
+        section[key] = value
 
 
 FIGURES = (

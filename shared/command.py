@@ -218,6 +218,11 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
     return 0
 
 
+def show(table: Table) -> None:
+    """Print a table: a number cut off would be worse than a line too long."""
+    Console(width=max(Console().width, Console(width=1000).measure(table).maximum)).print(table)
+
+
 def finish(summary: Summary, title: str, json: Path | None = None) -> None:
     """Print a summary as a table, and write it to a file.
 

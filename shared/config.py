@@ -268,11 +268,15 @@ class Scenario(Section, frozen=True):
                 return shapes.from_csv(Path(config.file), axes)
 
 
-def names() -> list[str]:
-    """The scenarios that come with Skytether."""
+COMPARED = "compare"
+"""Folder of those that `skytether compare` flies."""
+
+
+def names(folder: str = "") -> list[str]:
+    """The scenarios that come with Skytether, those of a folder of theirs as in `compare/name`."""
     return sorted(
-        file.name.removesuffix(".toml")
-        for file in resources.files("scenarios").iterdir()
+        f"{folder}/{file.name}".lstrip("/").removesuffix(".toml")
+        for file in (resources.files("scenarios") / folder).iterdir()
         if file.name.endswith(".toml")
     )
 
@@ -319,7 +323,7 @@ def _read(name: str, seen: Mapping[Path, str] = MappingProxyType({})) -> dict[st
     """The raw table of a scenario, laid over those that it extends; `seen` extend it in turn."""
     if name.endswith(".toml"):
         path = Path(name)
-    elif name in names():
+    elif name in (*names(), *names(COMPARED)):
         path = Path(str(resources.files("scenarios") / f"{name}.toml"))
     else:
         raise ConfigError(f"{name}: no such scenario; {hint(name, names())}")

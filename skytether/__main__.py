@@ -17,7 +17,8 @@ reorders and loses their packets.
   fleet [SCENARIO]      many vehicles on one server, and what each costs it
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
   reproduce             the paper's table and figures, and more, as a report
-  calibrate [SCENARIO]  search for the numbers that the paper does not print
+  compare               schemes and triggers on the same seeds, each at its best weights
+  calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
   scenarios             what can be flown
   server [SCENARIO]     one process by hand: plan for vehicles
   netem [SCENARIO]      one process by hand: be the network
@@ -41,6 +42,7 @@ COMMANDS = {
     "fleet": "skytether.fleet:fleet",
     "sweep": "skytether.sweep:sweep",
     "reproduce": "skytether.reproduce:reproduce",
+    "compare": "skytether.compare:compare",
     "calibrate": "skytether.calibrate:calibrate",
     "scenarios": "skytether.__main__:list_scenarios",
     "server": "server.__main__:serve",

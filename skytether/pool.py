@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -15,10 +15,11 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
 from itertools import islice
+from pathlib import Path
 from typing import Annotated, TypeVar
 
 import tyro
@@ -106,6 +107,16 @@ class Crew:
                 "the same command goes on from here",
                 128 + signal.SIGINT,
             )
+
+    def flown(self, plan: Sweep, folder: Path, title: str) -> Mapping[tuple[int, int], Done]:
+        """What is done of a sweep, and that is all of it; see `fly`.
+
+        Args:
+            folder: of its journal.
+        """
+        with closing(Journal(folder, plan, metadata.version("skytether"))) as journal:
+            self.fly(plan, journal, title)
+            return journal.done
 
 
 @contextmanager

@@ -1,17 +1,9 @@
 """`skytether reproduce`: the paper's table and figures, and more, flown and put in a report."""
 
-import contextlib
 import json
-import os
-import platform
-import shlex
 import signal
-import subprocess
-import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from importlib import metadata
 from inspect import cleandoc
 from pathlib import Path
@@ -20,25 +12,19 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from lab import report, studies
 from lab.journal import Journal
 from lab.report import Measured
 from lab.studies import EVENT, EVERY, PERIODIC, Cells, Scale, Study
-from lab.sweep import Done, Sweep
 from shared import command, config, record
 from shared.command import CommandError
 from shared.config import ConfigError, Scenario
 from shared.model import Array
 from sim.flight import Flight, fly_batch
-from skytether import delays, pool, processes
+from skytether import delays, page, pool, processes
+from skytether.page import Call
 from skytether.pool import Crew, Scheduler, Workers, crew
-
-CALLS = "calls.jsonl"
-"""A line for each call that has added to the folder, or drawn it anew."""
-PACKAGES = ("skytether", "numpy", "scipy", "numba", "daqp", "msgpack", "matplotlib")
 
 
 @dataclass(frozen=True)
@@ -77,37 +63,18 @@ def reproduce(argv: Sequence[str]) -> None:
     if options.quick:
         scale = replace(studies.QUICK, runs=min(options.runs, studies.QUICK.runs))
     scenario = msgspec.structs.replace(config.load(studies.SCENARIO), duration=scale.duration)
-    began, began_s = datetime.now(UTC), time.monotonic()
+    call = Call.now("reproduce", argv)
     try:
         measured, runs = _measure(options, scenario, scale)
-        call = _call(argv, began, runs)
         drawn = report.draw(measured)
-        for picture in drawn.pictures:
-            for suffix, content in picture.files().items():
-                (options.out / f"{picture.name}{suffix}").write_bytes(content)
-        for table in drawn.tables:
-            (options.out / f"{table.name}.csv").write_text(table.csv)
-        call["seconds"] = round(time.monotonic() - began_s, 1)
-        with (options.out / CALLS).open("a") as file:
-            file.write(json.dumps(call) + "\n")
-        calls = [json.loads(line) for line in (options.out / CALLS).read_text().splitlines()]
-        (options.out / "report.html").write_text(report.html(drawn, scenario, calls))
+        page.write(options.out, drawn, scenario, call, runs)
     except ConfigError as error:
         raise CommandError(str(error), command.CONFIGURATION) from None
     except OSError as error:
         raise CommandError(f"{error.filename or options.out}: {error.strerror or error}") from None
-    _show(drawn.tables[0])
-    print(f"{options.out / 'report.html'}: {len(drawn.pictures)} figures; {runs} runs flown")
+    page.show(drawn.tables[0])
+    print(f"{options.out / page.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
-
-
-def _show(table: report.Table) -> None:
-    shown = Table(title=table.title, title_justify="left")
-    for heading in table.heading:
-        shown.add_column(heading)
-    for row in table.rows:
-        shown.add_row(*map(str, row))
-    Console().print(shown)
 
 
 def _measure(options: Options, scenario: Scenario, scale: Scale) -> tuple[Measured, int]:
@@ -118,18 +85,17 @@ def _measure(options: Options, scenario: Scenario, scale: Scale) -> tuple[Measur
     points = sum(study.runs * len(study.axis.values) for study in (table, *curves))
     total = points * (len(studies.METHODS.values) + 1)
     total += sum(len(plan.cells) * plan.runs for plan in (maps, periods))
-    version = metadata.version("skytether")
+    sweeps = options.out / "sweeps"
     # Another reproduction's folder is refused before anything is flown.
-    Journal(options.out / "sweeps" / table.name, table.first(), version).close()
+    Journal(sweeps / table.name, table.first(), metadata.version("skytether")).close()
     # First what is measured on the clock, while nobody else needs the cores.
     delay_ms = _delays(options.out, scenario, scale)
     real = {method: _really(options.out, table, method, scale) for method in (EVERY, EVENT)}
     with crew(options.workers, options.scheduler, "Table 1", total) as flyers:
-        fly = _Flyer(options.out, version, flyers)
-        table_cells = fly.study(table, "Table 1")
-        curve_cells = [fly.study(study, f"RMSE, {study.name}") for study in curves]
-        map_cells = fly.sweep(maps, "fig5", "Fig. 5")
-        period_cells = fly.sweep(periods, "fig5-periodic", "Fig. 5, periodic")
+        table_cells = _fly_study(flyers, sweeps, table, "Table 1")
+        curve_cells = [_fly_study(flyers, sweeps, study, f"RMSE, {study.name}") for study in curves]
+        map_cells = flyers.flown(maps, sweeps / "fig5", "Fig. 5")
+        period_cells = flyers.flown(periods, sweeps / "fig5-periodic", "Fig. 5, periodic")
     measured = Measured(
         table=(table, table_cells),
         curves=list(zip(curves, curve_cells, strict=True)),
@@ -142,27 +108,13 @@ def _measure(options: Options, scenario: Scenario, scale: Scale) -> tuple[Measur
     return measured, flyers.spent.runs
 
 
-@dataclass(frozen=True, slots=True)
-class _Flyer:
-    """Flies sweeps, each with a journal in a folder of its own."""
-
-    out: Path
-    version: str
-    crew: Crew
-
-    def sweep(self, plan: Sweep, name: str, title: str) -> Mapping[tuple[int, int], Done]:
-        """What is done of it, and that is all of it."""
-        with closing(Journal(self.out / "sweeps" / name, plan, self.version)) as journal:
-            self.crew.fly(plan, journal, title)
-            return journal.done
-
-    def study(self, study: Study, title: str) -> Cells:
-        """Both its sweeps."""
-        first = study.first()
-        firstly = self.sweep(first, study.name, title)
-        second = study.second(studies.flown(first, firstly))
-        secondly = self.sweep(second, f"{study.name}-periodic", f"{title}, periodic")
-        return studies.cells(study, first, firstly, second, secondly)
+def _fly_study(flyers: Crew, out: Path, study: Study, title: str) -> Cells:
+    """Both its sweeps."""
+    first = study.first()
+    firstly = flyers.flown(first, out / study.name, title)
+    second = study.second(studies.flown(first, firstly))
+    secondly = flyers.flown(second, out / f"{study.name}-periodic", f"{title}, periodic")
+    return studies.cells(study, first, firstly, second, secondly)
 
 
 def _delays(out: Path, scenario: Scenario, scale: Scale) -> Array:
@@ -241,36 +193,3 @@ def _keep(file: Path, write: Callable[[Any], None]) -> None:
     with part.open("wb") as sink:
         write(sink)
     part.replace(file)
-
-
-def _call(argv: Sequence[str], began: datetime, runs: int) -> dict[str, Any]:
-    """What a reader has to know about this call."""
-    model = platform.processor() or platform.machine()
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-        model = names[0] if names else model
-    return {
-        "command": shlex.join(["skytether", "reproduce", *argv]),
-        "date": began.isoformat(timespec="seconds"),
-        "runs": runs,
-        "machine": f"{model}, {len(os.sched_getaffinity(0))} cores, {platform.platform()}",
-        "python": platform.python_version(),
-        "versions": {name: metadata.version(name) for name in PACKAGES},
-        "commit": _commit(),
-    }
-
-
-def _commit() -> str | None:
-    """Of the checkout that this runs from, where it is one."""
-    with contextlib.suppress(OSError):
-        run = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=12", "--dirty"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if run.returncode == 0:
-            return run.stdout.strip()
-    return None

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -110,8 +109,7 @@ def _finish(options: Options, plan: Sweep, journal: Journal, spent: Spent) -> No
         for figure, (_, spec) in shown.items():
             row.append(_interval(*estimate(runs, figure), spec))
         table.add_row(*map(Text, row))
-    # A number cut off would be worse than a line too long.
-    Console(width=max(Console().width, Console(width=1000).measure(table).maximum)).print(table)
+    command.show(table)
     failed = sum(not run.steps for runs in cells for run in runs)
     if failed:
         print(f"{failed} runs found no server and count in no mean of the error")

@@ -7,7 +7,9 @@ import pytest
 from msgspec.structs import replace
 
 from lab import calibration
-from lab.calibration import COLUMNS, TABLE_1, Free, Search
+from lab.calibration import COLUMNS, HERE, TABLE_1, UNFLYABLE, Rmse, Table1
+from lab.search import Free, Search, check_free, put
+from lab.sweep import interval, summaries
 from shared import config
 from shared.config import ConfigError
 from skytether.__main__ import main
@@ -48,7 +50,7 @@ def test_a_free_key_that_is_none_is_refused(text: str, said: str) -> None:
 def test_a_free_key_is_read_as_it_is_meant() -> None:
     """A number in a list goes by its place."""
     assert Free.parse("model.tau_s.0=0.2:2") == LAG
-    assert calibration.put(PAPER, {LAG: 0.5, RADIUS: 2.0}) == replace(
+    assert put(PAPER, {LAG: 0.5, RADIUS: 2.0}) == replace(
         PAPER,
         model=replace(PAPER.model, tau_s=(0.5,)),
         reference=replace(PAPER.reference, radius_m=2.0),
@@ -70,7 +72,7 @@ def test_a_free_key_is_read_as_it_is_meant() -> None:
 def test_what_cannot_be_searched_for_is_refused(free: Free, said: str) -> None:
     """Before anything is flown."""
     with pytest.raises(ConfigError) as refused:
-        calibration.check_free([free], PAPER)
+        check_free([free], PAPER)
     assert str(refused.value).startswith(f"--free: {said}")
 
 
@@ -84,13 +86,85 @@ def off_by(share: float) -> calibration.Values:
 
 def test_the_score_is_the_squares_of_the_deviations_and_punishes_those_out_of_tolerance() -> None:
     """Ten entries; the event ratio may be twice as far off as the others."""
-    assert calibration.score(TABLE_1) == 0.0
-    assert calibration.score(off_by(0.05)) == pytest.approx(10 * 0.05**2)
-    assert calibration.score(off_by(0.15)) == pytest.approx((9 * 10 + 1) * 0.15**2)
-    assert calibration.score(off_by(float("nan"))) == calibration.UNFLYABLE
+    assert Table1().score(TABLE_1) == 0.0
+    assert Table1().score(off_by(0.05)) == pytest.approx(10 * 0.05**2)
+    assert Table1().score(off_by(0.15)) == pytest.approx((9 * 10 + 1) * 0.15**2)
+    assert Table1().score(off_by(float("nan"))) == UNFLYABLE
     assert calibration.is_admissible(off_by(-0.09))
     assert not calibration.is_admissible(off_by(0.11))
     assert set(COLUMNS) == set(TABLE_1)
+
+
+def weighs(trigger: str) -> Rmse:
+    """The smallest error at a tenth of the steps, with a trigger."""
+    return Rmse(replace(PAPER, control=replace(PAPER.control, trigger=trigger)), 0.1)
+
+
+def flew(rmse_xy: float, event_ratio: float, most: float) -> calibration.Values:
+    """What a point came to."""
+    here = {"rmse_xy": rmse_xy, "event_ratio": event_ratio, "event_ratio_most": most}
+    return {HERE: here}
+
+
+def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
+    """It is scored by what other seeds may send, where the trigger decides."""
+    event, every = weighs("paper"), weighs("always")
+    assert event.score(flew(0.2, 0.08, 0.09)) == 0.2
+    assert event.score(flew(0.2, 0.09, 0.11)) == pytest.approx(0.2 * 1.1**3)
+    assert event.score(flew(0.1, 0.2, 0.2)) == pytest.approx(0.8)
+    assert every.score(flew(0.1, 1.0, 1.0)) == 0.1
+    assert every.score(flew(float("nan"), 1.0, 1.0)) == UNFLYABLE
+    told, clock = weighs("paper(3.6, 1.5) & budget(5, 2)"), weighs("periodic(2) | heartbeat(1)")
+    assert told.score(flew(0.1, 0.2, 0.2)) == pytest.approx(0.8)
+    assert clock.score(flew(0.1, 0.5, 0.5)) == 0.1
+
+
+def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> None:
+    """The position's weight stays, for only ratios matter; so does what is switched off."""
+    weights = {
+        *("control.state_weight.1", "control.terminal_weight.0", "control.terminal_weight.1"),
+        *("control.input_weight", "control.change_weight"),
+    }
+    assert {key.key for key in weighs("always").free()} == weights
+    own = {"control.epsilon", "control.decay_rate"}
+    assert {key.key for key in weighs("paper").free()} == weights | own
+    off = replace(PAPER, control=replace(PAPER.control, trigger="always", change_weight=0.0))
+    assert {key.key for key in Rmse(off, 0.1).free()} == weights - {"control.change_weight"}
+    learns = replace(off.control, scheme="committed", observer_s=2.0, change_weight=0.1)
+    committed = Rmse(replace(off, control=learns), 0.1)
+    assert {key.key for key in committed.free()} == weights | {"control.observer_s"}
+
+
+@pytest.mark.parametrize(
+    ("trigger", "keys"),
+    [
+        ("periodic", []),
+        ("cost_gap & budget(5, 2)", ["control.cost_gap"]),
+        ("deviation | heartbeat(1)", ["control.deviation_m"]),
+        ("paper(3.6, 1.5)", []),
+        ("cost_gap | (cost_gap & always)", ["control.cost_gap"]),
+    ],
+)
+def test_a_trigger_has_the_keys_of_the_policies_in_it(trigger: str, keys: list[str]) -> None:
+    """But not of those that are told their own numbers."""
+    assert [key.key for key in calibration.trigger_keys(trigger)] == keys
+
+
+def test_a_point_is_its_flights_with_an_upper_end_of_what_they_send() -> None:
+    """Mean, and the upper end of the 95 % interval; one that does not fly is no number."""
+    short = replace(PAPER, duration=4.0, settle=0.0)
+    here = Rmse(short, 0.1).fly(short, [5, 6, 7])[HERE]
+    runs = summaries("", short, [5, 6, 7])
+    ratios = [run.event_ratio for run in runs if run.event_ratio is not None]
+    mean, half = interval(ratios)
+    assert mean is not None
+    assert half is not None
+    assert here["event_ratio"] == pytest.approx(mean)
+    assert here["event_ratio_most"] == pytest.approx(mean + half)
+    assert here["rmse_xy"] == pytest.approx(sum(run.rmse_xy or 0.0 for run in runs) / 3)
+    deaf = replace(short.network.uplink, loss=1.0)
+    deaf = replace(short, network=replace(short.network, uplink=deaf))
+    assert Rmse(deaf, 0.1).score(Rmse(deaf, 0.1).fly(deaf, [5])) == UNFLYABLE
 
 
 def test_a_search_begins_where_it_was_told_to() -> None:
@@ -151,6 +225,31 @@ def test_a_search_goes_on_from_its_log_though_a_line_was_cut(
     assert "of 8 points have every entry within tolerance" in capsys.readouterr().out
 
 
+def test_the_smallest_error_is_searched_for_and_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Weights and the trigger's own keys; the first point is the scenario's, the best no worse."""
+    argv = ["calibrate", "paper", "--objective", "rmse", "--packets", "0.3", *ARGV[5:]]
+    assert main([*argv, "--generations", "2", "--out", str(tmp_path)]) == 0
+    settings, *generations = map(json.loads, (tmp_path / "log.jsonl").read_text().splitlines())
+    assert (settings["objective"], settings["packets"]) == ("rmse", 0.3)
+    points = [point for generation in generations for point in generation]
+    best = min(points, key=lambda point: point["score"])
+    found = config.load(str(tmp_path / "best.toml"))
+    assert found.control.epsilon == best["keys"]["control.epsilon"]
+    assert found.control.state_weight == (
+        PAPER.control.state_weight[0],
+        best["keys"]["control.state_weight.1"],
+    )
+    assert points[0]["keys"]["control.input_weight"] == PAPER.control.input_weight
+    assert best["score"] < points[0]["score"]
+    said = capsys.readouterr().out
+    assert f"{best['values'][HERE]['rmse_xy']:.4f}" in said
+    assert f"{best['values'][HERE]['event_ratio']:.4f}" in said
+    assert main([*argv, "--packets", "0.2", "--generations", "2", "--out", str(tmp_path)]) == 2
+    assert "holds a search with another packets" in capsys.readouterr().err
+
+
 def test_another_search_in_the_same_folder_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -183,6 +282,7 @@ def test_a_log_that_does_not_fit_the_search_is_refused(
         (["--runs", "0"], "--runs: got 0, expected 1 to 1000"),
         (["--population", "1"], "--population: got 1, expected 4 to 1000"),
         (["--sigma", "0"], "--sigma: got 0, expected more than 0, at most 1"),
+        (["--packets", "2"], "--packets: got 2, expected more than 0, at most 1"),
         (["--free", "model.tau_s"], "--free: got 'model.tau_s', expected KEY=LOW:HIGH"),
     ],
 )

@@ -93,6 +93,7 @@ def test_every_documented_command_is_tested() -> None:
     known = ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
     known += ("skytether scenarios", "skytether calibrate ")
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
+    known += ("skytether compare",)  # by test_compare.py
     known += ("docker compose up",)
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:

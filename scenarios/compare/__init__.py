@@ -1,0 +1,1 @@
+"""What `skytether compare` flies: each contender in each case, at the weights found for it."""

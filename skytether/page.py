@@ -1,0 +1,116 @@
+"""The folder of a report: its page, each table and figure beside it, and the calls that made it."""
+
+import contextlib
+import json
+import os
+import platform
+import shlex
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import rich.table
+from rich.text import Text
+
+from lab import report
+from lab.report import Drawn, Table
+from shared import command
+from shared.config import Scenario
+
+PAGE = "report.html"
+CALLS = "calls.jsonl"
+"""A line for each call that has added to the folder, or drawn it anew."""
+PACKAGES = ("skytether", "numpy", "scipy", "numba", "daqp", "msgpack", "matplotlib")
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A command under way."""
+
+    command: str
+    began: datetime
+    began_s: float
+    """On a clock that nobody sets."""
+
+    @classmethod
+    def now(cls, name: str, argv: Sequence[str]) -> "Call":
+        """The command of this name begins."""
+        return cls(shlex.join(["skytether", name, *argv]), datetime.now(UTC), time.monotonic())
+
+    def facts(self, runs: int) -> dict[str, Any]:
+        """What a reader has to know about it.
+
+        Args:
+            runs: that were flown.
+        """
+        return {
+            "command": self.command,
+            "date": self.began.isoformat(timespec="seconds"),
+            "runs": runs,
+            "machine": f"{_processor()}, {len(os.sched_getaffinity(0))} cores, "
+            f"{platform.platform()}",
+            "python": platform.python_version(),
+            "versions": {name: metadata.version(name) for name in PACKAGES},
+            "commit": _commit(),
+            "seconds": round(time.monotonic() - self.began_s, 1),
+        }
+
+
+def write(out: Path, drawn: Drawn, scenario: Scenario, call: Call, runs: int) -> None:
+    """All files of a report.
+
+    Args:
+        scenario: what it is about.
+        runs: flown by this call.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    for picture in drawn.pictures:
+        for suffix, content in picture.files().items():
+            (out / f"{picture.name}{suffix}").write_bytes(content)
+    for table in drawn.tables:
+        (out / f"{table.name}.csv").write_text(table.csv)
+    with (out / CALLS).open("a") as file:
+        file.write(json.dumps(call.facts(runs)) + "\n")
+    calls = [json.loads(line) for line in (out / CALLS).read_text().splitlines()]
+    (out / PAGE).write_text(report.html(drawn, scenario, calls))
+
+
+def show(table: Table) -> None:
+    """Print a table of a report."""
+    shown = rich.table.Table(title=table.title, title_justify="left")
+    for heading in table.heading:
+        shown.add_column(Text(heading), no_wrap=True)
+    for row in table.rows:
+        shown.add_row(*map(Text, row))
+    command.show(shown)
+
+
+def _processor() -> str:
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """Of the checkout that this runs from, where it is one."""
+    with contextlib.suppress(OSError):
+        run = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--dirty"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if run.returncode == 0:
+            return run.stdout.strip()
+    return None

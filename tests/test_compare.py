@@ -1,0 +1,422 @@
+"""The comparison: who flies in what, at which weights, what is said of it, and its files."""
+
+import csv
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from lab import contenders
+from lab.calibration import Rmse
+from lab.comparison import CLAIMS, Claim, Flown, judge, measure, ratio
+from lab.contenders import CASES, CONTENDERS, Contender, Flying
+from shared import config
+from shared.config import COMPARED, Scenario
+from shared.summary import summarise
+from sim import flight
+from skytether import pool
+from skytether.__main__ import main
+
+PAPER = config.load("paper")
+BY_NAME = {contender.name: contender for contender in CONTENDERS}
+SCALE = contenders.full(100, 40)
+QUIET = CASES[0]
+
+
+# -- what is flown -------------------------------------------------------------------------------
+
+
+def test_contenders_differ_in_scheme_and_trigger_alone_and_cases_in_the_vehicle() -> None:
+    """Plant, network, trajectory and weights are where the search starts for all."""
+    for case in CASES:
+        for contender in CONTENDERS:
+            start = contenders.search_start(contender, case, SCALE)
+            keys = set(contenders.differences(start))
+            own = {f"control.{key}" for key in contender.control} | set(case.keys)
+            assert keys <= own
+            assert start.seed == 1001
+    slow = contenders.search_start(CONTENDERS[0], CASES[-1], SCALE)
+    assert slow.vehicle.tau_s[0] == pytest.approx(1.25 * PAPER.model.tau_s[0])
+    assert slow.model == PAPER.model
+
+
+def test_the_search_never_sees_the_seeds_that_are_compared() -> None:
+    """However many runs are asked for, up to a thousand."""
+    start = contenders.search_start(CONTENDERS[0], QUIET, SCALE)
+    assert not set(range(start.seed, start.seed + SCALE.search_runs)) & set(range(1, 1001))
+
+
+@pytest.mark.parametrize("name", config.names(COMPARED))
+def test_a_scenario_that_comes_along_is_its_contender_with_weights_that_were_free(
+    name: str,
+) -> None:
+    """Nothing else was changed to make it fly better; it flies by its name."""
+    (pair,) = [
+        (contender, case)
+        for contender in CONTENDERS
+        for case in CASES
+        if f"{COMPARED}/{contenders.file_name(contender, case)}" == f"{name}.toml"
+    ]
+    start = contenders.search_start(*pair, SCALE)
+    scenario, free = config.load(name), Rmse(start, 0.1).free()
+    there = contenders.differences(start)
+    changed = {
+        key for key, value in contenders.differences(scenario).items() if value != there.get(key)
+    }
+    assert changed <= {key.key.removesuffix(".0").removesuffix(".1") for key in free}
+    assert scenario.control.state_weight[0] == PAPER.control.state_weight[0]
+    assert "compare" not in " ".join(config.names())
+
+
+def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
+    """It holds what differs from the plant, and where it comes from."""
+    contender, case = BY_NAME["committed-gap"], CASES[-1]
+    start = contenders.search_start(contender, case, SCALE)
+    control = replace(start.control, state_weight=(7.1, 1e-4), cost_gap=12.5)
+    found = replace(start, control=control)
+    file = tmp_path / contenders.file_name(contender, case)
+    file.write_bytes(contenders.to_file(contender, case, found, "Found."))
+    read = config.load(str(file))
+    assert replace(read, title="") == replace(
+        found, title="", duration=PAPER.duration, seed=PAPER.seed
+    )
+    assert file.read_text().startswith("# Found.\n")
+    assert "radius" not in file.read_text()
+
+
+def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, bool]:
+    """Those of its curve, and which is tuned."""
+    points = contenders.flying(contender, scenario, SCALE)
+    return {point.threshold: point.tuned for point in points}
+
+
+def test_a_curve_goes_through_what_was_found_and_rises() -> None:
+    """Thresholds around it; whole steps of a period, none of them twice; one point of `always`."""
+    gap = replace(PAPER, control=replace(PAPER.control, cost_gap=0.8))
+    found = thresholds(BY_NAME["committed-gap"], gap)
+    assert list(found) == [0.05, 0.2, 0.4, 0.8, 1.0, 1.6, 6.4]
+    assert [value for value, tuned in found.items() if tuned] == [0.8]
+    assert list(thresholds(BY_NAME["paper-periodic"], PAPER)) == [1, 2, 5, 10, 15, 20, 40]
+    often = replace(PAPER, control=replace(PAPER.control, period=2))
+    assert list(thresholds(BY_NAME["paper-periodic"], often)) == [1, 2, 3, 4, 8]
+    assert thresholds(BY_NAME["paper-every-step"], PAPER) == {None: True}
+
+
+# -- what is said of it --------------------------------------------------------------------------
+
+SUMMARY = summarise(PAPER, "paper", flight.fly(replace(PAPER, duration=6.0)).client)
+
+
+def flew(
+    name: str,
+    errors: Sequence[float | None],
+    *,
+    share: float = 0.1,
+    threshold: float | None = None,
+    tuned: bool = True,
+) -> Flown:
+    """A contender with these errors, that sent a share of its 20 packets/s."""
+    counts = {"uplink_packets": round(1200 * share), "uplink_bytes": 60_000}
+    counts |= {"downlink_packets": 1200, "downlink_bytes": 120_000}
+    runs = [
+        replace(SUMMARY, rmse_xy=error, event_ratio=share, duration_s=60.0, **counts)
+        for error in errors
+    ]
+    return Flown(Flying(BY_NAME[name], threshold, tuned, {}), runs)
+
+
+def test_packets_and_bytes_are_of_a_second_of_flight() -> None:
+    """Bytes both ways; what has not flown counts in nothing."""
+    one = flew("paper-event", [0.1, None, 0.3])
+    assert one.estimate("rmse_xy")[0] == pytest.approx(0.2)
+    assert one.estimate("uplink_packets_per_s")[0] == pytest.approx(2.0)
+    assert one.estimate("total_bytes_per_s")[0] == pytest.approx(3000.0)
+    assert measure(one.runs[1], "uplink_packets_per_s") is None
+    assert math.isnan(flew("paper-event", [None]).mean("rmse_xy"))
+
+
+ERRORS = st.lists(st.tuples(st.floats(0.01, 10.0), st.floats(0.01, 10.0)), min_size=2, max_size=30)
+
+
+@given(ERRORS, st.floats(0.1, 10.0))
+@settings(max_examples=30)
+def test_a_ratio_lies_in_its_interval_and_goes_with_what_is_compared(
+    errors: list[tuple[float, float]], factor: float
+) -> None:
+    """Of the means; twice the error is twice the ratio, and its interval."""
+    ours, theirs = zip(*errors, strict=True)
+    found = ratio(flew("paper-event", ours), flew("paper-periodic", theirs))
+    more = ratio(flew("paper-event", np.multiply(ours, factor)), flew("paper-periodic", theirs))
+    assert found is not None
+    assert more is not None
+    value, low, high = found
+    assert value == pytest.approx(np.mean(ours) / np.mean(theirs))
+    assert low <= high
+    assert min(np.divide(ours, theirs)) - 1e-9 <= low
+    assert high <= max(np.divide(ours, theirs)) + 1e-9
+    np.testing.assert_allclose(more, np.multiply(found, factor))
+
+
+def test_an_interval_is_of_pairs() -> None:
+    """What varies from seed to seed for both alike does not widen it; unpaired it would."""
+    rng = np.random.default_rng(3)
+    seeds = rng.uniform(0.1, 1.0, 50)
+    found = ratio(flew("paper-event", 0.5 * seeds), flew("paper-periodic", seeds))
+    assert found == pytest.approx((0.5, 0.5, 0.5))
+    mixed = ratio(flew("paper-event", 0.5 * rng.permutation(seeds)), flew("paper-periodic", seeds))
+    assert mixed is not None
+    assert mixed[2] - mixed[1] > 0.05
+
+
+def test_a_bootstrap_is_an_interval_of_students_where_both_apply() -> None:
+    """Errors spread little, so that the ratio of means is nearly linear."""
+    rng = np.random.default_rng(4)
+    ours, theirs = 1.0 + 0.05 * rng.standard_normal((2, 100))
+    found = ratio(flew("paper-event", ours), flew("paper-periodic", theirs))
+    assert found is not None
+    half = 1.984 * np.std(ours - theirs, ddof=1) / math.sqrt(100)
+    assert found[1] == pytest.approx(found[0] - half, abs=0.2 * half)
+    assert found[2] == pytest.approx(found[0] + half, abs=0.2 * half)
+
+
+def test_seeds_that_did_not_fly_in_both_are_left_out() -> None:
+    """And fewer than two are no comparison."""
+    ours, theirs = flew("paper-event", [1.0, None, 3.0]), flew("paper-periodic", [2.0, 2.0, 2.0])
+    found = ratio(ours, theirs)
+    assert found is not None
+    assert found[0] == pytest.approx(1.0)
+    assert ratio(flew("paper-event", [1.0, None]), flew("paper-periodic", [2.0, 2.0])) is None
+
+
+CLAIM = Claim("committed-gap", "committed-periodic", at_most={"quiet": 0.9})
+PERIODIC = flew("committed-periodic", [1.0, 1.1, 1.2])
+
+
+def curve(*points: tuple[float, float, float]) -> list[Flown]:
+    """Of the cost gap: threshold, share of packets, error; the first of them is tuned."""
+    return [
+        flew(
+            "committed-gap",
+            [error, 1.1 * error, 1.2 * error],
+            share=share,
+            threshold=threshold,
+            tuned=threshold == points[0][0],
+        )
+        for threshold, share, error in points
+    ]
+
+
+def test_what_sends_too_much_is_judged_at_the_next_threshold_that_does_not() -> None:
+    """Not at the best of the curve: that would be chosen on the seeds that are reported."""
+    judged = judge(CLAIM, QUIET, [*curve((1, 0.11, 0.5), (2, 0.09, 0.8), (8, 0.05, 0.7)), PERIODIC])
+    assert judged.ours.what.threshold == 2
+    assert judged.ratio is not None
+    assert judged.ratio[0] == pytest.approx(0.8)
+    assert judged.holds
+    never = judge(CLAIM, QUIET, [*curve((1, 0.3, 0.5), (2, 0.2, 0.5)), PERIODIC])
+    assert never.holds is False
+    sparse = judge(CLAIM, QUIET, [*curve((1, 0.1, 0.5), (2, 0.09, 0.8)), PERIODIC])
+    assert sparse.ours.what.threshold == 1
+
+
+def test_a_claim_holds_with_all_of_its_interval_or_not_at_all() -> None:
+    """And where nothing is asked for, it neither does nor does not."""
+    assert not judge(CLAIM, QUIET, [*curve((1, 0.1, 0.95)), PERIODIC]).holds
+    wide = flew("committed-gap", [0.1, 0.1, 1.9], threshold=1)
+    judged = judge(CLAIM, QUIET, [wide, PERIODIC])
+    assert judged.ratio is not None
+    assert judged.ratio[0] < 0.9 < judged.ratio[2]
+    assert judged.holds is False
+    assert judge(CLAIM, CASES[-1], [*curve((1, 0.1, 0.5)), PERIODIC]).holds is None
+
+
+def test_a_share_of_the_steps_may_be_the_limit() -> None:
+    """Against one that sends at every step, the same packets would be no limit."""
+    claim = Claim("committed-gap", "paper-every-step", 0.1, {"quiet": 0.75})
+    every = flew("paper-every-step", [1.0, 1.1, 1.2], share=1.0)
+    assert judge(claim, QUIET, [*curve((1, 0.09, 0.5)), every]).holds
+    assert not judge(claim, QUIET, [*curve((1, 0.11, 0.5)), every]).holds
+
+
+def test_what_is_claimed_is_what_was_asked_for() -> None:
+    """All of it about contenders and cases that there are."""
+    for claim in CLAIMS:
+        assert {claim.ours, claim.theirs} <= BY_NAME.keys()
+        assert set(claim.at_most) <= {case.name for case in CASES}
+
+
+# -- the command ---------------------------------------------------------------------------------
+
+TUNE = ["compare", "--quick", "--tune", "--generations", "1", "--workers", "1"]
+FLOWN = 102
+"""Runs of a quick comparison: in two cases two contenders at one threshold, five at three."""
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with quick weights, and the logs of their searches in `out`."""
+    folder = tmp_path_factory.mktemp("tuned")
+    assert main([*TUNE, "--scenarios", str(folder), "--out", str(folder / "out")]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def out(tuned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a quick comparison."""
+    folder = tmp_path_factory.mktemp("compare")
+    assert main(["compare", "--quick", "--scenarios", str(tuned), "--out", str(folder)]) == 0
+    return folder
+
+
+def test_every_contender_gets_the_same_search(tuned: Path) -> None:
+    """Seeds, points and flights; what it found is its scenario."""
+    logs = sorted((tuned / "out" / "searches").iterdir())
+    assert len(logs) == len(list(tuned.glob("*.toml"))) == 2 * len(CONTENDERS)
+    for log in logs:
+        head, generation = map(json.loads, (log / "log.jsonl").read_text().splitlines())
+        same = (head["runs"], head["population"], head["sigma"], head["packets"], len(generation))
+        assert same == (2, 4, 0.1, 0.1, 4)
+        best = min(generation, key=lambda point: point["score"])
+        found = config.load(str(tuned / f"{log.name}.toml"))
+        assert found.control.input_weight == best["keys"]["control.input_weight"]
+        assert found.duration == PAPER.duration
+
+
+def test_searches_that_are_done_are_not_done_again(
+    tuned: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same command reads their logs, and writes the same."""
+    kept = {path: path.read_bytes() for path in tuned.rglob("*") if path.is_file()}
+    monkeypatch.setattr(pool, "share", None)
+    assert main([*TUNE, "--scenarios", str(tuned), "--out", str(tuned / "out")]) == 0
+    assert {path: path.read_bytes() for path in tuned.rglob("*") if path.is_file()} == kept
+
+
+def rows(file: Path) -> list[dict[str, str]]:
+    """Of a table."""
+    return list(csv.DictReader(file.read_text().splitlines()))
+
+
+def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None:
+    """Means over the seeds from 1 on, of the scenario in the folder."""
+    table = rows(out / "contenders.csv")
+    assert [row["contender"] for row in table] == [each.name for each in CONTENDERS] * 2
+    (row,) = [
+        row for row in table if (row["case"], row["contender"]) == ("wind-0.3", "committed-gap")
+    ]
+    scenario = replace(config.load(str(tuned / "committed-gap-wind-0.3.toml")), duration=15.0)
+    runs = [
+        summarise(scenario, "", each.client, each.server, each.netem)
+        for each in flight.fly_batch(scenario, [1, 2, 3])
+    ]
+    errors, packets = zip(*((run.rmse_xy, run.uplink_packets) for run in runs), strict=True)
+    assert float(row["rmse_xy"]) == pytest.approx(np.mean(errors))
+    assert float(row["uplink_packets_per_s"]) == pytest.approx(np.mean(packets) / 15.0)
+    assert float(row["threshold"]) == scenario.control.cost_gap
+    (weights,) = [
+        row
+        for row in rows(out / "weights.csv")
+        if (row["case"], row["contender"]) == ("wind-0.3", "committed-gap")
+    ]
+    assert float(weights["control.cost_gap"]) == pytest.approx(scenario.control.cost_gap, rel=1e-3)
+    assert len(rows(out / "ratios.csv")) == 2 * len(CLAIMS)
+
+
+def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
+    """A row for each point, one of each contender tuned, and PNG and PDF beside it."""
+    for name in ("trade-quiet", "trade-wind-0.3"):
+        assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert (out / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        points = rows(out / f"{name}.csv")
+        assert len(points) == FLOWN // 6
+        found = [row["contender"] for row in points if row["tuned"] == "true"]
+        assert found == [each.name for each in CONTENDERS]
+        assert all(row["flown"] == row["runs"] == "3" for row in points)
+    page = (out / "report.html").read_text()
+    for contender in CONTENDERS:
+        assert contender.title in page
+    assert "http" not in page
+
+
+def test_the_second_time_it_only_draws(
+    out: Path, tuned: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And says the same."""
+    kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert main(["compare", "--quick", "--scenarios", str(tuned), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "2 figures; 0 runs flown" in said
+    assert "ratios that are asked for hold" in said
+    changed = {path.name for path, content in kept.items() if path.read_bytes() != content}
+    assert changed == {"report.html", "calls.jsonl"}
+    calls = [json.loads(line)["runs"] for line in (out / "calls.jsonl").read_text().splitlines()]
+    assert calls[:2] == [FLOWN, 0]
+
+
+def test_other_weights_are_another_comparison(
+    out: Path, tuned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What was flown with those of before is not mixed with them."""
+    for file in tuned.glob("*.toml"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    file = tmp_path / "paper-every-step-quiet.toml"
+    file.write_text(file.read_text().replace("input_weight", "input_weight = 77.0 #"))
+    assert main(["compare", "--quick", "--scenarios", str(tmp_path), "--out", str(out)]) == 2
+    assert "as the sweep there began; or another --out" in capsys.readouterr().err
+
+
+def test_weights_that_nobody_has_searched_for_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rather than the plant's own, in silence."""
+    assert main(["compare", "--quick", "--scenarios", str(tmp_path), "--out", str(tmp_path)]) == 2
+    file = tmp_path / "paper-every-step-quiet.toml"
+    said = f"compare: {file}: there is none; `skytether compare --tune` makes it"
+    assert capsys.readouterr().err.strip() == said
+
+
+def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(tmp_path: Path) -> None:
+    """What is in its log stays there."""
+    argv = [*TUNE[:3], "--generations", "2", "--workers", "1"]
+    argv += ["--scenarios", str(tmp_path / "s"), "--out", str(tmp_path)]
+    log = tmp_path / "searches" / "paper-every-step-quiet" / "log.jsonl"
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", "skytether", *argv], stderr=subprocess.PIPE, text=True
+    ) as process:
+        while process.poll() is None and not (log.exists() and log.read_text().count("\n") > 1):
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "of 14 searches done; the same command goes on from here" in said
+    flown = log.read_text()
+    assert main(argv) == 0
+    assert log.read_text().startswith(flown)
+    assert len(list((tmp_path / "s").iterdir())) == 14
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--runs", "0"], "--runs: got 0, expected 1 to 100000"),
+        (["--generations", "0"], "--generations: got 0, expected 1 to 1000000"),
+        (["--workers", "0"], "--workers: got 0, expected 1 to 1024"),
+    ],
+)
+def test_an_impossible_comparison_is_refused(
+    argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line, before anything is written."""
+    assert main(["compare", "--out", str(tmp_path / "out"), *argv]) == 2
+    assert capsys.readouterr().err.strip() == f"compare: {said}"
+    assert not (tmp_path / "out").exists()
