@@ -133,7 +133,7 @@ class Judged:
 
 
 def judge(claim: Claim, case: Case, flown: Sequence[Flown]) -> Judged:
-    """A claim, with ours at its own threshold, or the next one that sends no more than it may."""
+    """A claim, with ours at the threshold that sends most without sending more than it may."""
 
     def curve(name: str) -> list[Flown]:
         return [each for each in flown if each.what.contender.name == name]
@@ -145,9 +145,8 @@ def judge(claim: Claim, case: Case, flown: Sequence[Flown]) -> Judged:
 
     (theirs,) = (each for each in curve(claim.theirs) if each.what.tuned)
     ours = curve(claim.ours)
-    (tuned,) = (number for number, each in enumerate(ours) if each.what.tuned)
     # Thresholds rise, and packets fall with them.
-    found = next((each for each in ours[tuned:] if is_sparse(each)), ours[-1])
+    found = next(filter(is_sparse, ours), ours[-1])
     return Judged(claim, case, found, theirs, ratio(found, theirs), is_sparse(found))
 
 

@@ -39,7 +39,7 @@ def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
     """
     from matplotlib.figure import Figure  # takes half a second to import
 
-    figure = Figure(figsize=(5.2 * len(flown), 5.2), layout="constrained")
+    figure = Figure(figsize=(5.2 * len(flown), 5.6), layout="constrained")
     grid = figure.subplots(
         2, len(flown), squeeze=False, sharex="row", sharey="row", height_ratios=(6, 1)
     )

@@ -58,13 +58,13 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
     """Steps planned ahead, H."""
-    scheme: Literal["committed", "paper", "none"] = "paper"
+    scheme: Literal["committed", "paper", "none"] = "committed"
     """Delay compensation at both ends: committed inputs, eq. (11) and (13), or none."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """A horizon that comes is in force at most so long after it was made [s]; auto: as was seen."""
-    observer_s: NonNegative = 0.0
+    observer_s: NonNegative = 4.0
     """How soon steady wind and a wrong gain are learned, as a time constant [s]; 0: never."""
-    trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "paper"
+    trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "cost_gap | heartbeat(1)"
     """When a horizon is sent: policies that combine with & and |, as in docs/triggers.md."""
     period: Annotated[int, Meta(ge=1, le=policy.PERIOD_MAX)] = 10
     """Steps from one horizon to the next of the policy `periodic`."""
@@ -74,17 +74,17 @@ class ControlConfig(Section, frozen=True):
     """Tolerance ε of eq. (16)."""
     decay_rate: NonNegative = 1.5
     """Decay rate λ of eq. (16) [1/s]."""
-    cost_gap: NonNegative = 0.01
+    cost_gap: NonNegative = 1.0
     """Cost of flying on with what was sent, above which the policy `cost_gap` sends."""
     deviation_m: NonNegative = 0.05
     """Distance from the plan, above which the policy `deviation` sends [m]."""
-    state_weight: tuple[NonNegative, NonNegative] = (7.1, 14.0)
+    state_weight: tuple[NonNegative, NonNegative] = (7.0, 1.0)
     """Q of eq. (5), on the position and the velocity of every axis."""
-    terminal_weight: tuple[NonNegative, NonNegative] = (73.0, 555.0)
+    terminal_weight: tuple[NonNegative, NonNegative] = (50.0, 20.0)
     """P of eq. (5) and (16), on position and velocity."""
-    input_weight: Positive = 1.8
+    input_weight: Positive = 0.01
     """R of eq. (5)."""
-    change_weight: NonNegative = 0.03
+    change_weight: NonNegative = 0.0
     """S of eq. (9), on the change against the horizon before."""
     input_reference: bool = False
     """Let R weigh u - v_ref instead of u, so that it does not ask for standing still."""

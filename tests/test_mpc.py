@@ -23,11 +23,17 @@ U_MAX = np.array([1.8, 1.0])
 
 
 CALM = np.zeros((1, 2))
+WEIGHTS = {
+    "state_weight": (7.1, 14.0),
+    "terminal_weight": (73.0, 555.0),
+    "input_weight": 1.8,
+    "change_weight": 0.03,
+}
 
 
 def control(H: int, **keys: object) -> ControlConfig:
     """Weights of the paper's scenario over H steps, some of them changed."""
-    return ControlConfig(horizon=H, **keys)
+    return ControlConfig(horizon=H, **(WEIGHTS | keys))
 
 
 def printed_cost(

@@ -20,7 +20,13 @@ H = 15
 SCENARIO = check(
     {
         "model": {"tau_s": [0.81, 0.3], "u_max": [1.8, 1.0]},
-        "control": {"horizon": H, "change_weight": 5.0},
+        "control": {
+            "horizon": H,
+            "state_weight": [7.1, 14.0],
+            "terminal_weight": [73.0, 555.0],
+            "input_weight": 1.8,
+            "change_weight": 5.0,
+        },
         "reference": {"shape": "circle", "radius_m": 1.5, "period_s": 7.0},
     },
     "test",
@@ -163,7 +169,13 @@ def test_generator_never_looks_at_the_vehicle_again() -> None:
 
 def test_tracker_follows_all_of_the_trajectory() -> None:
     """E9: where inputs cost nothing, the vehicle that is on X_p stays on it at every stage."""
-    free = {"horizon": H, "change_weight": 0.0, "input_weight": 1e-6}
+    free = {
+        "horizon": H,
+        "change_weight": 0.0,
+        "input_weight": 1e-6,
+        "state_weight": [7.1, 14.0],
+        "terminal_weight": [73.0, 555.0],
+    }
     raw = {"model": {"tau_s": [0.81, 0.3], "u_max": [3.0]}, "control": free}
     planner = make(scenario=check(raw, "test"))
     run(planner, 0, START)

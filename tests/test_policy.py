@@ -125,7 +125,10 @@ def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
 def test_what_compares_committed_inputs_needs_their_scheme(name: str) -> None:
     """Deep in an expression, too."""
     text = f"heartbeat(1) | {name}(1) & budget(5, 2)"
-    assert refusal(text) == (
+    control = {"trigger": text, "scheme": "paper"}
+    with pytest.raises(config.ConfigError) as caught:
+        config.check({"control": control}, "mine")
+    assert str(caught.value) == (
         f"mine: control.scheme: got 'paper', expected 'committed' with the trigger {name}"
     )
     config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")

@@ -357,3 +357,15 @@ def test_the_vehicle_says_which_horizon_it_flies_and_since_when() -> None:
     ahead = flight.server["ahead"][100:]
     assert ahead.min() >= np.quantile(delays, 0.9)
     assert ahead.max() <= delays.max() + 2
+
+
+def test_a_budget_is_kept_in_any_window_of_a_flight() -> None:
+    """Also where every step would be worth a packet."""
+    control = {"trigger": "cost_gap & budget(5, 2)", "cost_gap": 0.0, **FIRM}
+    flight = fly(scenario(control=control, vehicle={"wind": 0.3}, duration=30.0))
+    sent_s = flight.server["step"][flight.server["event"]] * 0.05
+    assert len(sent_s) > 4 * 30
+    number = np.arange(len(sent_s))
+    window_s = sent_s[None, :] - sent_s[:, None]
+    count = number[None, :] - number[:, None] + 1
+    assert (count <= 2 + 5 * window_s + 1e-9)[window_s >= 0.0].all()

@@ -329,16 +329,16 @@ def test_deviation_is_a_distance_above_the_threshold() -> None:
 
 def test_cost_gap_may_fire_until_it_is_known() -> None:
     """Then it is a cost above the threshold."""
-    for text in ("cost_gap(0.01)", "cost_gap"):
+    for text in ("cost_gap(1)", "cost_gap"):
         trigger = trigger_of(text)
         assert trigger.test(facing(1, fresh=True)).surely.tolist() == [True]
         verdict = trigger.test(facing(1))
         assert (verdict.surely.tolist(), verdict.perhaps.tolist()) == ([False], [True])
         assert np.isnan(verdict.error).all()
-        for gap, event in ((0.01, False), (0.011, True)):
+        for gap, event in ((1.0, False), (1.1, True)):
             verdict = trigger.test(facing(1, cost_gap=gap))
             assert verdict.surely.tolist() == verdict.perhaps.tolist() == [event]
-            assert (verdict.error.tolist(), verdict.threshold.tolist()) == ([gap], [0.01])
+            assert (verdict.error.tolist(), verdict.threshold.tolist()) == ([gap], [1.0])
 
 
 def test_no_solve_is_asked_for_where_it_could_change_nothing() -> None:
@@ -536,7 +536,7 @@ def test_documented_trigger_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     verdict = ask(slip, 3, estimate)
     assert verdict.surely.tolist() == [True]
     assert verdict.error == pytest.approx([math.hypot(0.3, 0.5)])
-    control = {"trigger": "slip(0.1) & budget(4, 1) | heartbeat(1)"}
+    control = {"scheme": "paper", "trigger": "slip(0.1) & budget(4, 1) | heartbeat(1)"}
     flown = config.check({"duration": 10.0, "control": control}, "test")
     server = fly(flown).server
     sent_s = server["step"][server["event"]] * flown.control.dt
