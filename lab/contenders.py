@@ -40,7 +40,7 @@ class Contender:
     """and what it is multiplied with for a curve."""
 
 
-NEAR = (1 / 16, 1 / 4, 1 / 2, 2 / 3, 0.8, 0.9, 1, 5 / 4, 3)
+NEAR = (1 / 8, 0.6, 0.8, 1, 5 / 4, 2, 8)
 """Factors of a quadratic threshold."""
 PERIODS = (0.1, 0.2, 0.5, 1, 1.5, 2, 4)
 """Factors of ten steps."""
