@@ -23,7 +23,7 @@ def scenario(*, scheme: str = "paper", exhausted: str = "hold") -> Scenario:
     return check(
         {
             "model": {"u_max": [1.8, 0.9]},
-            "control": {"dt": 0.1, "horizon": H, "scheme": scheme},
+            "control": {"dt": 0.1, "horizon": H, "scheme": scheme, "trigger": "always"},
             "vehicle": {"exhausted": exhausted, "brake_mps2": 2.0},
             "network": {"uplink": direction, "downlink": direction},
         },

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +14,6 @@ from server.exact import ExactSolver
 from server.mpc import MPC, condense
 from server.solver import NEAR, OsqpSolver
 from shared import config
-from shared.config import ControlConfig
 from shared.model import Array, discretise
 
 U_MAX = np.array([1.8, 1.0])
@@ -21,7 +21,7 @@ U_MAX = np.array([1.8, 1.0])
 
 def mpc(tau_s: tuple[float, ...] = (0.855, 0.3), **control: Any) -> MPC:
     """The paper's problem, with some keys of `control` changed."""
-    settings_ = ControlConfig(**control)
+    settings_ = msgspec.structs.replace(config.load("paper").control, **control)
     model = discretise(np.array(tau_s), settings_.dt)
     return condense(model, settings_, change_weight=settings_.change_weight)
 

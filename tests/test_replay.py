@@ -321,16 +321,16 @@ def test_most_horizons_are_not_even_planned_with_a_trigger_that_needs_no_plan(
     ids=["steady wind", "and a wrong gain"],
 )
 def test_the_disturbance_observer_leaves_no_offset(vehicle: dict[str, Any]) -> None:
-    """Hovering in constant wind, in the last ten seconds, whatever R; without it there is one."""
+    """Hovering in constant wind, in the last twenty seconds; without it there is one."""
     offsets = {}
     for observer_s in (0.0, 4.0):
-        control = {"trigger": "cost_gap & periodic(2)", "observer_s": observer_s}
+        control = {"trigger": "cost_gap", "cost_gap": 0.01, "observer_s": observer_s}
         reference = {"shape": "hover", "points_m": [[0.0, 0.0]]}
         flown = scenario(control=control, reference=reference, vehicle=vehicle, duration=60.0)
         flight = fly(flown)
-        offsets[observer_s] = np.abs(flight.client["state"][-200:, :, 0].mean(axis=0)).max()
+        offsets[observer_s] = np.abs(flight.client["state"][-400:, :, 0].mean(axis=0)).max()
     assert offsets[0.0] > 0.05
-    assert offsets[4.0] < 0.005
+    assert offsets[4.0] < 0.01
 
 
 def test_a_mean_loss_of_half_each_way_is_flown_through() -> None:
