@@ -34,7 +34,7 @@ class Options:
     tune: bool = False
     """Search for the weights of every contender in every case, with the same effort for each, and
     write them to the folder of scenarios; nothing else."""
-    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 20
+    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 40
     """How long each of these searches goes on."""
     scenarios: Path = Path(str(resources.files("scenarios") / config.COMPARED))
     """Folder of the scenarios with the weights."""
