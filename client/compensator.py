@@ -2,14 +2,18 @@
 
     u* = u(min(k, k_h + H - 1) | k_h)        k_h: the step that the horizon was made for
 
-With committed inputs at its head a horizon is that much longer, and read in the same way.
+With committed inputs at its head a horizon is that much longer, and read in the same way. Where it
+brings feedback, the vehicle is led back to where it would be, x̄, had nothing else happened:
+
+    u*(k) = u(k|k_h) + K (x̄(k) - x(k)),     x̄(i+1) = A x̄(i) + B (u(i|k_h) + w)
+
 The horizon of the newest generation wins, in whatever order they arrive (E11).
 """
 
 import numpy as np
 
 from shared.config import Scenario
-from shared.model import Array
+from shared.model import Array, discretise
 from shared.protocol import NO_HORIZON, Horizon, ProtocolError
 
 
@@ -23,6 +27,9 @@ class Compensator:
         self._brake_per_step = scenario.vehicle.brake_mps2 * scenario.control.dt
         self._bound = scenario.u_max[:, None]
         self._inputs: Array = np.zeros((self._H, scenario.model.axes))
+        self._model = discretise(scenario.tau_s, scenario.control.dt)
+        self._back: tuple[Array, Array] | None = None
+        """With feedback, x̄ along the inputs, and K; shapes (stages, axes, 2) and (axes, 2)."""
         self.in_force = NO_HORIZON
         """k_h, or NO_HORIZON: then the vehicle hovers."""
         self.since = 0
@@ -47,9 +54,18 @@ class Compensator:
         self.in_force, self._new = horizon.step, True
         self.observed_ns = horizon.observed_ns
         self._inputs = horizon.inputs.clip(-self._bound, self._bound).T
+        self._back = None
+        if horizon.feedback.size:
+            told = horizon.feedback.astype(np.float64)
+            led = self._model.roll_out(told[:, :2], self._inputs + told[:, 2])
+            self._back = led, told[:, 3:]
 
-    def choose(self, step: int) -> Array:
-        """u* for `step` [m/s]; shape (axes,)."""
+    def choose(self, step: int, state: Array) -> Array:
+        """u* for `step` [m/s]; shape (axes,).
+
+        Args:
+            state: position [m] and velocity [m/s] at the step; shape (axes, 2).
+        """
         if self._new:
             self.since, self._new = step, False
         if self.in_force == NO_HORIZON:
@@ -59,7 +75,12 @@ class Compensator:
         stage, length = step - self.in_force, len(self._inputs)
         if stage >= length and self._brakes:
             return self._braked(stage - length + 1)
-        return self._inputs[min(max(stage, 0), length - 1)].copy()
+        told: Array = self._inputs[min(max(stage, 0), length - 1)]
+        if self._back and 0 <= stage < length:
+            led, gain = self._back
+            back = (gain * (led[stage] - state)).sum(axis=1)
+            return (told + back).clip(-self._bound[:, 0], self._bound[:, 0])
+        return told.copy()
 
     def _braked(self, steps: int) -> Array:
         """The last input, slowed down for `steps` at a constant rate, straight ahead."""

@@ -74,7 +74,7 @@ class Client(Endpoint):
         """The step that comes next,"""
         self._flown = 0
         """and the one whose state the plant is in."""
-        self._input = self._compensator.choose(0)
+        self._input = self._compensator.choose(0, plant.state())
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self.failure: str | None = None
         """Why there can be no flight."""
@@ -167,8 +167,8 @@ class Client(Endpoint):
         for _ in range(self._flown, present):
             self._plant.advance(self._input)
         self._flown, self._step = present, present + 1
-        self._input = self._compensator.choose(present)
         state, stamp_ns = self._plant.state(), epoch_ns + present * self._dt_ns
+        self._input = self._compensator.choose(present, state)
         assert self._session is not None
         self._send(
             Observation(

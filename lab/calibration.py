@@ -132,8 +132,10 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
 }
 """Of the policies that look at the flight, so that weights and thresholds decide what they send."""
+OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
 SCHEME_KEYS: Mapping[str, Sequence[Free]] = {
-    "committed": (Free("control.observer_s", 0.05, 50.0),),
+    "committed": OBSERVER_KEYS,
+    "feedback": OBSERVER_KEYS,
 }
 HERE = "here"
 """The one column of a point that is flown as it is."""

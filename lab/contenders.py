@@ -77,6 +77,12 @@ CONTENDERS = (
         GAP | {"trigger": "cost_gap & budget(5, 2)"},
         *("cost_gap", NEAR),
     ),
+    Contender(
+        "feedback-gap",
+        "committed with feedback aboard, cost gap",
+        GAP | {"scheme": "feedback"},
+        *("cost_gap", NEAR),
+    ),
 )
 
 

@@ -114,7 +114,7 @@ class Server(Endpoint):
         reach = max(1, round(REACH_S / control.dt))
         self._scheme: Scheme = (
             Replay(scenario, model, room, reach, self._clock)
-            if control.scheme == "committed"
+            if control.commits
             else Estimator(model, room, reach, compensate=control.scheme == "paper")
         )
         self._planner = Planner(scenario, model, room, self.stopwatch)
@@ -325,14 +325,15 @@ class Server(Endpoint):
         event = verdict.surely & plan.solved
         sent = np.flatnonzero(event)
         horizons, lengths = foresight.horizons(plan.inputs), foresight.ahead + self._terms.horizon
-        self._scheme.remember(rows, step, horizons, lengths, sent)  # (12)
+        self._scheme.remember(rows, step, foresight, horizons, sent)  # (12)
         self._trigger.sent(rows[sent], step[sent], verdict.error[sent])
         stopwatch.lap("plan")
         of_each = (sent, rows[sent], step[sent], lengths[sent])
         for i, row, k, length in zip(*map(np.ndarray.tolist, of_each), strict=True):
             session, inputs = self._by_row[row], horizons[i, :, :length]
             horizon = Horizon(
-                session.vehicle, session.session, k, now_ns, session.observed_ns, inputs
+                *(session.vehicle, session.session, k, now_ns, session.observed_ns),
+                *(inputs, foresight.feedback[i]),
             )
             self._send(session, horizon, now_ns)
         self.counts["events"] += len(sent)

@@ -37,6 +37,8 @@ class Foresight:
     """Inputs from k+d on, if nothing more were sent [m/s]; shape (n, axes, H)."""
     disturbance: Array
     """ŵ, an input that nobody gave [m/s]; shape (n, axes)."""
+    feedback: NDArray[np.float32]
+    """What goes with a horizon, see `shared.protocol.Horizon`; shape (n, axes, 0 or FEEDBACK)."""
 
     def horizons(self, inputs: Array) -> NDArray[np.float32]:
         """What to send, from k on: the committed inputs, then planned ones from k + d on.
@@ -54,7 +56,7 @@ class Foresight:
         """Of some of the vehicles."""
         return Foresight(
             *(self.estimate[some], self.ahead[some], self.start[some]),
-            *(self.committed[some], self.held[some], self.disturbance[some]),
+            *(self.committed[some], self.held[some], self.disturbance[some], self.feedback[some]),
         )
 
 
@@ -84,8 +86,8 @@ class Scheme(Protocol):
         self,
         rows: Indices,
         step: Indices,
+        foresight: Foresight,
         horizons: NDArray[np.float32],
-        lengths: Indices,
         sent: Indices,
     ) -> None:
         """What was computed for the steps from k on, and which of it is sent.
@@ -93,8 +95,8 @@ class Scheme(Protocol):
         Args:
             rows: the vehicles; shape (n,).
             step: k of each; shape (n,).
-            horizons: [m/s], float32; shape (n, axes, at least the largest length).
-            lengths: inputs that each has; shape (n,).
+            foresight: what it was computed from.
+            horizons: [m/s], float32; shape (n, axes, largest d + H).
             sent: which of the n are sent.
         """
 
@@ -123,6 +125,7 @@ class Estimator:
         self._last_step = np.full(capacity, -1, dtype=np.int64)
         """The step whose û was computed last, or -1."""
         self._nothing = np.zeros((capacity, axes, 0))
+        self._no_feedback = np.zeros((capacity, axes, 0), dtype=np.float32)
 
     def forget(self, row: int) -> None:
         """A new vehicle in this row."""
@@ -160,14 +163,16 @@ class Estimator:
         """See `Scheme`: planning starts at k, from x̂(k)."""
         estimate, n = self.estimate(rows, step), len(rows)
         nothing, here = self._nothing[:n], np.zeros(n, dtype=np.int64)
-        return Foresight(estimate, here, estimate, nothing, nothing, np.zeros(estimate.shape[:2]))
+        calm = np.zeros(estimate.shape[:2])
+        aboard = self._no_feedback[:n]
+        return Foresight(estimate, here, estimate, nothing, nothing, calm, aboard)
 
     def remember(
         self,
         rows: Indices,
         step: Indices,
+        foresight: Foresight,  # noqa: ARG002 - the first input is all that (12) asks for
         horizons: NDArray[np.float32],
-        lengths: Indices,  # noqa: ARG002 - the first input is all that (12) asks for
         sent: Indices,  # noqa: ARG002
     ) -> None:
         """û(k) ← u(k|k), eq. (12), whether sent or not (E12).

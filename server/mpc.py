@@ -22,6 +22,10 @@ from shared.config import ControlConfig
 from shared.model import Array, Indices, Model
 
 
+ROUNDS = 10_000
+"""Most of the Riccati recursion, for weights with which it hardly settles."""
+
+
 @dataclass(frozen=True, slots=True)
 class MPC:
     """One horizon of (9) in condensed form; n vehicles in one call."""
@@ -111,6 +115,26 @@ def condense(model: Model, control: ControlConfig, *, change_weight: float) -> M
         *(model, weights, input_weights, control.input_weight, target_weight),
         *(change_weights, hessian),
     )
+
+
+def stationary_gain(model: Model, control: ControlConfig) -> Array:
+    """K of the linear-quadratic regulator u = -K x: what (9) comes to without end and bounds.
+
+    Returns:
+        on position [1/s] and velocity; shape (axes, 2).
+    """
+    A, B, Q = model.A, model.B, np.diag(control.state_weight)
+    cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 2, 2))
+    gain = np.zeros_like(B)
+    for _ in range(ROUNDS):
+        if np.allclose(cost, before, rtol=1e-12, atol=0.0):
+            break
+        ahead = np.einsum("ai,aij->aj", B, cost)
+        weight = control.input_weight + control.change_weight + np.einsum("aj,aj->a", ahead, B)
+        gain = np.einsum("ai,aij->aj", ahead, A) / weight[:, None]
+        left = A - B[:, :, None] * gain[:, None, :]
+        cost, before = Q + np.einsum("aji,ajk,akl->ail", A, cost, left), cost
+    return gain
 
 
 @njit("f8[:,:,::1](f8[:,:,::1], i8[:])", cache=True)

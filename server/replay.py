@@ -14,6 +14,11 @@ had d steps and was not in force is lost, and left out.
 w is what else acts on the vehicle, as an input of its own: constant wind, a wrong gain. Each
 observation shows how far the velocity has come away from where the one before it, replayed, says;
 the disturbance observer follows that with a time constant of `control.observer_s`.
+
+With feedback aboard, a horizon tells the vehicle also where its inputs lead, x̄ from x̂(k) on, and
+how to come back to there: it flies u(i) + K (x̄(i) - x(i)). That is replayed in the same way. What
+is committed are the inputs that this comes to if nothing else happens, along x̄ from x̂(k): as K is
+always the same, it makes no difference when the next horizon replaces the one before.
 """
 
 from collections import Counter
@@ -25,9 +30,10 @@ from numpy.typing import NDArray
 from server.clock import ClockMap
 from server.delay import DelayBound
 from server.estimator import Foresight
+from server.mpc import stationary_gain
 from shared.config import Scenario
 from shared.model import Flags, Indices, Model
-from shared.protocol import INPUTS_MAX, NO_HORIZON, Observation
+from shared.protocol import FEEDBACK, INPUTS_MAX, NO_HORIZON, Observation
 
 MARGIN = 2
 """Steps on top of half a round trip, until a horizon has been acknowledged."""
@@ -51,7 +57,13 @@ class Replay:
         self.counts: Counter[str] = Counter()
         self._reach = reach
         brake_mps2 = vehicle.brake_mps2 if vehicle.exhausted == "brake" else 0.0
-        self._flies = (model.A, model.B, scenario.u_max, brake_mps2 * control.dt)
+        self._feeds_back = control.scheme == "feedback"
+        gain = np.zeros((axes, 2), dtype=np.float32)
+        if self._feeds_back:
+            gain += stationary_gain(model, control).astype(np.float32)
+        self._gain = gain
+        bounds = (scenario.u_max, brake_mps2 * control.dt)
+        self._flies = (model.A, model.B, *bounds, gain.astype(np.float64))
         """A and B, and what `client.compensator` makes of a horizon."""
         observer_s = control.observer_s
         self._observer_decay = float(np.exp(-control.dt / observer_s)) if observer_s else 1.0
@@ -76,12 +88,14 @@ class Replay:
         self._horizons = np.zeros((capacity, room, axes, 2 * H), dtype=np.float32)
         self._lengths = np.zeros((capacity, room), dtype=np.int64)
         self._sent = np.zeros(capacity, dtype=np.int64)
-        self._told = (self._stamps, self._horizons, self._lengths, self._sent)
-        """Horizons that were sent, a ring: step, inputs, how many; and how many horizons so far."""
+        self._origins = np.zeros((capacity, room, axes, 3), dtype=np.float32)
+        self._told = (self._stamps, self._horizons, self._lengths, self._origins, self._sent)
+        """Horizons that were sent, a ring: step, inputs, how many, and x̂ and ŵ that they start
+        from; and how many horizons so far."""
         self._base_step = np.full(capacity, -1, dtype=np.int64)
-        base_velocity = np.zeros((capacity, axes))
+        base_state = np.zeros((capacity, axes, 2))
         base_in_force = np.full(capacity, NO_HORIZON, dtype=np.int64)
-        self._base = (base_velocity, self._base_step, base_in_force)
+        self._base = (base_state, self._base_step, base_in_force)
         """The observation before, from which the disturbance observer starts; step -1 for none."""
         self._disturbance = np.zeros((capacity, axes))
         self._judged = np.zeros(capacity, dtype=np.int64)
@@ -120,21 +134,28 @@ class Replay:
         )
         self.counts["horizons lost"] += lost
         disturbance = self._disturbance[rows]
-        return Foresight(estimate, ahead, start, committed, held, disturbance)
+        feedback = np.empty((*disturbance.shape, FEEDBACK * self._feeds_back), dtype=np.float32)
+        if self._feeds_back:
+            feedback[..., :2], feedback[..., 2] = estimate, disturbance
+            feedback[..., 3:] = self._gain
+        return Foresight(estimate, ahead, start, committed, held, disturbance, feedback)
 
     def remember(
         self,
         rows: Indices,
         step: Indices,
+        foresight: Foresight,
         horizons: NDArray[np.float32],
-        lengths: Indices,
         sent: Indices,
     ) -> None:
         """See `Scheme`; only what was sent counts."""
-        rows, step, horizons, lengths = rows[sent], step[sent], horizons[sent], lengths[sent]
+        rows = rows[sent]
         slot = self._sent[rows] % self._stamps.shape[1]
-        self._stamps[rows, slot], self._lengths[rows, slot] = step, lengths
-        self._horizons[rows, slot, :, : horizons.shape[2]] = horizons
+        self._stamps[rows, slot] = step[sent]
+        self._lengths[rows, slot] = foresight.ahead[sent] + self._H
+        self._horizons[rows, slot, :, : horizons.shape[2]] = horizons[sent]
+        if self._feeds_back:
+            self._origins[rows, slot] = foresight.feedback[sent, :, :3]
         self._sent[rows] += 1
 
     def _listen(self, rows: Indices) -> None:
@@ -159,8 +180,8 @@ class Replay:
             )
 
 
-FLIES = "Tuple((f8[:,:,::1], f8[:,::1], f8[::1], f8))"
-TOLD = "Tuple((i8[:,::1], f4[:,:,:,::1], i8[:,::1], i8[::1]))"
+FLIES = "Tuple((f8[:,:,::1], f8[:,::1], f8[::1], f8, f8[:,::1]))"
+TOLD = "Tuple((i8[:,::1], f4[:,:,:,::1], i8[:,::1], f4[:,:,:,::1], i8[::1]))"
 SEEN = "Tuple((f8[:,:,::1], i8[::1], i8[::1], i8[::1]))"
 """Of the kernels: `Replay._flies`, `_told` and `_seen`."""
 HOVERS, UNKNOWN = -1, -2
@@ -189,24 +210,62 @@ def _first_after(stamps, sent, row, stamp):  # type: ignore[no-untyped-def]  # n
     return number
 
 
-@njit(f"f8({TOLD}, {FLIES}, i8, i8, i8, i8, f8)", cache=True, error_model="numpy")
-def _command(told, flies, row, number, axis, step, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """What `client.compensator` flies at a step with a horizon; v is the velocity there."""
+@njit("UniTuple(f8, 2)(f8[:,:,::1], f8[:,::1], i8, f8, f8, f8)", cache=True)
+def _roll(A, B, axis, p, v, u):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    """Eq. (4)."""
+    return (
+        A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u,
+        A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u,
+    )
+
+
+@njit(f"f8({TOLD}, {FLIES}, i8, i8, i8, i8)", cache=True)
+def _told_input(told, flies, row, number, axis, stage):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    """The input of a stage of a horizon, or its last, as far as the vehicle will go."""
+    _, horizons, lengths, _, _ = told
+    slot, most = number % horizons.shape[1], flies[2][axis]
+    u = float(horizons[row, slot, axis, min(max(stage, 0), lengths[row, slot] - 1)])
+    return min(max(u, -most), most)
+
+
+@njit(f"UniTuple(f8, 2)({TOLD}, {FLIES}, i8, i8, i8, i8, i8, f8, f8)", cache=True)
+def _lead(told, flies, row, number, axis, begin, end, p, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    """x̄ of a horizon at step `end`: from p, v at `begin`, or from where it starts if that is -1."""
+    if number < 0:
+        return p, v
+    stamps, _, _, origins, _ = told
+    slot = number % stamps.shape[1]
+    stamp = stamps[row, slot]
+    if begin < 0:
+        begin = stamp
+        p, v = float(origins[row, slot, axis, 0]), float(origins[row, slot, axis, 1])
+    w = float(origins[row, slot, axis, 2])
+    for step in range(max(begin, stamp), end):
+        u = _told_input(told, flies, row, number, axis, step - stamp) + w
+        p, v = _roll(flies[0], flies[1], axis, p, v, u)
+    return p, v
+
+
+@njit(f"f8({TOLD}, {FLIES}, i8, i8, i8, i8, f8, f8, f8, f8)", cache=True, error_model="numpy")
+def _command(told, flies, row, number, axis, step, p, v, p_led, v_led):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    """What `client.compensator` flies at a step with a horizon; p, v is the state there, led is x̄."""
     if number == HOVERS:
         return 0.0
     if number == UNKNOWN:
         return v  # as good a guess as any: it flies on
-    stamps, horizons, lengths, _ = told
-    _, _, u_max, brake = flies
-    axes, slot = horizons.shape[2], number % horizons.shape[1]
+    stamps, horizons, lengths, _, _ = told
+    _, _, u_max, brake, gain = flies
+    slot = number % horizons.shape[1]
     stage, end = step - stamps[row, slot], lengths[row, slot] - 1
-    u = min(max(float(horizons[row, slot, axis, min(stage, end)]), -u_max[axis]), u_max[axis])
-    if stage <= end or brake == 0.0:
+    u = _told_input(told, flies, row, number, axis, stage)
+    if 0 <= stage <= end:
+        u += gain[axis, 0] * (p_led - p) + gain[axis, 1] * (v_led - v)
+        return min(max(u, -u_max[axis]), u_max[axis])
+    if stage < 0 or brake == 0.0:
         return u
     squares = 0.0
-    for other in range(axes):
-        last = min(max(float(horizons[row, slot, other, end]), -u_max[other]), u_max[other])
-        squares += last**2
+    for other in range(horizons.shape[2]):
+        squares += _told_input(told, flies, row, number, other, end) ** 2
     speed = np.sqrt(squares)
     return u * (max(0.0, speed - (stage - end) * brake) / speed) if speed > 0.0 else 0.0
 
@@ -219,13 +278,13 @@ def _command(told, flies, row, number, axis, step, v):  # type: ignore[no-untype
 )
 def _replay(flies, told, seen, judged, disturbance, rows, steps, ahead, H):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """See `Replay.foresee`: x̂(k), x̂(k+d), committed and held inputs, and newly lost horizons."""
-    A, B, _, _ = flies
-    stamps, _, _, sent = told
+    A, B, _, _, gain = flies
+    stamps, _, _, _, sent = told
     state, observed_step, in_force, _ = seen
     n, axes, room = len(rows), len(A), stamps.shape[1]
     estimate, start = np.empty((n, axes, 2)), np.empty((n, axes, 2))
     committed, held = np.zeros((n, axes, H)), np.zeros((n, axes, H))
-    lost = 0
+    lost, feeds_back = 0, gain.any()
     for i in range(n):
         row, k, d = rows[i], steps[i], ahead[i]
         observed = observed_step[row]
@@ -238,41 +297,41 @@ def _replay(flies, told, seen, judged, disturbance, rows, steps, ahead, H):  # t
         for axis in range(axes):
             p, v = state[row, axis, 0], state[row, axis, 1]
             number, following = flown, first
+            led, p_led, v_led = -1, 0.0, 0.0
             for step in range(observed, k + d + H):
                 while following < sent[row] and stamps[row, following % room] + d <= step:
-                    number, following = following, following + 1
+                    number, following, led = following, following + 1, -1
+                if feeds_back:
+                    p_led, v_led = _lead(told, flies, row, number, axis, led, step, p_led, v_led)
+                    led = step
                 # An observation from ahead of k, where clocks disagree, is taken as it is.
                 if step == max(k, observed):
                     estimate[i, axis, 0], estimate[i, axis, 1] = p, v
                 if step == max(k + d, observed):
                     start[i, axis, 0], start[i, axis, 1] = p, v
-                u = _command(told, flies, row, number, axis, step, v)
-                if step >= k + d:
+                u = _command(told, flies, row, number, axis, step, p, v, p_led, v_led)
+                if step < k + d:
+                    if step >= k:
+                        committed[i, axis, step - k] = u
+                else:
                     held[i, axis, step - k - d] = u
-                    continue
-                if step >= k:
-                    committed[i, axis, step - k] = u
-                command = u + disturbance[row, axis]
-                p, v = (
-                    A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * command,
-                    A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * command,
-                )
+                p, v = _roll(A, B, axis, p, v, u + disturbance[row, axis])
     return estimate, start, committed, held, lost
 
 
 @njit(
-    f"({FLIES}, {TOLD}, {SEEN}, Tuple((f8[:,::1], i8[::1], i8[::1])), f8[:,::1], i8[:], i8[:],"
+    f"({FLIES}, {TOLD}, {SEEN}, Tuple((f8[:,:,::1], i8[::1], i8[::1])), f8[:,::1], i8[:], i8[:],"
     "i8, f8)",
     cache=True,
     error_model="numpy",
 )
 def _observe_disturbance(flies, told, seen, base, disturbance, rows, ahead, reach, decay):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """Disturbance observer: from the observation before to the newest, where there is a new one."""
-    A, B, u_max, _ = flies
-    stamps, _, _, sent = told
+    A, B, u_max, _, gain = flies
+    stamps, _, _, _, sent = told
     state, observed_step, in_force, since = seen
-    base_velocity, base_step, base_in_force = base
-    axes, room = len(A), stamps.shape[1]
+    base_state, base_step, base_in_force = base
+    axes, room, feeds_back = len(A), stamps.shape[1], gain.any()
     for i in range(len(rows)):
         row, d = rows[i], ahead[i]
         begin, end = base_step[row], observed_step[row]
@@ -282,20 +341,24 @@ def _observe_disturbance(flies, told, seen, base, disturbance, rows, ahead, reac
         after = _number(stamps, sent, row, in_force[row])
         known = min(before, after) > UNKNOWN and begin >= 0 and end - begin <= reach
         for axis in range(axes):
-            v, number = base_velocity[row, axis], before
+            p, v, number = base_state[row, axis, 0], base_state[row, axis, 1], before
+            led, p_led, v_led = -1, 0.0, 0.0
             following = _first_after(stamps, sent, row, max(base_in_force[row], begin - d))
             for step in range(begin, end if known else begin):
                 while following < after and stamps[row, following % room] + d <= step:
-                    number, following = following, following + 1
-                if step >= since[row]:
-                    number = after
-                u = _command(told, flies, row, number, axis, step, v)
-                v = A[axis, 1, 1] * v + B[axis, 1] * (u + disturbance[row, axis])
+                    number, following, led = following, following + 1, -1
+                if step >= since[row] and number != after:
+                    number, led = after, -1
+                if feeds_back:
+                    p_led, v_led = _lead(told, flies, row, number, axis, led, step, p_led, v_led)
+                    led = step
+                u = _command(told, flies, row, number, axis, step, p, v, p_led, v_led)
+                p, v = _roll(A, B, axis, p, v, u + disturbance[row, axis])
             if known:
                 # A change of w changes the velocity after m steps by 1 - a^m of it.
                 m = end - begin
                 off = (state[row, axis, 1] - v) / (1.0 - A[axis, 1, 1] ** m)
                 w = disturbance[row, axis] + (1.0 - decay**m) * off
                 disturbance[row, axis] = min(max(w, -u_max[axis]), u_max[axis])
-            base_velocity[row, axis] = state[row, axis, 1]
+            base_state[row, axis] = state[row, axis]
         base_step[row], base_in_force[row] = end, in_force[row]

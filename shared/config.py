@@ -58,8 +58,9 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
     """Steps planned ahead, H."""
-    scheme: Literal["committed", "paper", "none"] = "committed"
-    """Delay compensation at both ends: committed inputs, eq. (11) and (13), or none."""
+    scheme: Literal["committed", "feedback", "paper", "none"] = "committed"
+    """Delay compensation at both ends: committed inputs, the same with feedback aboard, eq. (11)
+    and (13), or none."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """A horizon that comes is in force at most so long after it was made [s]; auto: as was seen."""
     observer_s: NonNegative = 4.0
@@ -88,6 +89,11 @@ class ControlConfig(Section, frozen=True):
     """S of eq. (9), on the change against the horizon before."""
     input_reference: bool = False
     """Let R weigh u - v_ref instead of u, so that it does not ask for standing still."""
+
+    @property
+    def commits(self) -> bool:
+        """Whether horizons begin with committed inputs."""
+        return self.scheme in ("committed", "feedback")
 
 
 class ReferenceConfig(Section, frozen=True):
@@ -468,8 +474,9 @@ def _no_trigger(control: ControlConfig) -> typing.Iterator[tuple[str, object, st
         yield "control.trigger", repr(error.given), error.expected
         return
     for name in (part.name for part in policy.policies(trigger)):
-        if policy.SIGNATURES[name].committed and control.scheme != "committed":
-            yield "control.scheme", repr(control.scheme), f"'committed' with the trigger {name}"
+        if policy.SIGNATURES[name].committed and not control.commits:
+            schemes = "'committed' or 'feedback'"
+            yield "control.scheme", repr(control.scheme), f"{schemes} with the trigger {name}"
 
 
 def _no_reference(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:

@@ -30,6 +30,28 @@ class Model:
         """f(x, u) of eq. (4): x of shape (..., axes, 2), u of shape (..., axes)."""
         return np.einsum("aij,...aj->...ai", self.A, x) + self.B * u[..., None]
 
+    def roll_out(self, x: Array, inputs: Array) -> Array:
+        """States at the stages of a horizon, the first of them x.
+
+        Args:
+            x: shape (axes, 2).
+            inputs: shape (stages, axes).
+
+        Returns:
+            shape (stages, axes, 2).
+        """
+        # Plain numbers: numpy costs more than it saves on so few.
+        states = np.empty((len(inputs), *x.shape))
+        for axis, ((p, v), u, ((a, b), (c, d)), (e, f)) in enumerate(
+            zip(x.tolist(), inputs.T.tolist(), self.A.tolist(), self.B.tolist(), strict=True)
+        ):
+            along = []
+            for each in u:
+                along.append((p, v))
+                p, v = a * p + b * v + e * each, c * p + d * v + f * each
+            states[:, axis] = along
+        return states
+
 
 def discretise(tau_s: Array, dt_s: float) -> Model:
     """Exact zero-order hold of eq. (1)-(3): the matrix exponential in closed form.

@@ -8,7 +8,7 @@
 | 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, terms         |
 | 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
 |      |             |         | received_ns, state                                         |
-| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs              |
+| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback    |
 | 5    | HEARTBEAT   | server  | session, server_ns                                         |
 
 `docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
@@ -30,8 +30,11 @@ PAYLOAD_BYTES_MAX = 1200
 """So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
 
 AXES_MAX = 3
-INPUTS_MAX = 288
+INPUTS_MAX = 270
 """Inputs of all axes in one horizon: what fits beside the other fields."""
+
+FEEDBACK = 5
+"""Numbers of each axis that feedback aboard takes."""
 
 INPUT_TOLERANCE = 1.001
 """How far over its bound an input may be (float32 rounds) before the packet is refused."""
@@ -120,6 +123,10 @@ class Horizon(NamedTuple):
     """Stamp of the observation it was computed from, echoed [client clock]."""
     inputs: NDArray[np.float32]
     """Desired velocity [m/s]; shape (axes, d + H), with d, 0 … H, committed ones first."""
+    feedback: NDArray[np.float32]
+    """The position [m] and velocity [m/s] at `step` that they lead on from, the disturbance that
+    was reckoned with [m/s], and the gains on what the position [1/s] and the velocity are away from
+    that; shape (axes, FEEDBACK), or (axes, 0) where the inputs are to be flown as they are."""
 
 
 class Heartbeat(NamedTuple):
@@ -185,6 +192,15 @@ def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
     return inputs
 
 
+def _feedback(value: object, ours: Terms) -> NDArray[np.float32]:
+    feedback = _array(value, _FLOAT32, ours.axes, (0, FEEDBACK))
+    if feedback.shape[1] not in (0, FEEDBACK):
+        raise ProtocolError("shape")
+    if not all(map(math.isfinite, feedback.ravel().tolist())):
+        raise ProtocolError("not finite")
+    return feedback
+
+
 def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
     """Of each axis at least and at most so many numbers."""
     if type(value) is not bytes:
@@ -210,7 +226,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),
     (Welcome, (_U16, _U32, _U64, _U64, _STAMP, _terms)),
     (Observation, (_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP, _state)),
-    (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs)),
+    (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback)),
     (Heartbeat, (_U16, _U32, _STAMP)),
 )
 """Message of each type number (from 1) and the check of each of its fields."""
