@@ -36,6 +36,8 @@ INPUTS_MAX = 270
 FEEDBACK = 5
 """Numbers of each axis that feedback aboard takes."""
 
+NO_FEEDBACK = np.empty((0, 0), np.float32)
+
 INPUT_TOLERANCE = 1.001
 """How far over its bound an input may be (float32 rounds) before the packet is refused."""
 
@@ -123,7 +125,7 @@ class Horizon(NamedTuple):
     """Stamp of the observation it was computed from, echoed [client clock]."""
     inputs: NDArray[np.float32]
     """Desired velocity [m/s]; shape (axes, d + H), with d, 0 … H, committed ones first."""
-    feedback: NDArray[np.float32]
+    feedback: NDArray[np.float32] = NO_FEEDBACK
     """The position [m] and velocity [m/s] at `step` that they lead on from, the disturbance that
     was reckoned with [m/s], and the gains on what the position [1/s] and the velocity are away from
     that; shape (axes, FEEDBACK), or (axes, 0) where the inputs are to be flown as they are."""

@@ -7,14 +7,16 @@ from hypothesis import strategies as st
 
 from client.compensator import Compensator
 from shared.config import Scenario, check
-from shared.model import Array
-from shared.protocol import NO_HORIZON, Horizon, ProtocolError
+from shared.model import Array, discretise
+from shared.protocol import FEEDBACK, NO_HORIZON, Horizon, ProtocolError
 
 quick = settings(max_examples=60, deadline=None)
 
 H = 10
 INPUTS = np.array([np.linspace(0.1, 1.0, H), np.linspace(-0.5, 0.5, H)])
 """Every stage unlike every other."""
+HERE = np.zeros((2, 2))
+"""A state; without feedback none matters."""
 
 
 def scenario(*, scheme: str = "paper", exhausted: str = "hold") -> Scenario:
@@ -47,20 +49,20 @@ def test_vehicle_hovers_before_its_first_horizon() -> None:
     """There is nothing to fly yet."""
     compensator = Compensator(scenario())
     assert compensator.in_force == NO_HORIZON
-    assert compensator.choose(0).tolist() == [0.0, 0.0]
-    assert compensator.choose(1000).tolist() == [0.0, 0.0]
+    assert compensator.choose(0, HERE).tolist() == [0.0, 0.0]
+    assert compensator.choose(1000, HERE).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("step", range(100, 100 + H))
 def test_stage_is_the_step_since_the_horizon_was_made(step: int) -> None:
     """u(k|k_h): a packet under way for five steps is entered at its fifth stage."""
-    np.testing.assert_allclose(holding(100).choose(step), INPUTS[:, step - 100], rtol=1e-7)
+    np.testing.assert_allclose(holding(100).choose(step, HERE), INPUTS[:, step - 100], rtol=1e-7)
 
 
 @pytest.mark.parametrize("step", [100 + H, 101 + H, 100_000])
 def test_held_horizon_flies_its_last_input_for_ever(step: int) -> None:
     """E10: the paper's min(k, k_h + H - 1)."""
-    np.testing.assert_allclose(holding(100).choose(step), INPUTS[:, -1], rtol=1e-7)
+    np.testing.assert_allclose(holding(100).choose(step, HERE), INPUTS[:, -1], rtol=1e-7)
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
@@ -68,20 +70,20 @@ def test_horizon_for_a_later_step_begins_at_once(exhausted: str) -> None:
     """The server's idea of the step may be ahead: its first input is the nearest there is."""
     compensator = Compensator(scenario(exhausted=exhausted))
     compensator.offer(horizon(105), 100)
-    np.testing.assert_allclose(compensator.choose(101), INPUTS[:, 0], rtol=1e-7)
+    np.testing.assert_allclose(compensator.choose(101, HERE), INPUTS[:, 0], rtol=1e-7)
 
 
 def test_braking_begins_only_after_the_last_stage() -> None:
     """The last input is flown for its own step in full."""
     np.testing.assert_allclose(
-        holding(100, exhausted="brake").choose(99 + H), INPUTS[:, -1], rtol=1e-7
+        holding(100, exhausted="brake").choose(99 + H, HERE), INPUTS[:, -1], rtol=1e-7
     )
 
 
 def test_brake_takes_the_speed_away_at_its_rate() -> None:
     """1.0 m/s at 2 m/s² in steps of 0.1 s: 0.8, 0.6 … 0, then hovering."""
     compensator = holding(0, np.tile([[0.6], [0.8]], H), exhausted="brake")
-    speeds = [float(np.linalg.norm(compensator.choose(H + i))) for i in range(8)]
+    speeds = [float(np.linalg.norm(compensator.choose(H + i, HERE))) for i in range(8)]
     assert speeds == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0, 0.0, 0.0, 0.0], abs=1e-7)
 
 
@@ -90,17 +92,17 @@ def test_brake_takes_the_speed_away_at_its_rate() -> None:
 def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> None:
     """Whatever was flown last, its direction stays and its speed only falls."""
     compensator = holding(0, np.tile([[x], [y]], H), exhausted="brake")
-    last, now, then = (compensator.choose(H - 1 + i) for i in (0, later, later + 1))
+    last, now, then = (compensator.choose(H - 1 + i, HERE) for i in (0, later, later + 1))
     assert last[0] * now[1] == pytest.approx(last[1] * now[0], abs=1e-12)
     assert float(last @ now) >= 0.0
     lost = np.linalg.norm(now) - np.linalg.norm(then)
     assert -1e-12 <= lost <= 0.2 + 1e-12
-    assert compensator.choose(H + 10).tolist() == [0.0, 0.0]
+    assert compensator.choose(H + 10, HERE).tolist() == [0.0, 0.0]
 
 
 def test_brake_from_a_standstill_stays() -> None:
     """There is no direction to brake in."""
-    assert holding(0, np.zeros((2, H)), exhausted="brake").choose(H + 3).tolist() == [0.0, 0.0]
+    assert holding(0, np.zeros((2, H)), exhausted="brake").choose(H + 3, HERE).tolist() == [0.0, 0.0]
 
 
 def test_stale_horizon_is_ignored_after_reordering() -> None:
@@ -109,7 +111,7 @@ def test_stale_horizon_is_ignored_after_reordering() -> None:
     for made in (10, 12, 11, 12, 10):
         compensator.offer(horizon(made, INPUTS + 0.01 * (made - 10), observed_ns=made), 14)
     assert (compensator.in_force, compensator.observed_ns, compensator.stale) == (12, 12, 3)
-    np.testing.assert_allclose(compensator.choose(14), INPUTS[:, 2] + 0.02, rtol=1e-6)
+    np.testing.assert_allclose(compensator.choose(14, HERE), INPUTS[:, 2] + 0.02, rtol=1e-6)
 
 
 @quick
@@ -120,7 +122,7 @@ def test_order_of_arrival_does_not_matter(order: list[int], step: int) -> None:
     for made in order:
         compensator.offer(horizon(made, INPUTS * 0.1 * (made + 1)), 4)
     expected = INPUTS[:, min(step - 4, H - 1)] * 0.5
-    np.testing.assert_allclose(compensator.choose(step), expected, rtol=1e-6)
+    np.testing.assert_allclose(compensator.choose(step, HERE), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
@@ -130,7 +132,7 @@ def test_without_compensation_the_newest_first_input_is_flown(step: int, exhaust
     compensator = holding(5, scheme="none", exhausted=exhausted)
     compensator.offer(horizon(7, INPUTS + 0.2), 9)
     compensator.offer(horizon(6, INPUTS + 0.3), 9)
-    np.testing.assert_allclose(compensator.choose(step), INPUTS[:, 0] + 0.2, rtol=1e-6)
+    np.testing.assert_allclose(compensator.choose(step, HERE), INPUTS[:, 0] + 0.2, rtol=1e-6)
 
 
 def test_horizon_from_the_future_is_refused() -> None:
@@ -139,7 +141,7 @@ def test_horizon_from_the_future_is_refused() -> None:
     with pytest.raises(ProtocolError, match=r"^from the future$"):
         compensator.offer(horizon(111 + H, INPUTS + 0.2), 110)
     assert (compensator.in_force, compensator.stale) == (100, 0)
-    np.testing.assert_allclose(compensator.choose(103), INPUTS[:, 3], rtol=1e-7)
+    np.testing.assert_allclose(compensator.choose(103, HERE), INPUTS[:, 3], rtol=1e-7)
 
 
 def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
@@ -152,12 +154,68 @@ def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
 def test_inputs_are_held_within_the_bounds() -> None:
     """The last clamp, apart from the parser's: each axis its own, on both sides."""
     compensator = holding(0, np.tile([[1.8015, -5.0], [-0.9005, 3.0]], H // 2))
-    assert compensator.choose(0).tolist() == [1.8, -0.9]
-    assert compensator.choose(1).tolist() == [-1.8, 0.9]
+    assert compensator.choose(0, HERE).tolist() == [1.8, -0.9]
+    assert compensator.choose(1, HERE).tolist() == [-1.8, 0.9]
 
 
 def test_chosen_input_is_the_caller_s_own() -> None:
     """Writing to it does not write to the horizon."""
     for compensator in (holding(0), holding(0, scheme="none"), holding(0, exhausted="brake")):
-        compensator.choose(0)[:] = 9.0
-        np.testing.assert_allclose(compensator.choose(0), INPUTS[:, 0], rtol=1e-7)
+        compensator.choose(0, HERE)[:] = 9.0
+        np.testing.assert_allclose(compensator.choose(0, HERE), INPUTS[:, 0], rtol=1e-7)
+
+
+# -- feedback aboard -----------------------------------------------------------------------------
+
+GAIN = np.array([[3.0, 1.5], [2.0, 0.5]])
+
+
+def with_feedback(x: Array, disturbance: Array, gain: Array = GAIN) -> Horizon:
+    """A horizon for step 100 that leads on from a state."""
+    feedback = np.concatenate([x, disturbance[:, None], gain], axis=1).astype(np.float32)
+    assert feedback.shape == (2, FEEDBACK)
+    return horizon(100)._replace(feedback=feedback)
+
+
+@pytest.mark.parametrize("stage", [0, 1, 5, H - 1])
+def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
+    """K times what the state is away from there, onto the input of the stage."""
+    flown = scenario(scheme="feedback")
+    model = discretise(flown.tau_s, flown.control.dt)
+    x, disturbance = np.array([[0.5, 0.25], [-1.0, 0.125]]), np.array([0.25, -0.5])
+    compensator = Compensator(flown)
+    compensator.offer(with_feedback(x, disturbance), 100)
+    for u in INPUTS[:, :stage].T:
+        x = model.step(x, u + disturbance)
+    on_course = compensator.choose(100 + stage, x)
+    np.testing.assert_allclose(on_course, INPUTS[:, stage], atol=1e-6)
+    away = np.array([[0.02, -0.01], [0.03, 0.04]])
+    back = compensator.choose(100 + stage, x + away) - on_course
+    np.testing.assert_allclose(back, [-0.045, -0.08], atol=1e-6)
+
+
+def test_feedback_stays_within_the_bounds() -> None:
+    """However far away the vehicle is."""
+    compensator = Compensator(scenario(scheme="feedback"))
+    compensator.offer(with_feedback(HERE, np.zeros(2)), 100)
+    far = np.array([[1e6, 0.0], [-1e6, 0.0]])
+    assert compensator.choose(105, far).tolist() == [-1.8, 0.9]
+
+
+@pytest.mark.parametrize("step", [99, 100 + H, 120 + H])
+def test_there_is_no_feedback_where_there_is_no_stage(step: int) -> None:
+    """Before the first and after the last: nothing says where the vehicle should be."""
+    compensator, plain = Compensator(scenario(exhausted="brake")), holding(100, exhausted="brake")
+    compensator.offer(with_feedback(HERE, np.zeros(2)), 99)
+    near, far = (compensator.choose(step, HERE + away) for away in (0.0, 3.0))
+    np.testing.assert_array_equal(near, far)
+    np.testing.assert_array_equal(near, plain.choose(step, HERE))
+
+
+def test_feedback_ends_with_its_horizon() -> None:
+    """The next may come without."""
+    compensator = Compensator(scenario(scheme="feedback"))
+    compensator.offer(with_feedback(HERE, np.zeros(2)), 100)
+    compensator.offer(horizon(101), 101)
+    near, far = (compensator.choose(103, HERE + away) for away in (0.0, 3.0))
+    np.testing.assert_array_equal(near, far)

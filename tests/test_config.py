@@ -57,8 +57,8 @@ WRONG = {
     "a time step too long": ("control.dt = 2", "control.dt: got 2, expected a number <= 1.0"),
     "no horizon": ("control.horizon = 0", "control.horizon: got 0, expected a whole number >= 1"),
     "a horizon beyond any datagram": (
-        "control.horizon = 289",
-        "control.horizon: got 289, expected a whole number <= 288",
+        "control.horizon = 271",
+        "control.horizon: got 271, expected a whole number <= 270",
     ),
     "a negative weight": (
         "control.state_weight = [1.0, -2.0]",
@@ -96,7 +96,7 @@ WRONG = {
     # Not one of the choices.
     "a scheme that is none": (
         'control.scheme = "papr"',
-        "control.scheme: got 'papr', expected 'committed' or 'paper' or 'none'",
+        "control.scheme: got 'papr', expected 'committed' or 'feedback' or 'paper' or 'none'",
     ),
     "a trigger nobody knows": (
         'control.trigger = "often"',
@@ -176,8 +176,8 @@ WRONG = {
         "control.delay_bound: got 3.0, expected less than horizon · dt = 2 s",
     ),
     "a horizon in space that fits no datagram": (
-        "model.axes = 3\ncontrol.horizon = 97",
-        "control.horizon: got 97, expected at most 96 with 3 axes, to fit one datagram",
+        "model.axes = 3\ncontrol.horizon = 91",
+        "control.horizon: got 91, expected at most 90 with 3 axes, to fit one datagram",
     ),
     "nothing left after settling": (
         "duration = 5.0\nsettle = 5.0",

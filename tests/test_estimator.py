@@ -16,7 +16,7 @@ MODEL = discretise(np.array([0.81, 0.3]), 0.05)
 ROW = np.array([0])
 
 
-SENT = np.array([3]), np.array([0])
+SENT = np.array([0])
 """Length of a horizon, and which were sent; neither is asked for."""
 
 
@@ -30,6 +30,10 @@ def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
     return Estimator(MODEL, capacity, REACH, compensate=compensate)
 
 
+FORESIGHT = make().foresee(ROW, np.array([-1]))
+"""Of nothing: (12) does not ask what a horizon was computed from."""
+
+
 def horizons(inputs: Array) -> Array:
     """That begin with these inputs of shape (n, axes)."""
     return np.repeat(inputs.astype(np.float32)[:, :, None], 3, axis=2)
@@ -38,7 +42,7 @@ def horizons(inputs: Array) -> Array:
 def remember(estimator: Estimator, inputs: Array, *, start: int = 0) -> None:
     """û(start), û(start + 1), … of the one vehicle; inputs of shape (steps, axes)."""
     for step, u in enumerate(inputs, start):
-        estimator.remember(ROW, np.array([step]), horizons(u[None]), *SENT)
+        estimator.remember(ROW, np.array([step]), FORESIGHT, horizons(u[None]), SENT)
 
 
 def estimate(estimator: Estimator, step: int) -> Array:
@@ -206,7 +210,7 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
     for row in both:
         estimator.observe(row, seen(500, x))
     for step in range(480, 501):
-        estimator.remember(both, np.full(2, step), horizons(np.ones((2, 2))), *SENT)
+        estimator.remember(both, np.full(2, step), FORESIGHT, horizons(np.ones((2, 2))), SENT)
     estimator.forget(0)
     assert estimator.within_reach(both, np.array([501, 501])).tolist() == [False, True]
     assert estimator.observe(0, seen(0, x))
@@ -230,9 +234,9 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
     for _ in range(30):
         step += rng.integers(1, 4, vehicles)
         u = rng.normal(size=(vehicles, 2)).astype(np.float32)
-        together.remember(rows, step, horizons(u), *SENT)
+        together.remember(rows, step, FORESIGHT, horizons(u), SENT)
         for i, single in enumerate(singles):
-            single.remember(ROW, step[[i]], horizons(u[[i]]), *SENT)
+            single.remember(ROW, step[[i]], FORESIGHT, horizons(u[[i]]), SENT)
     for i, (row, single) in enumerate(zip(rows, singles, strict=True)):
         x, observed = rng.normal(size=(2, 2)), int(step[i] + 1 - rng.integers(0, REACH + 1))
         together.observe(int(row), seen(observed, x))

@@ -12,7 +12,7 @@ from server.controller import VEHICLES_MAX, Server
 from shared import config
 from shared.chance import stream
 from shared.endpoint import NEWS_MAX, SECOND_NS, Datagram, Endpoint
-from shared.protocol import Heartbeat, Hello, Horizon, Observation, Welcome, encode
+from shared.protocol import FEEDBACK, Heartbeat, Hello, Horizon, Observation, Welcome, encode
 
 SCENARIO = config.load("paper")
 TERMS = SCENARIO.terms()
@@ -29,6 +29,7 @@ def hostile(rng: random.Random) -> Iterator[bytes]:
             Welcome(1, 7, 5, 3, 10, TERMS),
             Observation(1, 7, 5, 10, 4, 4, 8, 9, np.zeros((2, 2))),
             Horizon(1, 7, 5, 10, 9, inputs),
+            Horizon(1, 7, 5, 10, 9, inputs, np.ones((2, FEEDBACK), np.float32)),
             Heartbeat(1, 7, 10),
         )
     ]

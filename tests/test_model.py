@@ -94,3 +94,14 @@ def test_very_short_time_constant_follows_at_once() -> None:
     """With τ far below Δt the vehicle flies u, and lags by u τ."""
     x = discretise(np.array([1e-4]), 0.5).step(np.array([[0.0, -9.0]]), np.array([2.0]))
     np.testing.assert_allclose(x, [[2.0 * 0.5 - 11.0 * 1e-4, 2.0]], rtol=1e-14)
+
+
+def test_a_roll_out_is_step_after_step() -> None:
+    """Its first state is where it starts."""
+    model, rng = discretise(np.array([0.8, 0.3, 1.1]), 0.05), np.random.default_rng(1)
+    x, inputs = rng.normal(size=(3, 2)), rng.normal(size=(30, 3))
+    states = model.roll_out(x, inputs)
+    assert states.shape == (30, 3, 2)
+    for state, u in zip(states, inputs, strict=True):
+        np.testing.assert_allclose(state, x, rtol=0, atol=1e-12)
+        x = model.step(x, u)

@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from shared import protocol
 from shared.protocol import (
+    FEEDBACK,
     INPUTS_MAX,
     NO_HORIZON,
     PAYLOAD_BYTES_MAX,
@@ -61,6 +62,11 @@ messages: st.SearchStrategy[Message] = st.one_of(
             st.tuples(st.just(2), st.integers(40, 80)),
             elements=st.floats(-1.75, 1.75, width=32),
         ),
+        arrays(
+            "<f4",
+            st.tuples(st.just(2), st.sampled_from([0, FEEDBACK])),
+            elements=st.floats(allow_nan=False, allow_infinity=False, width=32),
+        ),
     ),
     st.builds(Heartbeat, u16, u32, stamp),
 )
@@ -85,7 +91,8 @@ def test_the_longest_horizon_fits_one_datagram(axes: int) -> None:
     """All numbers at their largest, and as many inputs as the limit allows."""
     longest = INPUTS_MAX // axes
     horizon = Horizon(
-        2**16 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**63 - 1, np.ones((axes, longest), np.float32)
+        *(2**16 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**63 - 1),
+        *(np.ones((axes, longest), np.float32), np.ones((axes, FEEDBACK), np.float32)),
     )
     assert len(encode(horizon)) <= PAYLOAD_BYTES_MAX
 
@@ -95,9 +102,12 @@ def test_documented_sizes_are_the_real_ones() -> None:
     inputs = np.zeros((2, 40), np.float32)
     state = np.zeros((2, 2))
     stamp_ns, session = 3 * 10**14, 2**31
-    assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs))) == 353
+    assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs))) == 355
     committed = np.zeros((2, 51), np.float32)
-    assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, committed))) == 353 + 11 * 8
+    committing = Horizon(1, session, 500, stamp_ns, stamp_ns, committed)
+    assert len(encode(committing)) == 355 + 11 * 8
+    aboard = np.zeros((2, FEEDBACK), np.float32)
+    assert len(encode(committing._replace(feedback=aboard))) == 355 + 11 * 8 + 40
     observation = Observation(1, session, 500, stamp_ns, 480, 490, stamp_ns, stamp_ns, state)
     assert len(encode(observation)) == 79
     assert len(encode(Heartbeat(1, session, stamp_ns))) == 18
@@ -143,6 +153,11 @@ HELLO = Hello(1, 99, TERMS)
         (HORIZON, 7, np.full(80, -1.81, np.float32).tobytes(), "input out of range"),
         (HORIZON, 7, np.array([9] * 79 + [-math.inf], np.float32).tobytes(), "not finite"),
         (HORIZON, 7, b"\x00\x00\xa0\x7f" * 80, "not finite"),  # signalling NaNs
+        (HORIZON, 8, np.zeros(2, np.float32).tobytes(), "shape"),
+        (HORIZON, 8, np.zeros(12, np.float32).tobytes(), "shape"),
+        (HORIZON, 8, [], "shape"),
+        (HORIZON, 8, np.array([9] * 9 + [math.nan], np.float32).tobytes(), "not finite"),
+        (HORIZON, 8, np.array([9] * 9 + [-math.inf], np.float32).tobytes(), "not finite"),
         (HELLO, 4, [0, 40, 2, [0.8, 0.7], [1.8, -1.0]], "field"),
         (HELLO, 4, [0, 40, 2, [0.8, 0.7], [1.8, math.nan]], "field"),
         (HELLO, 4, [0, 40, 2, [0.8, 0.7], [1.8]], "field"),
