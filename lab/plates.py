@@ -394,8 +394,8 @@ class Bought:
     tuned: bool
 
 
-COLOURS = ("0.5", "#c1272d", "#e69f00", "black", "#56b4e9", "#0072b2", "#009e73")
-MARKERS = "sov^D<P"
+COLOURS = ("0.5", "#c1272d", "#e69f00", "black", "#56b4e9", "#0072b2", "#009e73", "#cc79a7")
+MARKERS = "sov^D<P*"
 """Of the curves of `trade`, in order; apart without colour, too."""
 
 

@@ -108,7 +108,7 @@ WRONG = {
     "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),
     "a trigger for another scheme": (
         'control.scheme = "paper"\ncontrol.trigger = "cost_gap"',
-        "control.scheme: got 'paper', expected 'committed' with the trigger cost_gap",
+        "control.scheme: got 'paper', expected 'committed' or 'feedback' with the trigger cost_gap",
     ),
     "a negative cost": (
         "control.cost_gap = -1.0",
