@@ -56,7 +56,8 @@ class Foresight:
         """Of some of the vehicles."""
         return Foresight(
             *(self.estimate[some], self.ahead[some], self.start[some]),
-            *(self.committed[some], self.held[some], self.disturbance[some], self.feedback[some]),
+            *(self.committed[some], self.held[some], self.disturbance[some]),
+            self.feedback[some],
         )
 
 

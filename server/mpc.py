@@ -21,7 +21,6 @@ from numba import njit
 from shared.config import ControlConfig
 from shared.model import Array, Indices, Model
 
-
 ROUNDS = 10_000
 """Most of the Riccati recursion, for weights with which it hardly settles."""
 

@@ -248,7 +248,7 @@ def _lead(told, flies, row, number, axis, begin, end, p, v):  # type: ignore[no-
 
 @njit(f"f8({TOLD}, {FLIES}, i8, i8, i8, i8, f8, f8, f8, f8)", cache=True, error_model="numpy")
 def _command(told, flies, row, number, axis, step, p, v, p_led, v_led):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """What `client.compensator` flies at a step with a horizon; p, v is the state there, led is x̄."""
+    """What `client.compensator` flies at a step with a horizon, from the state p, v; led is x̄."""
     if number == HOVERS:
         return 0.0
     if number == UNKNOWN:

@@ -42,13 +42,11 @@ class Model:
         """
         # Plain numbers: numpy costs more than it saves on so few.
         states = np.empty((len(inputs), *x.shape))
-        for axis, ((p, v), u, ((a, b), (c, d)), (e, f)) in enumerate(
-            zip(x.tolist(), inputs.T.tolist(), self.A.tolist(), self.B.tolist(), strict=True)
-        ):
-            along = []
-            for each in u:
+        for axis, (A, B) in enumerate(zip(self.A.tolist(), self.B.tolist(), strict=True)):
+            (p, v), along = x[axis].tolist(), []
+            for u in inputs[:, axis].tolist():
                 along.append((p, v))
-                p, v = a * p + b * v + e * each, c * p + d * v + f * each
+                p, v = A[0][0] * p + A[0][1] * v + B[0] * u, A[1][0] * p + A[1][1] * v + B[1] * u
             states[:, axis] = along
         return states
 

@@ -102,7 +102,8 @@ def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> N
 
 def test_brake_from_a_standstill_stays() -> None:
     """There is no direction to brake in."""
-    assert holding(0, np.zeros((2, H)), exhausted="brake").choose(H + 3, HERE).tolist() == [0.0, 0.0]
+    compensator = holding(0, np.zeros((2, H)), exhausted="brake")
+    assert compensator.choose(H + 3, HERE).tolist() == [0.0, 0.0]
 
 
 def test_stale_horizon_is_ignored_after_reordering() -> None:

@@ -129,7 +129,8 @@ def test_what_compares_committed_inputs_needs_their_scheme(name: str) -> None:
     with pytest.raises(config.ConfigError) as caught:
         config.check({"control": control}, "mine")
     assert str(caught.value) == (
-        f"mine: control.scheme: got 'paper', expected 'committed' or 'feedback' with the trigger {name}"
+        "mine: control.scheme: got 'paper', "
+        f"expected 'committed' or 'feedback' with the trigger {name}"
     )
     config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
 
