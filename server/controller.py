@@ -316,12 +316,14 @@ class Server(Endpoint):
             *(rows, step + foresight.ahead, foresight.start),
             *(situation.planned, situation.fresh, foresight.disturbance),
         )
-        if (verdict.perhaps != verdict.surely).any():
+        undecided = np.flatnonzero(verdict.perhaps != verdict.surely)
+        if len(undecided):  # of the others nothing is found out, as if they were alone
 
             def cost_gap() -> Array:
-                return self._planner.cost_gap(rows, foresight.held)
+                return self._planner.cost_gap(rows[undecided], foresight.held[undecided])
 
-            verdict = self._trigger.test(replace(situation, cost_gap=cost_gap))
+            now_known = replace(situation.of(undecided), cost_gap=cost_gap)
+            verdict = verdict.settled(undecided, self._trigger.test(now_known))
         event = verdict.surely & plan.solved
         sent = np.flatnonzero(event)
         horizons, lengths = foresight.horizons(plan.inputs), foresight.ahead + self._terms.horizon

@@ -77,6 +77,13 @@ class Verdict:
             *(self.surely[some], self.perhaps[some], self.error[some], self.threshold[some])
         )
 
+    def settled(self, some: Indices, verdict: "Verdict") -> "Verdict":
+        """With another verdict on some of the vehicles."""
+        surely, error, threshold = self.surely.copy(), self.error.copy(), self.threshold.copy()
+        surely[some], error[some] = verdict.surely, verdict.error
+        threshold[some] = verdict.threshold
+        return Verdict(surely, surely, error, threshold)
+
 
 class Trigger(Protocol):
     """Decides at every step which vehicles are sent a horizon."""
