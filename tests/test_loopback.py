@@ -302,11 +302,22 @@ def differences(real: Flight, virtual: Flight) -> list[str]:
             (real.client, virtual.client, virtual.client.dtype.names),
         )
         for column in columns or ()
-        if column != "age_ns" and not np.array_equal(flown[column], expected[column])
+        if column != "age_ns"
+        and not np.array_equal(flown[column], expected[column], equal_nan=True)
     ]
 
 
-async def test_both_worlds_decide_the_same_on_a_network_without_delay() -> None:
+@pytest.mark.parametrize(
+    "control",
+    [
+        {"epsilon": 0.05},
+        {"scheme": "feedback", "trigger": "cost_gap", "cost_gap": 1.0, "delay_bound": 0.4},
+    ],
+    ids=["paper", "feedback"],
+)
+async def test_both_worlds_decide_the_same_on_a_network_without_delay(
+    control: dict[str, Any],
+) -> None:
     """The same scenario over loopback and in virtual time: same events, same inputs, same order.
 
     Steps are 0.2 s, and the server ticks in the middle of the vehicle's. Only a pause of the
@@ -317,7 +328,8 @@ async def test_both_worlds_decide_the_same_on_a_network_without_delay() -> None:
     changes = {
         "duration": 5.0,
         "network": {"uplink": none, "downlink": none},
-        "control": {"dt": 0.2, "horizon": 10, "epsilon": 0.05},
+        "control": {"dt": 0.2, "horizon": 10, **control},
+        "vehicle": {"wind": 0.1},
         "seed": 4,
     }
     flown = scenario("paper", **changes)
