@@ -39,7 +39,7 @@ def skytether(line: str) -> list[str]:
     "line",
     [
         line
-        for line in COMMANDS
+        for line in dict.fromkeys(COMMANDS)
         if line.startswith(("skytether fl", "skytether sc", "skytether sw", "skytether ca"))
     ],
 )
