@@ -58,12 +58,9 @@ class Replay:
         self._reach = reach
         brake_mps2 = vehicle.brake_mps2 if vehicle.exhausted == "brake" else 0.0
         self._feeds_back = control.scheme == "feedback"
-        gain = np.zeros((axes, 2), dtype=np.float32)
-        if self._feeds_back:
-            gain += stationary_gain(model, control).astype(np.float32)
-        self._gain = gain
+        self._gain = (self._feeds_back * stationary_gain(model, control)).astype(np.float32)
         bounds = (scenario.u_max, brake_mps2 * control.dt)
-        self._flies = (model.A, model.B, *bounds, gain.astype(np.float64))
+        self._flies = (model.A, model.B, *bounds, self._gain.astype(np.float64))
         """A and B, and what `client.compensator` makes of a horizon."""
         observer_s = control.observer_s
         self._observer_decay = float(np.exp(-control.dt / observer_s)) if observer_s else 1.0
