@@ -183,6 +183,8 @@ SEEN = "Tuple((f8[:,:,::1], i8[::1], i8[::1], i8[::1]))"
 """Of the kernels: `Replay._flies`, `_told` and `_seen`."""
 HOVERS, UNKNOWN = -1, -2
 """In place of the number of a horizon: none yet; one that was sent in an earlier life of ours."""
+NEVER = 2**62
+"""A step."""
 
 
 @njit("i8(i8[:,::1], i8[::1], i8, i8)", cache=True)
@@ -217,53 +219,71 @@ def _roll(A, B, axis, p, v, u):  # type: ignore[no-untyped-def]  # noqa: ANN001,
 
 
 @njit(f"f8({TOLD}, {FLIES}, i8, i8, i8, i8)", cache=True)
-def _told_input(told, flies, row, number, axis, stage):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """The input of a stage of a horizon, or its last, as far as the vehicle will go."""
-    _, horizons, lengths, _, _ = told
-    slot, most = number % horizons.shape[1], flies[2][axis]
-    u = float(horizons[row, slot, axis, min(max(stage, 0), lengths[row, slot] - 1)])
-    return min(max(u, -most), most)
+def _input(told, flies, row, slot, axis, stage):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    """The input of a stage of a horizon, as far as the vehicle will go."""
+    most = flies[2][axis]
+    return min(max(float(told[1][row, slot, axis, stage]), -most), most)
 
 
-@njit(f"UniTuple(f8, 2)({TOLD}, {FLIES}, i8, i8, i8, i8, i8, f8, f8)", cache=True)
-def _lead(told, flies, row, number, axis, begin, end, p, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """x̄ of a horizon at step `end`: from p, v at `begin`, or from where it starts if that is -1."""
+@njit(f"Tuple((i8, i8, i8, f8))({TOLD}, {FLIES}, i8, i8)", cache=True)
+def _take(told, flies, row, number):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    """A horizon: where it is in the ring, its step, its last stage, and the speed it ends with."""
     if number < 0:
+        return number, 0, 0, 0.0
+    stamps, horizons, lengths, _, _ = told
+    slot, squares = number % stamps.shape[1], 0.0
+    end = lengths[row, slot] - 1
+    for axis in range(horizons.shape[2]):
+        squares += _input(told, flies, row, slot, axis, end) ** 2
+    return slot, stamps[row, slot], end, np.sqrt(squares)
+
+
+@njit(f"i8({TOLD}, i8, i8, i8)", cache=True)
+def _due(told, row, number, d):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+    """The step from which a horizon in flight is counted on."""
+    stamps, _, _, _, sent = told
+    return stamps[row, number % stamps.shape[1]] + d if number < sent[row] else NEVER
+
+
+@njit(
+    f"UniTuple(f8, 2)({TOLD}, {FLIES}, i8, Tuple((i8, i8, i8, f8)), i8, i8, i8, f8, f8)", cache=True
+)
+def _lead(told, flies, row, taken, axis, begin, end, p, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+    """x̄ of a horizon at step `end`: from p, v at `begin`, or from where it starts if that is -1."""
+    slot, stamp, last, _ = taken
+    if slot < 0:
         return p, v
-    stamps, _, _, origins, _ = told
-    slot = number % stamps.shape[1]
-    stamp = stamps[row, slot]
+    origins = told[3]
     if begin < 0:
         begin = stamp
         p, v = float(origins[row, slot, axis, 0]), float(origins[row, slot, axis, 1])
     w = float(origins[row, slot, axis, 2])
     for step in range(max(begin, stamp), end):
-        u = _told_input(told, flies, row, number, axis, step - stamp) + w
+        u = _input(told, flies, row, slot, axis, min(step - stamp, last)) + w
         p, v = _roll(flies[0], flies[1], axis, p, v, u)
     return p, v
 
 
-@njit(f"f8({TOLD}, {FLIES}, i8, i8, i8, i8, f8, f8, f8, f8)", cache=True, error_model="numpy")
-def _command(told, flies, row, number, axis, step, p, v, p_led, v_led):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
+@njit(
+    f"f8({TOLD}, {FLIES}, i8, Tuple((i8, i8, i8, f8)), i8, i8, f8, f8, f8, f8)",
+    cache=True,
+    error_model="numpy",
+)
+def _command(told, flies, row, taken, axis, step, p, v, p_led, v_led):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
     """What `client.compensator` flies at a step with a horizon, from the state p, v; led is x̄."""
-    if number == HOVERS:
+    slot, stamp, end, speed = taken
+    if slot == HOVERS:
         return 0.0
-    if number == UNKNOWN:
+    if slot == UNKNOWN:
         return v  # as good a guess as any: it flies on
-    stamps, horizons, lengths, _, _ = told
     _, _, u_max, brake, gain = flies
-    slot = number % horizons.shape[1]
-    stage, end = step - stamps[row, slot], lengths[row, slot] - 1
-    u = _told_input(told, flies, row, number, axis, stage)
+    stage = step - stamp
+    u = _input(told, flies, row, slot, axis, min(max(stage, 0), end))
     if 0 <= stage <= end:
         u += gain[axis, 0] * (p_led - p) + gain[axis, 1] * (v_led - v)
         return min(max(u, -u_max[axis]), u_max[axis])
     if stage < 0 or brake == 0.0:
         return u
-    squares = 0.0
-    for other in range(horizons.shape[2]):
-        squares += _told_input(told, flies, row, number, other, end) ** 2
-    speed = np.sqrt(squares)
     return u * (max(0.0, speed - (stage - end) * brake) / speed) if speed > 0.0 else 0.0
 
 
@@ -293,20 +313,21 @@ def _replay(flies, told, seen, judged, disturbance, rows, steps, ahead, H):  # t
         judged[row] = max(judged[row], observed - d)
         for axis in range(axes):
             p, v = state[row, axis, 0], state[row, axis, 1]
-            number, following = flown, first
-            led, p_led, v_led = -1, 0.0, 0.0
+            taken, following = _take(told, flies, row, flown), first
+            due, led, p_led, v_led = _due(told, row, following, d), -1, 0.0, 0.0
             for step in range(observed, k + d + H):
-                while following < sent[row] and stamps[row, following % room] + d <= step:
-                    number, following, led = following, following + 1, -1
+                while due <= step:
+                    taken, following, led = _take(told, flies, row, following), following + 1, -1
+                    due = _due(told, row, following, d)
                 if feeds_back:
-                    p_led, v_led = _lead(told, flies, row, number, axis, led, step, p_led, v_led)
+                    p_led, v_led = _lead(told, flies, row, taken, axis, led, step, p_led, v_led)
                     led = step
                 # An observation from ahead of k, where clocks disagree, is taken as it is.
                 if step == max(k, observed):
                     estimate[i, axis, 0], estimate[i, axis, 1] = p, v
                 if step == max(k + d, observed):
                     start[i, axis, 0], start[i, axis, 1] = p, v
-                u = _command(told, flies, row, number, axis, step, p, v, p_led, v_led)
+                u = _command(told, flies, row, taken, axis, step, p, v, p_led, v_led)
                 if step < k + d:
                     if step >= k:
                         committed[i, axis, step - k] = u
@@ -328,7 +349,7 @@ def _observe_disturbance(flies, told, seen, base, disturbance, rows, ahead, reac
     stamps, _, _, _, sent = told
     state, observed_step, in_force, since = seen
     base_state, base_step, base_in_force = base
-    axes, room, feeds_back = len(A), stamps.shape[1], gain.any()
+    axes, feeds_back = len(A), gain.any()
     for i in range(len(rows)):
         row, d = rows[i], ahead[i]
         begin, end = base_step[row], observed_step[row]
@@ -339,17 +360,22 @@ def _observe_disturbance(flies, told, seen, base, disturbance, rows, ahead, reac
         known = min(before, after) > UNKNOWN and begin >= 0 and end - begin <= reach
         for axis in range(axes):
             p, v, number = base_state[row, axis, 0], base_state[row, axis, 1], before
-            led, p_led, v_led = -1, 0.0, 0.0
+            taken = _take(told, flies, row, number)
             following = _first_after(stamps, sent, row, max(base_in_force[row], begin - d))
+            due, led, p_led, v_led = _due(told, row, following, d), -1, 0.0, 0.0
             for step in range(begin, end if known else begin):
-                while following < after and stamps[row, following % room] + d <= step:
-                    number, following, led = following, following + 1, -1
-                if step >= since[row] and number != after:
-                    number, led = after, -1
+                was = number
+                while due <= step and following < after:
+                    number, following = following, following + 1
+                    due = _due(told, row, following, d)
+                if step >= since[row]:
+                    number = after
+                if number != was:
+                    taken, led = _take(told, flies, row, number), -1
                 if feeds_back:
-                    p_led, v_led = _lead(told, flies, row, number, axis, led, step, p_led, v_led)
+                    p_led, v_led = _lead(told, flies, row, taken, axis, led, step, p_led, v_led)
                     led = step
-                u = _command(told, flies, row, number, axis, step, p, v, p_led, v_led)
+                u = _command(told, flies, row, taken, axis, step, p, v, p_led, v_led)
                 p, v = _roll(A, B, axis, p, v, u + disturbance[row, axis])
             if known:
                 # A change of w changes the velocity after m steps by 1 - a^m of it.
