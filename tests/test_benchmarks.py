@@ -91,7 +91,7 @@ def test_the_flights_are_what_they_are_called(
     assert saturated.active() > 0.2
 
 
-@pytest.mark.parametrize("name", contestants(TUNINGS[0]).keys() - {NOTHING})
+@pytest.mark.parametrize("name", sorted(contestants(TUNINGS[0]).keys() - {NOTHING}))
 def test_contestants_solve_the_same_problems(name: str, saturated: Recorded) -> None:
     """Whatever form they are given them in; at OSQP's own tolerance only roughly."""
     entry = solvers.Entry(contestants(TUNINGS[0])[name], saturated)
