@@ -133,10 +133,7 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
 }
 """Of the policies that look at the flight, so that weights and thresholds decide what they send."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
-SCHEME_KEYS: Mapping[str, Sequence[Free]] = {
-    "committed": OBSERVER_KEYS,
-    "feedback": OBSERVER_KEYS,
-}
+"""Of the schemes that have one."""
 HERE = "here"
 """The one column of a point that is flown as it is."""
 
@@ -162,7 +159,8 @@ class Rmse:
     def free(self) -> Sequence[Free]:
         """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
         control, table = self.scenario.control, plain(self.scenario)
-        keys = [*WEIGHTS, *trigger_keys(control.trigger), *SCHEME_KEYS.get(control.scheme, ())]
+        observer = OBSERVER_KEYS if control.commits else ()
+        keys = [*WEIGHTS, *trigger_keys(control.trigger), *observer]
         return [key for key in keys if key.of(table) > 0.0]
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
