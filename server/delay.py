@@ -29,7 +29,7 @@ class DelayBound:
 
     Args:
         dt_s: length of a step [s].
-        most: the largest d that leaves a horizon something to plan, H - 1.
+        most: the largest d, what a horizon has room for.
         fixed_s: a bound that is known [s]; None to estimate it.
     """
 

@@ -446,8 +446,8 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
         if len(values) not in (0, axes):
             yield key, list(values), f"{axes} numbers with model.axes = {axes}"
     if control.horizon * axes > INPUTS_MAX:
-        most = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
-        yield "control.horizon", control.horizon, most
+        fit = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
+        yield "control.horizon", control.horizon, fit
     covered_s, delay_s = control.horizon * control.dt, scenario.network.uplink.mean_s
     if covered_s < delay_s - 1e-9:  # as much as floating point may make of 40 · 0.011
         cover = (
@@ -457,6 +457,11 @@ def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, st
     bound_s = control.delay_bound
     if bound_s != "auto" and bound_s >= covered_s - 1e-9:
         yield "control.delay_bound", bound_s, f"less than horizon · dt = {covered_s:g} s"
+    steps = max(1, math.ceil((delay_s if bound_s == "auto" else bound_s) / control.dt - 1e-9))
+    most = INPUTS_MAX // axes - steps
+    if control.commits and control.horizon > most:
+        fit = f"at most {most} beside {steps} committed steps with {axes} axes, to fit one datagram"
+        yield "control.horizon", control.horizon, fit
     if scenario.settle >= scenario.duration:
         yield "settle", scenario.settle, f"less than the duration of {scenario.duration:g} s"
     link = scenario.link

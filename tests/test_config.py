@@ -179,6 +179,20 @@ WRONG = {
         "model.axes = 3\ncontrol.horizon = 91",
         "control.horizon: got 91, expected at most 90 with 3 axes, to fit one datagram",
     ),
+    "a horizon that leaves no room for committed steps": (
+        "control.horizon = 130",
+        (
+            "control.horizon: got 130, expected at most 126 beside 9 committed steps with 2 axes, "
+            "to fit one datagram"
+        ),
+    ),
+    "a delay bound that leaves no room for the horizon": (
+        "control.horizon = 80\ncontrol.delay_bound = 3.0",
+        (
+            "control.horizon: got 80, expected at most 75 beside 60 committed steps with 2 axes, "
+            "to fit one datagram"
+        ),
+    ),
     "nothing left after settling": (
         "duration = 5.0\nsettle = 5.0",
         "settle: got 5.0, expected less than the duration of 5 s",
