@@ -24,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.clock import ClockMap
-from server.estimator import Estimator, Foresight, Scheme
+from server.estimator import Estimator
 from server.planner import Planner
 from server.replay import Replay
+from server.scheme import Foresight, Scheme
 from server.trigger import Situation, Verdict, make_trigger
 from shared.config import Scenario
 from shared.endpoint import (

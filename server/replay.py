@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 from server.clock import ClockMap
 from server.delay import DelayBound
-from server.estimator import Foresight
 from server.mpc import stationary_gain
+from server.scheme import Foresight
 from shared.config import Scenario
 from shared.model import Flags, Indices, Model
 from shared.protocol import FEEDBACK, INPUTS_MAX, NO_HORIZON, Observation
