@@ -174,6 +174,19 @@ def test_the_newest_observation_counts() -> None:
     assert not replay.within_reach(ROW, np.array([7]))[0]
 
 
+@pytest.mark.parametrize("scheme", ["committed", "feedback"])
+@pytest.mark.parametrize("ahead", [1, BOUND, BOUND + 1, 100, 10**12])
+def test_an_observation_from_ahead_is_taken_as_it_is(scheme: str, ahead: int) -> None:
+    """Clocks may disagree, by however much: nothing is flown back, and nothing made up."""
+    replay, x = make(small(scheme=scheme)), np.array([[1.0, 0.3], [-2.0, -0.1]])
+    send(replay, 100, np.ones((2, 2 * H)))
+    see(replay, 100 + ahead, x, 100)
+    seen = replay.foresee(ROW, np.array([100]))
+    np.testing.assert_array_equal(seen.estimate[0], x)
+    if ahead >= BOUND:
+        np.testing.assert_array_equal(seen.start[0], x)
+
+
 def test_many_horizons_are_kept_and_no_more() -> None:
     """The ring turns; one that has fallen out is not known any more."""
     replay = make(small(), reach=10)
