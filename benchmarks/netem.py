@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from benchmarks.harness import CONSOLE, Table, machine, median, progress, quantile_ms, sleep_until
 from shared.config import DirectionConfig
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
-from shared.udp import kernel_drops, open_socket
+from shell.udp import kernel_drops, open_socket
 
 HOST = "127.0.0.1"
 HEAD = struct.Struct("<qq")

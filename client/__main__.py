@@ -13,13 +13,13 @@ import tyro
 from client.fleet import Fleet
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
-from shared import command
 from shared.chance import stream
-from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import Scenario
 from shared.record import Recorder, client_columns, parse
 from shared.summary import summarise
-from shared.udp import allow_sockets, within_reach_of
+from shell import command
+from shell.command import CommandError, ScenarioFlags, ScenarioName
+from shell.udp import allow_sockets, within_reach_of
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ WEIGHTS = (
 )
 """Only ratios matter: the weight on the position stays what it is."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
-    "paper": (Free("control.epsilon", 1e-4, 1e4), Free("control.decay_rate", 1e-2, 1e2)),
+    "state_gap": (Free("control.epsilon", 1e-4, 1e4), Free("control.decay_rate", 1e-2, 1e2)),
     "cost_gap": (Free("control.cost_gap", 1e-6, 1e3),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
 }

@@ -52,7 +52,7 @@ LOOSE = {
     "change_weight": 20.0,
 }
 """Where searches begin with the paper's scheme: near the best of 240 points drawn at random."""
-EVENT = {"trigger": "paper", "epsilon": 30.0}
+EVENT = {"trigger": "state_gap", "epsilon": 30.0}
 TIGHT = {
     "state_weight": [7.1, 1.0],
     "terminal_weight": [50.0, 20.0],

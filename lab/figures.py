@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from lab.sweep import Axis
-from shared.command import CommandError
-from shared.config import Scenario
+from shared.config import ConfigError, Scenario
 from shared.model import Array, Indices
 from shared.record import Rows
 from shared.summary import position_error
@@ -22,12 +21,12 @@ def check(path: Path) -> None:
     """Refuse a file that no picture can be written to, before anything is flown.
 
     Raises:
-        CommandError: with what would do.
+        ConfigError: with what would do.
     """
     if path.suffix not in FORMATS:
-        raise CommandError(f"{path}: expected a file in {', '.join(FORMATS)}", 2)
+        raise ConfigError(f"{path}: expected a file in {', '.join(FORMATS)}")
     if not path.absolute().parent.is_dir():
-        raise CommandError(f"{path}: there is no folder {path.parent}", 2)
+        raise ConfigError(f"{path}: there is no folder {path.parent}")
 
 
 def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:

@@ -53,7 +53,7 @@ class Axis:
 
 
 def parse_axis(text: str) -> Axis:
-    """A grid as the user writes it: `control.epsilon=0.5:8:10`, or `control.scheme=paper,none`.
+    """A grid as the user writes it: `control.epsilon=0.5:8:10` or `control.scheme=committed,none`.
 
     Raises:
         ConfigError: it is none.

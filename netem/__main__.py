@@ -9,11 +9,11 @@ from typing import Annotated
 import tyro
 
 from netem.proxy import FLOWS_MAX, Proxy
-from shared import command
-from shared.command import ScenarioFlags, ScenarioName
 from shared.config import Scenario
 from shared.record import PACKET_COLUMNS, Recorder
-from shared.udp import allow_sockets
+from shell import command
+from shell.command import ScenarioFlags, ScenarioName
+from shell.udp import allow_sockets
 
 
 @dataclass(frozen=True)

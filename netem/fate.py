@@ -32,7 +32,7 @@ def delays_ns(
 ) -> NDArray[np.int64]:
     """Delays of packets [ns]; shape (count,)."""
     match direction.delay:
-        case "paper":
+        case "poisson":
             slots = rng.poisson(direction.slots_mean, count)
             return seconds_to_ns(direction.minimum_s) + slots * seconds_to_ns(direction.slot_s)
         case "constant":

@@ -12,13 +12,13 @@ from typing import Annotated
 import tyro
 
 from server.controller import VEHICLES_MAX, Server
-from shared import command, workers
-from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import Scenario
 from shared.endpoint import Address
 from shared.record import Recorder, server_columns
 from shared.stopwatch import Stopwatch
-from shared.udp import AddressError
+from shell import command, workers
+from shell.command import CommandError, ScenarioFlags, ScenarioName
+from shell.udp import AddressError
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ class Server(Endpoint):
         self._scheme: Scheme = (
             Replay(scenario, model, room, reach, self._clock)
             if control.commits
-            else Estimator(model, room, reach, compensate=control.scheme == "paper")
+            else Estimator(model, room, reach, compensate=control.scheme == "predictive")
         )
         self._planner = Planner(scenario, model, room, self.stopwatch)
         self._trigger = make_trigger(control, room)

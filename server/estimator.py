@@ -5,7 +5,7 @@
 û is the history (12) of the first inputs the server computed, whether sent or not (E12). The sum is
 not formed: one step of (4) after the other says the same.
 
-This is the scheme "paper", and "none", which takes the newest observation for the present.
+This is the scheme "predictive", and "none", which takes the newest observation for the present.
 `server.replay` is the other.
 """
 

@@ -1,6 +1,6 @@
 """When a horizon is worth a packet: small policies that combine with & and |.
 
-A scenario writes `cost_gap & budget(5, 2) | heartbeat(1)`; `shared/policy.py` has the grammar,
+A scenario writes `cost_gap & budget(5, 2) | silence(1)`; `shared/policy.py` has the grammar,
 docs/triggers.md says what each policy is good for, and how to add one.
 
 What it costs to fly on without a packet is known only once the new optimum is. So a verdict has
@@ -150,7 +150,7 @@ class Periodic:
         self._sent_step[rows] = step
 
 
-def heartbeat(control: ControlConfig, capacity: int, seconds: float) -> Periodic:
+def silence(control: ControlConfig, capacity: int, seconds: float) -> Periodic:
     """No silence is longer than so many seconds, or a step where that is longer."""
     steps = int(seconds / control.dt + 1e-9)  # as much as floating point may take from 0.35 / 0.05
     return Periodic(control, capacity, steps)
@@ -193,7 +193,7 @@ class Budget:
         return np.minimum(self._tokens[rows] + gained, self._burst)
 
 
-class Paper:
+class StateGap:
     """Eq. (16): V(k) = ‖x̂(k) - x_p(k|k-1)‖²_P above S(k) = V(k_i) exp(-λ Δt (k - k_i)) + ε.
 
     k_i is the last event; λ is per second (E5).
@@ -306,10 +306,10 @@ class Combined:
 POLICIES: dict[str, Callable[..., Trigger]] = {
     "always": Always,
     "periodic": Periodic,
-    "paper": Paper,
+    "state_gap": StateGap,
     "cost_gap": CostGap,
     "deviation": Deviation,
-    "heartbeat": heartbeat,
+    "silence": silence,
     "budget": Budget,
 }
 """What makes each policy of `SIGNATURES`, of the scenario, the capacity and its arguments."""

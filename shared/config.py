@@ -58,14 +58,14 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
     """Steps planned ahead, H."""
-    scheme: Literal["committed", "feedback", "paper", "none"] = "committed"
+    scheme: Literal["committed", "feedback", "predictive", "none"] = "committed"
     """Delay compensation at both ends: committed inputs, the same with feedback aboard, eq. (11)
     and (13), or none."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """A horizon that comes is in force at most so long after it was made [s]; auto: as was seen."""
     observer_s: NonNegative = 4.0
     """How soon steady wind and a wrong gain are learned, as a time constant [s]; 0: never."""
-    trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "cost_gap | heartbeat(1)"
+    trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "cost_gap | silence(1)"
     """When a horizon is sent: policies that combine with & and |, as in docs/triggers.md."""
     period: Annotated[int, Meta(ge=1, le=policy.PERIOD_MAX)] = 10
     """Steps from one horizon to the next of the policy `periodic`."""
@@ -147,7 +147,7 @@ class VehicleConfig(Section, frozen=True):
 class DirectionConfig(Section, frozen=True):
     """One direction of the network."""
 
-    delay: Literal["paper", "constant", "none"] = "paper"
+    delay: Literal["poisson", "constant", "none"] = "poisson"
     """Delay of a packet: minimum_s + slot_s · Poisson(slots_mean) (17), minimum_s, or none."""
     minimum_s: Duration = 0.4
     """The smallest delay [s]."""
@@ -161,7 +161,7 @@ class DirectionConfig(Section, frozen=True):
     @property
     def mean_s(self) -> float:
         """Mean delay [s]."""
-        jitter_s = self.slot_s * self.slots_mean if self.delay == "paper" else 0.0
+        jitter_s = self.slot_s * self.slots_mean if self.delay == "poisson" else 0.0
         return 0.0 if self.delay == "none" else self.minimum_s + jitter_s
 
 

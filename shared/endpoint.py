@@ -1,7 +1,7 @@
 """The one idea: server, client and netem are endpoints, driven by datagrams and time only.
 
 An endpoint opens no socket, reads no clock, draws no unseeded number and prints nothing.
-`shared.shell` drives one on real UDP sockets; `sim.world` drives many in virtual time.
+`shell.driver` drives one on real UDP sockets; `sim.world` drives many in virtual time.
 """
 
 from abc import ABC, abstractmethod

@@ -1,4 +1,4 @@
-"""Triggers as a scenario writes them: `cost_gap & budget(5, 2) | heartbeat(1)`.
+"""Triggers as a scenario writes them: `cost_gap & budget(5, 2) | silence(1)`.
 
     trigger := policy | trigger & trigger | trigger "|" trigger | ( trigger )
     policy  := name | name(number, …)
@@ -21,7 +21,7 @@ TEXT_MAX = 200
 PERIOD_MAX = 1_000_000
 """Steps from one horizon to the next."""
 
-FORM = "policies such as 'paper & budget(5, 2) | heartbeat(1)'"
+FORM = "policies such as 'state_gap & budget(5, 2) | silence(1)'"
 
 _TOKENS = re.compile(
     r"(?:[\s&|(),]|[a-z_]\w*\b|-?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?(?![\w.]))*",
@@ -89,12 +89,12 @@ class Signature:
 SIGNATURES = {
     "always": Signature(),
     "periodic": Signature((Parameter("N", 1, PERIOD_MAX, whole=True, key="period"),)),
-    "paper": Signature(
+    "state_gap": Signature(
         (Parameter("epsilon", 0, key="epsilon"), Parameter("decay_rate", 0, key="decay_rate"))
     ),
     "cost_gap": Signature((Parameter("c", 0, key="cost_gap"),), committed=True),
     "deviation": Signature((Parameter("metres", 0, key="deviation_m"),), committed=True),
-    "heartbeat": Signature((Parameter("seconds", 0.001, 3600),)),
+    "silence": Signature((Parameter("seconds", 0.001, 3600),)),
     "budget": Signature(
         (Parameter("packets_per_s", 0.001, 1_000_000), Parameter("burst", 1, 1_000_000))
     ),

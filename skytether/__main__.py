@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from importlib import metadata
 from pkgutil import resolve_name
 
-from shared import command, config
+from shared import config
 from shared.hint import hint
+from shell import command
 
 USAGE = """usage: skytether COMMAND ...
 

@@ -19,9 +19,9 @@ from rich.text import Text
 from lab import calibration
 from lab.calibration import HERE, Objective, ObjectiveName, Values
 from lab.search import Free, Search, check_free, put
-from shared import command
-from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import ConfigError, Scenario, to_toml
+from shell import command
+from shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether import pool
 from skytether.pool import Scheduler, Workers
 

@@ -12,9 +12,10 @@ import tyro
 
 from lab import calibration, comparison, contenders
 from lab.contenders import CONTENDERS, PACKETS, PLANT, SEARCH_SEED, Plan, Scale
-from shared import command, config
-from shared.command import CommandError
+from shared import config
 from shared.config import ConfigError
+from shell import command
+from shell.command import CommandError
 from skytether import page, pool
 from skytether.calibrate import SIGMA, Hunt, best, progress
 from skytether.page import Call

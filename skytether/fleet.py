@@ -18,12 +18,13 @@ from rich.table import Table
 from rich.text import Text
 
 from lab import figures
-from shared import command, record
-from shared.command import CommandError, ScenarioFlags, ScenarioName
+from shared import record
 from shared.config import Scenario
 from shared.record import Rows
 from shared.stopwatch import Stopwatch
 from shared.summary import summarise
+from shell import command
+from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
 from skytether import processes
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import msgspec
 
 from lab import figures
-from shared import command, config, record
-from shared.command import CommandError, ScenarioFlags, ScenarioName
+from shared import config, record
 from shared.config import ConfigError, Scenario
 from shared.summary import Summary, summarise
+from shell import command
+from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
 from skytether import processes
 

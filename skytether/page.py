@@ -19,8 +19,8 @@ from rich.text import Text
 
 from lab import report
 from lab.report import Drawn, Table
-from shared import command
 from shared.config import Scenario
+from shell import command
 
 PAGE = "report.html"
 CALLS = "calls.jsonl"

@@ -29,9 +29,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 import lab.sweep
 from lab.journal import Journal
 from lab.sweep import Done, Sweep, Task
-from shared import command
-from shared.command import CommandError
-from shared.workers import die_with_parent
+from shell import command
+from shell.command import CommandError
+from shell.workers import die_with_parent
 
 UNDER_WAY_MAX = 256
 """Tasks handed out at once: more than any machine has cores, and no more than need be."""

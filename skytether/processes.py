@@ -9,11 +9,11 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from shared.command import CommandError
 from shared.config import Scenario, to_toml
 from shared.endpoint import Address
-from shared.shell import new_event_loop
-from shared.workers import die_with_parent
+from shell.command import CommandError
+from shell.driver import new_event_loop
+from shell.workers import die_with_parent
 
 NAMES = ("client", "server", "netem")
 """Of the processes, and of their parts of the record."""

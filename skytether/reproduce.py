@@ -17,10 +17,11 @@ from lab import report, studies
 from lab.journal import Journal
 from lab.report import Measured
 from lab.studies import EVENT, EVERY, PERIODIC, Cells, Scale, Study
-from shared import command, config, record
-from shared.command import CommandError
+from shared import config, record
 from shared.config import ConfigError, Scenario
 from shared.model import Array
+from shell import command
+from shell.command import CommandError
 from sim.flight import Flight, fly_batch
 from skytether import delays, page, pool, processes
 from skytether.page import Call

@@ -15,9 +15,9 @@ from rich.text import Text
 from lab import figures
 from lab.journal import Journal
 from lab.sweep import Sweep, estimate, parse_axis
-from shared import command
-from shared.command import CommandError, ScenarioFlags, ScenarioName
 from shared.config import ConfigError, Scenario
+from shell import command
+from shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether import pool
 from skytether.pool import Scheduler, Spent, Workers, crew
 

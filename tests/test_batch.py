@@ -39,7 +39,7 @@ def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Flight]:
 
 directions = st.fixed_dictionaries(
     {
-        "delay": st.sampled_from(["paper", "constant", "none"]),
+        "delay": st.sampled_from(["poisson", "constant", "none"]),
         "minimum_s": st.sampled_from([0.0, 0.05, 0.1, 0.4]),
         "loss": st.sampled_from([0.0, 0.1, 0.5]),
     }
@@ -50,9 +50,9 @@ scenarios = st.fixed_dictionaries(
         "control": st.fixed_dictionaries(
             {
                 "dt": st.sampled_from([0.05, 0.03]),
-                "scheme": st.sampled_from(["paper", "none", "committed", "feedback"]),
+                "scheme": st.sampled_from(["predictive", "none", "committed", "feedback"]),
                 "trigger": st.sampled_from(
-                    ["paper", "always", "periodic", "paper & budget(5, 2) | heartbeat(0.3)"]
+                    ["state_gap", "always", "periodic", "state_gap & budget(5, 2) | silence(0.3)"]
                 ),
                 "observer_s": st.sampled_from([0.0, 2.0]),
                 "epsilon": st.sampled_from([0.01, 0.5]),

@@ -108,13 +108,13 @@ def flew(rmse_xy: float, event_ratio: float, most: float) -> calibration.Values:
 
 def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
     """It is scored by what other seeds may send, where the trigger decides."""
-    event, every = weighs("paper"), weighs("always")
+    event, every = weighs("state_gap"), weighs("always")
     assert event.score(flew(0.2, 0.08, 0.09)) == 0.2
     assert event.score(flew(0.2, 0.09, 0.11)) == pytest.approx(0.2 * 1.1**3)
     assert event.score(flew(0.1, 0.2, 0.2)) == pytest.approx(0.8)
     assert every.score(flew(0.1, 1.0, 1.0)) == 0.1
     assert every.score(flew(float("nan"), 1.0, 1.0)) == UNFLYABLE
-    told, clock = weighs("paper(3.6, 1.5) & budget(5, 2)"), weighs("periodic(2) | heartbeat(1)")
+    told, clock = weighs("state_gap(3.6, 1.5) & budget(5, 2)"), weighs("periodic(2) | silence(1)")
     assert told.score(flew(0.1, 0.2, 0.2)) == pytest.approx(0.8)
     assert clock.score(flew(0.1, 0.5, 0.5)) == 0.1
 
@@ -127,7 +127,7 @@ def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> 
     }
     assert {key.key for key in weighs("always").free()} == weights
     own = {"control.epsilon", "control.decay_rate"}
-    assert {key.key for key in weighs("paper").free()} == weights | own
+    assert {key.key for key in weighs("state_gap").free()} == weights | own
     off = replace(PAPER, control=replace(PAPER.control, trigger="always", change_weight=0.0))
     assert {key.key for key in Rmse(off, 0.1).free()} == weights - {"control.change_weight"}
     learns = replace(off.control, scheme="committed", observer_s=2.0, change_weight=0.1)
@@ -140,8 +140,8 @@ def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> 
     [
         ("periodic", []),
         ("cost_gap & budget(5, 2)", ["control.cost_gap"]),
-        ("deviation | heartbeat(1)", ["control.deviation_m"]),
-        ("paper(3.6, 1.5)", []),
+        ("deviation | silence(1)", ["control.deviation_m"]),
+        ("state_gap(3.6, 1.5)", []),
         ("cost_gap | (cost_gap & always)", ["control.cost_gap"]),
     ],
 )

@@ -16,8 +16,8 @@ import pytest
 
 import skytether.__main__
 from shared import config
-from shared.command import parse
 from shared.record import client_columns
+from shell.command import parse
 from skytether.fly import Options
 
 PATIENCE_S = 30.0
@@ -254,7 +254,7 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
 def test_flags_lie_over_the_scenario(tmp_path: Path) -> None:
     """An override changes what is flown; the scenario may be named first or last."""
     ratios = []
-    for trigger in ("always", "paper"):
+    for trigger in ("always", "state_gap"):
         file = tmp_path / f"{trigger}.json"
         flags = ["--virtual", "--duration", "8", "--control.trigger", trigger, "--json", str(file)]
         assert skytether_("fly", *flags, "paper").returncode == 0

@@ -19,7 +19,7 @@ HERE = np.zeros((2, 2))
 """A state; without feedback none matters."""
 
 
-def scenario(*, scheme: str = "paper", exhausted: str = "hold") -> Scenario:
+def scenario(*, scheme: str = "predictive", exhausted: str = "hold") -> Scenario:
     """Ten stages of 0.1 s, on a network of no delay."""
     direction = {"delay": "none"}
     return check(

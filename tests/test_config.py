@@ -96,19 +96,22 @@ WRONG = {
     # Not one of the choices.
     "a scheme that is none": (
         'control.scheme = "papr"',
-        "control.scheme: got 'papr', expected 'committed' or 'feedback' or 'paper' or 'none'",
+        "control.scheme: got 'papr', expected 'committed' or 'feedback' or 'predictive' or 'none'",
     ),
     "a trigger nobody knows": (
         'control.trigger = "often"',
         (
-            "control.trigger: got 'often', expected a policy; there are always, periodic, paper, "
-            "cost_gap, deviation, heartbeat, budget"
+            "control.trigger: got 'often', expected a policy; there are always, periodic, "
+            "state_gap, cost_gap, deviation, silence, budget"
         ),
     ),
     "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),
     "a trigger for another scheme": (
-        'control.scheme = "paper"\ncontrol.trigger = "cost_gap"',
-        "control.scheme: got 'paper', expected 'committed' or 'feedback' with the trigger cost_gap",
+        'control.scheme = "predictive"\ncontrol.trigger = "cost_gap"',
+        (
+            "control.scheme: got 'predictive', "
+            "expected 'committed' or 'feedback' with the trigger cost_gap"
+        ),
     ),
     "a negative cost": (
         "control.cost_gap = -1.0",

@@ -18,11 +18,12 @@ from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
 from server.controller import Server
-from shared import config, workers
+from shared import config
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram
 from shared.record import Recorder, Rows, client_columns, parse
+from shell import workers
 from sim.world import Clock, World
 from skytether.fleet import STAGES
 

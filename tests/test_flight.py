@@ -212,6 +212,6 @@ def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
         n, i = np.arange(len(sent_s)), np.tril_indices(len(sent_s))
         return ((n[:, None] - n + 1) - 5.0 * (sent_s[:, None] - sent_s))[i].max()
 
-    alone = sent_s("paper")
-    assert most(sent_s("paper & budget(5, 2)")) <= 2.0 + 1e-9 < 4.0 < most(alone)
-    assert np.diff(sent_s("paper | heartbeat(1)")).max() <= 1.0 + 1e-9 < np.diff(alone).max()
+    alone = sent_s("state_gap")
+    assert most(sent_s("state_gap & budget(5, 2)")) <= 2.0 + 1e-9 < 4.0 < most(alone)
+    assert np.diff(sent_s("state_gap | silence(1)")).max() <= 1.0 + 1e-9 < np.diff(alone).max()

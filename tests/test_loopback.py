@@ -16,13 +16,14 @@ from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
 from server.controller import Server
-from shared import config, shell, timer, udp
+from shared import config
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
 from shared.record import PACKET_COLUMNS, Recorder, client_columns, parse, server_columns
-from shared.shell import Shell
-from shared.udp import AddressError
+from shell import timer, udp
+from shell.driver import Shell, new_event_loop
+from shell.udp import AddressError
 from sim.flight import Flight
 from sim.flight import fly as fly_virtually
 
@@ -109,7 +110,7 @@ async def test_wakes_come_in_time_and_never_early(
 ) -> None:
     """Both timers, twenty wakes: some already past when asked for, some in the future."""
     if not kernel:
-        monkeypatch.setattr(shell, "make_timer", timer.LoopTimer)
+        monkeypatch.setattr("shell.driver.make_timer", timer.LoopTimer)
     now_ns = time.monotonic_ns()
     wakes_ns = [now_ns + step * 2_000_000 for step in range(-5, 15)]
     echo = Echo(wakes_ns, last=20)
@@ -194,7 +195,7 @@ async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.Monk
         return addresses["first" if len(looked_up) == 1 else "then"]
 
     monkeypatch.setattr(udp, "look_up", look_up)
-    monkeypatch.setattr(shell, "RESOLVE_EVERY_S", 0.001)
+    monkeypatch.setattr("shell.driver.RESOLVE_EVERY_S", 0.001)
     driver = Shell(Echo(), LOOPBACK, [("moving", 1)])
     assert driver._names.name(addresses["first"]) == ("moving", 1)
     async with driven(driver):
@@ -363,7 +364,7 @@ async def test_datagrams_dropped_by_the_kernel_are_counted(
 def test_uvloop_is_used_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
     """And asyncio's own loop where it does not."""
     for module in ("uvloop", "asyncio"):
-        loop = shell.new_event_loop()
+        loop = new_event_loop()
         loop.close()
         assert type(loop).__module__.startswith(module)
         monkeypatch.setitem(sys.modules, "uvloop", None)

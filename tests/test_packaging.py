@@ -10,7 +10,7 @@ from pathlib import Path
 from shared import config
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ["shared", "server", "client", "netem", "sim", "lab", "skytether", "scenarios"]
+PACKAGES = ["shared", "shell", "server", "client", "netem", "sim", "lab", "skytether", "scenarios"]
 
 
 def test_each_top_level_name_belongs_to_our_distribution_alone() -> None:

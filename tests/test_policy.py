@@ -10,30 +10,30 @@ from shared import config, policy
 from shared.config import ConfigError
 from shared.policy import SIGNATURES, TEXT_MAX, Combination, Policy, policies
 
-FORM = "policies such as 'paper & budget(5, 2) | heartbeat(1)'"
-PAPER, ALWAYS = Policy("paper", ()), Policy("always", ())
-BUDGET, HEARTBEAT = Policy("budget", (5, 2)), Policy("heartbeat", (0.5,))
+FORM = "policies such as 'state_gap & budget(5, 2) | silence(1)'"
+STATE_GAP, ALWAYS = Policy("state_gap", ()), Policy("always", ())
+BUDGET, SILENCE = Policy("budget", (5, 2)), Policy("silence", (0.5,))
 
 READ = {
-    "paper": PAPER,
-    " paper()\n": PAPER,
-    "((paper))": PAPER,
+    "state_gap": STATE_GAP,
+    " state_gap()\n": STATE_GAP,
+    "((state_gap))": STATE_GAP,
     "budget(5, 2)": BUDGET,
-    "heartbeat( 5e-1 )": HEARTBEAT,
-    "paper(.5, 2.)": Policy("paper", (0.5, 2.0)),
-    "paper & always": Combination("&", PAPER, ALWAYS),
-    "paper|\n always": Combination("|", PAPER, ALWAYS),
+    "silence( 5e-1 )": SILENCE,
+    "state_gap(.5, 2.)": Policy("state_gap", (0.5, 2.0)),
+    "state_gap & always": Combination("&", STATE_GAP, ALWAYS),
+    "state_gap|\n always": Combination("|", STATE_GAP, ALWAYS),
     # & binds tighter than |, and both from the left.
-    "paper & budget(5, 2) | heartbeat(0.5)": Combination(
-        "|", Combination("&", PAPER, BUDGET), HEARTBEAT
+    "state_gap & budget(5, 2) | silence(0.5)": Combination(
+        "|", Combination("&", STATE_GAP, BUDGET), SILENCE
     ),
-    "heartbeat(0.5) | paper & budget(5, 2)": Combination(
-        "|", HEARTBEAT, Combination("&", PAPER, BUDGET)
+    "silence(0.5) | state_gap & budget(5, 2)": Combination(
+        "|", SILENCE, Combination("&", STATE_GAP, BUDGET)
     ),
-    "(heartbeat(0.5) | paper) & budget(5, 2)": Combination(
-        "&", Combination("|", HEARTBEAT, PAPER), BUDGET
+    "(silence(0.5) | state_gap) & budget(5, 2)": Combination(
+        "&", Combination("|", SILENCE, STATE_GAP), BUDGET
     ),
-    "paper | always | paper": Combination("|", Combination("|", PAPER, ALWAYS), PAPER),
+    "state_gap | always | state_gap": Combination("|", Combination("|", STATE_GAP, ALWAYS), STATE_GAP),
 }
 
 PERIODIC = "periodic or periodic(N) with 1 <= N <= 1000000 (whole)"
@@ -42,28 +42,28 @@ BOUNDED += "1 <= burst <= 1000000"
 REFUSED = {
     # No expression of policies.
     "": ("", FORM),
-    "paper &": ("paper &", FORM),
-    "(paper": ("(paper", FORM),
-    "paper always": ("paper always", FORM),
-    "paper and always": ("paper and always", FORM),
-    "always & (not paper)": ("not paper", FORM),
-    "always & (lambda: paper)": ("always & (lambda: paper)", FORM),
-    "paper - 3": ("paper - 3", FORM),
-    "paper -3": ("paper - 3", FORM),
+    "state_gap &": ("state_gap &", FORM),
+    "(state_gap": ("(state_gap", FORM),
+    "state_gap always": ("state_gap always", FORM),
+    "state_gap and always": ("state_gap and always", FORM),
+    "always & (not state_gap)": ("not state_gap", FORM),
+    "always & (lambda: state_gap)": ("always & (lambda: state_gap)", FORM),
+    "state_gap - 3": ("state_gap - 3", FORM),
+    "state_gap -3": ("state_gap - 3", FORM),
     "3": ("3", FORM),
     "None": ("None", FORM),
-    "(paper, always)": ("(paper, always)", FORM),
-    "paper(1, 2)(3)": ("paper(1, 2)(3)", FORM),
+    "(state_gap, always)": ("(state_gap, always)", FORM),
+    "state_gap(1, 2)(3)": ("state_gap(1, 2)(3)", FORM),
     "1or 2": ("1or 2", FORM),
-    "paper.test": ("paper.test", FORM),
-    "paper[0]": ("paper[0]", FORM),
-    "paper # always": ("paper # always", FORM),
-    "paper(*always)": ("paper(*always)", FORM),
+    "state_gap.test": ("state_gap.test", FORM),
+    "state_gap[0]": ("state_gap[0]", FORM),
+    "state_gap # always": ("state_gap # always", FORM),
+    "state_gap(*always)": ("state_gap(*always)", FORM),
     "budget(packets_per_s=5, burst=2)": ("budget(packets_per_s=5, burst=2)", FORM),
     "\N{FULLWIDTH LATIN SMALL LETTER P}aper": ("\N{FULLWIDTH LATIN SMALL LETTER P}aper", FORM),
     # No such policy.
     "perodic(3)": ("perodic(3)", "a policy; did you mean periodic?"),
-    "paper | cost_gab": ("cost_gab", "a policy; did you mean cost_gap?"),
+    "state_gap | cost_gab": ("cost_gab", "a policy; did you mean cost_gap?"),
     "print(1)": (
         "print(1)",
         f"a policy; there are {', '.join(SIGNATURES)}",
@@ -75,17 +75,17 @@ REFUSED = {
     "periodic(2.5)": ("periodic(2.5)", PERIODIC),
     "periodic(True)": ("periodic(True)", PERIODIC),
     "periodic(1000001)": ("periodic(1000001)", PERIODIC),
-    "periodic(paper)": ("periodic(paper)", PERIODIC),
-    "paper & budget": ("budget", BOUNDED),
+    "periodic(state_gap)": ("periodic(state_gap)", PERIODIC),
+    "state_gap & budget": ("budget", BOUNDED),
     "budget(5)": ("budget(5)", BOUNDED),
     "budget(0, 2)": ("budget(0, 2)", BOUNDED),
     "budget(5, 0.9)": ("budget(5, 0.9)", BOUNDED),
-    "heartbeat()": ("heartbeat()", "heartbeat(seconds) with 0.001 <= seconds <= 3600"),
+    "silence()": ("silence()", "silence(seconds) with 0.001 <= seconds <= 3600"),
     "cost_gap(-1)": ("cost_gap(-1)", "cost_gap or cost_gap(c) with 0 <= c"),
     "deviation(1e999)": ("deviation(1e309)", "deviation or deviation(metres) with 0 <= metres"),
-    "paper(3.6)": (
-        "paper(3.6)",
-        "paper or paper(epsilon, decay_rate) with 0 <= epsilon and 0 <= decay_rate",
+    "state_gap(3.6)": (
+        "state_gap(3.6)",
+        "state_gap or state_gap(epsilon, decay_rate) with 0 <= epsilon and 0 <= decay_rate",
     ),
 }
 """What is no trigger: the part that is said to be wrong, and what would be right."""
@@ -117,19 +117,19 @@ def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
     assert len(deep) == TEXT_MAX
     assert policy.parse(deep) == ALWAYS
     assert refusal(deep + " ").endswith(" ', expected a text of length <= 200")
-    longest = " | ".join(["paper"] * 25)
-    assert list(policies(policy.parse(longest))) == [PAPER] * 25
+    longest = " | ".join(["state_gap"] * 16)
+    assert list(policies(policy.parse(longest))) == [STATE_GAP] * 16
 
 
 @pytest.mark.parametrize("name", [name for name in SIGNATURES if SIGNATURES[name].committed])
 def test_what_compares_committed_inputs_needs_their_scheme(name: str) -> None:
     """Deep in an expression, too."""
-    text = f"heartbeat(1) | {name}(1) & budget(5, 2)"
-    control = {"trigger": text, "scheme": "paper"}
+    text = f"silence(1) | {name}(1) & budget(5, 2)"
+    control = {"trigger": text, "scheme": "predictive"}
     with pytest.raises(config.ConfigError) as caught:
         config.check({"control": control}, "mine")
     assert str(caught.value) == (
-        "mine: control.scheme: got 'paper', "
+        "mine: control.scheme: got 'predictive', "
         f"expected 'committed' or 'feedback' with the trigger {name}"
     )
     config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
@@ -161,7 +161,7 @@ words = st.sampled_from(
     | st.lists(words, max_size=40).map(" ".join)
 )
 @example("(" * 200)
-@example("paper(" * 33)
+@example("state_gap(" * 33)
 @example("-" * 200)
 @example("always\0")
 @example("\ud800")
@@ -186,7 +186,7 @@ def test_nothing_written_is_ever_run() -> None:
 
 
 trees = st.recursive(
-    st.sampled_from([PAPER, ALWAYS, BUDGET, HEARTBEAT]),
+    st.sampled_from([STATE_GAP, ALWAYS, BUDGET, SILENCE]),
     lambda tree: st.builds(Combination, st.sampled_from("&|"), tree, tree),
     max_leaves=5,
 )

@@ -353,11 +353,11 @@ def rmse(flown: Scenario, flight: Flight) -> float:
 def test_it_is_stable_without_the_s_term_where_the_papers_scheme_is_not() -> None:
     """The same weights, network and seed."""
     errors = {}
-    for scheme in ("paper", "committed"):
+    for scheme in ("predictive", "committed"):
         flown = scenario(control={"scheme": scheme, "trigger": "always", **TIGHT}, duration=40.0)
         errors[scheme] = rmse(flown, fly(flown))
     assert errors["committed"] < 0.002
-    assert errors["paper"] > 0.5
+    assert errors["predictive"] > 0.5
 
 
 def test_most_horizons_are_not_even_planned_with_a_trigger_that_needs_no_plan(
@@ -418,7 +418,7 @@ def test_feedback_aboard_flies_in_wind_with_a_packet_a_second() -> None:
     """A third of the error of committed inputs alone, with fewer packets; none without a gain."""
     errors, packets = {}, {}
     for scheme in ("committed", "feedback"):
-        control = {"scheme": scheme, "trigger": "cost_gap | heartbeat(1)", "cost_gap": 1.0, **FIRM}
+        control = {"scheme": scheme, "trigger": "cost_gap | silence(1)", "cost_gap": 1.0, **FIRM}
         flown = scenario(control=control, vehicle={"wind": 0.1}, settle=5.0)
         flights = fly_batch(flown, range(1, 5))
         errors[scheme] = np.mean([rmse(flown, flight) for flight in flights])
@@ -439,7 +439,7 @@ def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
 def test_the_observer_sees_past_feedback_aboard() -> None:
     """What feedback does against steady wind is no disturbance, nor is the wind forgotten."""
     reference = {"shape": "hover", "points_m": [[0.0, 0.0]]}
-    control = {"scheme": "feedback", "trigger": "cost_gap | heartbeat(1)", "observer_s": 2.0}
+    control = {"scheme": "feedback", "trigger": "cost_gap | silence(1)", "observer_s": 2.0}
     vehicle = {"steady_wind_mps": [0.3, -0.2], "gain": 0.8}
     flown = scenario(control=control | FIRM, reference=reference, vehicle=vehicle, duration=60.0)
     flight = fly(flown)

@@ -29,7 +29,7 @@ PATIENCE_S = 30.0
 
 SWEEP = [
     *("sweep", "paper", "--duration", "5", "--settle", "1", "--runs", "60"),
-    *("--grid", "control.epsilon=1:3:2", "--grid", "control.trigger=paper,periodic"),
+    *("--grid", "control.epsilon=1:3:2", "--grid", "control.trigger=state_gap,periodic"),
 ]
 """Four cells, three tasks each."""
 TASKS = 12
@@ -48,8 +48,8 @@ PAPER = replace(config.load("paper"), duration=5.0, settle=1.0)
         ("control.epsilon=8:0.5:2", "control.epsilon", (8.0, 0.5)),
         ("control.horizon=20:40:3", "control.horizon", (20, 30, 40)),
         ("control.epsilon=1,2.5", "control.epsilon", (1, 2.5)),
-        ("control.trigger=paper,always", "control.trigger", ("paper", "always")),
-        ('control.trigger="paper"', "control.trigger", ("paper",)),
+        ("control.trigger=state_gap,always", "control.trigger", ("state_gap", "always")),
+        ('control.trigger="state_gap"', "control.trigger", ("state_gap",)),
         ("control.input_reference=true,false", "control.input_reference", (True, False)),
         ("model.tau_s=[0.8],[0.8, 0.9]", "model.tau_s", ([0.8], [0.8, 0.9])),
         ("reference.file=a.csv, b/c.csv", "reference.file", ("a.csv", "b/c.csv")),
@@ -129,10 +129,10 @@ def test_seeds_end_where_a_scenarios_do() -> None:
 
 def test_a_sweep_is_every_combination_in_chunks_of_seeds() -> None:
     """The last grid changes fastest; the last chunk holds what is left."""
-    axes = [parse_axis("control.epsilon=1,2"), parse_axis("control.trigger=paper,always")]
+    axes = [parse_axis("control.epsilon=1,2"), parse_axis("control.trigger=state_gap,always")]
     tasks = list(Sweep("paper", replace(PAPER, seed=7), axes, CHUNK + 5).tasks())
     controls = [(t.scenario.control.epsilon, t.scenario.control.trigger) for t in tasks[::2]]
-    assert controls == [(1.0, "paper"), (1.0, "always"), (2.0, "paper"), (2.0, "always")]
+    assert controls == [(1.0, "state_gap"), (1.0, "always"), (2.0, "state_gap"), (2.0, "always")]
     assert [(task.cell, task.chunk) for task in tasks[:3]] == [(0, 0), (0, 1), (1, 0)]
     assert tasks[2].seeds + tasks[3].seeds == tuple(range(7, 7 + CHUNK + 5))
     assert len(tasks[0].seeds) == CHUNK

@@ -24,7 +24,7 @@ from sim.flight import fly
 quick = settings(max_examples=60, deadline=None)
 
 CONTROL = ControlConfig(
-    trigger="paper", dt=0.1, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
+    trigger="state_gap", dt=0.1, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
 )
 ROW = np.array([0])
 PLANNED = np.array([[[1.0, 0.5], [-1.0, 0.0]]])
@@ -57,7 +57,7 @@ def after_event(step: int, error: float, control: ControlConfig = CONTROL) -> Tr
 def test_error_weighs_position_and_velocity_with_p() -> None:
     """V = 50·0.2² + 8·0.5² + 50·0.1² + 8·1² = 2 + 2 + 0.5 + 8."""
     estimate = PLANNED + np.array([[[0.2, -0.5], [-0.1, 1.0]]])
-    for text in ("paper", "always", "periodic", "heartbeat(1)", "budget(1, 1)"):
+    for text in ("state_gap", "always", "periodic", "silence(1)", "budget(1, 1)"):
         assert ask(trigger_of(text), 7, estimate).error == pytest.approx([12.5])
 
 
@@ -70,7 +70,7 @@ def test_threshold_decays_per_second() -> None:
 def test_threshold_depends_on_time_and_not_on_how_it_is_cut() -> None:
     """Ten steps of 0.05 s are five of 0.1 s."""
     fine = ControlConfig(
-        trigger="paper", dt=0.05, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
+        trigger="state_gap", dt=0.05, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
     )
     one = ask(after_event(20, 10.0), 25, off_by(0.0)).threshold
     other = ask(after_event(20, 10.0, fine), 30, off_by(0.0)).threshold
@@ -94,7 +94,7 @@ def test_threshold_is_the_tolerance_long_after() -> None:
 
 def test_first_step_is_an_event_however_small_the_error() -> None:
     """E18: the vehicle has nothing to fly yet."""
-    verdict = ask(trigger_of("paper"), 0, off_by(0.0), fresh=True)
+    verdict = ask(trigger_of("state_gap"), 0, off_by(0.0), fresh=True)
     assert (verdict.surely.tolist(), verdict.error.tolist()) == ([True], [0.0])
     assert verdict.threshold.tolist() == [3.0]
 
@@ -137,7 +137,7 @@ def test_faster_decay_means_a_lower_threshold(
 ) -> None:
     """Fig. 5: more λ, more events."""
     slow, fast = (
-        ControlConfig(trigger="paper", dt=0.1, epsilon=3.0, decay_rate=decay)
+        ControlConfig(trigger="state_gap", dt=0.1, epsilon=3.0, decay_rate=decay)
         for decay in (rate, rate + more)
     )
     low = ask(after_event(0, error, fast), steps, PLANNED).threshold[0]
@@ -154,7 +154,9 @@ def test_more_tolerance_means_a_higher_threshold(
     """Fig. 5: more ε, fewer events; S rises by just as much."""
     low, high = (
         ask(
-            after_event(0, error, ControlConfig(trigger="paper", epsilon=tolerance)), steps, PLANNED
+            after_event(0, error, ControlConfig(trigger="state_gap", epsilon=tolerance)),
+            steps,
+            PLANNED,
         ).threshold[0]
         for tolerance in (epsilon, epsilon + more)
     )
@@ -213,10 +215,10 @@ def test_periodic_counts_for_each_vehicle_by_itself() -> None:
     assert verdict.surely.tolist() == [True, False]
 
 
-def test_heartbeat_ends_every_silence_in_time() -> None:
+def test_silence_ends_in_time() -> None:
     """0.35 s are seven steps of 0.05 s, in floating point too; 0.33 s are six, and 0.01 s one."""
     for seconds, steps in ((0.35, 7), (0.33, 6), (0.01, 1)):
-        trigger = trigger_of(f"heartbeat({seconds})", dt=0.05)
+        trigger = trigger_of(f"silence({seconds})", dt=0.05)
         assert events(trigger, 3, 40) == list(range(3, 41, steps))
 
 
@@ -233,7 +235,7 @@ def test_budget_binds_a_vehicle_at_its_first_step_too() -> None:
     trigger = trigger_of("budget(5, 2)", dt=0.05)
     assert events(trigger, 5000, 5002) == [5000, 5001]
     assert events(trigger, 0, 12) == [3, 7, 11]
-    for text in ("always", "periodic", "paper", "cost_gap", "deviation", "heartbeat(1)"):
+    for text in ("always", "periodic", "state_gap", "cost_gap", "deviation", "silence(1)"):
         situation = facing(1, step=3, fresh=True, cost_gap=0.0, deviation_m=0.0)
         assert trigger_of(text).test(situation).surely.tolist() == [True]
 
@@ -342,8 +344,8 @@ def test_cost_gap_may_fire_until_it_is_known() -> None:
 
 
 def test_no_solve_is_asked_for_where_it_could_change_nothing() -> None:
-    """Without a token nothing is sent, and at a heartbeat something is, whatever it would say."""
-    trigger = trigger_of("cost_gap & budget(1, 1) | heartbeat(2)", capacity=2)
+    """Without a token nothing is sent, and after the longest silence something is, whatever it would say."""
+    trigger = trigger_of("cost_gap & budget(1, 1) | silence(2)", capacity=2)
     trigger.test(facing(2, step=0, fresh=True))
     trigger.sent(np.array([0, 1]), np.array([0, 0]), np.zeros(2))
     wanted = []
@@ -357,9 +359,9 @@ def test_no_solve_is_asked_for_where_it_could_change_nothing() -> None:
 def test_figure_for_the_record_is_that_of_the_leftmost_policy_that_has_one() -> None:
     """The others have V and no threshold."""
     for text, error, threshold in (
-        ("heartbeat(1) | cost_gap(3) & paper(5, 1)", 0.25, 3.0),
+        ("silence(1) | cost_gap(3) & state_gap(5, 1)", 0.25, 3.0),
         ("budget(1, 1) & (deviation(2) | cost_gap(3))", 0.5, 2.0),
-        ("paper(5, 1) | deviation(2)", 0.0, 5.0),
+        ("state_gap(5, 1) | deviation(2)", 0.0, 5.0),
         ("always & budget(1, 1)", 0.0, 0.0),
     ):
         verdict = trigger_of(text).test(facing(1, fresh=True, deviation_m=0.5, cost_gap=0.25))
@@ -368,7 +370,7 @@ def test_figure_for_the_record_is_that_of_the_leftmost_policy_that_has_one() -> 
 
 def test_each_policy_is_told_its_own_error_when_a_packet_goes_out() -> None:
     """V(k_i) of eq. (16) is V, also behind a policy whose cost gap is recorded in its stead."""
-    trigger = trigger_of("cost_gap(3) | paper(3, 2)")
+    trigger = trigger_of("cost_gap(3) | state_gap(3, 2)")
     situation = Situation(
         *(ROW, np.array([20]), np.array([False])),
         *(off_by(10.0), PLANNED, None, lambda: np.array([7.0])),
@@ -417,7 +419,13 @@ def test_scenario_names_its_trigger() -> None:
     """Every policy that a scenario may name is made, with the scenario's keys for its arguments."""
     assert POLICIES.keys() == SIGNATURES.keys()
     control = ControlConfig(period=4, epsilon=2.0, decay_rate=0.0, cost_gap=7.0, deviation_m=8.0)
-    thresholds = {"paper": 2.0, "cost_gap": 7.0, "deviation": 8.0, "always": 0.0, "periodic": 0.0}
+    thresholds = {
+        "state_gap": 2.0,
+        "cost_gap": 7.0,
+        "deviation": 8.0,
+        "always": 0.0,
+        "periodic": 0.0,
+    }
     for name, threshold in thresholds.items():
         trigger = make_trigger(msgspec.structs.replace(control, trigger=name), 1)
         verdict = trigger.test(facing(1, cost_gap=0.0, deviation_m=0.0))
@@ -427,8 +435,8 @@ def test_scenario_names_its_trigger() -> None:
 
 
 LEAVES = (
-    *("always", "periodic(3)", "paper(1, 1)", "cost_gap(1)"),
-    *("deviation(1)", "heartbeat(0.5)", "budget(2, 2)"),
+    *("always", "periodic(3)", "state_gap(1, 1)", "cost_gap(1)"),
+    *("deviation(1)", "silence(0.5)", "budget(2, 2)"),
 )
 trees = st.recursive(
     st.sampled_from(LEAVES),
@@ -536,7 +544,7 @@ def test_documented_trigger_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     verdict = ask(slip, 3, estimate)
     assert verdict.surely.tolist() == [True]
     assert verdict.error == pytest.approx([math.hypot(0.3, 0.5)])
-    control = {"scheme": "paper", "trigger": "slip(0.1) & budget(4, 1) | heartbeat(1)"}
+    control = {"scheme": "predictive", "trigger": "slip(0.1) & budget(4, 1) | silence(1)"}
     flown = config.check({"duration": 10.0, "control": control}, "test")
     server = fly(flown).server
     sent_s = server["step"][server["event"]] * flown.control.dt

@@ -27,10 +27,10 @@ from rich.text import Text
 from shared import config
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint
-from shared.shell import Shell, run
 from shared.stopwatch import Stopwatch
 from shared.summary import Summary
-from shared.udp import AddressError, is_loopback
+from shell.driver import Shell, run
+from shell.udp import AddressError, is_loopback
 
 CONFIGURATION, RUN = 2, 1
 """Exit codes: the command asked for something impossible, or it went wrong on the way."""
@@ -210,6 +210,9 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
     except CommandError as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return error.code
+    except ConfigError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return CONFIGURATION
     except KeyboardInterrupt:  # before there was anything to end in order
         return 128 + signal.SIGINT
     except BrokenPipeError:  # whoever read our output has seen enough

@@ -1,6 +1,6 @@
 """The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
 
-All of asyncio and signals is in here and in `shared.timer`, all of sockets in `shared.udp`. It
+All of asyncio and signals is in here and in `shell.timer`, all of sockets in `shell.udp`. It
 knows nothing of control or of the protocol: datagrams and time go in, datagrams and news come out.
 """
 
@@ -15,8 +15,8 @@ from socket import socket
 
 from shared.endpoint import Address, Datagram, Endpoint
 from shared.stopwatch import Stopwatch
-from shared.timer import make_timer
-from shared.udp import Names, kernel_drops, open_socket, within_reach_of
+from shell.timer import make_timer
+from shell.udp import Names, kernel_drops, open_socket, within_reach_of
 
 BURST_MAX = 128
 """Datagrams read from one socket before timers and other sockets have their turn."""

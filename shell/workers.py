@@ -16,7 +16,7 @@ from multiprocessing.connection import wait
 from socket import socket
 
 from shared.endpoint import Address
-from shared.udp import open_socket
+from shell.udp import open_socket
 
 FORK = multiprocessing.get_context("fork")
 """What has been imported and compiled is there at once, and in memory only once."""
