@@ -8,7 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from server.controller import Server
+from server.endpoint import Server
 from server.planner import Plan, Planner
 from server.solver import NEAR
 from shared.config import Scenario

@@ -16,7 +16,7 @@ import numpy as np
 
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, seconds_to_ns
-from shared.model import Array, discretise
+from shared.model import Array, advance, discretise
 
 
 class Plant(Protocol):
@@ -40,7 +40,7 @@ class FirstOrderPlant:
         vehicle, dt, tau = scenario.vehicle, scenario.control.dt, scenario.true_tau_s
         # Plain numbers, of each axis: numpy costs more than it saves on so few.
         model = discretise(tau, dt)
-        self._A, self._B = model.A.tolist(), model.B.tolist()
+        self._model = model.axes()
         self._gain = vehicle.gain
         whole, rest_ns = divmod(seconds_to_ns(vehicle.dead_time_s), scenario.dt_ns)
         self._commands = deque([[0.0] * len(tau)] * (whole + 2), whole + 2)
@@ -71,9 +71,7 @@ class FirstOrderPlant:
         self._commands.append(command.tolist())
         before, due = self._commands[0], self._commands[1]
         for i, u in enumerate(due):
-            (p, v), A, B = self._x[i], self._A[i], self._B[i]
-            w = self._gain * u + self._push[i]
-            self._x[i] = (p + A[0][1] * v + B[0] * w, A[1][1] * v + B[1] * w)
+            self._x[i] = advance(self._model[i], *self._x[i], self._gain * u + self._push[i])
         for i, L in enumerate(self._B_before):
             (p, v), w = self._x[i], self._gain * (before[i] - due[i])
             self._x[i] = (p + L[0] * w, v + L[1] * w)

@@ -51,12 +51,12 @@ class Client(Endpoint):
     ) -> None:
         super().__init__()
         self._terms = scenario.terms()
-        self._dt_ns = scenario.dt_ns
+        self._dt_ns = self._terms.dt_ns
         self._steps = scenario.steps
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._connect_ns = seconds_to_ns(scenario.link.connect_s)
         self._plant = plant
-        self._compensator = Compensator(scenario)
+        self._compensator = Compensator(self._terms)
         self._server = server
         self.vehicle = vehicle
         self._boot_id = boot_id
@@ -110,7 +110,7 @@ class Client(Endpoint):
             raise ProtocolError("for another life")
         if welcome.terms != self._terms:
             if self._session is None:
-                difference = welcome.terms.against(self._terms)
+                difference = ", ".join(map(str, self._terms.differences(welcome.terms)))
                 self.failure = f"the server flies another scenario: {difference}"
             raise ProtocolError("other terms")
         if self._server_boot_id not in (None, welcome.server_boot_id):

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from server.controller import VEHICLES_MAX, Server
+from server.endpoint import VEHICLES_MAX, Server
 from shared.config import Scenario
 from shared.endpoint import Address
 from shared.record import Recorder, server_columns

@@ -6,97 +6,120 @@ by its echo of our own stamp, G = t4 - t3 (sent here, received aboard). Over the
     offset = (min G - min F) / 2,    bound = (min F + min G) / 2,
 
 vehicle's clock minus server's. Half of any asymmetry of the two smallest delays stays unknown: the
-offset is right to within the bound and no better.
+offset is right to within the bound and no better. Step k begins at epoch + k Δt of the vehicle.
 """
 
 import numpy as np
-from numba import njit
 
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
+from shared.kernel import I1, I2, I3, kernel, part
 from shared.model import Indices
 
 BUCKET_NS = SECOND_NS // 2
+"""Minima are kept for each half second [ns]."""
 BUCKETS = 40
-"""Minima are kept for each half second, over 20 s."""
-RECENT, OLD = 3, 8
-"""A clock that stepped shows between the last 1.5 s and what is older than 4 s,"""
+"""Half seconds for which minima are kept: 20 s."""
+RECENT = 3
+"""Half seconds that are recent, where a step of a clock is looked for."""
+OLD = 8
+"""Half seconds after which minima are old enough to compare the recent ones with."""
 STEP_SAMPLES = 5
-"""in so many samples of each,"""
+"""Samples that recent and old minima need each before a clock may be said to have stepped."""
 STEP_NS = 40 * MILLISECOND_NS
-"""as a change by this much: up in one direction, and down by about as much in the other."""
+"""Smallest step of a clock: up in one direction, and down by about as much in the other [ns]."""
 
 UNSEEN = 2**61
+"""In place of a minimum where nothing was seen."""
 
 
 class ClockMap:
-    """Offsets of up to `capacity` vehicles [ns]."""
+    """Offsets and steps of up to `capacity` vehicles.
+
+    It follows an estimate of the offset only when that has moved by more than half a step: a step
+    index that went back and forth at a boundary would skip and repeat steps for nothing.
+    """
 
     def __init__(self, capacity: int, dt_ns: int) -> None:
-        self._half_step_ns = dt_ns // 2
-        self._minimum = np.full((capacity, 2, BUCKETS), UNSEEN, dtype=np.int64)
-        """min F and min G of each half second: a ring over the server's time."""
+        self._dt_ns = dt_ns
+        self.minimum = np.full((capacity, 2, BUCKETS), UNSEEN, dtype=np.int64)
+        """min F and min G of each half second [ns], a ring; shape (capacity, 2, BUCKETS)."""
         self._samples = np.zeros((capacity, BUCKETS), dtype=np.int64)
         self._newest = np.zeros(capacity, dtype=np.int64)
-        """Half second of the newest sample."""
+        """Half second of the newest sample; shape (capacity,)."""
         self._adopted = np.full(capacity, UNSEEN, dtype=np.int64)
+        """Offset that is reckoned with [ns]; shape (capacity,)."""
+        self.epoch_ns = np.zeros(capacity, dtype=np.int64)
+        """Begin of step 0 [vehicle's clock]; shape (capacity,)."""
 
     def forget(self, row: int) -> None:
-        """A new vehicle in this row, or a new life of it."""
-        self._minimum[row] = UNSEEN
+        """Begin anew with a vehicle, or with a new life of it."""
+        self.minimum[row] = UNSEEN
         self._samples[row] = 0
         self._adopted[row] = UNSEEN
 
     def observe(self, row: int, forward_ns: int, backward_ns: int, *, now_ns: int) -> None:
-        """One F and one G of a vehicle, received at `now_ns`."""
-        history = (self._minimum[row], self._samples[row], self._newest[row : row + 1])
-        _observe(*history, forward_ns, backward_ns, now_ns // BUCKET_NS)
+        """Take one F and one G of a vehicle, received at `now_ns`."""
+        _observe(
+            self.minimum,
+            self._samples,
+            self._newest,
+            row,
+            forward_ns,
+            backward_ns,
+            now_ns // BUCKET_NS,
+        )
+
+    def steps(self, rows: Indices, now_ns: int) -> Indices:
+        """k of each vehicle at a time of the server's clock; shape (n,)."""
+        steps = np.empty(len(rows), dtype=np.int64)
+        _steps(
+            self.minimum,
+            self._samples,
+            self._newest,
+            self._adopted,
+            self.epoch_ns,
+            rows,
+            now_ns,
+            self._dt_ns,
+            steps,
+        )
+        return steps
 
     def offset_ns(self, rows: Indices) -> Indices:
-        """Vehicle's clock minus ours, for vehicles observed at least once; shape (n,).
+        """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
+        self.steps(rows, 0)
+        return self._adopted[rows]
 
-        It follows the estimate only when that has moved by more than half a step: a step index that
-        went back and forth at a boundary would skip and repeat steps for nothing.
-        """
-        self._drop_stepped(rows)
-        offset: Indices = _follow(self._minimum, self._adopted, rows, self._half_step_ns)
-        return offset
-
-    def bound_ns(self, rows: Indices) -> Indices:
-        """How far the offset may be off; shape (n,)."""
-        bound: Indices = self._minimum[rows].min(axis=2).sum(axis=1) // 2
-        return bound
-
-    def _drop_stepped(self, rows: Indices) -> None:
-        """Where one of the two clocks has stepped, keep only what came since."""
-        _drop_stepped(self._minimum, self._samples, self._newest, rows)
+    def bound_ns(self, row: int) -> int:
+        """How far the offset of a vehicle may be off [ns]."""
+        return int(half_trip_ns.py_func(self.minimum, row))
 
 
-@njit("(i8[:,::1], i8[::1], i8[::1], i8, i8, i8)", cache=True)
-def _observe(minimum, samples, newest, forward, backward, bucket):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    for passed in range(max(newest[0] + 1, bucket - BUCKETS + 1), bucket + 1):
-        minimum[:, passed % BUCKETS], samples[passed % BUCKETS] = UNSEEN, 0
-    newest[0] = max(newest[0], bucket)
+@part
+def half_trip_ns(minimum: I3, row: int) -> int:
+    """Half of the smallest round trip of a vehicle [ns]."""
+    return (minimum[row, 0].min() + minimum[row, 1].min()) // 2
+
+
+@kernel
+def _observe(
+    minimum: I3, samples: I2, newest: I1, row: int, forward: int, backward: int, bucket: int
+) -> None:
+    """Take F and G [ns] of a vehicle into the half second `bucket`; changes the arrays in place."""
+    for passed in range(max(newest[row] + 1, bucket - BUCKETS + 1), bucket + 1):
+        slot = passed % BUCKETS
+        minimum[row, 0, slot], minimum[row, 1, slot] = UNSEEN, UNSEEN
+        samples[row, slot] = 0
+    newest[row] = max(newest[row], bucket)
     slot = bucket % BUCKETS
-    minimum[0, slot] = min(minimum[0, slot], forward)
-    minimum[1, slot] = min(minimum[1, slot], backward)
-    samples[slot] += 1
+    minimum[row, 0, slot] = min(minimum[row, 0, slot], forward)
+    minimum[row, 1, slot] = min(minimum[row, 1, slot], backward)
+    samples[row, slot] += 1
 
 
-@njit("i8[::1](i8[:,:,::1], i8[::1], i8[:], i8)", cache=True)
-def _follow(minimum, adopted, rows, half_step):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    offset = np.empty(len(rows), dtype=np.int64)
-    for i in range(len(rows)):
-        row = rows[i]
-        estimate = (minimum[row, 1].min() - minimum[row, 0].min()) // 2
-        if adopted[row] == UNSEEN or abs(estimate - adopted[row]) > half_step:
-            adopted[row] = estimate
-        offset[i] = adopted[row]
-    return offset
-
-
-@njit("i8(i8[::1], i8)", cache=True)
-def _change(minimum, newest):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    """Smallest delay of the last 1.5 s, less that of what is older than 4 s."""
+@part
+def _change(minimum: I1, newest: int) -> int:
+    """Smallest delay of the last 1.5 s, less that of what is older than 4 s [ns]."""
     recent, old = UNSEEN, UNSEEN
     for age in range(BUCKETS):
         value = minimum[(newest - age) % BUCKETS]
@@ -107,22 +130,45 @@ def _change(minimum, newest):  # type: ignore[no-untyped-def]  # noqa: ANN001, A
     return recent - old
 
 
-@njit("(i8[:,:,::1], i8[:,::1], i8[::1], i8[:])", cache=True)
-def _drop_stepped(minimum, samples, newest, rows):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    for row in rows:
-        counts, recent, old = samples[row], 0, 0
-        for age in range(BUCKETS):
-            count = counts[(newest[row] - age) % BUCKETS]
-            if age < RECENT:
-                recent += count
-            elif age >= OLD:
-                old += count
-        if min(recent, old) < STEP_SAMPLES:
-            continue
-        forward = _change(minimum[row, 0], newest[row])
-        backward = _change(minimum[row, 1], newest[row])
-        large = min(abs(forward), abs(backward)) > STEP_NS
-        if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
-            for age in range(RECENT, BUCKETS):
-                slot = (newest[row] - age) % BUCKETS
-                minimum[row, :, slot], samples[row, slot] = UNSEEN, 0
+@part
+def _drop_stepped(minimum: I3, samples: I2, newest: I1, row: int) -> None:
+    """Keep only what came since, where one of a vehicle's two clocks has stepped."""
+    recent, old = 0, 0
+    for age in range(BUCKETS):
+        count = samples[row, (newest[row] - age) % BUCKETS]
+        if age < RECENT:
+            recent += count
+        elif age >= OLD:
+            old += count
+    if min(recent, old) < STEP_SAMPLES:
+        return
+    forward = _change(minimum[row, 0], newest[row])
+    backward = _change(minimum[row, 1], newest[row])
+    large = min(abs(forward), abs(backward)) > STEP_NS
+    if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
+        for age in range(RECENT, BUCKETS):
+            slot = (newest[row] - age) % BUCKETS
+            minimum[row, 0, slot], minimum[row, 1, slot] = UNSEEN, UNSEEN
+            samples[row, slot] = 0
+
+
+@kernel
+def _steps(
+    minimum: I3,
+    samples: I2,
+    newest: I1,
+    adopted: I1,
+    epoch: I1,
+    rows: I1,
+    now: int,
+    dt: int,
+    steps: I1,
+) -> None:
+    """Fill in k of each vehicle, see `ClockMap.steps`; forgets what came before a clock stepped."""
+    for i in range(len(rows)):
+        row = rows[i]
+        _drop_stepped(minimum, samples, newest, row)
+        estimate = (minimum[row, 1].min() - minimum[row, 0].min()) // 2
+        if adopted[row] == UNSEEN or abs(estimate - adopted[row]) > dt // 2:
+            adopted[row] = estimate
+        steps[i] = (now + adopted[row] - epoch[row]) // dt

@@ -11,85 +11,79 @@ So d is a high quantile that is never below what was seen recently; it rises at 
 step at a time. A horizon that was lost or overtaken by a newer one was never in force: no sample.
 """
 
+from typing import NamedTuple
+
 import numpy as np
-from numba import njit
 
 from shared.endpoint import seconds_to_ns
-from shared.model import Indices
+from shared.kernel import I1, I2, part
 
 SAMPLES = 128
+"""Newest samples that count."""
 LATE = 0.01
+"""Largest share of them that may be later than d."""
 RECENT = 16
-"""On the paper's network d then changes every 4 s (Δt = 0.02 s, every step sent) to every 35 s
-(0.05 s, one step in ten); of the horizons in force 0.3 to 1.3 % came later than d."""
+"""Newest samples of which none may be later than d. On the paper's network d then changes every 4 s
+(Δt = 0.02 s, every step sent) to every 35 s (0.05 s, one step in ten); of the horizons in force 0.3
+to 1.3 % came later than d."""
 
 
-class DelayBound:
-    """d of up to `capacity` vehicles.
+class DelayBound(NamedTuple):
+    """d of up to `capacity` vehicles, and the samples that it comes from."""
+
+    steps: I1
+    """d of each vehicle, or 0 while nothing is known; shape (capacity,)."""
+    samples: I2
+    """Newest samples of each [steps], a ring; shape (capacity, SAMPLES)."""
+    count: I1
+    """Number of samples seen so far; shape (capacity,)."""
+    least: int
+    """Smallest d."""
+    most: int
+    """Largest d."""
+
+
+def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) -> DelayBound:
+    """The delay bounds of vehicles of which nothing is known yet.
 
     Args:
         dt_s: length of a step [s].
         most: the largest d, what a horizon has room for.
         fixed_s: a bound that is known [s]; None to estimate it.
     """
-
-    def __init__(self, capacity: int, dt_s: float, most: int, fixed_s: float | None) -> None:
-        if fixed_s is None:
-            self._least, self._most = 1, most
-        else:
-            fixed = -(-seconds_to_ns(fixed_s) // seconds_to_ns(dt_s))
-            self._least = self._most = min(max(fixed, 1), most)
-        self._steps = np.full(capacity, self._least, dtype=np.int64)
-        self._samples = np.zeros((capacity, SAMPLES), dtype=np.int64)
-        """A ring; shape (capacity, SAMPLES)."""
-        self._counts = np.zeros(capacity, dtype=np.int64)
-        """Of the samples there were."""
-
-    def forget(self, row: int) -> None:
-        """A new vehicle in this row, or a new life of it."""
-        self._steps[row] = self._least
-        self._counts[row] = 0
-
-    def begin(self, rows: Indices, guess: Indices) -> None:
-        """A first d [steps], for vehicles without a sample; shape (n,)."""
-        self._steps[rows] = guess.clip(self._least, self._most)
-
-    def acknowledged(self, rows: Indices, delays: Indices) -> None:
-        """Samples [steps] of vehicles that have a new one; once a tick: d falls by one a call.
-
-        Args:
-            rows: each at most once; shape (n,).
-            delays: shape (n,).
-        """
-        _acknowledged(
-            *(self._samples, self._counts, self._steps, rows, delays),
-            *(self._least, self._most, RECENT, LATE),
-        )
-
-    def steps(self, rows: Indices) -> Indices:
-        """d, 1 <= d <= most; shape (n,)."""
-        return self._steps[rows]
+    least = 1
+    if fixed_s is not None:
+        fixed = -(-seconds_to_ns(fixed_s) // seconds_to_ns(dt_s))
+        least = most = min(max(fixed, 1), most)
+    steps, count = np.zeros((2, capacity), dtype=np.int64)
+    samples = np.zeros((capacity, SAMPLES), dtype=np.int64)
+    return DelayBound(steps, samples, count, least, most)
 
 
-@njit(
-    "(i8[:,::1], i8[::1], i8[::1], i8[:], i8[:], i8, i8, i8, f8)",
-    cache=True,
-    error_model="numpy",
-)
-def _acknowledged(samples, counts, bounds, rows, delays, least, most, recent, late):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    size = samples.shape[1]
-    for i in range(len(rows)):
-        row = rows[i]
-        newest = counts[row] % size
-        samples[row, newest] = delays[i]
-        counts[row] += 1
-        d = max(bounds[row], min(delays[i], most))
-        known = min(counts[row], size)
-        needed, since = 0, known  # samples that need d, and how many came after the last of these
-        for slot in range(known):
-            if samples[row, slot] >= d:
-                age = newest - slot if slot <= newest else newest - slot + size
-                needed, since = needed + 1, min(since, age)
-        if d > least and since >= recent and needed <= late * known:
-            d -= 1
-        bounds[row] = d
+def forget(bound: DelayBound, row: int) -> None:
+    """Begin anew with a vehicle, or with a new life of it."""
+    bound.steps[row] = bound.count[row] = 0
+
+
+@part
+def begin(bound: DelayBound, row: int, guess: int) -> None:
+    """Set a first d [steps] of a vehicle without a sample."""
+    bound.steps[row] = min(max(guess, bound.least), bound.most)
+
+
+@part
+def acknowledge(bound: DelayBound, row: int, delay: int) -> None:
+    """Take a sample [steps] of a vehicle into its d, which falls by one at most."""
+    newest = bound.count[row] % SAMPLES
+    bound.samples[row, newest] = delay
+    bound.count[row] += 1
+    d = max(bound.steps[row], min(delay, bound.most))
+    known = min(bound.count[row], SAMPLES)
+    needed, since = 0, known  # samples that need d, and how many came after the last of these
+    for slot in range(known):
+        if bound.samples[row, slot] >= d:
+            age = newest - slot if slot <= newest else newest - slot + SAMPLES
+            needed, since = needed + 1, min(since, age)
+    if d > bound.least and since >= RECENT and needed <= LATE * known:
+        d -= 1
+    bound.steps[row] = d

@@ -12,11 +12,11 @@ This is the scheme "predictive", and "none", which takes the newest observation 
 from collections import Counter
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
+from server.model import Axes, advance, axes_of
 from server.scheme import Foresight
-from shared.model import Array, Flags, Indices, Model
+from shared.kernel import F3, I1, S3, kernel
+from shared.model import Flags, Indices, Model
 from shared.protocol import Observation
 
 
@@ -25,29 +25,25 @@ class Estimator:
 
     Args:
         model: eq. (4).
-        reach: largest τ that is compensated; an older observation gives no estimate.
+        reach: largest τ that is compensated.
         compensate: False for "no compensation": x̂(k) is the newest observation, as it is.
     """
 
     def __init__(self, model: Model, capacity: int, reach: int, *, compensate: bool) -> None:
-        axes = len(model.B)
-        self.plans_always = True
+        axes = len(model.b0)
         self.counts: Counter[str] = Counter()
-        self._model = model
-        self._reach = reach
+        self._model = axes_of(model)
         self._compensate = compensate
         self.observed_step = np.full(capacity, -1, dtype=np.int64)
         """Step of the newest observation, or -1; shape (capacity,)."""
         self._state = np.zeros((capacity, axes, 2))
         self._inputs = np.zeros((capacity, axes, reach))
-        """û, a ring over the steps: zero, hovering, where nothing was computed."""
+        """û, a ring over the steps: zero, hovering, where nothing was computed [m/s]."""
         self._last_step = np.full(capacity, -1, dtype=np.int64)
-        """The step whose û was computed last, or -1."""
-        self._nothing = np.zeros((capacity, axes, 0))
-        self._no_feedback = np.zeros((capacity, axes, 0), dtype=np.float32)
+        """Step whose û was computed last, or -1; shape (capacity,)."""
 
     def forget(self, row: int) -> None:
-        """A new vehicle in this row."""
+        """See `Scheme`."""
         self.observed_step[row] = -1
         self._inputs[row] = 0.0
         self._last_step[row] = -1
@@ -60,79 +56,73 @@ class Estimator:
         self._state[row] = observation.state
         return True
 
-    def age(self, rows: Indices, step: Indices) -> Indices:
-        """τ: steps between the newest observation and `step`; shape (n,)."""
-        return np.maximum(step - self.observed_step[rows], 0)
-
-    def within_reach(self, rows: Indices, step: Indices) -> Flags:
-        """See `Scheme`."""
-        return (self.observed_step[rows] >= 0) & (self.age(rows, step) <= self._reach)
-
-    def estimate(self, rows: Indices, step: Indices) -> Array:
-        """x̂(k) of eq. (13), for vehicles within reach; shape (n, axes, 2)."""
-        if not self._compensate:
-            return self._state[rows]
-        estimate: Array = _fly_on(
-            *(self._model.A, self._model.B, self._state, self.observed_step),
-            *(self._inputs, self._last_step, rows, step),
+    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
+        """See `Scheme`: planning starts at k, from x̂(k) of eq. (13)."""
+        _fly_on(
+            self._model,
+            self._state,
+            self.observed_step,
+            self._inputs,
+            self._last_step,
+            self._compensate,
+            rows,
+            step,
+            found.estimate,
+            found.start,
         )
-        return estimate
-
-    def foresee(self, rows: Indices, step: Indices) -> Foresight:
-        """See `Scheme`: planning starts at k, from x̂(k)."""
-        estimate, n = self.estimate(rows, step), len(rows)
-        nothing, here = self._nothing[:n], np.zeros(n, dtype=np.int64)
-        calm = np.zeros(estimate.shape[:2])
-        aboard = self._no_feedback[:n]
-        return Foresight(estimate, here, estimate, nothing, nothing, calm, aboard)
 
     def remember(
         self,
         rows: Indices,
         step: Indices,
-        foresight: Foresight,  # noqa: ARG002 - the first input is all that (12) asks for
-        horizons: NDArray[np.float32],
-        sent: Indices,  # noqa: ARG002
+        found: Foresight,
+        event: Flags,  # noqa: ARG002 - whether sent or not (E12)
     ) -> None:
-        """û(k) ← u(k|k), eq. (12), whether sent or not (E12).
+        """û(k) ← u(k|k), eq. (12).
 
         Steps before at which nothing was computed flew on with the input of before them.
         """
-        _write_down(self._inputs, self._last_step, rows, step, horizons)
+        _write_down(self._inputs, self._last_step, rows, step, found.horizons)
 
 
-@njit(
-    "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8[::1], f8[:,:,::1], i8[::1], i8[:], i8[:])",
-    cache=True,
-    error_model="numpy",
-)
-def _fly_on(A, B, state, observed_step, inputs, last_step, rows, steps):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    n, axes, reach = len(rows), len(A), inputs.shape[2]
-    estimate = np.empty((n, axes, 2))
-    for i in range(n):
+@kernel
+def _fly_on(
+    model: Axes,
+    state: F3,
+    observed_step: I1,
+    inputs: F3,
+    last_step: I1,
+    compensate: bool,
+    rows: I1,
+    steps: I1,
+    estimate: F3,
+    start: F3,
+) -> None:
+    """Fill in x̂(k), eq. (13), as `estimate` and `start`; see `Estimator` for the shapes."""
+    reach = inputs.shape[2]
+    for i in range(len(rows)):
         row = rows[i]
-        for axis in range(axes):
+        for axis in range(len(model)):
             p, v = state[row, axis, 0], state[row, axis, 1]
-            for step in range(observed_step[row], steps[i]):
-                u = inputs[row, axis, min(step, last_step[row]) % reach]
-                p, v = (
-                    A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u,
-                    A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u,
-                )
+            if compensate:
+                for step in range(observed_step[row], steps[i]):
+                    u = inputs[row, axis, min(step, last_step[row]) % reach]
+                    p, v = advance(model[axis], p, v, u)
             estimate[i, axis, 0], estimate[i, axis, 1] = p, v
-    return estimate
+            start[i, axis, 0], start[i, axis, 1] = p, v
 
 
-@njit("(f8[:,:,::1], i8[::1], i8[:], i8[:], f4[:,:,:])", cache=True)
-def _write_down(inputs, last_step, rows, steps, new):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
+@kernel
+def _write_down(inputs: F3, last_step: I1, rows: I1, steps: I1, horizons: S3) -> None:
+    """Put the first input of each horizon into the history `inputs`, see `Estimator.remember`."""
     reach = inputs.shape[2]
     for i in range(len(rows)):
         row, step, last = rows[i], steps[i], last_step[rows[i]]
         if last >= 0:
-            for axis in range(new.shape[1]):
+            for axis in range(horizons.shape[1]):
                 held = inputs[row, axis, last % reach]
                 for missed in range(max(last + 1, step - reach + 1), step):
                     inputs[row, axis, missed % reach] = held
-        for axis in range(new.shape[1]):
-            inputs[row, axis, step % reach] = new[i, axis, 0]
+        for axis in range(horizons.shape[1]):
+            inputs[row, axis, step % reach] = horizons[i, axis, 0]
         last_step[row] = step

@@ -2,225 +2,455 @@
 
 Both are the MPC of (9) in closed succession: each starts from its own horizon of the step before.
 The generator plans from its own last prediction and never looks at the UAV (E17); the tracker leads
-the UAV's estimated state along the generator's plan.
+the UAV's estimated state along the generator's plan. What the new plan is worth is found out on the
+way: V of eq. (16), and the cost and the deviation of flying on with what was sent.
+
+With the exact solver, all of that is one compiled pass over a vehicle, which touches no more memory
+than a horizon takes. Another solver, or one that has to help out, takes the same moves in turn with
+it: pose the generator's problem, solve; pose the tracker's, solve; conclude.
 """
 
-from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
-from server.exact import ExactSolver
-from server.mpc import MPC, condense, shift
+from server.exact import ExactSolver, Workspace, active_set, workspace
+from server.model import advance
+from server.mpc import FIRST, LATER, MPC, add_cost, gradient, hessian, make_mpc, predict
+from server.scheme import Foresight
 from server.solver import OsqpSolver, Solver
-from shared.config import ControlConfig, Scenario
-from shared.model import Array, Flags, Indices, Model
-from shared.reference import Reference
+from shared.config import Scenario
+from shared.kernel import F1, F2, F3, F4, I1, kernel, part, record, records
+from shared.model import Array, Indices
 from shared.stopwatch import Stopwatch
+from shared.terms import Terms
 
 WINDOW = 4096
 """Steps of the reference that are held at a time."""
+GENERATOR, TRACKER = 0, 1
+"""First index of what both MPCs have."""
+
+FIGURES = record(
+    ("step", "i8"),
+    ("error", "f8"),
+    ("cost_gap", "f8"),
+    ("deviation_m", "f8"),
+    ("fresh", "?"),
+    ("solved", "?"),
+)
+"""What is known of a vehicle once its plan is made: k; V(k) of eq. (16); the cost of flying on with
+what was sent, above that of the plan; the largest distance between that and the generator's last
+plan [m]; whether it is at its first step or after a gap that no plan reached over; and whether the
+plan is new and right, so that it may be sent."""
+Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
+"""Shape (n,)."""
 
 
-def make_solver(control: ControlConfig, mpc: MPC, u_max: Array) -> Solver:
-    """The solver that a scenario names, for the QPs of one MPC."""
-    if control.solver == "exact":
-        return ExactSolver(mpc, u_max)
-    return OsqpSolver(mpc.hessian, u_max)
+class Memory(NamedTuple):
+    """What both MPCs remember of every vehicle."""
+
+    inputs: F4
+    """U(k-1), the horizon computed last [m/s]; shape (2, capacity, axes, H)."""
+    states: F4
+    """X(k-1) of the generator, behind where it was computed from [m, m/s]; shape
+    (capacity, axes, H + 1, 2)."""
+    step: I1
+    """Step that they were computed for, or -1; shape (capacity,)."""
 
 
-class Successive:
-    """One MPC solved at every step, for up to `capacity` vehicles."""
+class Draft(NamedTuple):
+    """The plans of a block of vehicles in the making."""
 
-    def __init__(
-        self, scenario: Scenario, model: Model, capacity: int, stopwatch: Stopwatch
-    ) -> None:
-        control, axes, H = scenario.control, len(model.B), scenario.control.horizon
-        self._stopwatch = stopwatch
-        self.mpc = condense(model, control, change_weight=control.change_weight)
-        self._solver = make_solver(control, self.mpc, scenario.u_max)
-        # Without a horizon before there is no S-term (E8), which is another Hessian.
-        self._first = condense(model, control, change_weight=0.0)
-        self._first_solver = make_solver(control, self._first, scenario.u_max)
-        self.inputs = np.zeros((capacity, axes, H))
-        """U(k-1), the horizon computed last."""
-        self.states = np.zeros((capacity, axes, H + 1, 2))
-        """Where it was computed from, and X(k-1), the states predicted with it."""
-        self.solve_ns = 0
-        """How long solving took last, where the stopwatch runs."""
-
-    def solve(  # noqa: PLR0917 - all that a plan starts from
-        self,
-        rows: Indices,
-        gap: Indices,
-        fresh: Flags,
-        x: Array,
-        target: Array,
-        disturbance: Array,
-    ) -> Flags:
-        """{X(k), U(k)} ← MPC, eq. (10), into `states` and `inputs`.
-
-        Args:
-            rows: the vehicles; shape (n,).
-            gap: steps since each was solved last, of no matter where it starts anew; shape (n,).
-            fresh: which of them start anew; shape (n,).
-            x: state at stage 0; shape (n, axes, 2).
-            target: desired states at the stages 0 … H; shape (n, axes, H + 1, 2).
-            disturbance: see `MPC.gradient`; shape (n, axes).
-
-        Returns:
-            which were solved; the others go on with their horizon of before, shifted.
-        """
-        previous = shift(self.inputs[rows], gap)
-        anew = fresh.any()
-        if anew:
-            previous[fresh] = 0.0
-        gradient = self.mpc.gradient(x, target, previous, disturbance)
-        self._stopwatch.lap("plan")
-        inputs, solved = self._solver.solve(gradient, previous)
-        if anew:
-            gradient = self._first.gradient(
-                x[fresh], target[fresh], previous[fresh], disturbance[fresh]
-            )
-            inputs[fresh], solved[fresh] = self._first_solver.solve(gradient, previous[fresh])
-        self.solve_ns = self._stopwatch.lap("solve")
-        # What is sent is float32: planning goes on with what the vehicle will really be told.
-        self.inputs[rows] = inputs = inputs.astype(np.float32).astype(np.float64)
-        self.mpc.predict(x, inputs, disturbance, self.states, rows)
-        return solved
+    planned: F3
+    """x_p(k|k-1), where the generator starts [m, m/s]; shape (block, axes, 2)."""
+    gradient: F3
+    """g of the problem to be solved; shape (block, axes, H)."""
+    guess: F3
+    """Horizon of the step before, shifted [m/s]; shape (block, axes, H)."""
+    inputs: F4
+    """U(k) of both MPCs [m/s]; shape (2, block, axes, H)."""
+    states: F4
+    """X(k) of the generator [m, m/s]; shape (block, axes, H + 1, 2)."""
+    drift: F2
+    """Scratch of `gradient`; shape (H, 2)."""
+    distance: F1
+    """Scratch: squares of distances [m²]; shape (H + 1,)."""
 
 
-class Desired:
-    """The reference at the stages 0 … H of any step, looked up rather than computed each time."""
+class Given(NamedTuple):
+    """What a plan starts from, besides what was foreseen."""
 
-    def __init__(self, reference: Reference, dt_s: float, H: int) -> None:
-        self._reference = reference
-        self._dt_s = dt_s
-        self._stages = np.arange(H + 1)
-        self._steps = np.arange(WINDOW + H)
-        self._first = 0
+    mpc: MPC
+    """The problem."""
+    terminal_weight: F1
+    """P, on position and velocity; shape (2,)."""
+    compares: bool
+    """Whether what was sent before is known, so that the plan can be compared with it."""
+
+
+class Desired(NamedTuple):
+    """The reference at the stages of each vehicle."""
+
+    table: F3
+    """Desired states one step after the other [m, m/s]; shape (axes, many, 2)."""
+    first: I1
+    """Where in the table the stages 0 … H of each vehicle begin; shape (n,)."""
+
+
+class Reference:
+    """The desired trajectory at any step, looked up rather than computed each time."""
+
+    def __init__(self, scenario: Scenario, terms: Terms) -> None:
+        self._sample = scenario.make_reference()
+        self._dt_s = terms.dt_s
+        self._stages = np.arange(terms.horizon + 1)
+        self._steps = np.arange(WINDOW + terms.horizon)
         self._fill(0)
 
-    def __call__(self, step: Indices) -> Array:
-        """x_d(k|k) … x_d(k+H|k) for each of these k; shape (n, axes, H + 1, 2)."""
+    def __call__(self, step: Indices) -> Desired:
+        """x_d at the stages 0 … H of each of these steps k."""
         low, high = int(step.min()), int(step.max())
         if high - low >= WINDOW:  # vehicles that fly hours apart share no table
-            times = (step[:, None] + self._stages) * self._dt_s
-            return self._reference(times).transpose(0, 2, 1, 3)
+            apart = self._table((step[:, None] + self._stages).ravel())
+            return Desired(apart, np.arange(len(step)) * len(self._stages))
         if not self._first <= low <= high < self._first + WINDOW:
             self._fill(low)
-        return self._windows[:, step - self._first].transpose(1, 0, 2, 3)
+        return Desired(self._held, step - self._first)
 
     def _fill(self, first: int) -> None:
-        states = self._reference((first + self._steps) * self._dt_s).transpose(1, 0, 2)
-        windows = sliding_window_view(np.ascontiguousarray(states), len(self._stages), axis=1)
-        self._first, self._windows = first, windows.swapaxes(2, 3)
+        self._first, self._held = first, self._table(first + self._steps)
 
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What the planner has to say about n vehicles at one step."""
-
-    inputs: Array
-    """U(k) of (15) [m/s]; shape (n, axes, H)."""
-    solved: Flags
-    """Whether U(k) is new and right, so that it may be sent; shape (n,)."""
-    solve_ns: int
-    """How long it took to solve both problems of all n; -1 where nobody measured."""
+    def _table(self, steps: Indices) -> Array:
+        states = self._sample(steps * self._dt_s)
+        return np.ascontiguousarray(states.transpose(1, 0, 2))
 
 
 class Planner:
-    """Trajectory generator and tracker of up to `capacity` vehicles."""
+    """Trajectory generator and tracker of up to `capacity` vehicles, `block` of them at a time."""
 
     def __init__(
-        self, scenario: Scenario, model: Model, capacity: int, stopwatch: Stopwatch
+        self,
+        scenario: Scenario,
+        terms: Terms,
+        capacity: int,
+        block: int,
+        stopwatch: Stopwatch,
     ) -> None:
-        control = scenario.control
-        self._H = control.horizon
-        self._desired = Desired(scenario.make_reference(), control.dt, control.horizon)
-        self._generator = Successive(scenario, model, capacity, stopwatch)
-        self._tracker = Successive(scenario, model, capacity, stopwatch)
+        control, axes, H = scenario.control, terms.axes, terms.horizon
+        self._reference = Reference(scenario, terms)
+        mpc = make_mpc(terms, control)
+        self._given = Given(mpc, np.array(control.terminal_weight), terms.commits)
+        self._exact = control.solver == "exact"
+        self._work = workspace(mpc)
+        self._solvers: list[Solver] = [
+            ExactSolver(terms.model, mpc, which)
+            if self._exact
+            else OsqpSolver(hessian(terms.model, mpc.weights, which), mpc.bounds)
+            for which in (FIRST, LATER)
+        ]
         self._stopwatch = stopwatch
-        self._step = np.full(capacity, -1, dtype=np.int64)
+        self._memory = Memory(
+            inputs=np.zeros((2, capacity, axes, H)),
+            states=np.zeros((capacity, axes, H + 1, 2)),
+            step=np.full(capacity, -1, dtype=np.int64),
+        )
+        self._draft = Draft(
+            planned=np.zeros((block, axes, 2)),
+            gradient=np.zeros((block, axes, H)),
+            guess=np.zeros((block, axes, H)),
+            inputs=np.zeros((2, block, axes, H)),
+            states=np.zeros((block, axes, H + 1, 2)),
+            drift=np.zeros((H, 2)),
+            distance=np.zeros(H + 1),
+        )
+        self.figures: Figures = np.zeros(block, dtype=FIGURES)
+        """What the last plans are worth; those of a block come first."""
+        self.planned = self._draft.planned
+        """x_p(k+d|k-1) of the last plans [m, m/s]; shape (block, axes, 2)."""
+        self.inputs = self._memory.inputs[TRACKER]
+        """U of the last plan of each vehicle [m/s]; shape (capacity, axes, H)."""
+        self.solve_ns = -1
+        """How long planning for the last block took, or -1 where nobody measures it."""
 
     def forget(self, row: int) -> None:
-        """The next plan of this vehicle is its first."""
-        self._step[row] = -1
+        """Make the next plan of this vehicle its first."""
+        self._memory.step[row] = -1
 
-    def planned(self, rows: Indices, step: Indices, estimate: Array) -> tuple[Array, Flags]:
-        """x_p(k|k-1) ∈ X_p(k-1), and which vehicles start anew, from their estimate.
-
-        A vehicle starts anew at its first step, and after a gap that its plan does not reach over.
-
-        Returns:
-            shape (n, axes, 2) and (n,).
-        """
-        last = self._step[rows]
-        gap = step - last
-        fresh = (last < 0) | (gap > self._H)
-        planned = self._generator.states[rows, :, np.minimum(gap, self._H)]
-        planned[fresh] = estimate[fresh]
-        return planned, fresh
-
-    def plan(  # noqa: PLR0917 - all that a plan starts from
-        self,
-        rows: Indices,
-        step: Indices,
-        estimate: Array,
-        planned: Array,
-        fresh: Flags,
-        disturbance: Array,
-    ) -> Plan:
-        """Eq. (14), then (15).
+    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
+        """Plan for vehicles, eq. (14), then (15); fills in `found.horizons`, `figures`, `planned`.
 
         Args:
             rows: the vehicles; shape (n,).
-            step: where each plan starts, later than the last one, or there; shape (n,).
-            estimate: x̂ at that step; shape (n, axes, 2).
-            planned: x_p there, and `fresh`: from `planned`.
-            disturbance: see `MPC.gradient`; shape (n, axes).
+            step: k of each; shape (n,).
+            found: what is foreseen of them.
         """
-        gap = step - self._step[rows]
-        calm = np.zeros_like(disturbance)  # the generator plans for no vehicle in particular
-        led = self._generator.solve(rows, gap, fresh, planned, self._desired(step), calm)
-        trajectory = self._generator.states[rows]
-        solved = led & self._tracker.solve(rows, gap, fresh, estimate, trajectory, disturbance)
-        self._step[rows] = step
-        if not solved.all():  # a first plan that failed is no plan to go on from
-            self._step[rows[fresh & ~solved]] = -1
-        solve_ns = self._generator.solve_ns + self._tracker.solve_ns
-        return Plan(self._tracker.inputs[rows], solved, solve_ns if self._stopwatch.runs else -1)
+        desired = self._reference(step + found.ahead[: len(rows)])
+        batch = (self._given, self._memory, self._draft, rows, step, found)
+        left = np.arange(len(rows))
+        if self._exact:
+            undone = _plan(*batch, desired, self._work, self.figures)
+            left = np.flatnonzero(~self.figures["solved"][: len(rows)]) if undone else left[:0]
+        if len(left):
+            _pose_generators(*batch, desired, left, self.figures)
+            self._solve(GENERATOR, left)
+            _pose_trackers(*batch, left, self.figures)
+            self._solve(TRACKER, left)
+            _conclude_all(*batch, left, self.figures)
+        took_ns = self._stopwatch.lap("plan")
+        self.solve_ns = took_ns if self._stopwatch.runs else -1
 
-    def cost_gap(self, rows: Indices, held: Array) -> Array:
-        """(U_old - U)ᵀ 𝓗 (U_old - U): what it costs to fly `held` instead of the plan just made.
+    def _solve(self, which: int, left: Indices) -> None:
+        """Solve the problems posed in the draft for some vehicles of the block, by index."""
+        draft = self._draft
+        fresh = self.figures["fresh"][left]
+        for some, solver in zip((left[fresh], left[~fresh]), self._solvers, strict=True):
+            if len(some):
+                inputs, solved = solver.solve(draft.gradient[some], draft.guess[some])
+                draft.inputs[which, some] = inputs
+                self.figures["solved"][some] &= solved
 
-        Args:
-            rows: the vehicles; shape (n,).
-            held: U_old; shape (n, axes, H).
 
-        Returns:
-            shape (n,).
-        """
-        return self._tracker.mpc.cost(held - self._tracker.inputs[rows])
+@part
+def _rounded(u: F1) -> None:
+    """Round inputs to float32: planning goes on with what the vehicle will really be told."""
+    for i in range(len(u)):
+        u[i] = np.float64(np.float32(u[i]))
 
-    def deviation_m(
-        self, rows: Indices, step: Indices, estimate: Array, held: Array, disturbance: Array
-    ) -> Array:
-        """How far `held` leads away from the generator's last plan, at most, as far as that goes.
 
-        Args:
-            rows, step, estimate, disturbance: see `plan`.
-            held: inputs from `step` on; shape (n, axes, H).
+@part
+def _shift(inputs: F1, gap: int, fresh: bool, shifted: F1) -> None:
+    """Fill in a horizon as seen `gap` steps later, its last input repeated (11); 0 for the fresh."""
+    H = len(inputs)
+    for i in range(H):
+        shifted[i] = 0.0 if fresh else inputs[min(i + gap, H - 1)]
 
-        Returns:
-            distance [m]; shape (n,).
-        """
-        n, axes, H = held.shape
-        states = np.empty((n, axes, H + 1, 2))
-        self._tracker.mpc.predict(estimate, held, disturbance, states, np.arange(n))
-        gap = step - self._step[rows]
-        stage = np.arange(H + 1) + gap[:, None]
-        plan = self._generator.states[rows[:, None], :, np.minimum(stage, H), 0].transpose(0, 2, 1)
-        distance = np.linalg.norm(states[..., 0] - plan, axis=1)
-        largest: Array = np.where(stage <= H, distance, 0.0).max(axis=1)
-        return largest
+
+@part
+def _appraise(memory: Memory, row: int, start: int, figures: Figures, i: int, k: int) -> int:
+    """Steps since a vehicle was planned for last; notes whether its plan is to begin anew."""
+    last = memory.step[row]
+    gap = start - last
+    figures[i].step, figures[i].solved = k, True
+    figures[i].fresh = last < 0 or gap > memory.inputs.shape[3]
+    return gap
+
+
+@part
+def _pose_generator(
+    given: Given,
+    memory: Memory,
+    draft: Draft,
+    found: Foresight,
+    desired: Desired,
+    i: int,
+    at: int,
+    row: int,
+    axis: int,
+    gap: int,
+    fresh: bool,
+) -> None:
+    """Pose the generator's problem (14) on one axis of vehicle `i` of the block, at draft `at`."""
+    H = memory.inputs.shape[3]
+    if fresh:
+        x = (found.start[i, axis, 0], found.start[i, axis, 1])
+    else:
+        x = (memory.states[row, axis, gap, 0], memory.states[row, axis, gap, 1])
+    draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
+    _shift(memory.inputs[GENERATOR, row, axis], gap, fresh, draft.guess[at, axis])
+    first = desired.first[i]
+    gradient(
+        given.mpc,
+        axis,
+        FIRST if fresh else LATER,
+        x,
+        0.0,  # the generator plans for no vehicle in particular
+        desired.table[axis, first : first + H + 1],
+        draft.guess[at, axis],
+        draft.drift,
+        draft.gradient[at, axis],
+    )
+
+
+@part
+def _pose_tracker(
+    given: Given,
+    memory: Memory,
+    draft: Draft,
+    found: Foresight,
+    i: int,
+    at: int,
+    row: int,
+    axis: int,
+    gap: int,
+    fresh: bool,
+) -> None:
+    """Pose the tracker's problem (15) on one axis, behind the generator's answer in the draft."""
+    u, states = draft.inputs[GENERATOR, at, axis], draft.states[at, axis]
+    _rounded(u)
+    planned = (draft.planned[i, axis, 0], draft.planned[i, axis, 1])
+    predict(given.mpc, axis, planned, 0.0, u, states)
+    _shift(memory.inputs[TRACKER, row, axis], gap, fresh, draft.guess[at, axis])
+    gradient(
+        given.mpc,
+        axis,
+        FIRST if fresh else LATER,
+        (found.start[i, axis, 0], found.start[i, axis, 1]),
+        found.disturbance[i, axis],
+        states,
+        draft.guess[at, axis],
+        draft.drift,
+        draft.gradient[at, axis],
+    )
+
+
+@part
+def _conclude(
+    given: Given,
+    memory: Memory,
+    draft: Draft,
+    found: Foresight,
+    i: int,
+    at: int,
+    row: int,
+    start: int,
+    gap: int,
+    figures: Figures,
+) -> None:
+    """Appraise the plan of vehicle `i`, whose answers are in the draft, and remember it."""
+    axes, H, P = len(given.mpc.model), memory.inputs.shape[3], given.terminal_weight
+    error, cost, d = 0.0, 0.0, found.ahead[i]
+    change, compared = draft.gradient[at, 0], H - gap if not figures[i].fresh else -1
+    for axis in range(axes):
+        u = draft.inputs[TRACKER, at, axis]
+        _rounded(u)
+        off_p = found.start[i, axis, 0] - draft.planned[i, axis, 0]
+        off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
+        error += off_p * off_p * P[0] + off_v * off_v * P[1]
+        if given.compares:
+            for stage in range(H):
+                change[stage] = found.held[i, axis, stage] - u[stage]
+            cost = add_cost(given.mpc, axis, change, cost)
+            x = (found.start[i, axis, 0], found.start[i, axis, 1])
+            states = memory.states[row, axis]
+            model, w, (p, v) = given.mpc.model[axis], found.disturbance[i, axis], x
+            for stage in range(compared + 1):
+                away = p - states[stage + gap, 0]
+                before = draft.distance[stage] if axis > 0 else 0.0
+                draft.distance[stage] = before + away * away
+                if stage < H:
+                    p, v = advance(model, p, v, found.held[i, axis, stage] + w)
+        for stage in range(d):
+            found.horizons[i, axis, stage] = found.committed[i, axis, stage]
+        for stage in range(H):
+            found.horizons[i, axis, d + stage] = u[stage]
+    furthest = 0.0
+    for stage in range(compared + 1):
+        furthest = max(furthest, draft.distance[stage])
+    figures[i].error, figures[i].cost_gap = error, cost
+    figures[i].deviation_m = np.sqrt(furthest)
+    for axis in range(axes):
+        memory.inputs[GENERATOR, row, axis] = draft.inputs[GENERATOR, at, axis]
+        memory.inputs[TRACKER, row, axis] = draft.inputs[TRACKER, at, axis]
+        memory.states[row, axis] = draft.states[at, axis]
+    # A first plan that failed is no plan to go on from.
+    memory.step[row] = start if figures[i].solved or not figures[i].fresh else -1
+
+
+@kernel
+def _plan(
+    given: Given,
+    memory: Memory,
+    draft: Draft,
+    rows: I1,
+    steps: I1,
+    found: Foresight,
+    desired: Desired,
+    work: Workspace,
+    figures: Figures,
+) -> int:
+    """Plan for vehicles with the exact solver, see `Planner.plan`; how many have to be left.
+
+    Those have no `solved` in their figures, and are as they were.
+    """
+    mpc, undone = given.mpc, 0
+    for i in range(len(rows)):
+        row, start = rows[i], steps[i] + found.ahead[i]
+        gap = _appraise(memory, row, start, figures, i, steps[i])
+        fresh = figures[i].fresh
+        which = FIRST if fresh else LATER
+        for axis in range(len(mpc.model)):
+            g, guess = draft.gradient[0, axis], draft.guess[0, axis]
+            _pose_generator(given, memory, draft, found, desired, i, 0, row, axis, gap, fresh)
+            u = draft.inputs[GENERATOR, 0, axis]
+            if active_set(mpc, axis, which, work, g, guess, u) <= 0:
+                figures[i].solved = False
+                break
+            _pose_tracker(given, memory, draft, found, i, 0, row, axis, gap, fresh)
+            u = draft.inputs[TRACKER, 0, axis]
+            if active_set(mpc, axis, which, work, g, guess, u) <= 0:
+                figures[i].solved = False
+                break
+        if figures[i].solved:
+            _conclude(given, memory, draft, found, i, 0, row, start, gap, figures)
+        else:
+            undone += 1
+    return undone
+
+
+@kernel
+def _pose_generators(
+    given: Given,
+    memory: Memory,
+    draft: Draft,
+    rows: I1,
+    steps: I1,
+    found: Foresight,
+    desired: Desired,
+    left: I1,
+    figures: Figures,
+) -> None:
+    """Pose the generator's problems of those `left` in a block, by index."""
+    for i in left:
+        start = steps[i] + found.ahead[i]
+        gap = _appraise(memory, rows[i], start, figures, i, steps[i])
+        for axis in range(len(given.mpc.model)):
+            fresh = figures[i].fresh
+            _pose_generator(given, memory, draft, found, desired, i, i, rows[i], axis, gap, fresh)
+
+
+@kernel
+def _pose_trackers(
+    given: Given,
+    memory: Memory,
+    draft: Draft,
+    rows: I1,
+    steps: I1,
+    found: Foresight,
+    left: I1,
+    figures: Figures,
+) -> None:
+    """Pose the tracker's problems of those `left` in a block, by index."""
+    for i in left:
+        gap = steps[i] + found.ahead[i] - memory.step[rows[i]]
+        for axis in range(len(given.mpc.model)):
+            fresh = figures[i].fresh
+            _pose_tracker(given, memory, draft, found, i, i, rows[i], axis, gap, fresh)
+
+
+@kernel
+def _conclude_all(
+    given: Given,
+    memory: Memory,
+    draft: Draft,
+    rows: I1,
+    steps: I1,
+    found: Foresight,
+    left: I1,
+    figures: Figures,
+) -> None:
+    """Conclude the plans of those `left` in a block, by index."""
+    for i in left:
+        start = steps[i] + found.ahead[i]
+        gap = start - memory.step[rows[i]]
+        _conclude(given, memory, draft, found, i, i, rows[i], start, gap, figures)

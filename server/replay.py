@@ -19,379 +19,418 @@ With feedback aboard, a horizon tells the vehicle also where its inputs lead, x�
 how to come back to there: it flies u(i) + K (x̄(i) - x(i)). That is replayed in the same way. What
 is committed are the inputs that this comes to if nothing else happens, along x̄ from x̂(k): as K is
 always the same, it makes no difference when the next horizon replaces the one before.
+
+Both the replay and the observer work in two moves: which horizon is in force from which step on (a
+course), and the roll along it by the rule of flight (`shared.rule`).
 """
 
 from collections import Counter
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from server.clock import ClockMap
-from server.delay import DelayBound
+from server import delay
+from server.clock import ClockMap, half_trip_ns
+from server.delay import DelayBound, acknowledge, begin, delay_bound
+from server.model import AXIS_FIELDS, advance, bounded, entry, flown, led_back, stage_at
 from server.mpc import stationary_gain
 from server.scheme import Foresight
-from shared.config import Scenario
-from shared.model import Flags, Indices, Model
-from shared.protocol import FEEDBACK, INPUTS_MAX, NO_HORIZON, Observation
+from shared.config import ControlConfig
+from shared.kernel import B1, F1, F2, I1, I3, S4, kernel, part, record, records
+from shared.model import Flags, Indices
+from shared.protocol import INPUTS_MAX, NO_HORIZON, Observation
+from shared.terms import Terms
 
 MARGIN = 2
 """Steps on top of half a round trip, until a horizon has been acknowledged."""
+HOVERS, UNKNOWN = -1, -2
+"""In place of the number of a horizon: none yet; one that was sent in an earlier life of ours."""
+
+RULE = record(*AXIS_FIELDS, ("bound", "f8"), ("gain_p", "f8"), ("gain_v", "f8"))
+"""Eq. (4) on one axis, u_max [m/s], and K on position [1/s] and velocity, 0 without feedback."""
+SEEN = record(
+    ("step", "i8"),
+    ("in_force", "i8"),
+    ("since", "i8"),
+    ("base_step", "i8"),
+    ("base_in_force", "i8"),
+    ("acknowledged", "i8"),
+    ("judged", "i8"),
+    ("sent", "i8"),
+)
+"""What is known of one vehicle: step, horizon in force, and first step flown with it, of its newest
+observation; step and horizon of the one before, or -1; the horizon last seen to have come into
+force; the step up to which horizons were seen in force, or lost, or overtaken; and the number of
+horizons sent so far."""
+STATE = record(("p", "f8"), ("v", "f8"), ("base_p", "f8"), ("base_v", "f8"), ("w", "f8"))
+"""On one axis of a vehicle: position [m] and velocity [m/s] of its newest observation and of the
+one before, and the disturbance [m/s]."""
+SENT = record(("step", "i8"), ("length", "i8"), ("speed", "f8"))
+"""A horizon that was sent: the step it was made for, how many inputs it has, and the magnitude of
+the last [m/s]."""
+ORIGIN = record(("p", "f4"), ("v", "f4"), ("w", "f4"))
+"""Where a horizon leads on from on one axis: position [m], velocity [m/s], disturbance [m/s]."""
+
+
+class Settings(NamedTuple):
+    """What is the same for all vehicles."""
+
+    rule: Annotated[NDArray[np.void], records(RULE, 1)]
+    """Model, bound and gain; shape (axes,)."""
+    H: int
+    """Steps planned ahead."""
+    reach: int
+    """Largest age of an observation that counts [steps]."""
+    dt_ns: int
+    """Length of a step [ns]."""
+    brake: float
+    """Speed that braking takes away in a step [m/s]."""
+    decay: float
+    """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
+    feeds_back: bool
+    """Whether horizons bring feedback."""
+
+
+class Memory(NamedTuple):
+    """What is known of every vehicle, and what it was sent."""
+
+    seen: Annotated[NDArray[np.void], records(SEEN, 1)]
+    """Shape (capacity,)."""
+    state: Annotated[NDArray[np.void], records(STATE, 2)]
+    """Shape (capacity, axes)."""
+    sent: Annotated[NDArray[np.void], records(SENT, 2)]
+    """Horizons that were sent, a ring; shape (capacity, room)."""
+    inputs: S4
+    """Their inputs [m/s]; shape (capacity, room, axes, 2 H)."""
+    origins: Annotated[NDArray[np.void], records(ORIGIN, 3)]
+    """Where they lead on from; shape (capacity, room, axes)."""
 
 
 class Replay:
     """The committed `Scheme`: observations of, and horizons sent to, up to `capacity` vehicles.
 
     Args:
-        model: eq. (4).
-        reach: an observation more steps old than this gives no estimate.
+        terms: the rule of flight.
+        control: `observer_s`, `delay_bound`, and the weights that make the gain of feedback aboard.
+        reach: largest age of an observation [steps].
         clock: knows half of the smallest round trip, which is a first guess at the delay bound.
     """
 
     def __init__(
-        self, scenario: Scenario, model: Model, capacity: int, reach: int, clock: ClockMap
+        self, terms: Terms, control: ControlConfig, capacity: int, reach: int, clock: ClockMap
     ) -> None:
-        control, vehicle, axes = scenario.control, scenario.vehicle, len(model.B)
-        H = self._H = control.horizon
-        self.plans_always = False
+        axes, H = terms.axes, terms.horizon
         self.counts: Counter[str] = Counter()
-        self._reach = reach
-        brake_mps2 = vehicle.brake_mps2 if vehicle.exhausted == "brake" else 0.0
-        self._feeds_back = control.scheme == "feedback"
-        gain = stationary_gain(model, control) if self._feeds_back else np.zeros((axes, 2))
-        self._gain = gain.astype(np.float32)
-        bounds = (scenario.u_max, brake_mps2 * control.dt)
-        self._flies = (model.A, model.B, *bounds, self._gain.astype(np.float64))
-        """A and B, and what `client.compensator` makes of a horizon."""
-        observer_s = control.observer_s
-        self._observer_decay = float(np.exp(-control.dt / observer_s)) if observer_s else 1.0
+        rule = np.zeros(axes, dtype=RULE)
+        for name, numbers in terms.model._asdict().items():
+            rule[name] = numbers
+        rule["bound"] = terms.u_max
+        if terms.feeds_back:  # as the vehicle will be told it, in float32
+            rule["gain_p"], rule["gain_v"] = stationary_gain(terms.model, control).T.astype("f4")
+        self._settings = Settings(
+            rule=rule,
+            H=H,
+            reach=reach,
+            dt_ns=terms.dt_ns,
+            brake=terms.brake,
+            decay=float(np.exp(-terms.dt_s / control.observer_s)) if control.observer_s else 1.0,
+            feeds_back=terms.feeds_back,
+        )
+        room = reach + H
+        self._memory = Memory(
+            seen=np.zeros(capacity, dtype=SEEN),
+            state=np.zeros((capacity, axes), dtype=STATE),
+            sent=np.zeros((capacity, room), dtype=SENT),
+            inputs=np.zeros((capacity, room, axes, 2 * H), dtype=np.float32),
+            origins=np.zeros((capacity, room, axes), dtype=ORIGIN),
+        )
         given = control.delay_bound
         fixed_s = None if given == "auto" else given
-        most = min(H, INPUTS_MAX // axes - H)
-        self._delay_bound = DelayBound(capacity, control.dt, most, fixed_s)
-        self._dt_ns = scenario.dt_ns
+        self.delay_bound = delay_bound(
+            capacity, terms.dt_s, min(H, INPUTS_MAX // axes - H), fixed_s
+        )
         self._clock = clock
-        self._begun = np.zeros(capacity, dtype=np.bool_)
-        self.observed_step = np.full(capacity, -1, dtype=np.int64)
-        """Step of the newest observation, or -1; shape (capacity,)."""
-        self._state = np.zeros((capacity, axes, 2))
-        self._in_force = np.full(capacity, NO_HORIZON, dtype=np.int64)
-        self._since = np.zeros(capacity, dtype=np.int64)
-        self._seen = (self._state, self.observed_step, self._in_force, self._since)
-        """The newest observation."""
-        self._acknowledged = np.full(capacity, NO_HORIZON, dtype=np.int64)
-        """The horizon that was last seen to have come into force."""
-        room = reach + H
-        self._stamps = np.zeros((capacity, room), dtype=np.int64)
-        self._horizons = np.zeros((capacity, room, axes, 2 * H), dtype=np.float32)
-        self._lengths = np.zeros((capacity, room), dtype=np.int64)
-        self._sent = np.zeros(capacity, dtype=np.int64)
-        self._origins = np.zeros((capacity, room, axes, 3), dtype=np.float32)
-        self._told = (self._stamps, self._horizons, self._lengths, self._origins, self._sent)
-        """Horizons that were sent, a ring: step, inputs, how many, and x̂ and ŵ that they start
-        from; and how many horizons so far."""
-        self._base_step = np.full(capacity, -1, dtype=np.int64)
-        base_state = np.zeros((capacity, axes, 2))
-        base_in_force = np.full(capacity, NO_HORIZON, dtype=np.int64)
-        self._base = (base_state, self._base_step, base_in_force)
-        """The observation before, from which the disturbance observer starts; step -1 for none."""
-        self._disturbance = np.zeros((capacity, axes))
-        self._judged = np.zeros(capacity, dtype=np.int64)
-        """Horizons of up to this step have been seen in force, or lost, or overtaken."""
+        self.observed_step: Indices = self._memory.seen["step"]
+        """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
+        for row in range(capacity):
+            self.forget(row)
 
     def forget(self, row: int) -> None:
-        """A new vehicle in this row."""
-        self.observed_step[row] = self._base_step[row] = -1
-        self._disturbance[row] = 0.0
-        self._acknowledged[row] = NO_HORIZON
-        self._sent[row] = self._judged[row] = 0
-        self._begun[row] = False
-        self._delay_bound.forget(row)
+        """See `Scheme`."""
+        memory = self._memory
+        memory.seen[row] = (-1, NO_HORIZON, 0, -1, NO_HORIZON, NO_HORIZON, 0, 0)
+        memory.state["w"][row] = 0.0
+        delay.forget(self.delay_bound, row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
-        if observation.step <= self.observed_step[row]:
+        seen, state = self._memory.seen[row], self._memory.state[row]
+        if observation.step <= seen["step"]:
             return False
-        self.observed_step[row] = observation.step
-        self._state[row] = observation.state
-        self._in_force[row], self._since[row] = observation.in_force, observation.since
+        seen["step"] = observation.step
+        seen["in_force"], seen["since"] = observation.in_force, observation.since
+        state["p"], state["v"] = observation.state.T
         return True
 
-    def within_reach(self, rows: Indices, step: Indices) -> Flags:
-        """See `Scheme`."""
-        observed = self.observed_step[rows]
-        return (observed >= 0) & (step - observed <= self._reach)
-
-    def foresee(self, rows: Indices, step: Indices) -> Foresight:
+    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
         """See `Scheme`: planning starts at k + d."""
-        self._listen(rows)
-        ahead = self._delay_bound.steps(rows)
-        estimate, start, committed, held, lost = _replay(
-            *(self._flies, self._told, self._seen, self._judged, self._disturbance),
-            *(rows, step, ahead, self._H),
+        lost = _foresee(
+            self._settings,
+            self._memory,
+            self.delay_bound,
+            self._clock.minimum,
+            rows,
+            step,
+            found,
         )
-        self.counts["horizons lost"] += lost
-        disturbance = self._disturbance[rows]
-        feedback = np.empty((*disturbance.shape, FEEDBACK * self._feeds_back), dtype=np.float32)
-        if self._feeds_back:
-            feedback[..., :2], feedback[..., 2] = estimate, disturbance
-            feedback[..., 3:] = self._gain
-        return Foresight(estimate, ahead, start, committed, held, disturbance, feedback)
+        if lost:
+            self.counts["horizons lost"] += lost
 
-    def remember(
-        self,
-        rows: Indices,
-        step: Indices,
-        foresight: Foresight,
-        horizons: NDArray[np.float32],
-        sent: Indices,
-    ) -> None:
+    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; only what was sent counts."""
-        rows = rows[sent]
-        slot = self._sent[rows] % self._stamps.shape[1]
-        self._stamps[rows, slot] = step[sent]
-        self._lengths[rows, slot] = foresight.ahead[sent] + self._H
-        self._horizons[rows, slot, :, : horizons.shape[2]] = horizons[sent]
-        if self._feeds_back:
-            self._origins[rows, slot] = foresight.feedback[sent, :, :3]
-        self._sent[rows] += 1
-
-    def _listen(self, rows: Indices) -> None:
-        """What observations have come with since the last time: delays, and a disturbance."""
-        begin = rows[~self._begun[rows]]
-        if len(begin):
-            self._begun[begin] = True
-            half_trip = -(-self._clock.bound_ns(begin) // self._dt_ns)
-            self._delay_bound.begin(begin, half_trip + MARGIN)
-        in_force = self._in_force[rows]
-        told = rows[(in_force != self._acknowledged[rows]) & (self._sent[rows] > 0)]
-        if len(told):
-            oldest = np.maximum(self._sent[told] - self._stamps.shape[1], 0)
-            ours = self._stamps[told, oldest % self._stamps.shape[1]] <= self._in_force[told]
-            known = told[ours]
-            self._delay_bound.acknowledged(known, self._since[known] - self._in_force[known])
-            self._acknowledged[told] = self._in_force[told]
-        if self._observer_decay < 1.0:
-            _observe_disturbance(
-                *(self._flies, self._told, self._seen, self._base, self._disturbance),
-                *(rows, self._delay_bound.steps(rows), self._reach, self._observer_decay),
-            )
+        _remember(self._settings, self._memory, rows, step, found, event)
 
 
-FLIES = "Tuple((f8[:,:,::1], f8[:,::1], f8[::1], f8, f8[:,::1]))"
-TOLD = "Tuple((i8[:,::1], f4[:,:,:,::1], i8[:,::1], f4[:,:,:,::1], i8[::1]))"
-SEEN = "Tuple((f8[:,:,::1], i8[::1], i8[::1], i8[::1]))"
-"""Of the kernels: `Replay._flies`, `_told` and `_seen`."""
-HOVERS, UNKNOWN = -1, -2
-"""In place of the number of a horizon: none yet; one that was sent in an earlier life of ours."""
-NEVER = 2**62
-"""A step."""
+class Course(NamedTuple):
+    """Which horizon is in force from which step on; room for more than can be in flight."""
+
+    begins: I1
+    """First step of each leg."""
+    numbers: I1
+    """Number of the horizon flown on it, HOVERS or UNKNOWN."""
 
 
-@njit("i8(i8[:,::1], i8[::1], i8, i8)", cache=True)
-def _number(stamps, sent, row, stamp):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    """Of the horizon made for step `stamp`, counted from 0 in the order of sending."""
-    if stamp < 0:
+class Track(NamedTuple):
+    """What was flown on one axis, step by step, and where that led."""
+
+    commands: F1
+    """Inputs [m/s]."""
+    states: F2
+    """Position [m] and velocity [m/s] at each step and after the last."""
+
+
+@part
+def _number(memory: Memory, row: int, made_for: int) -> int:
+    """Number of the horizon made for a step, counted from 0 in the order of sending."""
+    if made_for < 0:
         return HOVERS
-    room = stamps.shape[1]
-    for number in range(sent[row] - 1, max(sent[row] - room, 0) - 1, -1):
-        if stamps[row, number % room] <= stamp:
-            return number if stamps[row, number % room] == stamp else UNKNOWN
+    room = memory.sent.shape[1]
+    count = memory.seen[row].sent
+    for number in range(count - 1, max(count - room, 0) - 1, -1):
+        step = memory.sent[row, number % room].step
+        if step <= made_for:
+            return number if step == made_for else UNKNOWN
     return UNKNOWN
 
 
-@njit("i8(i8[:,::1], i8[::1], i8, i8)", cache=True)
-def _first_after(stamps, sent, row, stamp):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    """Number of the first horizon made for a step after `stamp`."""
-    room = stamps.shape[1]
-    number = sent[row]
-    while number > max(sent[row] - room, 0) and stamps[row, (number - 1) % room] > stamp:
+@part
+def _first_after(memory: Memory, row: int, step: int) -> int:
+    """Number of the first horizon made for a later step."""
+    room = memory.sent.shape[1]
+    count = memory.seen[row].sent
+    number = count
+    while number > max(count - room, 0) and memory.sent[row, (number - 1) % room].step > step:
         number -= 1
     return number
 
 
-@njit("UniTuple(f8, 2)(f8[:,:,::1], f8[:,::1], i8, f8, f8, f8)", cache=True)
-def _roll(A, B, axis, p, v, u):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """Eq. (4)."""
-    return (
-        A[axis, 0, 0] * p + A[axis, 0, 1] * v + B[axis, 0] * u,
-        A[axis, 1, 0] * p + A[axis, 1, 1] * v + B[axis, 1] * u,
-    )
+@part
+def _chart(
+    course: Course, memory: Memory, row: int, begin: int, d: int, flown: int, following: range
+) -> int:
+    """Number of legs of the course from `begin`: `flown`, then each of those following it.
 
-
-@njit(f"f8({TOLD}, {FLIES}, i8, i8, i8, i8)", cache=True)
-def _input(told, flies, row, slot, axis, stage):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """The input of a stage of a horizon, as far as the vehicle will go."""
-    most = flies[2][axis]
-    return min(max(float(told[1][row, slot, axis, stage]), -most), most)
-
-
-@njit(f"Tuple((i8, i8, i8, f8))({TOLD}, {FLIES}, i8, i8)", cache=True)
-def _take(told, flies, row, number):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    """A horizon: where it is in the ring, its step, its last stage, and the speed it ends with."""
-    if number < 0:
-        return number, 0, 0, 0.0
-    stamps, horizons, lengths, _, _ = told
-    slot, squares = number % stamps.shape[1], 0.0
-    end = lengths[row, slot] - 1
-    for axis in range(horizons.shape[2]):
-        squares += _input(told, flies, row, slot, axis, end) ** 2
-    return slot, stamps[row, slot], end, np.sqrt(squares)
-
-
-@njit(f"i8({TOLD}, i8, i8, i8)", cache=True)
-def _due(told, row, number, d):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202 - compiled
-    """The step from which a horizon in flight is counted on."""
-    stamps, _, _, _, sent = told
-    return stamps[row, number % stamps.shape[1]] + d if number < sent[row] else NEVER
-
-
-# `_lead` and `_command` are called side by side: one that calls the other is not inlined any more,
-# and a replay then takes two and a half times as long.
-
-
-@njit(
-    f"UniTuple(f8, 2)({TOLD}, {FLIES}, i8, Tuple((i8, i8, i8, f8)), i8, i8, i8, f8, f8)", cache=True
-)
-def _lead(told, flies, row, taken, axis, begin, end, p, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """x̄ of a horizon at step `end`: from p, v at `begin`, or from where it starts if that is -1.
-
-    After its last step there is no feedback any more, and x̄ stays what it is.
+    Args:
+        following: numbers of horizons, each in force d steps after it was made.
     """
-    slot, stamp, last, _ = taken
-    if slot < 0:
-        return p, v
-    origins = told[3]
-    if begin < 0:
-        begin = stamp
-        p, v = float(origins[row, slot, axis, 0]), float(origins[row, slot, axis, 1])
-    w = float(origins[row, slot, axis, 2])
-    for step in range(max(begin, stamp), min(end, stamp + last)):
-        u = _input(told, flies, row, slot, axis, step - stamp) + w
-        p, v = _roll(flies[0], flies[1], axis, p, v, u)
-    return p, v
-
-
-@njit(
-    f"f8({TOLD}, {FLIES}, i8, Tuple((i8, i8, i8, f8)), i8, i8, f8, f8, f8, f8)",
-    cache=True,
-    error_model="numpy",
-)
-def _command(told, flies, row, taken, axis, step, p, v, p_led, v_led):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """What `client.compensator` flies at a step with a horizon, from the state p, v; led is x̄."""
-    slot, stamp, end, speed = taken
-    if slot == HOVERS:
-        return 0.0
-    if slot == UNKNOWN:
-        return v  # as good a guess as any: it flies on
-    _, _, u_max, brake, gain = flies
-    stage = step - stamp
-    u = _input(told, flies, row, slot, axis, min(max(stage, 0), end))
-    if 0 <= stage <= end:
-        u += gain[axis, 0] * (p_led - p) + gain[axis, 1] * (v_led - v)
-        return min(max(u, -u_max[axis]), u_max[axis])
-    if stage < 0 or brake == 0.0:
-        return u
-    return u * (max(0.0, speed - (stage - end) * brake) / speed) if speed > 0.0 else 0.0
-
-
-@njit(
-    f"Tuple((f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], i8))({FLIES}, {TOLD}, {SEEN},"
-    "i8[::1], f8[:,::1], i8[:], i8[:], i8[:], i8)",
-    cache=True,
-    error_model="numpy",
-)
-def _replay(flies, told, seen, judged, disturbance, rows, steps, ahead, H):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """See `Replay.foresee`: x̂(k), x̂(k+d), committed and held inputs, and newly lost horizons."""
-    A, B, _, _, gain = flies
-    stamps, _, _, _, sent = told
-    state, observed_step, in_force, _ = seen
-    n, axes, room = len(rows), len(A), stamps.shape[1]
-    estimate, start = np.empty((n, axes, 2)), np.empty((n, axes, 2))
-    committed, held = np.zeros((n, axes, H)), np.zeros((n, axes, H))
-    lost, feeds_back = 0, gain.any()
-    for i in range(n):
-        row, k, d = rows[i], steps[i], ahead[i]
-        observed = observed_step[row]
-        # Those that had d steps and are not in force have been overtaken, or are lost.
-        flown = _number(stamps, sent, row, in_force[row])
-        first = _first_after(stamps, sent, row, max(in_force[row], observed - d))
-        for number in range(_first_after(stamps, sent, row, in_force[row]), first):
-            lost += stamps[row, number % room] > judged[row]
-        judged[row] = max(judged[row], observed - d)
-        for axis in range(axes):
-            p, v = state[row, axis, 0], state[row, axis, 1]
-            taken, following = _take(told, flies, row, flown), first
-            due, led, p_led, v_led = _due(told, row, following, d), -1, 0.0, 0.0
-            # An observation from ahead of k, where clocks disagree, is taken as it is.
-            estimate[i, axis, 0], estimate[i, axis, 1] = p, v
-            start[i, axis, 0], start[i, axis, 1] = p, v
-            for step in range(observed, k + d + H):
-                while due <= step:
-                    taken, following, led = _take(told, flies, row, following), following + 1, -1
-                    due = _due(told, row, following, d)
-                if feeds_back:
-                    p_led, v_led = _lead(told, flies, row, taken, axis, led, step, p_led, v_led)
-                    led = step
-                if step == k:
-                    estimate[i, axis, 0], estimate[i, axis, 1] = p, v
-                if step == k + d:
-                    start[i, axis, 0], start[i, axis, 1] = p, v
-                u = _command(told, flies, row, taken, axis, step, p, v, p_led, v_led)
-                if step < k + d:
-                    if step >= k:
-                        committed[i, axis, step - k] = u
-                else:
-                    held[i, axis, step - k - d] = u
-                p, v = _roll(A, B, axis, p, v, u + disturbance[row, axis])
-    return estimate, start, committed, held, lost
-
-
-@njit(
-    f"({FLIES}, {TOLD}, {SEEN}, Tuple((f8[:,:,::1], i8[::1], i8[::1])), f8[:,::1], i8[:], i8[:],"
-    "i8, f8)",
-    cache=True,
-    error_model="numpy",
-)
-def _observe_disturbance(flies, told, seen, base, disturbance, rows, ahead, reach, decay):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0917 - compiled
-    """Disturbance observer: from the observation before to the newest, where there is a new one."""
-    A, B, u_max, _, gain = flies
-    stamps, _, _, _, sent = told
-    state, observed_step, in_force, since = seen
-    base_state, base_step, base_in_force = base
-    axes, feeds_back = len(A), gain.any()
-    for i in range(len(rows)):
-        row, d = rows[i], ahead[i]
-        begin, end = base_step[row], observed_step[row]
-        if end == begin:
+    room, legs = memory.sent.shape[1], 1
+    course.begins[0], course.numbers[0] = begin, flown
+    for number in following:
+        due = memory.sent[row, number % room].step + d
+        if due <= begin:
+            course.numbers[0] = number
             continue
-        before = _number(stamps, sent, row, base_in_force[row])
-        after = _number(stamps, sent, row, in_force[row])
-        known = min(before, after) > UNKNOWN and begin >= 0 and end - begin <= reach
+        course.begins[legs], course.numbers[legs] = due, number
+        legs += 1
+    return legs
+
+
+@part
+def _roll(
+    settings: Settings,
+    memory: Memory,
+    row: int,
+    axis: int,
+    course: Course,
+    legs: int,
+    end: int,
+    x: tuple[float, float],
+    track: Track,
+) -> None:
+    """Fly one axis along a course from its begin to step `end`, from x = (p, v), into `track`."""
+    rule, room, begin = settings.rule[axis], memory.sent.shape[1], course.begins[0]
+    (p, v), w = x, memory.state[row, axis].w
+    for leg in range(legs):
+        first = course.begins[leg]
+        last = min(end, course.begins[leg + 1] if leg + 1 < legs else end)
+        number = course.numbers[leg]
+        if first >= last:
+            continue
+        if number < 0:
+            for step in range(first, last):
+                u = 0.0 if number == HOVERS else v  # as good a guess as any: it flies on
+                track.commands[step - begin] = u
+                track.states[step - begin, 0], track.states[step - begin, 1] = p, v
+                p, v = advance(rule, p, v, u + w)
+            continue
+        slot = number % room
+        horizon, inputs = memory.sent[row, slot], memory.inputs[row, slot, axis]
+        made_for, length, speed = horizon.step, horizon.length, horizon.speed
+        # x̄, by now.
+        origin = memory.origins[row, slot, axis]
+        led_p, led_v, led_w = float(origin.p), float(origin.v), float(origin.w)
+        if settings.feeds_back:
+            for stage in range(min(first - made_for, length - 1)):
+                u = bounded(float(inputs[stage]), rule.bound)
+                led_p, led_v = advance(rule, led_p, led_v, u + led_w)
+        for step in range(first, last):
+            stage, back = stage_at(step, made_for, True), 0.0
+            told = bounded(float(inputs[entry(stage, length)]), rule.bound)
+            if settings.feeds_back:
+                back = led_back(rule.gain_p, rule.gain_v, led_p - p, led_v - v)
+            u = flown(stage, length, told, back, speed, settings.brake, rule.bound)
+            if settings.feeds_back and 0 <= stage < length - 1:
+                led_p, led_v = advance(rule, led_p, led_v, told + led_w)
+            track.commands[step - begin] = u
+            track.states[step - begin, 0], track.states[step - begin, 1] = p, v
+            p, v = advance(rule, p, v, u + w)
+    after = max(end - begin, 0)
+    track.states[after, 0], track.states[after, 1] = p, v
+
+
+@part
+def _observe_disturbance(
+    settings: Settings, memory: Memory, row: int, d: int, course: Course, track: Track
+) -> None:
+    """Disturbance observer: from the observation before to the newest, where there is a new one."""
+    seen = memory.seen[row]
+    begin, end = seen.base_step, seen.step
+    if end == begin:
+        return
+    before, after = _number(memory, row, seen.base_in_force), _number(memory, row, seen.in_force)
+    if min(before, after) > UNKNOWN and begin >= 0 and end - begin <= settings.reach:
+        first = _first_after(memory, row, max(seen.base_in_force, begin - d))
+        legs = _chart(course, memory, row, begin, d, before, range(first, after))
+        # What came into force, and when, is known.
+        while legs > 1 and course.begins[legs - 1] >= seen.since:
+            legs -= 1
+        if seen.since <= begin:
+            course.numbers[0] = after
+        elif seen.since < end:
+            course.begins[legs], course.numbers[legs] = seen.since, after
+            legs += 1
+        m = end - begin
+        for axis in range(len(settings.rule)):
+            state, rule = memory.state[row, axis], settings.rule[axis]
+            _roll(
+                settings, memory, row, axis, course, legs, end, (state.base_p, state.base_v), track
+            )
+            # A change of w changes the velocity after m steps by 1 - a11^m of it.
+            off = (state.v - track.states[m, 1]) / (1.0 - rule.a11**m)
+            w = state.w + (1.0 - settings.decay**m) * off
+            memory.state[row, axis].w = min(max(w, -rule.bound), rule.bound)
+    for axis in range(len(settings.rule)):
+        state = memory.state[row, axis]
+        memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v
+    memory.seen[row].base_step, memory.seen[row].base_in_force = end, seen.in_force
+
+
+@part
+def _listen(settings: Settings, memory: Memory, bound: DelayBound, minimum: I3, row: int) -> None:
+    """Take what the newest observation says of the delay of horizons."""
+    seen, room = memory.seen[row], memory.sent.shape[1]
+    if bound.steps[row] == 0:
+        begin(bound, row, -(-half_trip_ns(minimum, row) // settings.dt_ns) + MARGIN)
+    if seen.in_force == seen.acknowledged or seen.sent == 0:
+        return
+    oldest = max(seen.sent - room, 0)
+    if memory.sent[row, oldest % room].step <= seen.in_force:
+        acknowledge(bound, row, seen.since - seen.in_force)
+    memory.seen[row].acknowledged = seen.in_force
+
+
+@kernel
+def _foresee(
+    settings: Settings,
+    memory: Memory,
+    bound: DelayBound,
+    minimum: I3,
+    rows: I1,
+    steps: I1,
+    found: Foresight,
+) -> int:
+    """Fill in what is foreseen of vehicles at their steps k; the number of horizons newly lost."""
+    axes, H, room = len(settings.rule), settings.H, memory.sent.shape[1]
+    course = Course(np.empty(room + 2, dtype=np.int64), np.empty(room + 2, dtype=np.int64))
+    longest = settings.reach + 2 * H + 1
+    track, lost = Track(np.empty(longest), np.empty((longest, 2))), 0
+    for i in range(len(rows)):
+        row, k = rows[i], steps[i]
+        _listen(settings, memory, bound, minimum, row)
+        d = bound.steps[row]
+        if settings.decay < 1.0:
+            _observe_disturbance(settings, memory, row, d, course, track)
+        seen = memory.seen[row]
+        # Those that had d steps and are not in force have been overtaken, or are lost.
+        first = _first_after(memory, row, max(seen.in_force, seen.step - d))
+        for number in range(_first_after(memory, row, seen.in_force), first):
+            lost += memory.sent[row, number % room].step > seen.judged
+        memory.seen[row].judged = max(seen.judged, seen.step - d)
+        flying = _number(memory, row, seen.in_force)
+        legs = _chart(course, memory, row, seen.step, d, flying, range(first, seen.sent))
+        found.ahead[i] = d
         for axis in range(axes):
-            p, v, number = base_state[row, axis, 0], base_state[row, axis, 1], before
-            taken = _take(told, flies, row, number)
-            following = _first_after(stamps, sent, row, max(base_in_force[row], begin - d))
-            due, led, p_led, v_led = _due(told, row, following, d), -1, 0.0, 0.0
-            for step in range(begin, end if known else begin):
-                was = number
-                while due <= step and following < after:
-                    number, following = following, following + 1
-                    due = _due(told, row, following, d)
-                if step >= since[row]:
-                    number = after
-                if number != was:
-                    taken, led = _take(told, flies, row, number), -1
-                if feeds_back:
-                    p_led, v_led = _lead(told, flies, row, taken, axis, led, step, p_led, v_led)
-                    led = step
-                u = _command(told, flies, row, taken, axis, step, p, v, p_led, v_led)
-                p, v = _roll(A, B, axis, p, v, u + disturbance[row, axis])
-            if known:
-                # A change of w changes the velocity after m steps by 1 - a^m of it.
-                m = end - begin
-                off = (state[row, axis, 1] - v) / (1.0 - A[axis, 1, 1] ** m)
-                w = disturbance[row, axis] + (1.0 - decay**m) * off
-                disturbance[row, axis] = min(max(w, -u_max[axis]), u_max[axis])
-            base_state[row, axis] = state[row, axis]
-        base_step[row], base_in_force[row] = end, in_force[row]
+            state, rule = memory.state[row, axis], settings.rule[axis]
+            _roll(settings, memory, row, axis, course, legs, k + d + H, (state.p, state.v), track)
+            # An observation from ahead of k, where clocks disagree, is taken as it is.
+            now, then = k - seen.step, k + d - seen.step
+            for j in range(2):
+                found.estimate[i, axis, j] = track.states[max(now, 0), j]
+                found.start[i, axis, j] = track.states[max(then, 0), j]
+            for j in range(d):
+                found.committed[i, axis, j] = track.commands[now + j] if now + j >= 0 else 0.0
+            for j in range(H):
+                found.held[i, axis, j] = track.commands[then + j] if then + j >= 0 else 0.0
+            found.disturbance[i, axis] = state.w
+            if settings.feeds_back:
+                found.feedback[i, axis, 0] = found.estimate[i, axis, 0]
+                found.feedback[i, axis, 1] = found.estimate[i, axis, 1]
+                found.feedback[i, axis, 2] = state.w
+                found.feedback[i, axis, 3], found.feedback[i, axis, 4] = rule.gain_p, rule.gain_v
+    return lost
+
+
+@kernel
+def _remember(
+    settings: Settings, memory: Memory, rows: I1, steps: I1, found: Foresight, event: B1
+) -> None:
+    """Write down the horizons that are sent, see `Replay.remember`."""
+    room = memory.sent.shape[1]
+    for i in range(len(rows)):
+        if not event[i]:
+            continue
+        row = rows[i]
+        slot = memory.seen[row].sent % room
+        memory.seen[row].sent += 1
+        length, squares = found.ahead[i] + settings.H, 0.0
+        for axis in range(len(settings.rule)):
+            for stage in range(length):
+                memory.inputs[row, slot, axis, stage] = found.horizons[i, axis, stage]
+            last = bounded(float(found.horizons[i, axis, length - 1]), settings.rule[axis].bound)
+            squares += last * last
+            origin = memory.origins[row, slot, axis]
+            origin.p, origin.v = found.feedback[i, axis, 0], found.feedback[i, axis, 1]
+            origin.w = found.feedback[i, axis, 2]
+        sent = memory.sent[row, slot]
+        sent.step, sent.length, sent.speed = steps[i], length, np.sqrt(squares)

@@ -4,6 +4,7 @@ A scenario may say `extends = "other"` (a scenario's name, or a file beside it) 
 what differs. `skytether scenarios` lists those that come with Skytether.
 """
 
+import hashlib
 import math
 import re
 import tomllib
@@ -24,7 +25,8 @@ from shared import policy
 from shared import reference as shapes
 from shared.endpoint import seconds_to_ns
 from shared.hint import hint
-from shared.protocol import INPUTS_MAX, Terms
+from shared.protocol import INPUTS_MAX
+from shared.terms import Terms
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -244,13 +246,27 @@ class Scenario(Section, frozen=True):
         return np.array(np.broadcast_to(values, self.model.axes), dtype=np.float64)
 
     def terms(self) -> Terms:
-        """What both ends must agree on."""
+        """What both ends must agree on before a flight."""
+        control, vehicle, reference = self.control, self.vehicle, self.reference
+        table = Path(reference.file).read_bytes() if reference.shape == "csv" else b""
         return Terms(
-            self.dt_ns,
-            self.control.horizon,
-            self.model.axes,
-            tuple(self.tau_s.tolist()),
-            tuple(self.u_max.tolist()),
+            dt_ns=self.dt_ns,
+            horizon=control.horizon,
+            axes=self.model.axes,
+            tau_s=tuple(self.tau_s.tolist()),
+            u_max=tuple(self.u_max.tolist()),
+            scheme=control.scheme,
+            exhausted=vehicle.exhausted,
+            brake_mps2=vehicle.brake_mps2,
+            heartbeat_s=self.link.heartbeat_s,
+            shape=reference.shape,
+            radius_m=reference.radius_m,
+            period_s=reference.period_s,
+            altitude_m=reference.altitude_m,
+            points=_digest(repr(reference.points_m).encode() if reference.points_m else b""),
+            speed_mps=reference.speed_mps,
+            loop=reference.loop,
+            table=_digest(table),
         )
 
     def make_reference(self) -> shapes.Reference:
@@ -272,6 +288,11 @@ class Scenario(Section, frozen=True):
                 return shapes.hover(points[0])
             case "csv":
                 return shapes.from_csv(Path(config.file), axes)
+
+
+def _digest(content: bytes) -> str:
+    """A short text that differs where the content does, "none" of nothing."""
+    return hashlib.blake2s(content, digest_size=8).hexdigest() if content else "none"
 
 
 COMPARED = "compare"

@@ -2,10 +2,17 @@
 
 Per axis the state is x = [p, v] (position [m], velocity [m/s]) and the input u the desired velocity
 [m/s]; v follows u with the time constant tau. The axes do not couple, so the model of the whole
-vehicle is one 2 x 2 system an axis, and the same code flies in 2-D and 3-D.
+vehicle is one 2 x 2 system an axis, and the same code flies in 2-D and 3-D:
+
+    p(k+1) = p(k) + a01 v(k) + b0 u(k)          A = [[1, a01],   B = [b0,
+    v(k+1) =        a11 v(k) + b1 u(k)               [0, a11]]        b1]
+
+`advance` is the one home of eq. (4). It takes the numbers of one axis or the arrays of all, and is
+compiled into every kernel that rolls a state along.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,41 +24,63 @@ Flags = NDArray[np.bool_]
 """One yes or no per vehicle; shape (n,)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Model:
-    """x(k+1) = A x(k) + B u(k), eq. (4), for every axis."""
+class Axis(NamedTuple):
+    """Eq. (4) on one axis."""
 
-    A: Array
-    """shape (axes, 2, 2)"""
-    B: Array
-    """shape (axes, 2)"""
-
-    def step(self, x: Array, u: Array) -> Array:
-        """f(x, u) of eq. (4): x of shape (..., axes, 2), u of shape (..., axes)."""
-        return np.einsum("aij,...aj->...ai", self.A, x) + self.B * u[..., None]
-
-    def roll_out(self, x: Array, inputs: Array) -> Array:
-        """States at the stages of a horizon, the first of them x.
-
-        Args:
-            x: shape (axes, 2).
-            inputs: shape (stages, axes).
-
-        Returns:
-            shape (stages, axes, 2).
-        """
-        # Plain numbers: numpy costs more than it saves on so few.
-        states = np.empty((len(inputs), *x.shape))
-        for axis, (A, B) in enumerate(zip(self.A.tolist(), self.B.tolist(), strict=True)):
-            (p, v), along = x[axis].tolist(), []
-            for u in inputs[:, axis].tolist():
-                along.append((p, v))
-                p, v = A[0][0] * p + A[0][1] * v + B[0] * u, A[1][0] * p + A[1][1] * v + B[1] * u
-            states[:, axis] = along
-        return states
+    a01: float
+    """How far the velocity carries the position within a step [s]."""
+    a11: float
+    """Share of the velocity that is left after a step."""
+    b0: float
+    """How far the input carries the position within a step [s]."""
+    b1: float
+    """Share of the input that the velocity has taken on after a step."""
 
 
-def discretise(tau_s: Array, dt_s: float) -> Model:
+class Model(NamedTuple):
+    """Eq. (4) on every axis; each field has the shape (axes,)."""
+
+    a01: Array
+    """How far the velocity carries the position within a step [s]."""
+    a11: Array
+    """Share of the velocity that is left after a step."""
+    b0: Array
+    """How far the input carries the position within a step [s]."""
+    b1: Array
+    """Share of the input that the velocity has taken on after a step."""
+
+    def axes(self) -> list[Axis]:
+        """The model of each axis in plain numbers."""
+        columns = [field.tolist() for field in self]
+        return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
+
+    def step(self, x: Array, u: Array | float) -> Array:
+        """State a step later; x of shape (..., axes, 2), u of shape (..., axes)."""
+        return np.stack(advance(self, x[..., 0], x[..., 1], u), -1)
+
+    @property
+    def A(self) -> Array:  # noqa: N802 - the paper's letter
+        """A of eq. (4); shape (axes, 2, 2)."""
+        one, zero = np.ones_like(self.a01), np.zeros_like(self.a01)
+        return np.stack([np.stack([one, self.a01], -1), np.stack([zero, self.a11], -1)], -2)
+
+    @property
+    def B(self) -> Array:  # noqa: N802 - the paper's letter
+        """B of eq. (4); shape (axes, 2)."""
+        return np.stack([self.b0, self.b1], -1)
+
+
+def advance(axis: Any, p: Any, v: Any, u: Any) -> tuple[Any, Any]:
+    """Position and velocity a step later, x(k+1) = A x(k) + B u(k), eq. (4).
+
+    Args:
+        axis: an `Axis` and numbers, or a `Model` and arrays whose last axis is the spatial one.
+        p, v, u: position [m], velocity and input [m/s].
+    """
+    return p + axis.a01 * v + axis.b0 * u, axis.a11 * v + axis.b1 * u
+
+
+def discretise(tau_s: Array | Sequence[float], dt_s: float) -> Model:
     """Exact zero-order hold of eq. (1)-(3): the matrix exponential in closed form.
 
     Args:
@@ -59,10 +88,6 @@ def discretise(tau_s: Array, dt_s: float) -> Model:
         dt_s: length of a step [s].
     """
     tau = np.asarray(tau_s, dtype=np.float64)
-    decay = np.exp(-dt_s / tau)
     # 1 - exp(-dt/tau), without cancellation where tau is long.
     settled = -np.expm1(-dt_s / tau)
-    one, zero = np.ones_like(tau), np.zeros_like(tau)
-    A = np.stack([np.stack([one, tau * settled], -1), np.stack([zero, decay], -1)], -2)
-    B = np.stack([dt_s - tau * settled, settled], -1)
-    return Model(A, B)
+    return Model(tau * settled, np.exp(-dt_s / tau), dt_s - tau * settled, settled)

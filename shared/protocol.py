@@ -25,11 +25,15 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-VERSION = 1
+from shared.terms import Terms
+
+VERSION = 2
 PAYLOAD_BYTES_MAX = 1200
 """So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
 
 AXES_MAX = 3
+TEXT_MAX = 32
+"""Characters of a text in the terms."""
 INPUTS_MAX = 270
 """Inputs of all axes in one horizon: what fits beside the other fields."""
 
@@ -51,26 +55,6 @@ class ProtocolError(Exception):
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = reason
-
-
-class Terms(NamedTuple):
-    """What both ends must agree on before a flight."""
-
-    dt_ns: int
-    horizon: int
-    axes: int
-    tau_s: tuple[float, ...]
-    """Time constant of the model (2)-(3) per axis [s]."""
-    u_max: tuple[float, ...]
-    """Bound (6) of the input per axis [m/s]."""
-
-    def against(self, other: "Terms") -> str:
-        """Where they differ, for the operator of either end."""
-        return ", ".join(
-            f"{name} {mine} against {theirs}"
-            for name, mine, theirs in zip(self._fields, self, other, strict=True)
-            if mine != theirs
-        )
 
 
 class Hello(NamedTuple):
@@ -158,22 +142,26 @@ def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> 
 
 
 def _terms(value: object, ours: Terms) -> Terms:
-    """The peer's terms: they may differ from ours, but must make sense."""
-    if type(value) is not tuple or len(value) != len(_TERMS):
+    """The peer's terms: they may differ from ours, but must be of the same kind."""
+    if type(value) is not tuple or len(value) != len(ours):
         raise ProtocolError("field")
-    terms = Terms._make(_checked(list(value), _TERMS, ours))
-    if not len(terms.tau_s) == len(terms.u_max) == terms.axes:
-        raise ProtocolError("field")
-    return terms
-
-
-def _positive(value: object, _: Terms) -> tuple[float, ...]:
-    if type(value) is not tuple:
-        raise ProtocolError("field")
-    for number in value:
-        if type(number) is not float or not 0.0 < number < math.inf:
+    for theirs, our in zip(value, ours, strict=True):
+        if type(theirs) is not type(our) or not _is_plain(theirs):
             raise ProtocolError("field")
-    return value
+    return Terms._make(value)
+
+
+def _is_plain(value: object) -> bool:
+    """Whether a term is a finite number, a short text, yes or no, or a number for each axis."""
+    match value:
+        case float():
+            return math.isfinite(value)
+        case tuple():
+            numbers = all(type(number) is float and math.isfinite(number) for number in value)
+            return len(value) <= AXES_MAX and numbers
+        case str():
+            return len(value) <= TEXT_MAX
+    return True
 
 
 def _state(value: object, ours: Terms) -> NDArray[np.float64]:
@@ -221,8 +209,6 @@ _U64 = range(2**64)
 _STAMP = range(2**63)
 _STEP = range(2**40 + 1)
 _STEP_OR_NONE = range(NO_HORIZON, 2**40 + 1)
-_TERMS = (_STAMP, range(1, INPUTS_MAX + 1), range(1, AXES_MAX + 1), _positive, _positive)
-"""Check of each of the `Terms`."""
 
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),

@@ -20,7 +20,7 @@ import msgspec
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
-from server.controller import Server
+from server.endpoint import Server
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, seconds_to_ns

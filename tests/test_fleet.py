@@ -17,7 +17,7 @@ from client.fleet import Fleet
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
-from server.controller import Server
+from server.endpoint import Server
 from shared import config
 from shared.chance import stream
 from shared.config import Scenario

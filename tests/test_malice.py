@@ -8,7 +8,7 @@ import pytest
 
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
-from server.controller import VEHICLES_MAX, Server
+from server.endpoint import VEHICLES_MAX, Server
 from shared import config
 from shared.chance import stream
 from shared.endpoint import NEWS_MAX, SECOND_NS, Datagram, Endpoint

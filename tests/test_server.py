@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from server import controller
-from server.controller import Server
+from server.endpoint import Server
 from shared import config
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram

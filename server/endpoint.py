@@ -1,0 +1,262 @@
+"""The server as an endpoint: datagrams in, datagrams out, and a tick on its own grid of Δt.
+
+At a tick, for all vehicles in session: which step is it aboard (`clock`), what to do about it
+(`controller`), and a packet where there is one. Ticks have absolute deadlines; one whose time has
+passed is skipped and counted, never caught up with.
+"""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from server.clock import ClockMap
+from server.controller import BLOCK, Controller, Decisions
+from server.sessions import Session, Sessions
+from shared.config import Scenario
+from shared.endpoint import (
+    MILLISECOND_NS,
+    SECOND_NS,
+    Address,
+    Datagram,
+    Endpoint,
+    seconds_to_ns,
+)
+from shared.histogram import Histogram
+from shared.protocol import (
+    Heartbeat,
+    Hello,
+    Horizon,
+    Observation,
+    ProtocolError,
+    Welcome,
+    decode,
+    encode,
+)
+from shared.record import Recorder
+from shared.stopwatch import Stopwatch
+
+VEHICLES_MAX = 64
+"""Vehicles at once, unless room is made for more."""
+TOLD_MAX = 16
+"""Vehicles that a report tells of one by one."""
+TICK_BIN_NS = MILLISECOND_NS // 20
+"""Resolution at which the length of a tick is counted [ns]."""
+
+
+class Server(Endpoint):
+    """Plans for every vehicle that asks.
+
+    Args:
+        scenario: what to fly, and how to plan.
+        boot_id: a number that no other life of the server has had.
+        room: for how many vehicles at once.
+        recorder: takes one row a tick and vehicle.
+        stopwatch: measures the parts of a tick; the core has no clock of its own.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        boot_id: int,
+        room: int = VEHICLES_MAX,
+        recorder: Recorder | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
+        super().__init__()
+        self._terms = scenario.terms()
+        self._heartbeat_ns = seconds_to_ns(self._terms.heartbeat_s)
+        self._boot_id = boot_id
+        self._recorder = recorder
+        self.stopwatch = stopwatch or Stopwatch()
+        self._clock = ClockMap(room, self._terms.dt_ns)
+        self.controller = Controller(scenario, self._terms, room, self._clock, self.stopwatch)
+        self._sessions = Sessions(room, boot_id)
+        self._due_ns: int | None = None
+        self._expire_ns = 0
+        """When to look for vehicles that are gone."""
+        self.missed = 0
+        """Number of ticks that were slept through."""
+        self.ticks = Histogram(TICK_BIN_NS)
+        """How long each tick took, as far as the stopwatch runs."""
+        self._dropped: Counter[str] = Counter()
+        """Number of datagrams dropped, by reason."""
+
+    # -- datagrams ---------------------------------------------------------------------------
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """HELLO opens a session, OBSERVATION feeds it; anything else is dropped and counted."""
+        self.stopwatch.start()
+        try:
+            message = decode(datagram.payload, self._terms)
+            self.stopwatch.lap("decode")
+            if isinstance(message, Observation):
+                self._observe(message, datagram.peer, now_ns)
+            elif isinstance(message, Hello):
+                self._hello(message, datagram.peer, now_ns)
+            else:
+                raise ProtocolError("not for a server")
+        except ProtocolError as error:
+            self._dropped[f"dropped: {error.reason}"] += 1
+        self.stopwatch.lap("observe")
+
+    def _hello(self, hello: Hello, address: Address, now_ns: int) -> None:
+        number = 0
+        if hello.terms == self._terms:
+            number = self._sessions.welcome(hello, address).number
+        else:
+            differences = self._terms.differences(hello.terms)
+            told = ", ".join(map(str, differences))
+            self._news.append(f"vehicle {hello.vehicle} flies another scenario: {told}")
+        welcome = Welcome(hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, self._terms)
+        self._out.append(Datagram(encode(welcome), address))
+
+    def _observe(self, observation: Observation, address: Address, now_ns: int) -> None:
+        session = self._sessions.find(observation) or self._begin(observation, now_ns)
+        row = session.row
+        session.heard_ns = now_ns
+        self._clock.observe(
+            row,
+            now_ns - observation.stamp_ns,
+            observation.received_ns - observation.server_ns,
+            now_ns=now_ns,
+        )
+        if not self.controller.observe(row, observation):
+            session.stale += 1
+            return
+        session.address = address
+        session.observed_ns = observation.stamp_ns
+        self._clock.epoch_ns[row] = observation.stamp_ns - observation.step * self._terms.dt_ns
+        if self._due_ns is None:
+            self._due_ns = -(-now_ns // self._terms.dt_ns) * self._terms.dt_ns  # the next, or now
+
+    def _begin(self, observation: Observation, now_ns: int) -> Session:
+        """The session of a first observation, now live."""
+        session = self._sessions.begin(observation, now_ns)
+        self._clock.forget(session.row)
+        self.controller.forget(session.row)
+        host, port = session.address
+        self._news.append(f"vehicle {session.vehicle} flies, from {host}:{port}")
+        return session
+
+    # -- time --------------------------------------------------------------------------------
+
+    def next_wake_ns(self) -> int | None:
+        """When the next tick is due, while there is anybody to tick for."""
+        return self._due_ns
+
+    def wake(self, *, now_ns: int) -> None:
+        """The tick that is due; those that were slept through are only counted."""
+        if self._due_ns is None or now_ns < self._due_ns:
+            return
+        dt_ns = self._terms.dt_ns
+        late = (now_ns - self._due_ns) // dt_ns
+        self.missed += late
+        tick_ns = self._due_ns + late * dt_ns
+        self._due_ns = tick_ns + dt_ns
+        if now_ns >= self._expire_ns:
+            self._expire_ns = now_ns + SECOND_NS
+            for session in self._sessions.expire(now_ns):
+                self._news.append(f"vehicle {session.vehicle} is gone")
+        if len(self._sessions):
+            self._tick(tick_ns, now_ns)
+        else:
+            self._due_ns = None
+
+    def _tick(self, tick_ns: int, now_ns: int) -> None:
+        self.stopwatch.start()
+        before_ns = self.stopwatch.spent_ns.total()
+        rows = self._sessions.rows
+        step = self._clock.steps(rows, tick_ns)
+        able = self.controller.able(rows, step)
+        if not able.all():
+            rows, step = rows[able], step[able]
+        for first in range(0, len(rows), BLOCK):
+            block = slice(first, first + BLOCK)
+            decisions = self.controller.decide(rows[block], step[block])
+            self._send_horizons(decisions, now_ns)
+            self.stopwatch.lap("encode")
+            self._record(decisions)
+        for session in self._sessions:
+            if now_ns - session.sent_ns >= self._heartbeat_ns:
+                self._send(session, Heartbeat(session.vehicle, session.number, now_ns), now_ns)
+        self.stopwatch.lap("encode")
+        self.ticks.add(self.stopwatch.spent_ns.total() - before_ns)
+
+    def _send_horizons(self, decisions: Decisions, now_ns: int) -> None:
+        found, H, feeds_back = decisions.found, self._terms.horizon, self._terms.feeds_back
+        sent = np.flatnonzero(decisions.event)
+        rows, steps = decisions.rows[sent].tolist(), decisions.step[sent].tolist()
+        ahead = found.ahead[sent].tolist()
+        for i, row, step, d in zip(sent.tolist(), rows, steps, ahead, strict=True):
+            session = self._sessions.at(row)
+            inputs = found.horizons[i, :, : d + H]
+            feedback = found.feedback[i] if feeds_back else found.feedback[i, :, :0]
+            horizon = Horizon(
+                session.vehicle,
+                session.number,
+                step,
+                now_ns,
+                session.observed_ns,
+                inputs,
+                feedback,
+            )
+            self._send(session, horizon, now_ns)
+
+    def _record(self, decisions: Decisions) -> None:
+        if self._recorder is None:
+            return
+        rows, found, figures = decisions.rows, decisions.found, decisions.figures
+        n = len(rows)
+        self._recorder.append(
+            n,
+            vehicle=self._sessions.vehicle[rows],
+            step=decisions.step,
+            estimate=found.estimate[:n],
+            ahead=found.ahead[:n],
+            planned=decisions.planned,
+            input=found.horizons[:n, :, 0],
+            observed_step=self.controller.observed_step[rows],
+            error=decisions.verdict.figure,
+            threshold=decisions.verdict.threshold,
+            event=decisions.event,
+            solved=figures["solved"],
+            solve_ns=decisions.solve_ns,
+            stale=[self._sessions.at(row).stale for row in rows.tolist()],
+            missed=self.missed,
+        )
+        self.stopwatch.lap("record")
+
+    def _send(self, session: Session, message: Horizon | Heartbeat, now_ns: int) -> None:
+        session.sent_ns = now_ns
+        self._out.append(Datagram(encode(message), session.address))
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Events that were counted, by name."""
+        return self._dropped + self.controller.counts
+
+    def report(self) -> str:
+        """See `Endpoint`."""
+        counts = ", ".join(f"{value} {name}" for name, value in sorted(self.counts.items()))
+        here = f"{len(self._sessions)} in session, {self.missed} ticks missed"
+        lines = [f"{here}, {counts or 'no steps'}"]
+        for session in self._sessions.first(TOLD_MAX):
+            step = self.controller.last_step[session.row]
+            bound_ms = self._clock.bound_ns(session.row) / MILLISECOND_NS
+            lines.append(f"vehicle {session.vehicle}: step {step}, clock within {bound_ms:.1f} ms")
+        if len(self._sessions) > TOLD_MAX:
+            lines.append(f"and {len(self._sessions) - TOLD_MAX} more")
+        return "\n".join(lines)
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`."""
+        return {
+            "vehicles": len(self._sessions),
+            "missed": self.missed,
+            "tick_ms_p50": self.ticks.quantile_ms(0.5),
+            "tick_ms_p99": self.ticks.quantile_ms(0.99),
+            "spent_ns": dict(self.stopwatch.spent_ns),
+            "counts": dict(self.counts),
+        }

@@ -1,0 +1,135 @@
+"""Compiled kernels: loops along a horizon, compiled by numba when their module is imported.
+
+A kernel's signature is read off its annotations, so that mypy and numba check the same words: an
+array is annotated with one of the types below, an array of records with one made of its dtype, and
+arrays that travel together with their NamedTuple. A part is a function that only kernels call; it
+is compiled into each of them.
+
+Machine code is kept on disk, beside the sources or where NUMBA_CACHE_DIR says. Numba looks at the
+kernel's own file to see whether it is still right; here every function and constant that a kernel
+reaches counts, in whichever module it stands, so that no kernel flies by a rule that has changed.
+"""
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar, get_type_hints
+
+import numba
+import numpy as np
+from numba.core import caching, config
+from numpy.typing import NDArray
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+F1 = Annotated[NDArray[np.float64], numba.float64[::1]]
+F2 = Annotated[NDArray[np.float64], numba.float64[:, ::1]]
+F3 = Annotated[NDArray[np.float64], numba.float64[:, :, ::1]]
+F4 = Annotated[NDArray[np.float64], numba.float64[:, :, :, ::1]]
+F5 = Annotated[NDArray[np.float64], numba.float64[:, :, :, :, ::1]]
+I1 = Annotated[NDArray[np.int64], numba.int64[::1]]
+I2 = Annotated[NDArray[np.int64], numba.int64[:, ::1]]
+I3 = Annotated[NDArray[np.int64], numba.int64[:, :, ::1]]
+S3 = Annotated[NDArray[np.float32], numba.float32[:, :, ::1]]
+S4 = Annotated[NDArray[np.float32], numba.float32[:, :, :, ::1]]
+B1 = Annotated[NDArray[np.bool_], numba.boolean[::1]]
+"""Contiguous arrays of float64 (F), int64 (I), float32 (S) and bool (B), with their number of axes."""
+
+SCALARS = {int: numba.int64, float: numba.float64, bool: numba.boolean}
+
+
+def record(*fields: tuple[str, str]) -> np.dtype[np.void]:
+    """A dtype of named numbers that travel together, as in `record(("step", "i8"))`."""
+    return np.dtype(list(fields), align=True)
+
+
+def records(dtype: np.dtype[np.void], ndim: int) -> Any:
+    """The numba type of a contiguous array of such records, for an annotation."""
+    return numba.types.Array(numba.from_dtype(dtype), ndim, "C")
+
+
+def kernel(function: F) -> F:
+    """A function compiled now, for the types that its parameters are annotated with."""
+    hints = get_type_hints(function, include_extras=True)
+    hints.pop("return", None)
+    signature = tuple(map(_type, hints.values()))
+    before, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, ",".join(LOCATORS)
+    try:
+        compiled: F = numba.njit([signature], cache=True, error_model="numpy")(function)
+    finally:
+        config.CACHE_LOCATOR_CLASSES = before
+    return compiled
+
+
+def _type(hint: Any) -> Any:
+    """Numba's type for an annotation."""
+    if hasattr(hint, "__metadata__"):
+        return hint.__metadata__[0]
+    if hasattr(hint, "_fields"):
+        fields = get_type_hints(hint, include_extras=True)
+        return numba.types.BaseTuple.from_types([*map(_type, fields.values())], hint)
+    return SCALARS[hint]
+
+
+def part(function: F) -> F:
+    """A function that kernels call, once for a vehicle or an axis."""
+    compiled: F = numba.njit(error_model="numpy")(function)
+    return compiled
+
+
+def inline(function: F) -> F:
+    """A function of a few numbers that kernels call at every stage."""
+    compiled: F = numba.njit(error_model="numpy", inline="always")(function)
+    return compiled
+
+
+class Reaching:
+    """Makes one of numba's cache locators mind everything that a kernel reaches."""
+
+    def get_source_stamp(self) -> str:
+        """What must be as it was for machine code on disk to be used."""
+        return self.stamp
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        """The locator of a kernel, or None where this place cannot be written to."""
+        locator = super().from_function(py_func, py_file)  # type: ignore[misc]
+        if locator is not None:
+            locator.stamp = stamp(py_func)
+        return locator
+
+    stamp: str
+
+
+class Given(Reaching, caching.UserProvidedCacheLocator):  # type: ignore[misc]
+    """The folder that NUMBA_CACHE_DIR names."""
+
+
+class Beside(Reaching, caching.InTreeCacheLocator):  # type: ignore[misc]
+    """The folder `__pycache__` beside the source."""
+
+
+class OfUser(Reaching, caching.UserWideCacheLocator):  # type: ignore[misc]
+    """The user's own cache."""
+
+
+LOCATORS = [f"{each.__module__}.{each.__qualname__}" for each in (Given, Beside, OfUser)]
+
+
+def stamp(function: Callable[..., Any]) -> str:
+    """A digest of a function, and of all compiled functions and constants that it reaches."""
+    found: dict[str, str] = {}
+    waiting = [function]
+    while waiting:
+        each = waiting.pop()
+        place = f"{each.__module__}.{each.__qualname__}"
+        if place in found:
+            continue
+        found[place] = inspect.getsource(each)
+        for name in each.__code__.co_names:
+            value = each.__globals__.get(name)
+            if hasattr(value, "py_func"):
+                waiting.append(value.py_func)
+            elif isinstance(value, int | float | str | tuple | np.dtype):
+                found[f"{place}: {name}"] = repr(value)
+    return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()

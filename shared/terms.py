@@ -1,0 +1,185 @@
+"""The terms of a flight: what server and client must agree on before it.
+
+Whatever both ends predict with is a term, and both build it from the terms alone, so that what is
+left out here cannot be used. The keys of a scenario that are no terms belong to one end, which may
+set them as it likes; `FREE` says whose they are. There is no third kind.
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+from shared.endpoint import SECOND_NS
+from shared.model import Model, discretise
+
+
+class Difference(NamedTuple):
+    """A term on which two ends disagree."""
+
+    key: str
+    """Key of the scenario."""
+    here: str
+    """Value at the end that tells it."""
+    there: str
+    """Value at the other end."""
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.here} here, {self.there} there"
+
+
+class Terms(NamedTuple):
+    """What both ends must agree on before a flight, in plain numbers and texts."""
+
+    dt_ns: int
+    """Length of a step [ns]."""
+    horizon: int
+    """Steps planned ahead, H."""
+    axes: int
+    """Spatial axes, 2 or 3."""
+    tau_s: tuple[float, ...]
+    """Time constant of the model (2)-(3) of each axis [s]."""
+    u_max: tuple[float, ...]
+    """Bound (6) of the input on each axis [m/s]."""
+    scheme: str
+    """Delay compensation at both ends, as in `control.scheme`."""
+    exhausted: str
+    """What the vehicle does after a horizon's last input, "hold" or "brake"."""
+    brake_mps2: float
+    """How fast braking takes the desired velocity to zero [m/s²]."""
+    heartbeat_s: float
+    """Longest silence of the server [s]."""
+    shape: str
+    """Shape of the desired trajectory."""
+    radius_m: float
+    """Half the width of circle, figure-eight and square [m]."""
+    period_s: float
+    """Time for one round of them [s]."""
+    altitude_m: float
+    """Their height in 3-D [m]."""
+    points: str
+    """Digest of the waypoints."""
+    speed_mps: float
+    """Speed between waypoints [m/s]."""
+    loop: bool
+    """Whether the waypoints are flown round and round."""
+    table: str
+    """Digest of what stands in the trajectory's CSV file, wherever the file lies."""
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a step [s]."""
+        return self.dt_ns / SECOND_NS
+
+    @property
+    def model(self) -> Model:
+        """The UAV as both ends know it."""
+        return discretise(self.tau_s, self.dt_s)
+
+    @property
+    def indexed(self) -> bool:
+        """Whether the vehicle reads a horizon by the step it is at, and not always its first."""
+        return self.scheme != "none"
+
+    @property
+    def commits(self) -> bool:
+        """Whether horizons begin with committed inputs."""
+        return self.scheme in ("committed", "feedback")
+
+    @property
+    def feeds_back(self) -> bool:
+        """Whether horizons bring feedback."""
+        return self.scheme == "feedback"
+
+    @property
+    def brake(self) -> float:
+        """Speed that braking takes away in a step [m/s]; 0 where the last input is held."""
+        return self.brake_mps2 * self.dt_s if self.exhausted == "brake" else 0.0
+
+    def differences(self, other: "Terms") -> tuple[Difference, ...]:
+        """Every term on which another end's terms differ from these."""
+        return tuple(
+            Difference(KEYS[name], _text(name, here), _text(name, there))
+            for name, here, there in zip(self._fields, self, other, strict=True)
+            if here != there
+        )
+
+
+KEYS: Mapping[str, str] = MappingProxyType(
+    {
+        "dt_ns": "control.dt",
+        "horizon": "control.horizon",
+        "axes": "model.axes",
+        "tau_s": "model.tau_s",
+        "u_max": "model.u_max",
+        "scheme": "control.scheme",
+        "exhausted": "vehicle.exhausted",
+        "brake_mps2": "vehicle.brake_mps2",
+        "heartbeat_s": "link.heartbeat_s",
+        "shape": "reference.shape",
+        "radius_m": "reference.radius_m",
+        "period_s": "reference.period_s",
+        "altitude_m": "reference.altitude_m",
+        "points": "reference.points_m",
+        "speed_mps": "reference.speed_mps",
+        "loop": "reference.loop",
+        "table": "reference.file",
+    }
+)
+"""Key of the scenario that each term comes from."""
+
+FREE: Mapping[str, str] = MappingProxyType(
+    {
+        "title": "a word for people",
+        "duration": "the vehicle's: how long it flies",
+        "settle": "the vehicle's: what its summary leaves out",
+        "seed": "of chance, at each end its own",
+        "control.delay_bound": "the server's: where it plans from",
+        "control.observer_s": "the server's: how it estimates",
+        "control.trigger": "the server's: when it sends",
+        "control.period": "the server's: when it sends",
+        "control.epsilon": "the server's: when it sends",
+        "control.decay_rate": "the server's: when it sends",
+        "control.cost_gap": "the server's: when it sends",
+        "control.deviation_m": "the server's: when it sends",
+        "control.solver": "the server's: how it plans",
+        "control.state_weight": "the server's: how it plans",
+        "control.terminal_weight": "the server's: how it plans",
+        "control.input_weight": "the server's: how it plans",
+        "control.change_weight": "the server's: how it plans",
+        "control.input_reference": "the server's: how it plans",
+        "vehicle.tau_s": "the vehicle's: what it truly is",
+        "vehicle.gain": "the vehicle's: what it truly is",
+        "vehicle.dead_time_s": "the vehicle's: what it truly is",
+        "vehicle.start_m": "the vehicle's: where it starts",
+        "vehicle.wind": "the vehicle's: the air it flies in",
+        "vehicle.steady_wind_mps": "the vehicle's: the air it flies in",
+        "vehicle.gust_mps2": "the vehicle's: the air it flies in",
+        "vehicle.gust_every_s": "the vehicle's: the air it flies in",
+        "vehicle.gust_s": "the vehicle's: the air it flies in",
+        "network.uplink.delay": "netem's",
+        "network.uplink.minimum_s": "netem's",
+        "network.uplink.slot_s": "netem's",
+        "network.uplink.slots_mean": "netem's",
+        "network.uplink.loss": "netem's",
+        "network.downlink.delay": "netem's",
+        "network.downlink.minimum_s": "netem's",
+        "network.downlink.slot_s": "netem's",
+        "network.downlink.slots_mean": "netem's",
+        "network.downlink.loss": "netem's",
+        "link.timeout_s": "the vehicle's: when it says HELLO again",
+        "link.connect_s": "the vehicle's: when it gives up",
+        "simulation.compute_s": "of virtual time",
+        "simulation.clock_offset_s": "of virtual time",
+        "simulation.clock_drift_ppm": "of virtual time",
+    }
+)
+"""Keys of the scenario that may differ, and whose they are."""
+
+
+def _text(name: str, value: object) -> str:
+    """A term as the scenario writes it."""
+    if name == "dt_ns" and isinstance(value, int):
+        return f"{value / SECOND_NS:g}"
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(str, value))}]"
+    return str(value).lower() if isinstance(value, bool) else str(value)
