@@ -9,7 +9,7 @@ from collections import deque
 import numpy as np
 
 from server.endpoint import Server
-from server.planner import Plan, Planner
+from server.planner import Planner
 from server.solver import NEAR
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram

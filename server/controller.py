@@ -50,6 +50,8 @@ class Decisions:
     """What the trigger says."""
     event: Flags
     """Which are sent their horizon; shape (n,)."""
+    sent: Indices
+    """The same, by index."""
     solve_ns: int
     """How long planning took for all of them, or -1 where nobody measures it."""
 
@@ -123,17 +125,17 @@ class Controller:
         verdict = self._trigger.test(rows, figures)  # (16)
         solved = figures["solved"]
         event = verdict.event & solved
-        sent = int(np.count_nonzero(event))
+        sent = event.nonzero()[0]
         self._scheme.remember(rows, step, found, event)  # (12)
-        if sent:
-            self._trigger.sent(rows[event], figures[event])
+        if len(sent):
+            self._trigger.sent(rows[sent], figures[sent])
         self._counts["steps"] += n
-        self._counts["events"] += sent
-        self._counts["unsolved"] += n - int(np.count_nonzero(solved))
+        self._counts["events"] += len(sent)
+        self._counts["unsolved"] += n - np.count_nonzero(solved)
         stopwatch.lap("trigger")
         planned = self._planner.planned[:n]
         solve_ns = self._planner.solve_ns
-        return Decisions(rows, step, found, figures, planned, verdict, event, solve_ns)
+        return Decisions(rows, step, found, figures, planned, verdict, event, sent, solve_ns)
 
 
 @kernel

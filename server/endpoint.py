@@ -8,8 +8,6 @@ passed is skipped and counted, never caught up with.
 from collections import Counter
 from typing import Any
 
-import numpy as np
-
 from server.clock import ClockMap
 from server.controller import BLOCK, Controller, Decisions
 from server.sessions import Session, Sessions
@@ -186,7 +184,7 @@ class Server(Endpoint):
 
     def _send_horizons(self, decisions: Decisions, now_ns: int) -> None:
         found, H, feeds_back = decisions.found, self._terms.horizon, self._terms.feeds_back
-        sent = np.flatnonzero(decisions.event)
+        sent = decisions.sent
         rows, steps = decisions.rows[sent].tolist(), decisions.step[sent].tolist()
         ahead = found.ahead[sent].tolist()
         for i, row, step, d in zip(sent.tolist(), rows, steps, ahead, strict=True):

@@ -19,11 +19,11 @@ from typing import NamedTuple
 import daqp
 import numpy as np
 
-from server.model import advance
-from server.mpc import MPC, hessian
+from server.model import advance, axis_at
+from server.mpc import MPC, Problem, shifted
 from server.solver import NEAR, SolverFailed
 from shared.kernel import F1, F2, F3, F5, I2, kernel, part
-from shared.model import Array, Flags, Model
+from shared.model import Array, Flags
 
 ROUNDS_MAX = 8
 """Rounds in which the whole set may change; five have been the most on recorded flights."""
@@ -75,7 +75,7 @@ def _backward(
         last: the last stage whose side is another than the one its row was made for.
         rho: weights of the inputs; shape (H,).
     """
-    model, W = mpc.model[axis], mpc.weights.states
+    model, W = axis_at(mpc.model, axis), mpc.weights.states
     a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
     p00, p01, p11 = after
     for i in range(last, -1, -1):
@@ -97,23 +97,33 @@ def _backward(
 
 
 @part
-def active_set(mpc: MPC, axis: int, which: int, work: Workspace, g: F1, guess: F1, u: F1) -> int:
+def active_set(
+    mpc: MPC,
+    axis: int,
+    which: int,
+    work: Workspace,
+    g: F1,
+    previous: F1,
+    gap: int,
+    fresh: bool,
+    u: F1,
+) -> int:
     """Fill in the optimal inputs of one axis; rounds taken, or CYCLED or NOT_FINITE.
 
     Args:
         which: FIRST or LATER weights.
         work: of `workspace`; what it has of OWN sets is written to.
         g: gradient; shape (H,).
-        guess: inputs whose bounds are the first set [m/s]; shape (H,).
+        previous, gap, fresh: see `server.mpc.shifted`; what that is at its bound is the first set.
         u: what is filled in [m/s]; shape (H,).
     """
-    model, bound, W, H = mpc.model[axis], mpc.bounds[axis], mpc.weights.states, len(g)
+    model, bound, W, H = axis_at(mpc.model, axis), mpc.bounds[axis], mpc.weights.states, len(g)
     a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
     stages, side, own = work.stages[which, axis], work.side, work.own
     rho = mpc.weights.inputs[which]
     last, changed, total = -1, -1, 0.0
     for i in range(H):
-        v = guess[i]
+        v = shifted(previous, gap, fresh, i)
         side[i] = 1.0 if v >= NEAR * bound else -1.0 if v <= -NEAR * bound else 0.0
         if side[i] != 0.0:
             last = i
@@ -196,9 +206,8 @@ def _solve(
     for vehicle in range(len(gradient)):
         for axis in range(len(mpc.model)):
             g, first = gradient[vehicle, axis], guess[vehicle, axis]
-            rounds[vehicle, axis] = active_set(
-                mpc, axis, which, work, g, first, inputs[vehicle, axis]
-            )
+            u = inputs[vehicle, axis]
+            rounds[vehicle, axis] = active_set(mpc, axis, which, work, g, first, 0, False, u)
 
 
 def workspace(mpc: MPC) -> Workspace:
@@ -210,19 +219,11 @@ def workspace(mpc: MPC) -> Workspace:
 
 
 class ExactSolver:
-    """See `server.solver.Solver`; the answer depends on the problem alone, to rounding.
+    """See `server.solver.Solver`; the answer depends on the problem alone, to rounding."""
 
-    Args:
-        model: eq. (4).
-        mpc: whose QPs.
-        which: FIRST or LATER weights.
-    """
-
-    def __init__(self, model: Model, mpc: MPC, which: int) -> None:
-        self._mpc = mpc
-        self._which = which
-        self._hessian = hessian(model, mpc.weights, which)
-        self._work = workspace(mpc)
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self.work = workspace(problem.mpc)
         self.fallbacks = 0
         """Number of problems that DAQP had to solve."""
 
@@ -230,7 +231,8 @@ class ExactSolver:
         """See `Solver`."""
         inputs = np.empty_like(gradient)
         rounds = np.empty(gradient.shape[:2], dtype=np.int64)
-        _solve(self._mpc, self._which, self._work, gradient, guess, inputs, rounds)
+        mpc, which = self._problem.mpc, self._problem.which
+        _solve(mpc, which, self.work, gradient, guess, inputs, rounds)
         solved: Flags = (rounds != NOT_FINITE).all(axis=1)
         for vehicle, axis in np.argwhere((rounds == CYCLED) & solved[:, None]):
             self.fallbacks += 1
@@ -242,7 +244,9 @@ class ExactSolver:
         return inputs, solved
 
     def _dual(self, axis: int, gradient: Array) -> Array:
-        hessian, bound = self._hessian[axis], np.full(len(gradient), self._mpc.bounds[axis])
+        problem = self._problem
+        hessian = problem.hessian[axis]
+        bound = np.full(len(gradient), problem.mpc.bounds[axis])
         nothing = np.zeros((0, len(gradient)))
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12

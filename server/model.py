@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from shared import model, rule
 from shared.kernel import inline, record, records
-from shared.model import Model
+from shared.model import Axis, Model
 
 AXIS_FIELDS = [(name, "f8") for name in Model._fields]
 AXIS = record(*AXIS_FIELDS)
@@ -18,6 +18,13 @@ Axes = Annotated[NDArray[np.void], records(AXIS, 1)]
 advance = inline(model.advance)
 stage_at, entry, bounded = inline(rule.stage_at), inline(rule.entry), inline(rule.bounded)
 led_back, flown = inline(rule.led_back), inline(rule.flown)
+
+
+@inline
+def axis_at(model: Axes, axis: int) -> Axis:
+    """Eq. (4) on one axis, in numbers of its own that stay in registers."""
+    at = model[axis]
+    return Axis(at.a01, at.a11, at.b0, at.b1)
 
 
 def axes_of(model: Model) -> Axes:

@@ -13,13 +13,14 @@ vehicle. Each vehicle gets the same bits alone as in a batch, which a product wi
 promise.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from server.model import Axes, advance, axes_of
+from server.model import Axes, advance, axes_of, axis_at
 from shared.config import ControlConfig
-from shared.kernel import F1, F2, part
+from shared.kernel import F1, F2, inline, part
 from shared.model import Array, Model
 from shared.terms import Terms
 
@@ -77,9 +78,23 @@ def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
     return MPC(axes_of(terms.model), np.array(terms.u_max), weights)
 
 
-def hessian(model: Model, weights: Weights, which: int) -> Array:
-    """𝓗 of each axis, for the FIRST step or LATER ones; shape (axes, H, H)."""
-    axes, H = len(model.b0), len(weights.states)
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """The QPs of one Hessian, all that a solver has to know of them before it is given one."""
+
+    model: Model
+    """Eq. (4)."""
+    mpc: MPC
+    """What they come from."""
+    which: int
+    """FIRST or LATER weights."""
+    hessian: Array
+    """𝓗 of each axis; shape (axes, H, H)."""
+
+
+def pose(model: Model, mpc: MPC, which: int) -> Problem:
+    """The QPs for the FIRST step or for LATER ones."""
+    axes, H = len(model.b0), len(mpc.weights.states)
     forced = np.zeros((axes, H, 2, H))
     """Γ: what the inputs add to the states 1 … H."""
     response = model.B
@@ -87,8 +102,8 @@ def hessian(model: Model, weights: Weights, which: int) -> Array:
         for later in range(stage, H):
             forced[:, later, :, later - stage] = response
         response = model.step(response, 0.0)
-    result: Array = np.einsum("aipk,ip,aipl->akl", forced, weights.states, forced)
-    return result + np.diag(weights.inputs[which])
+    hessian = np.einsum("aipk,ip,aipl->akl", forced, mpc.weights.states, forced)
+    return Problem(model, mpc, which, hessian + np.diag(mpc.weights.inputs[which]))
 
 
 def stationary_gain(model: Model, control: ControlConfig) -> Array:
@@ -111,59 +126,89 @@ def stationary_gain(model: Model, control: ControlConfig) -> Array:
     return gain
 
 
+@inline
+def shifted(inputs: F1, gap: int, fresh: bool, i: int) -> float:
+    """Input `i` of a horizon as seen `gap` steps later, its last repeated (11); 0 for the fresh."""
+    return 0.0 if fresh else inputs[min(i + gap, len(inputs) - 1)]
+
+
+@part
+def lead(mpc: MPC, axis: int, x: tuple[float, float], w: float, target: F2, drift: F2) -> None:
+    """Fill in W (Φ x - target) of one axis: how far off the vehicle would come without any input.
+
+    Args:
+        x: position [m] and velocity [m/s] at stage 0.
+        w: what is added to every input on its way [m/s].
+        target: desired states at the stages 0 … H [m, m/s]; shape (H + 1, 2).
+        drift: what is filled in, of the stages 1 … H; shape (H, 2).
+    """
+    model, W, (p, v) = axis_at(mpc.model, axis), mpc.weights.states, x
+    for i in range(len(drift)):
+        p, v = advance(model, p, v, w)
+        drift[i, 0] = W[i, 0] * (p - target[i + 1, 0])
+        drift[i, 1] = W[i, 1] * (v - target[i + 1, 1])
+
+
+@part
+def follow(
+    mpc: MPC,
+    axis: int,
+    x: tuple[float, float],
+    w: float,
+    led: tuple[float, float],
+    u: F1,
+    states: F2,
+    drift: F2,
+) -> None:
+    """Fill in X(k) of eq. (7) of one vehicle, and `lead` another toward it, in one go.
+
+    Args:
+        x, w, drift: see `lead`, of the vehicle that follows.
+        led: position [m] and velocity [m/s] at stage 0 of the one that is followed.
+        u: its inputs [m/s]; shape (H,).
+        states: what is filled in: its states at the stages 0 … H [m, m/s]; shape (H + 1, 2).
+    """
+    model, W = axis_at(mpc.model, axis), mpc.weights.states
+    (p, v), (led_p, led_v) = x, led
+    states[0, 0], states[0, 1] = led_p, led_v
+    for i in range(len(u)):
+        led_p, led_v = advance(model, led_p, led_v, u[i])
+        states[i + 1, 0], states[i + 1, 1] = led_p, led_v
+        p, v = advance(model, p, v, w)
+        drift[i, 0], drift[i, 1] = W[i, 0] * (p - led_p), W[i, 1] * (v - led_v)
+
+
 @part
 def gradient(
     mpc: MPC,
     axis: int,
     which: int,
-    x: tuple[float, float],
     w: float,
     target: F2,
     previous: F1,
+    gap: int,
+    fresh: bool,
     drift: F2,
     g: F1,
 ) -> None:
-    """Fill in g of the QP of one axis: ΓᵀW (Φ x - target) by the adjoint of (4), less R and S terms.
+    """Fill in g of the QP of one axis: Γᵀ drift by the adjoint of (4), less R and S terms.
 
     Args:
         which: FIRST or LATER.
-        x: position [m] and velocity [m/s] at stage 0.
         w: what is added to every input on its way [m/s]; R weighs the sum.
         target: desired states at the stages 0 … H [m, m/s]; shape (H + 1, 2).
-        previous: u(k+i|k-1) of the S-term [m/s]; shape (H,).
-        drift: scratch; shape (H, 2).
+        previous, gap, fresh: see `shifted`; the horizon before makes the S-term [m/s]; shape (H,).
+        drift: see `lead`.
         g: what is filled in; shape (H,).
     """
-    model, weights, (p, v), H = mpc.model[axis], mpc.weights, x, len(g)
-    W, S, R, T = weights.states, weights.changes, weights.input, weights.target
-    for i in range(H):
-        p, v = advance(model, p, v, w)
-        drift[i, 0] = W[i, 0] * (p - target[i + 1, 0])
-        drift[i, 1] = W[i, 1] * (v - target[i + 1, 1])
-    a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
+    model, weights = axis_at(mpc.model, axis), mpc.weights
+    S, R, T = weights.changes, weights.input, weights.target
     l0, l1 = 0.0, 0.0
-    for i in range(H - 1, -1, -1):
-        l0, l1 = l0 + drift[i, 0], a01 * l0 + a11 * l1 + drift[i, 1]
-        toward = S[which, i] * previous[i] + T * target[i, 1]
+    for i in range(len(g) - 1, -1, -1):
+        l0, l1 = l0 + drift[i, 0], model.a01 * l0 + model.a11 * l1 + drift[i, 1]
+        toward = S[which, i] * shifted(previous, gap, fresh, i) + T * target[i, 1]
         toward -= R * w
-        g[i] = b0 * l0 + b1 * l1 - toward
-
-
-@part
-def predict(mpc: MPC, axis: int, x: tuple[float, float], w: float, u: F1, states: F2) -> None:
-    """Fill in X(k) of eq. (7): the states at the stages 0 … H on one axis.
-
-    Args:
-        x: position [m] and velocity [m/s] at stage 0.
-        w: what is added to every input [m/s].
-        u: inputs [m/s]; shape (H,).
-        states: what is filled in [m, m/s]; shape (H + 1, 2).
-    """
-    model, (p, v) = mpc.model[axis], x
-    states[0, 0], states[0, 1] = p, v
-    for i in range(len(u)):
-        p, v = advance(model, p, v, u[i] + w)
-        states[i + 1, 0], states[i + 1, 1] = p, v
+        g[i] = model.b0 * l0 + model.b1 * l1 - toward
 
 
 @part
@@ -173,7 +218,7 @@ def add_cost(mpc: MPC, axis: int, change: F1, cost: float) -> float:
     Args:
         change: ΔU [m/s]; shape (H,).
     """
-    model, W, rho = mpc.model[axis], mpc.weights.states, mpc.weights.inputs
+    model, W, rho = axis_at(mpc.model, axis), mpc.weights.states, mpc.weights.inputs
     p, v = 0.0, 0.0
     for i in range(len(change)):
         u = change[i]

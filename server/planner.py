@@ -15,19 +15,35 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from server.exact import ExactSolver, Workspace, active_set, workspace
-from server.model import advance
-from server.mpc import FIRST, LATER, MPC, add_cost, gradient, hessian, make_mpc, predict
+from server.exact import ExactSolver, Workspace, active_set
+from server.model import advance, axis_at
+from server.mpc import (
+    FIRST,
+    LATER,
+    MPC,
+    Problem,
+    add_cost,
+    follow,
+    gradient,
+    lead,
+    make_mpc,
+    pose,
+    shifted,
+)
 from server.scheme import Foresight
 from server.solver import OsqpSolver, Solver
-from shared.config import Scenario
-from shared.kernel import F1, F2, F3, F4, I1, kernel, part, record, records
-from shared.model import Array, Indices
+from shared.config import ControlConfig, Scenario
+from shared.kernel import F1, F2, F3, F4, I1, inline, kernel, part, record, records
+from shared.model import Indices
 from shared.stopwatch import Stopwatch
 from shared.terms import Terms
 
-WINDOW = 4096
-"""Steps of the reference that are held at a time."""
+PAGE = 128
+"""Steps of the desired trajectory in a page."""
+PAGES = 256
+"""Places for pages: more than a block of vehicles can need at once."""
+EMPTY = -1
+"""In place of the page that a place holds."""
 GENERATOR, TRACKER = 0, 1
 """First index of what both MPCs have."""
 
@@ -90,40 +106,61 @@ class Given(NamedTuple):
 
 
 class Desired(NamedTuple):
-    """The reference at the stages of each vehicle."""
+    """The desired trajectory, looked up in pages rather than computed each time."""
 
-    table: F3
-    """Desired states one step after the other [m, m/s]; shape (axes, many, 2)."""
-    first: I1
-    """Where in the table the stages 0 … H of each vehicle begin; shape (n,)."""
+    pages: F4
+    """Desired states of PAGE steps, and of H more, in each page [m, m/s]; shape
+    (PAGES, axes, PAGE + H + 1, 2)."""
+    held: I1
+    """Which page of the trajectory each is, or EMPTY; shape (PAGES,)."""
 
 
 class Reference:
-    """The desired trajectory at any step, looked up rather than computed each time."""
+    """The desired trajectory at any step."""
 
     def __init__(self, scenario: Scenario, terms: Terms) -> None:
         self._sample = scenario.make_reference()
         self._dt_s = terms.dt_s
-        self._stages = np.arange(terms.horizon + 1)
-        self._steps = np.arange(WINDOW + terms.horizon)
-        self._fill(0)
+        self._steps = np.arange(PAGE + terms.horizon + 1)
+        self._desired = Desired(
+            pages=np.zeros((PAGES, terms.axes, len(self._steps), 2)),
+            held=np.full(PAGES, EMPTY, dtype=np.int64),
+        )
 
-    def __call__(self, step: Indices) -> Desired:
-        """x_d at the stages 0 … H of each of these steps k."""
-        low, high = int(step.min()), int(step.max())
-        if high - low >= WINDOW:  # vehicles that fly hours apart share no table
-            apart = self._table((step[:, None] + self._stages).ravel())
-            return Desired(apart, np.arange(len(step)) * len(self._stages))
-        if not self._first <= low <= high < self._first + WINDOW:
-            self._fill(low)
-        return Desired(self._held, step - self._first)
+    def open(self, rows: Indices, steps: Indices, found: Foresight) -> Desired:
+        """The desired trajectory, with all pages that vehicles need at their steps k + d."""
+        pages, held = self._desired
+        while (page := _missing(self._desired, rows, steps, found)) != EMPTY:
+            if np.count_nonzero(held == EMPTY) == 1:
+                held[:] = EMPTY
+            at = _place.py_func(held, page)
+            states = self._sample((page * PAGE + self._steps) * self._dt_s)
+            pages[at], held[at] = states.transpose(1, 0, 2), page
+        return self._desired
 
-    def _fill(self, first: int) -> None:
-        self._first, self._held = first, self._table(first + self._steps)
 
-    def _table(self, steps: Indices) -> Array:
-        states = self._sample(steps * self._dt_s)
-        return np.ascontiguousarray(states.transpose(1, 0, 2))
+@inline
+def _place(held: I1, page: int) -> int:
+    """Where a page is held, or where there is room for it; one place at least must be EMPTY."""
+    at = page % PAGES
+    while held[at] != page and held[at] != EMPTY:
+        at = (at + 1) % PAGES
+    return at
+
+
+@kernel
+def _missing(desired: Desired, rows: I1, steps: I1, found: Foresight) -> int:
+    """A page that vehicles need and that is not held, or EMPTY."""
+    for i in range(len(rows)):
+        page = (steps[i] + found.ahead[i]) // PAGE
+        if desired.held[_place(desired.held, page)] != page:
+            return page
+    return EMPTY
+
+
+def make_solver(control: ControlConfig, problem: Problem) -> Solver:
+    """The solver that a scenario names."""
+    return ExactSolver(problem) if control.solver == "exact" else OsqpSolver(problem)
 
 
 class Planner:
@@ -141,13 +178,8 @@ class Planner:
         self._reference = Reference(scenario, terms)
         mpc = make_mpc(terms, control)
         self._given = Given(mpc, np.array(control.terminal_weight), terms.commits)
-        self._exact = control.solver == "exact"
-        self._work = workspace(mpc)
-        self._solvers: list[Solver] = [
-            ExactSolver(terms.model, mpc, which)
-            if self._exact
-            else OsqpSolver(hessian(terms.model, mpc.weights, which), mpc.bounds)
-            for which in (FIRST, LATER)
+        self._solvers = [
+            make_solver(control, pose(terms.model, mpc, which)) for which in (FIRST, LATER)
         ]
         self._stopwatch = stopwatch
         self._memory = Memory(
@@ -185,11 +217,12 @@ class Planner:
             step: k of each; shape (n,).
             found: what is foreseen of them.
         """
-        desired = self._reference(step + found.ahead[: len(rows)])
+        desired = self._reference.open(rows, step, found)
         batch = (self._given, self._memory, self._draft, rows, step, found)
         left = np.arange(len(rows))
-        if self._exact:
-            undone = _plan(*batch, desired, self._work, self.figures)
+        solver = self._solvers[LATER]
+        if type(solver) is ExactSolver:
+            undone = _plan(*batch, desired, solver.work, self.figures)
             left = np.flatnonzero(~self.figures["solved"][: len(rows)]) if undone else left[:0]
         if len(left):
             _pose_generators(*batch, desired, left, self.figures)
@@ -219,14 +252,6 @@ def _rounded(u: F1) -> None:
 
 
 @part
-def _shift(inputs: F1, gap: int, fresh: bool, shifted: F1) -> None:
-    """Fill in a horizon as seen `gap` steps later, its last input repeated (11); 0 for the fresh."""
-    H = len(inputs)
-    for i in range(H):
-        shifted[i] = 0.0 if fresh else inputs[min(i + gap, H - 1)]
-
-
-@part
 def _appraise(memory: Memory, row: int, start: int, figures: Figures, i: int, k: int) -> int:
     """Steps since a vehicle was planned for last; notes whether its plan is to begin anew."""
     last = memory.step[row]
@@ -247,6 +272,7 @@ def _pose_generator(
     at: int,
     row: int,
     axis: int,
+    start: int,
     gap: int,
     fresh: bool,
 ) -> None:
@@ -257,19 +283,13 @@ def _pose_generator(
     else:
         x = (memory.states[row, axis, gap, 0], memory.states[row, axis, gap, 1])
     draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
-    _shift(memory.inputs[GENERATOR, row, axis], gap, fresh, draft.guess[at, axis])
-    first = desired.first[i]
-    gradient(
-        given.mpc,
-        axis,
-        FIRST if fresh else LATER,
-        x,
-        0.0,  # the generator plans for no vehicle in particular
-        desired.table[axis, first : first + H + 1],
-        draft.guess[at, axis],
-        draft.drift,
-        draft.gradient[at, axis],
-    )
+    place, first = _place(desired.held, start // PAGE), start % PAGE
+    target = desired.pages[place, axis, first : first + H + 1]
+    previous, g = memory.inputs[GENERATOR, row, axis], draft.gradient[at, axis]
+    # The generator plans for no vehicle in particular, and so for no disturbance.
+    lead(given.mpc, axis, x, 0.0, target, draft.drift)
+    which = FIRST if fresh else LATER
+    gradient(given.mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
 
 
 @part
@@ -288,20 +308,12 @@ def _pose_tracker(
     """Pose the tracker's problem (15) on one axis, behind the generator's answer in the draft."""
     u, states = draft.inputs[GENERATOR, at, axis], draft.states[at, axis]
     _rounded(u)
+    x = (found.start[i, axis, 0], found.start[i, axis, 1])
     planned = (draft.planned[i, axis, 0], draft.planned[i, axis, 1])
-    predict(given.mpc, axis, planned, 0.0, u, states)
-    _shift(memory.inputs[TRACKER, row, axis], gap, fresh, draft.guess[at, axis])
-    gradient(
-        given.mpc,
-        axis,
-        FIRST if fresh else LATER,
-        (found.start[i, axis, 0], found.start[i, axis, 1]),
-        found.disturbance[i, axis],
-        states,
-        draft.guess[at, axis],
-        draft.drift,
-        draft.gradient[at, axis],
-    )
+    previous, g = memory.inputs[TRACKER, row, axis], draft.gradient[at, axis]
+    follow(given.mpc, axis, x, found.disturbance[i, axis], planned, u, states, draft.drift)
+    which, w = FIRST if fresh else LATER, found.disturbance[i, axis]
+    gradient(given.mpc, axis, which, w, states, previous, gap, fresh, draft.drift, g)
 
 
 @part
@@ -333,7 +345,7 @@ def _conclude(
             cost = add_cost(given.mpc, axis, change, cost)
             x = (found.start[i, axis, 0], found.start[i, axis, 1])
             states = memory.states[row, axis]
-            model, w, (p, v) = given.mpc.model[axis], found.disturbance[i, axis], x
+            model, w, (p, v) = axis_at(given.mpc.model, axis), found.disturbance[i, axis], x
             for stage in range(compared + 1):
                 away = p - states[stage + gap, 0]
                 before = draft.distance[stage] if axis > 0 else 0.0
@@ -380,15 +392,17 @@ def _plan(
         fresh = figures[i].fresh
         which = FIRST if fresh else LATER
         for axis in range(len(mpc.model)):
-            g, guess = draft.gradient[0, axis], draft.guess[0, axis]
-            _pose_generator(given, memory, draft, found, desired, i, 0, row, axis, gap, fresh)
-            u = draft.inputs[GENERATOR, 0, axis]
-            if active_set(mpc, axis, which, work, g, guess, u) <= 0:
+            g = draft.gradient[0, axis]
+            _pose_generator(
+                given, memory, draft, found, desired, i, 0, row, axis, start, gap, fresh
+            )
+            before, u = memory.inputs[GENERATOR, row, axis], draft.inputs[GENERATOR, 0, axis]
+            if active_set(mpc, axis, which, work, g, before, gap, fresh, u) <= 0:
                 figures[i].solved = False
                 break
             _pose_tracker(given, memory, draft, found, i, 0, row, axis, gap, fresh)
-            u = draft.inputs[TRACKER, 0, axis]
-            if active_set(mpc, axis, which, work, g, guess, u) <= 0:
+            before, u = memory.inputs[TRACKER, row, axis], draft.inputs[TRACKER, 0, axis]
+            if active_set(mpc, axis, which, work, g, before, gap, fresh, u) <= 0:
                 figures[i].solved = False
                 break
         if figures[i].solved:
@@ -396,6 +410,17 @@ def _plan(
         else:
             undone += 1
     return undone
+
+
+@part
+def _guess(
+    memory: Memory, draft: Draft, which: int, i: int, row: int, gap: int, fresh: bool
+) -> None:
+    """Fill in the guess of a solver that is no part of the pass: the horizon before, shifted."""
+    for axis in range(draft.guess.shape[1]):
+        for stage in range(draft.guess.shape[2]):
+            previous = memory.inputs[which, row, axis]
+            draft.guess[i, axis, stage] = shifted(previous, gap, fresh, stage)
 
 
 @kernel
@@ -414,9 +439,22 @@ def _pose_generators(
     for i in left:
         start = steps[i] + found.ahead[i]
         gap = _appraise(memory, rows[i], start, figures, i, steps[i])
+        _guess(memory, draft, GENERATOR, i, rows[i], gap, figures[i].fresh)
         for axis in range(len(given.mpc.model)):
-            fresh = figures[i].fresh
-            _pose_generator(given, memory, draft, found, desired, i, i, rows[i], axis, gap, fresh)
+            _pose_generator(
+                given,
+                memory,
+                draft,
+                found,
+                desired,
+                i,
+                i,
+                rows[i],
+                axis,
+                start,
+                gap,
+                figures[i].fresh,
+            )
 
 
 @kernel
@@ -433,6 +471,7 @@ def _pose_trackers(
     """Pose the tracker's problems of those `left` in a block, by index."""
     for i in left:
         gap = steps[i] + found.ahead[i] - memory.step[rows[i]]
+        _guess(memory, draft, TRACKER, i, rows[i], gap, figures[i].fresh)
         for axis in range(len(given.mpc.model)):
             fresh = figures[i].fresh
             _pose_tracker(given, memory, draft, found, i, i, rows[i], axis, gap, fresh)

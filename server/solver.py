@@ -11,6 +11,7 @@ import numpy as np
 import osqp
 from scipy import sparse
 
+from server.mpc import Problem
 from shared.model import Array, Flags
 
 ITERATIONS_MAX = 4000
@@ -51,16 +52,10 @@ class Solver(Protocol):
 class OsqpSolver:
     """OSQP, set up once per axis; only vectors change afterwards."""
 
-    def __init__(self, hessian: Array, u_max: Array) -> None:
-        """Set up.
-
-        Args:
-            hessian: shape (axes, H, H).
-            u_max: bound of every input [m/s]; shape (axes,).
-        """
-        self._hessian = hessian
-        self._u_max = u_max
-        self._axes = [_set_up(H, bound) for H, bound in zip(hessian, u_max, strict=True)]
+    def __init__(self, problem: Problem) -> None:
+        self._hessian = problem.hessian
+        self._u_max = problem.mpc.bounds
+        self._axes = [_set_up(H, b) for H, b in zip(self._hessian, self._u_max, strict=True)]
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
         """See `Solver`."""
