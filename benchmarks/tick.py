@@ -79,31 +79,39 @@ def mixes() -> dict[str, Scenario]:
 
 
 def measure(counts: Counts) -> dict[str, Any]:
-    """All of it."""
+    """All figures of this section."""
     lateness = Lateness()
-    flights = solvers.flights()
-    tunings = {
-        name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
-        for name, scenario in flights.items()
-    }
+    tunings = tune(counts, lateness)
     single = {
         name: _single(name, scenario, tunings[name], counts, lateness)
-        for name, scenario in flights.items()
-    }
-    fleets = {
-        name: _fleet(name, scenario, tunings["saturated" if name == "half" else "smooth"], counts)
-        for name, scenario in mixes().items()
+        for name, scenario in solvers.flights().items()
     }
     half = mixes()["half"]
     return {
         "single": single,
-        "fleets": fleets,
+        "fleets": fleets(counts, tunings),
         "crowd": _crowd(half, counts, lateness),
         "scaling": _scaling(half, counts, lateness),
         "memory": {"bytes_per_vehicle": _bytes_per_vehicle(half)},
         "tuned": {name: str(tuning) for name, tuning in tunings.items()},
         "counts": {"fleet": counts.fleet, "crowd": counts.crowd},
         "wake": lateness.figures(),
+    }
+
+
+def tune(counts: Counts, lateness: Lateness) -> dict[str, Tuning]:
+    """The fastest tuning of OSQP for each flight of `solvers.flights`."""
+    return {
+        name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
+        for name, scenario in solvers.flights().items()
+    }
+
+
+def fleets(counts: Counts, tunings: Mapping[str, Tuning]) -> dict[str, Any]:
+    """Figures of planning for a fleet in one batch against tuned OSQP, for each of `mixes`."""
+    return {
+        name: _fleet(name, scenario, tunings["saturated" if name == "half" else "smooth"], counts)
+        for name, scenario in mixes().items()
     }
 
 
@@ -277,16 +285,10 @@ def draw(result: Mapping[str, Any], file: Path = FIGURE) -> None:
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:
     """One vehicle, the fleets, and the crowd."""
-    shown = {"tick-single": _single_table(result["single"])}
-    rows = []
-    for name, figures in result["fleets"].items():
-        row = [f"{name} ({figures['active']:.0%})"]
-        row += [us(figures[key]["p50_us"]) for key in ("plan", "solve", "osqp")]
-        row += [times(figures["ratio"][key]["p50"], TARGET_FLEET) for key in ("plan", "solve")]
-        rows.append(row)
-    headings = ["bounds active", "ours, planning [µs]", "of it solving", "tuned OSQP, solving"]
-    headings += ["OSQP / planning", "OSQP / solving"]
-    shown["tick-fleet"] = Table(headings, rows)
+    shown = {
+        "tick-single": _single_table(result["single"]),
+        "tick-fleet": fleet_table(result["fleets"]),
+    }
     rows = [
         [stage, f"{figures['p50_ms']:.2f}", f"{figures['p99_ms']:.2f}"]
         for stage, figures in result["crowd"].items()
@@ -305,6 +307,19 @@ def tables(result: Mapping[str, Any]) -> dict[str, Table]:
         ["", "kB"], [["a server's memory for each vehicle", f"{kilobytes:.1f}"]]
     )
     return shown
+
+
+def fleet_table(fleets: Mapping[str, Any]) -> Table:
+    """Planning in one batch against OSQP one vehicle after the other, with the target."""
+    rows = []
+    for name, figures in fleets.items():
+        row = [f"{name} ({figures['active']:.0%})"]
+        row += [us(figures[key]["p50_us"]) for key in ("plan", "solve", "osqp")]
+        row += [times(figures["ratio"][key]["p50"], TARGET_FLEET) for key in ("plan", "solve")]
+        rows.append(row)
+    headings = ["bounds active", "ours, planning [µs]", "of it solving", "tuned OSQP, solving"]
+    headings += ["OSQP / planning", "OSQP / solving"]
+    return Table(headings, rows)
 
 
 def _single_table(single: Mapping[str, Any]) -> Table:

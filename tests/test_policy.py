@@ -33,7 +33,9 @@ READ = {
     "(silence(0.5) | state_gap) & budget(5, 2)": Combination(
         "&", Combination("|", SILENCE, STATE_GAP), BUDGET
     ),
-    "state_gap | always | state_gap": Combination("|", Combination("|", STATE_GAP, ALWAYS), STATE_GAP),
+    "state_gap | always | state_gap": Combination(
+        "|", Combination("|", STATE_GAP, ALWAYS), STATE_GAP
+    ),
 }
 
 PERIODIC = "periodic or periodic(N) with 1 <= N <= 1000000 (whole)"

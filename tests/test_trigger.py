@@ -344,7 +344,7 @@ def test_cost_gap_may_fire_until_it_is_known() -> None:
 
 
 def test_no_solve_is_asked_for_where_it_could_change_nothing() -> None:
-    """Without a token nothing is sent, and after the longest silence something is, whatever it would say."""
+    """Without a token nothing is sent; after the longest silence something is, whatever it says."""
     trigger = trigger_of("cost_gap & budget(1, 1) | silence(2)", capacity=2)
     trigger.test(facing(2, step=0, fresh=True))
     trigger.sent(np.array([0, 1]), np.array([0, 0]), np.zeros(2))
