@@ -64,9 +64,9 @@ class Counts:
     """Number of vehicles of the crowd."""
     planning: int = 40
     """Number of turns of 10 paced ticks of the crowd."""
-    flights: int = 7
+    flights: int = 20
     """Number of flights in virtual time, or of batches of them, of each scenario."""
-    seconds: float = 5.0
+    seconds: float = 3.0
     """Duration of these flights [s]."""
     osqp: tick.Counts = tick.FULL
     """Counts of the comparison with OSQP."""
@@ -117,7 +117,7 @@ def contests(counts: Counts) -> list[Contest]:
         title = f"tick of {vehicles} vehicles, per vehicle [µs]"
         turn = ("ticks", "half", vehicles, 11, False)
         found.append(Contest(title, turn, counts.fleet, 1e3, target_ratio="≤ 0.7"))
-    title = f"{counts.crowd} vehicles, estimate to solve [ms]"
+    title = f"{counts.crowd} vehicles, estimate + trigger + plan + solve [ms]"
     turn = ("planning", "half", counts.crowd, 10)
     target_p99 = f"< {tick.TARGET_P99_MS:g}"
     found.append(Contest(title, turn, counts.planning, 1e6, target_p99=target_p99))
