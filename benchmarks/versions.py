@@ -32,7 +32,7 @@ VALUES_MIN = 20
 
 @dataclass(frozen=True)
 class Contest:
-    """What both checkouts do by turns; a row of the table."""
+    """Work that both checkouts do by turns; a row of the table."""
 
     title: str
     """Description, with the unit of the figures in brackets."""
@@ -104,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def contests(counts: Counts) -> list[Contest]:
-    """Everything that both checkouts do."""
+    """Contests of a comparison, in the order of the table."""
     found = []
     for name in ("smooth", "saturated"):
         title = f"one vehicle's tick, {name}"
@@ -199,7 +199,7 @@ def _compete(
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:
-    """Both checkouts side by side, and planning against OSQP."""
+    """Tables of both checkouts side by side, and of planning against OSQP."""
     commits = " against ".join(f"{result[side]['commit']} ({side})" for side in SIDES[::-1])
     headings = ["", "before p50", "p99", "after p50", "p99", "after / before p50", "p99"]
     rows = [_row(title, figures) for title, figures in result["contests"].items()]

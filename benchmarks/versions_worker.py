@@ -101,7 +101,7 @@ def _pause(pause_s: float) -> None:
 TURNS: dict[str, Callable[..., Any]] = {
     turn.__name__: turn for turn in (where, ticks, planning, flight)
 }
-"""What a line may ask for."""
+"""Functions that a line may ask for, by name."""
 
 
 def main() -> None:
