@@ -59,7 +59,7 @@ class ControlConfig(Section, frozen=True):
     horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
     """Number of steps planned ahead, H."""
     scheme: Literal["committed", "feedback", "predictive", "none"] = "committed"
-    """Delay compensation: committed inputs, these with feedback aboard, eq. (11) and (13), or none."""
+    """Delay compensation: committed inputs, these with feedback, eq. (11) and (13), or none."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """Longest time from making a horizon to its being in force [s]; auto: as was seen."""
     observer_s: NonNegative = 4.0

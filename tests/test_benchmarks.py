@@ -34,7 +34,7 @@ TINY = MappingProxyType(
 
 @pytest.fixture(scope="module")
 def results() -> Iterator[dict[str, Any]]:
-    """Of every benchmark, as small as it goes."""
+    """Figures of every benchmark, as small as it goes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tick, "SETTLE", 2)
         patch.setattr(solvers, "TUNINGS", TUNINGS[::8])
@@ -57,7 +57,7 @@ def saturated() -> Recorded:
 def test_every_table_has_its_place_in_the_document(
     results: Mapping[str, Any], tmp_path: Path
 ) -> None:
-    """And is written there, figures and figure beside it; a section not run stays as it was."""
+    """Tables, figures and figure are written; a section that is not run stays as it was."""
     file, figure, document = (tmp_path / name for name in ("a.json", "b.png", "c.md"))
     document.write_text(DOCUMENT.read_text())
     write(results, file, document, figure)
@@ -125,7 +125,7 @@ def test_what_is_not_installed_does_not_compete() -> None:
 def test_the_reference_is_the_same_whoever_finds_it(
     monkeypatch: pytest.MonkeyPatch, saturated: Recorded
 ) -> None:
-    """quadprog or scipy: what is proved is the one optimum."""
+    """By quadprog or by scipy: what is proved is the one optimum."""
     reference = Reference(saturated.mpc.hessian[0], saturated.u_max[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]

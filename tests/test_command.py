@@ -229,13 +229,12 @@ def test_help_shows_the_scenario_that_was_named(
 
 
 def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
-    """The same seed, the same file; measured times stay out of it."""
+    """One seed gives one file, byte by byte; measured times stay out of it."""
     files = [tmp_path / "one.json", tmp_path / "two.json"]
+    argv = ["fly", "paper", "--virtual", "--duration", "12", "--seed", "3"]
+    argv += ["--figure", str(tmp_path / "flight.png")]
     for file in files:
-        run = skytether_(
-            *("fly", "paper", "--virtual", "--duration", "12", "--seed", "3"),
-            *("--json", str(file), "--figure", str(tmp_path / "flight.png")),
-        )
+        run = skytether_(*argv, "--json", str(file))
         assert run.returncode == 0, run.stderr
     assert files[0].read_bytes() == files[1].read_bytes()
     summary = json.loads(files[0].read_text())
@@ -316,9 +315,8 @@ def test_three_processes_by_hand(start: Callable[..., Process], tmp_path: Path) 
     address = server.address()
     netem = start("netem", "demo", "--bind", "127.0.0.1:0", "--server", address, *QUICK)
     address = netem.address()
-    client = start(
-        *("client", "demo", "--server", address, "--duration", "3", "--json", str(file), *QUICK)
-    )
+    argv = ["client", "demo", "--server", address, "--duration", "3", "--json", str(file)]
+    client = start(*argv, *QUICK)
     client.wait_for(r"waiting for the server at 127\.0\.0\.1:\d+")
     client.wait_for("session open, flying")
     server.wait_for("vehicle 1 flies, from 127.0.0.1:")

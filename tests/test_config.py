@@ -1,4 +1,4 @@
-"""shared.config: a scenario is right, or it is refused in one line that says what is wrong."""
+"""`shared.config`: a scenario is right, or it is refused in one line that says what is wrong."""
 
 from pathlib import Path
 
@@ -474,7 +474,7 @@ def test_a_trajectory_that_is_no_text_table_is_refused(tmp_path: Path) -> None:
 
 
 def test_one_value_is_for_all_axes() -> None:
-    """And a list has one for each."""
+    """A list has one value for each axis."""
     scenario = config.check(
         {"model": {"axes": 3, "tau_s": [0.5], "u_max": [1.0, 2.0, 3.0]}}, "mine.toml"
     )

@@ -20,7 +20,7 @@ ROW = np.array([0])
 
 
 def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
-    """d after each sample of one vehicle."""
+    """Delay d after each sample of one vehicle."""
     bound, steps = DelayBound(1, 0.05, most, None), []
     bound.begin(ROW, np.array([first]))
     for sample in delays:
@@ -157,7 +157,7 @@ def test_every_vehicle_has_a_bound_of_its_own() -> None:
 
 
 def test_a_vehicle_that_is_forgotten_begins_anew() -> None:
-    """And its neighbour does not."""
+    """The forgotten vehicle's neighbour keeps what is known of it."""
     bound, rows = DelayBound(2, 0.05, MOST, None), np.arange(2)
     for _ in range(200):
         bound.acknowledged(rows, np.array([30, 30]))
@@ -177,7 +177,7 @@ SECONDS = 60.0
 def flown(
     dt_s: float, period: int, seed: int, minima_s: tuple[float, ...] = (0.4,)
 ) -> tuple[list[int], float]:
-    """d at every step of a flight on the paper's uplink, and the share in force later than it.
+    """Delay d at every step on the paper's uplink, and the share in force later than it.
 
     Args:
         period: steps from a horizon to the next.

@@ -131,7 +131,7 @@ class Containers:
     """Length of the flight."""
     project: str = field(default_factory=lambda: f"skytether-test-{secrets.token_hex(4)}")
     ids: dict[str, str] = field(default_factory=dict)
-    """Of the containers, by service; they stay the same from `up` to `down`."""
+    """Identifiers of the containers, by service; they stay the same from `up` to `down`."""
 
     def compose(self, *arguments: str) -> str:
         """What Compose printed."""
@@ -227,10 +227,9 @@ class Containers:
     @contextlib.contextmanager
     def squatter(self, network: str) -> Iterator[None]:
         """A stranger who takes the address that a container had in a network."""
-        stranger = self.docker(
-            *("run", "--detach", "--rm", "--network", self.network(network)),
-            *("--entrypoint", "sleep", "skytether", "600"),
-        ).strip()
+        argv = ["run", "--detach", "--rm", "--network", self.network(network)]
+        argv += ["--entrypoint", "sleep", "skytether", "600"]
+        stranger = self.docker(*argv).strip()
         try:
             yield
         finally:
@@ -301,10 +300,9 @@ class Containers:
 
     def ask_for_the_server(self, host: str) -> tuple[int, str]:
         """Exit code and output of another client, where the client is."""
-        return attempt(
-            *("docker", "run", "--rm", "--network", f"container:{self.id('client')}", "skytether"),
-            *("client", "demo", "--id=2", "--link.connect-s=2", f"--server={host}:47001"),
-        )
+        argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}", "skytether"]
+        argv += ["client", "demo", "--id=2", "--link.connect-s=2", f"--server={host}:47001"]
+        return attempt(*argv)
 
 
 @contextlib.contextmanager

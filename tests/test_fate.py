@@ -1,4 +1,4 @@
-"""netem.fate: the delays of eq. (17) as corrected, and fates that depend on their names alone."""
+"""`netem.fate`: the delays of eq. (17) as corrected, and fates that depend on their names alone."""
 
 from itertools import islice
 
@@ -30,7 +30,7 @@ def first_fates(
 
 @pytest.fixture(scope="module")
 def slots() -> NDArray[np.int64]:
-    """m of eq. (17) in sampled delays."""
+    """Number m of slots of eq. (17) in sampled delays."""
     delays = delays_ns(PAPER, stream(17, "test"), SAMPLES)
     slots, rest_ns = np.divmod(delays - 400 * MILLISECOND_NS, 20 * MILLISECOND_NS)
     assert not rest_ns.any(), "a delay off the lattice 0.4 s + 0.02 s · m"

@@ -232,7 +232,7 @@ def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:
 def test_batch_has_the_gradients_of_its_singles(
     seed: int, vehicles: int, input_reference: bool
 ) -> None:
-    """And the predictions."""
+    """Gradients and predictions of a batch are those of its singles."""
     mpc = condense(TWO_TAUS, control(20, input_reference=input_reference), change_weight=0.3)
     x, target, previous = (
         np.stack(some)

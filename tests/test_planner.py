@@ -144,7 +144,7 @@ def test_first_plan_has_no_change_term() -> None:
 
 @pytest.mark.parametrize("gap", [1, 3, H])
 def test_generator_goes_on_from_its_own_prediction(gap: int) -> None:
-    """x_p(k|k-1) ∈ X_p(k-1): where its last inputs lead in as many steps as have passed."""
+    """Prediction x_p(k|k-1) ∈ X_p(k-1): where the last inputs lead in the steps that have passed."""
     planner = make()
     run(planner, 10, START)
     x = START

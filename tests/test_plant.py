@@ -172,7 +172,7 @@ def test_steady_gust_settles_at_u_plus_tau_a() -> None:
 
 
 def test_steady_gust_is_integrated_exactly() -> None:
-    """v̇ = (u - v)/τ + a, solved by quadrature over one step."""
+    """Model v̇ = (u - v)/τ + a, solved by quadrature over one step."""
     tau, dt = np.array([0.81, 0.3]), 0.05
     flown = plant(gust_mps2=2.0, gust_every_s=1e-9, gust_s=1e9)
     long = flight(flown, np.zeros((600, 2)))

@@ -1,4 +1,4 @@
-"""shared.record: what is written down is what is read back."""
+"""`shared.record`: what is written down is what is read back."""
 
 import io
 import struct
@@ -93,7 +93,7 @@ def test_a_part_begins_with_its_columns_in_a_line() -> None:
 
 
 def test_one_value_is_broadcast_to_all_rows() -> None:
-    """And a value for each row keeps its place."""
+    """A value for each row keeps its place."""
     sink = io.BytesIO()
     Recorder(PACKET_COLUMNS, sink).append(3, flow=7, number=[4, 5, 6], lost=True)
     rows = parse(sink.getvalue())

@@ -351,7 +351,7 @@ def rmse(flown: Scenario, flight: Flight) -> float:
 
 
 def test_it_is_stable_without_the_s_term_where_the_papers_scheme_is_not() -> None:
-    """The same weights, network and seed."""
+    """Both schemes fly with equal weights, network and seed."""
     errors = {}
     for scheme in ("predictive", "committed"):
         flown = scenario(control={"scheme": scheme, "trigger": "always", **TIGHT}, duration=40.0)

@@ -74,8 +74,15 @@ class Vehicles:
         """An observation that took no time: both clocks run alike, a day apart."""
         stamp_ns = self.now_ns + DAY_NS
         observation = Observation(
-            *(welcome.vehicle, welcome.session, step, stamp_ns, NO_HORIZON, 0),
-            *(self.now_ns, stamp_ns, np.array(state)),
+            welcome.vehicle,
+            welcome.session,
+            step,
+            stamp_ns,
+            in_force=NO_HORIZON,
+            since=0,
+            server_ns=self.now_ns,
+            received_ns=stamp_ns,
+            state=np.array(state),
         )
         assert self.say(observation, sender) == []
 

@@ -137,7 +137,7 @@ def test_answer_does_not_lean_on_its_guess() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5))
 def test_batch_is_solved_as_its_singles(seed: int, vehicles: int) -> None:
-    """The same bits, alone and in company."""
+    """Answers have equal bits, alone and in company."""
     gradient, guess = problems(seed, vehicles)
     solver = OsqpSolver(HESSIAN, U_MAX)
     u, _ = solver.solve(gradient, guess)

@@ -452,19 +452,12 @@ def dask(stack: ExitStack, *argv: str, folder: Path) -> subprocess.Popen[str]:
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
     """A scheduler and two workers, one of them killed on the way."""
     with ExitStack() as stack:
-        scheduler = dask(
-            *(stack, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
-            folder=tmp_path,
-        )
+        local = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+        scheduler = dask(stack, "scheduler", *local, folder=tmp_path)
         assert scheduler.stderr is not None
         at = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
-        workers = [
-            dask(
-                *(stack, "worker", at, "--nthreads", "1", "--no-nanny", "--no-dashboard"),
-                folder=tmp_path,
-            )
-            for _ in range(2)
-        ]
+        single = ("--nthreads", "1", "--no-nanny", "--no-dashboard")
+        workers = [dask(stack, "worker", at, *single, folder=tmp_path) for _ in range(2)]
         for worker in workers:
             assert worker.stderr is not None
             next(line for line in worker.stderr if "Registered to" in line)

@@ -49,7 +49,7 @@ def never() -> bool:
 
 @given(offsets, drifts, times)
 def test_a_clock_finds_its_own_time_again(offset_ns: int, drift_ppb: int, time_ns: int) -> None:
-    """world() is the first moment at which the clock shows at least the local time."""
+    """`world()` is the first moment at which the clock shows at least the local time."""
     clock = Clock(offset_ns, drift_ppb)
     local_ns = clock.local(time_ns)
     found = clock.world(local_ns)
