@@ -70,17 +70,17 @@ class Process:
         raise AssertionError(f"{pattern!r} was never said; this was: {self.said}")
 
     def address(self) -> str:
-        """What it listens on."""
+        """Address that the process listens on."""
         return self.wait_for(r"listening on (\S+:\d+), waiting for")[1]
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """Its exit code after a signal."""
+        """End the process by a signal; returns its exit code."""
         self.popen.send_signal(number)
         self.said += self._stdout.read().splitlines()
         return self.popen.wait(PATIENCE_S)
 
     def ended(self) -> int:
-        """Its exit code, once it has ended by itself."""
+        """Wait until the process has ended by itself; returns its exit code."""
         self.said += self._stdout.read().splitlines()
         return self.popen.wait(PATIENCE_S)
 
@@ -203,7 +203,7 @@ def test_the_front_door_names_every_command(capfd: pytest.CaptureFixture[str]) -
 
 
 def test_scenarios_are_listed_with_a_line_each(capfd: pytest.CaptureFixture[str]) -> None:
-    """All that come with Skytether."""
+    """Every scenario that comes with Skytether is listed."""
     assert skytether.__main__.main(["scenarios"]) == 0
     lines = capfd.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == config.names()

@@ -79,7 +79,7 @@ def test_a_scenario_that_comes_along_is_its_contender_with_weights_that_were_fre
 
 
 def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
-    """It holds what differs from the plant, and where it comes from."""
+    """The file holds what differs from the plant, and where that comes from."""
     contender, case = BY_NAME["committed-gap"], CASES[-1]
     start = contenders.search_start(contender, case, SCALE)
     control = replace(start.control, state_weight=(7.1, 1e-4), cost_gap=12.5)
@@ -217,7 +217,7 @@ def curve(*points: tuple[float, float, float]) -> list[Flown]:
 
 
 def test_what_sends_too_much_is_judged_at_the_next_threshold_that_does_not() -> None:
-    """Not at the best of the curve: that would be chosen on the seeds that are reported."""
+    """The best of the curve is not taken: it would be chosen on the seeds that are reported."""
     judged = judge(CLAIM, QUIET, [*curve((1, 0.11, 0.5), (2, 0.09, 0.8), (8, 0.05, 0.7)), PERIODIC])
     assert judged.ours.what.threshold == 2
     assert judged.ratio is not None
@@ -249,7 +249,7 @@ def test_a_share_of_the_steps_may_be_the_limit() -> None:
 
 
 def test_what_is_claimed_is_what_was_asked_for() -> None:
-    """All of it about contenders and cases that there are."""
+    """Every claim is about contenders and cases that exist."""
     for claim in CLAIMS:
         assert {claim.ours, claim.theirs} <= BY_NAME.keys()
         assert set(claim.at_most) <= {case.name for case in CASES}

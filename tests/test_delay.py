@@ -66,7 +66,7 @@ def test_before_any_sample_it_is_the_guess() -> None:
 
 
 def test_it_rises_at_once_and_no_further_than_most() -> None:
-    """Also for a delay that no horizon has room for."""
+    """A delay that no horizon has room for counts as the most."""
     assert known([9, 10, 14, 50]) == [9, 10, 14, MOST]
 
 
@@ -79,12 +79,12 @@ LONE = [11] * 128 + [30] + [11] * 40
 
 
 def test_a_lone_late_horizon_is_left_behind_step_by_step() -> None:
-    """It holds for as long as it is recent."""
+    """A lone late horizon counts for as long as it is recent."""
     assert known(LONE)[128:] == [30] * 16 + list(range(29, 10, -1)) + [11] * 6
 
 
 def test_a_few_of_a_hundred_are_no_lone_one() -> None:
-    """They hold until the ring has forgotten all but one."""
+    """Several late horizons count until the ring has forgotten all but one."""
     delays = [11] * 128 + [30] * 3 + [11] * 200
     steps = known(delays)[130:]
     assert steps[:127] == [30] * 127
@@ -129,7 +129,7 @@ def test_it_is_what_the_samples_say(delays: list[int], first: int) -> None:
 @quick
 @given(SAMPLES, st.integers(1, MOST))
 def test_it_is_never_below_what_was_seen_recently(delays: list[int], most: int) -> None:
-    """Nor beyond the most, nor below 1; it falls by one at most, and rises to a sample alone."""
+    """Delay d stays within 1 and the most, falls by one at most, and rises only to a sample."""
     steps = known(delays, most=most)
     for count, d in enumerate(steps, 1):
         assert min(max(delays[max(0, count - 16) : count]), most) <= d <= most

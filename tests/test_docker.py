@@ -34,13 +34,13 @@ STEPS_PER_S = round(1 / config.load("demo").control.dt)
 
 FLIGHT_S = 60
 FAULTY_FLIGHT_S = 75
-"""The faults and what proves their end take 45 s of it."""
+"""Duration of the flight with faults [s]; faults and what proves their end take 45 s of it."""
 FAULT_S = 3.0
-"""More than the demo's `link.timeout_s`, so that the client notices."""
+"""Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client notices."""
 HORIZONS = 10
-"""So many new ones show that orders flow."""
+"""Number of new horizons that shows that orders flow."""
 HOVER_M = 1.58
-"""`rmse_xy` of the demo for a vehicle that stays at its start."""
+"""Error `rmse_xy` of the demo for a vehicle that stays at its start [m]."""
 
 
 def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
@@ -150,11 +150,11 @@ class Containers:
         return self.ids[service]
 
     def network(self, name: str) -> str:
-        """Its name with Docker."""
+        """Name of a network with Docker."""
         return f"{self.project}_{name}"
 
     def inspect(self, service: str) -> dict[str, Any]:
-        """All that Docker knows."""
+        """Description of a container by Docker."""
         return json.loads(self.docker("inspect", self.id(service)))[0]
 
     def state(self, service: str) -> dict[str, Any]:
@@ -167,7 +167,7 @@ class Containers:
         return {name: network["IPAddress"] for name, network in networks.items()}
 
     def said(self, service: str) -> str:
-        """Its log."""
+        """Log of a container."""
         return attempt("docker", "logs", self.id(service))[1]
 
     def inside(self, service: str, *command: str) -> tuple[int, str]:

@@ -181,7 +181,7 @@ def test_old_observations_are_out_of_reach(observed: int, now: int, *, within: b
 
 
 def test_vehicle_that_was_never_observed_is_out_of_reach() -> None:
-    """Also at step 0."""
+    """No step of such a vehicle is within reach, step 0 included."""
     assert make().within_reach(ROW, np.array([0])).tolist() == [False]
 
 
@@ -204,7 +204,7 @@ def test_without_compensation_the_observation_is_the_estimate() -> None:
 
 
 def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
-    """Its old observation, its old inputs and its old step are gone; its neighbour's are not."""
+    """The old observation, inputs and step are gone; those of its neighbour are not."""
     estimator = make(2)
     both, x = np.array([0, 1]), np.array([[1.0, 2.0], [3.0, 4.0]])
     for row in both:

@@ -108,7 +108,7 @@ def test_the_next_due_time_is_that_of_the_earliest_packet() -> None:
 
 
 def test_lost_packets_never_leave_and_are_counted() -> None:
-    """They are packets, but hold no place in the queue."""
+    """Lost packets are counted as packets, but hold no place in the queue."""
     link = make_link()
     take(link, make_lane(0, 0, 0, lost=[0, 2]), "abc")
     assert (link.counts.packets, link.counts.lost, link.depth()) == (3, 2, 1)
@@ -166,7 +166,7 @@ def test_flows_do_not_overtake_each_other() -> None:
 
 
 def test_a_lost_packet_overtakes_nobody() -> None:
-    """It never comes out."""
+    """A lost packet never comes out, so nothing counts as overtaken by it."""
     link = make_link()
     take(link, make_lane(20, 0, lost=[1]), "ab")
     assert give(link, now_ns=20) == "a"

@@ -348,7 +348,7 @@ async def test_both_worlds_decide_the_same_on_a_network_without_delay(
 async def test_datagrams_dropped_by_the_kernel_are_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """They would look like losses of the network."""
+    """Uncounted, these drops would look like losses of the network."""
     monkeypatch.setattr(udp, "BUFFER_BYTES", 4096)
     driver = Shell(Echo(), LOOPBACK)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:

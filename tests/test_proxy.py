@@ -76,7 +76,7 @@ def test_a_stranger_at_a_flows_socket_is_refused() -> None:
 
 
 def test_a_packet_at_a_socket_of_no_flow_is_refused() -> None:
-    """Even if the server sent it."""
+    """Such a packet is refused even if the server sent it."""
     proxy = make_proxy()
     hear(proxy, b"!", SERVER, 1)
     assert (proxy.outbox(), proxy.refused) == ([], 1)
@@ -92,7 +92,7 @@ def test_a_client_too_many_is_refused() -> None:
 
 
 def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client() -> None:
-    """Its socket then carries the new client's answers, and the old one has to wait."""
+    """The flow's socket then carries the new client's answers, and the old one has to wait."""
     proxy = make_proxy(flows=2)
     pass_on(proxy, b"?", ALICE, at=0)
     pass_on(proxy, b"?", BOB, at=1)

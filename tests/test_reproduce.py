@@ -84,7 +84,7 @@ def test_the_baseline_has_at_each_value_the_rate_that_the_trigger_had_there() ->
 
 
 def test_jitter_grows_while_the_mean_delay_stays() -> None:
-    """Both ways."""
+    """Uplink and downlink keep their mean delay."""
     jitter = {study.name: study for study in studies.curve_studies(PAPER, studies.full(1))}[
         "jitter"
     ]
@@ -211,7 +211,7 @@ def test_every_figure_is_there_three_times_and_in_a_size_to_look_at(out: Path) -
 
 
 def test_the_page_opens_offline_and_shows_all(out: Path) -> None:
-    """Its tags are closed in order; every address in it is a picture of its own."""
+    """The page's tags are closed in order; every address in it is a picture of its own."""
     text = (out / "report.html").read_text()
     page = Page(text)
     assert page.open == []

@@ -262,7 +262,7 @@ def test_no_estimate_without_a_recent_observation() -> None:
 
 
 def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
-    """Its row is free again, and the server comes to rest."""
+    """The vehicle's row is free again, and the server comes to rest."""
     vehicles = Vehicles(scenario())
     vehicles.observe(vehicles.open(), 0)
     vehicles.now_ns += controller.SESSION_NS + vehicles.dt_ns

@@ -150,7 +150,7 @@ def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
 
 
 def test_a_run_that_never_flew_has_no_error_and_spoils_no_mean() -> None:
-    """It is a row like any other, with nothing in it."""
+    """Such a run is a row like any other, with nothing in it."""
     deaf = replace(PAPER.network.uplink, loss=0.85)
     scenario = replace(
         PAPER,
@@ -237,7 +237,7 @@ def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_pat
 
 
 def test_another_version_is_refused(tmp_path: Path) -> None:
-    """It may fly otherwise."""
+    """Another version may fly otherwise."""
     Journal(tmp_path, ONE, "1").close()
     with pytest.raises(ConfigError, match=r"version: got '2', expected '1'"):
         Journal(tmp_path, ONE, "2")
@@ -294,7 +294,7 @@ def test_a_line_that_is_no_task_is_named(tmp_path: Path) -> None:
 
 
 def command(*argv: str) -> list[str]:
-    """It, as this environment runs it."""
+    """Command line of the program in this environment."""
     return [sys.executable, "-P", "-m", "skytether", *argv]
 
 

@@ -330,7 +330,7 @@ def test_deviation_is_a_distance_above_the_threshold() -> None:
 
 
 def test_cost_gap_may_fire_until_it_is_known() -> None:
-    """Then it is a cost above the threshold."""
+    """Once known, the gap fires where it is above the threshold."""
     for text in ("cost_gap(1)", "cost_gap"):
         trigger = trigger_of(text)
         assert trigger.test(facing(1, fresh=True)).surely.tolist() == [True]

@@ -61,7 +61,7 @@ def splices(tree: ast.Module) -> Iterator[ast.Call]:
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_docstring_stands_alone(name: str) -> None:
-    """It begins as a sentence and ends as one; none runs on into that of the next field."""
+    """Every docstring begins and ends as a sentence; none runs on into the next field's."""
     tree = ast.parse((ROOT / name).read_text())
     faults = [
         f"{name}:{text.lineno}: {found}: {text.value[:60]!r}"
