@@ -31,16 +31,16 @@ SECTIONS: dict[Section, ModuleType] = {
 
 @dataclass(frozen=True)
 class Options:
-    """Of a run."""
+    """Options of a run."""
 
     only: tuple[Section, ...] = tuple(SECTIONS)
-    """Which to run."""
+    """Benchmarks to run."""
     quick: bool = False
-    """A look at all of them in under a minute; nothing is written."""
+    """Measure all of them in under a minute, and write nothing."""
 
 
 def main() -> int:
-    """Entry point; the exit code."""
+    """Run as the command line says, and return the exit code."""
     options = tyro.cli(Options, description=__doc__)
     for name in options.only:
         section = SECTIONS[name]
@@ -72,7 +72,7 @@ def write(
 
 
 def machines(results: Mapping[str, Any]) -> Table:
-    """What each section was measured on, and how late that machine woke meanwhile."""
+    """Machine that each section was measured on, and how late it woke meanwhile."""
     rows = []
     for name, figures in results.items():
         on, wake = figures["machine"], figures.get("wake")
@@ -84,7 +84,7 @@ def machines(results: Mapping[str, Any]) -> Table:
 
 
 def packages(results: Mapping[str, Any]) -> Table:
-    """Their versions, where the solvers were measured; without solvers there are none."""
+    """Versions of the solvers' packages; empty where no solvers were measured."""
     versions = results.get("solvers", {"machine": {"packages": {}}})["machine"]["packages"]
     return Table(["package", "version"], [list(pair) for pair in versions.items()])
 

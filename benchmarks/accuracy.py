@@ -26,11 +26,11 @@ from sim.flight import fly
 HORIZONS = (1, 30, 50, 100)
 STEPS_S = (0.02, 0.05, 0.1)
 INPUT_WEIGHTS = (1e-3, 1.93)
-"""R: hardly any, and the default."""
+"""Values of R: hardly any, and the default."""
 TAU_S = [0.4, 0.855]
-"""One axis each."""
+"""Time constants of the two axes [s]."""
 SCALES = (0.1, 1.0, 3.0, 10.0, 30.0)
-"""Of random states [m, m/s] and the targets' steps: smooth to heavily saturated."""
+"""Scales of random states [m, m/s] and the targets' steps: smooth to heavily saturated."""
 SATURATED = {"shape": "square", "period_s": 5.0}
 TARGET = 1e-6
 SEED = 1
@@ -41,9 +41,9 @@ class Counts:
     """How much to check, for each of the 24 combinations of H, Δt and R."""
 
     ticks: int = 260
-    """Of either flight; four problems a tick."""
+    """Number of ticks of either flight; four problems each."""
     random: int = 210
-    """Vehicles of each scale; two problems each."""
+    """Number of vehicles of each scale; two problems each."""
     horizons: tuple[int, ...] = HORIZONS
 
 
@@ -58,13 +58,13 @@ class Task:
     dt_s: float
     input_weight: float
     reference: str = ""
-    """Shape of a flight's reference,"""
+    """Shape of a flight's reference; empty for random problems."""
     scale: float = 0.0
-    """or scale of random problems."""
+    """Scale of random problems; 0 for a flight."""
     count: int = 0
 
     def scenario(self) -> Scenario:
-        """What is flown."""
+        """Scenario that is flown."""
         control = {"dt": self.dt_s, "horizon": self.horizon, "input_weight": self.input_weight}
         changes: dict[str, Any] = {"control": control, "model": {"tau_s": TAU_S}}
         changes["duration"] = (self.count + 100) * self.dt_s
@@ -78,7 +78,7 @@ class Task:
 
 
 def tasks(counts: Counts) -> list[Task]:
-    """All piles, the longest horizons first: they take longest."""
+    """Tasks, the longest horizons first: they take longest."""
     piles = []
     for H, dt_s, R in product(sorted(counts.horizons, reverse=True), STEPS_S, INPUT_WEIGHTS):
         piles += [Task(H, dt_s, R, reference=r, count=counts.ticks) for r in ("circle", "square")]
@@ -87,7 +87,7 @@ def tasks(counts: Counts) -> list[Task]:
 
 
 def measure(counts: Counts, workers: int | None = None) -> dict[str, Any]:
-    """All problems, by H; in so many processes."""
+    """Figures of all problems, by H, computed by so many processes."""
     piles = tasks(counts)
     with multiprocessing.get_context("spawn").Pool(workers or os.cpu_count()) as pool:
         checked = pool.imap_unordered(check, piles)
@@ -138,7 +138,7 @@ def check(task: Task) -> dict[str, Any]:
 
 
 def _problems(task: Task) -> Iterator[tuple[MPC, Array, Array, Array]]:
-    """Whose, u_max, gradients and guesses."""
+    """MPC, u_max [m/s], gradients and guesses [m/s] of a task."""
     scenario = task.scenario()
     if task.reference:
         with listening() as listeners:
@@ -173,7 +173,7 @@ def _problems(task: Task) -> Iterator[tuple[MPC, Array, Array, Array]]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:
-    """A line a group, and all."""
+    """Table with a row for each group and one for all."""
     rows = []
     for name, figures in [*result["groups"].items(), ("all", result["all"])]:
         target = f" (≤ {TARGET:g})" if name == "all" else ""

@@ -18,19 +18,19 @@ from shared.protocol import NO_HORIZON, Hello, Observation, Welcome, decode, enc
 from shared.stopwatch import Stopwatch
 
 NOISE = np.array([0.001, 0.01])
-"""Of a step, on position [m] and velocity [m/s]."""
+"""Standard deviation of a step's noise on position [m] and velocity [m/s]; shape (2,)."""
 DELAY_S = 0.44
-"""Of an observation: the mean of the paper's network."""
+"""Delay of an observation [s]: the mean of the paper's network."""
 AHEAD_NS = 10 * SECOND_NS
-"""Vehicle's clock minus the server's."""
+"""Offset of the vehicles' clock from the server's [ns]."""
 START_NS = 20 * SECOND_NS
-"""On the server's clock, the first tick."""
+"""Time of the first tick on the server's clock [ns]."""
 PERIOD_S = 27.5
-"""Over which the vehicles are spread along the reference."""
+"""Time over which the vehicles are spread along the reference [s]."""
 
 
 class Vehicles:
-    """n vehicles on their way.
+    """Vehicles on their way, flown by the model.
 
     Args:
         scenario: what they fly.
@@ -42,12 +42,12 @@ class Vehicles:
         self._model = discretise(scenario.true_tau_s, scenario.control.dt)
         spread = round(PERIOD_S / scenario.control.dt)
         self.step: Indices = self._rng.integers(spread, 2 * spread, count)
-        """k of each; shape (n,)."""
+        """Step k of each vehicle; shape (n,)."""
         self.x: Array = scenario.make_reference()(self.step * scenario.control.dt)
-        """shape (n, axes, 2)."""
+        """State of each vehicle [m, m/s]; shape (n, axes, 2)."""
 
     def fly(self, u: Array) -> None:
-        """One step with these inputs [m/s]; shape (n, axes)."""
+        """Fly one step with these inputs [m/s; shape (n, axes)]."""
         noise = self._rng.standard_normal(self.x.shape) * NOISE
         self.x = self._model.step(self.x, u) + noise
         self.step = self.step + 1
@@ -64,7 +64,7 @@ class PlannedFleet:
         self._plan: Plan | None = None
 
     def prepare(self) -> None:
-        """The step before is flown."""
+        """Fly the step before, and note what planning is given."""
         if self._plan is not None:
             self.vehicles.fly(self._plan.inputs[:, :, 0])
         step, x = self.vehicles.step, self.vehicles.x
@@ -72,7 +72,7 @@ class PlannedFleet:
         self._given = (self._rows, step, x, *planned, np.zeros(x.shape[:2]))
 
     def plan(self) -> None:
-        """Plan for all."""
+        """Plan for all vehicles."""
         self._plan = self.planner.plan(*self._given)
 
     def active(self, u_max: Array) -> float:
@@ -96,7 +96,7 @@ class Airspace:
         self._vehicles = Vehicles(scenario, count)
         self._dt_ns = scenario.dt_ns
         self._late = round(DELAY_S / scenario.control.dt)
-        """Steps that an observation is old."""
+        """Age of an observation in steps."""
         self._past = deque([self._vehicles.x] * (self._late + 1), maxlen=self._late + 1)
         self._due_ns = START_NS
         self._sessions = [self._open(number, scenario) for number in range(1, count + 1)]
@@ -111,7 +111,7 @@ class Airspace:
         return vehicle, welcome.session, address
 
     def _observe(self) -> None:
-        """Every vehicle is heard of, late."""
+        """Give the server an observation of every vehicle, late."""
         now_ns, late_ns = self._due_ns - MILLISECOND_NS, self._late * self._dt_ns
         stamp_ns, echo_ns = self._due_ns + AHEAD_NS - late_ns, now_ns - 2 * late_ns
         step = (self._vehicles.step - self._late).tolist()
@@ -123,11 +123,11 @@ class Airspace:
             self.server.receive(Datagram(encode(observation), address), now_ns=now_ns)
 
     def wake(self) -> None:
-        """The server's tick."""
+        """Run the server's tick."""
         self.server.wake(now_ns=self._due_ns)
 
     def prepare(self) -> None:
-        """The step before is flown, and the vehicles are heard of."""
+        """Fly the step before, and give the server an observation of every vehicle."""
         sent = len(self.server.outbox())
         if sent:
             assert sent == len(self._sessions), "a vehicle was sent no horizon"

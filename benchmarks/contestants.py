@@ -30,7 +30,7 @@ Factory = Callable[[MPC, Array], Solver]
 
 @dataclass(frozen=True)
 class Block:
-    """minimise ½ zᵀPz + qᵀz, lower ≤ Cz ≤ upper; z begins with the inputs of some axes."""
+    """One QP: minimise ½ zᵀPz + qᵀz, lower ≤ Cz ≤ upper; z begins with the inputs of some axes."""
 
     P: sparse.csc_matrix
     C: sparse.csc_matrix
@@ -40,7 +40,7 @@ class Block:
 
 
 def condensed(mpc: MPC, u_max: Array) -> list[Block]:
-    """A problem an axis."""
+    """Problems in the inputs alone, one for each axis."""
     H = mpc.hessian.shape[1]
     box = sparse.eye(H, format="csc")
     return [
@@ -50,7 +50,7 @@ def condensed(mpc: MPC, u_max: Array) -> list[Block]:
 
 
 def joint(mpc: MPC, u_max: Array) -> list[Block]:
-    """All axes in one problem, its Hessian block diagonal."""
+    """Problem of all axes in the inputs alone; its Hessian is block diagonal."""
     axes, H = mpc.hessian.shape[:2]
     bound = np.repeat(u_max, H)
     hessian = sparse.block_diag(list(mpc.hessian), format="csc")
@@ -58,7 +58,7 @@ def joint(mpc: MPC, u_max: Array) -> list[Block]:
 
 
 def with_states(mpc: MPC, u_max: Array) -> list[Block]:
-    """All axes in one problem, their states in it as well."""
+    """Problem of all axes in inputs and states."""
     axes, H = mpc.hessian.shape[:2]
     A, B = mpc.model.A, mpc.model.B
     weights = [np.tile(mpc.input_weights, axes), np.tile(mpc.weights.ravel(), axes)]
@@ -78,7 +78,7 @@ FORMS = {"condensed, by axis": condensed, "condensed, jointly": joint, "with sta
 
 @dataclass(frozen=True)
 class Tuning:
-    """Of OSQP at a tolerance of 1e-6: its step size fixed, so that it never refactorises."""
+    """Tuning of OSQP at a tolerance of 1e-6: its step size is fixed, so it never refactorises."""
 
     form: str
     rho: float
@@ -89,7 +89,7 @@ class Tuning:
         return f"{self.form}, eps 1e-6, rho {self.rho:g}, {scaled}, check every 10"
 
     def make(self, mpc: MPC, u_max: Array) -> Solver:
-        """OSQP, so tuned."""
+        """OSQP with this tuning."""
         return Osqp(
             FORMS[self.form](mpc, u_max),
             u_max,
@@ -159,7 +159,7 @@ class Daqp:
 
 
 class Quadprog:
-    """quadprog, condensed: the factor of the Hessian is made once; no warm start."""
+    """The solver quadprog, condensed: the factor of the Hessian is made once; no warm start."""
 
     def __init__(self, mpc: MPC, u_max: Array) -> None:
         import quadprog
@@ -277,7 +277,7 @@ class Nothing:
         self._solved = np.array([True])
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
-        """The guess."""
+        """Return the guess."""
         return guess, self._solved
 
 
@@ -287,7 +287,7 @@ NOTHING = "nothing"
 
 
 def contestants(tuned: Tuning) -> dict[str, Factory]:
-    """All that are installed, by name."""
+    """Contestants that are installed, by name."""
     extra: dict[str, tuple[str, Factory]] = {
         "quadprog": ("quadprog", Quadprog),
         "PIQP": ("piqp", Piqp),

@@ -31,7 +31,7 @@ from rich.table import Table as RichTable
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
 
 Durations = NDArray[np.int64]
-"""How long each of some problems took [ns]; shape (count,)."""
+"""CPU time of each problem [ns]; shape (count,)."""
 PACKAGES = ("casadi", "daqp", "numba", "numpy", "osqp", "piqp", "quadprog", "scipy")
 CONSOLE = Console()
 Step = TypeVar("Step")
@@ -60,25 +60,25 @@ class Lateness:
         self.late_ns.append(time.monotonic_ns() - due_ns)
 
     def figures(self) -> dict[str, float]:
-        """Quantiles [ms]."""
+        """Quantiles of the lateness [ms], by name."""
         shares = {"p50_ms": 0.5, "p99_ms": 0.99, "max_ms": 1.0}
         return {name: quantile_ms(self.late_ns, share) for name, share in shares.items()}
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How contestants take turns."""
+    """Rule by which contestants take turns."""
 
     turn: int
-    """Problems in a row; the first of several only warms up."""
+    """Number of problems in a row; the first of several only warms up."""
     pause_s: float
     """Sleep before every turn [s]."""
 
 
 HOT = Pace(turn=50, pause_s=0.001)
-"""Back to back, with everything in the caches."""
+"""Pace of problems back to back, with everything in the caches."""
 PACED = Pace(turn=1, pause_s=0.005)
-"""Every problem after a pause, as in a controller's own time: caches and clock frequency cool."""
+"""Pace of a controller: every problem after a pause, in which caches and clock frequency cool."""
 
 
 def interleave(
@@ -122,7 +122,7 @@ def interleave(
 
 @contextmanager
 def without_gc() -> Iterator[None]:
-    """No garbage is collected meanwhile."""
+    """Context in which no garbage is collected."""
     gc.collect()
     gc.disable()
     try:
@@ -148,7 +148,7 @@ def ratios(theirs: Mapping[str, float], ours: Mapping[str, float]) -> dict[str, 
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
+    """Description of the machine, the packages and the commit that are measured."""
     return {
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0))
@@ -180,7 +180,7 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Of the checkout, with a + where something in it has changed since; None without git."""
+    """Commit of the checkout, with a + where something has changed since; None without git."""
     here = Path(__file__).parent
     try:
         done = subprocess.run(
@@ -200,13 +200,13 @@ class Table:
     rows: list[list[str]]
 
     def markdown(self) -> str:
-        """As in the documents."""
+        """Table as Markdown."""
         rule = ["---", *["---:"] * (len(self.headings) - 1)]
         lines = [[" ".join(heading.split()) for heading in self.headings], rule, *self.rows]
         return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
     def show(self, title: str) -> None:
-        """On the console."""
+        """Print the table on the console."""
         table = RichTable(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for i, heading in enumerate(self.headings):
             table.add_column(heading, justify="right" if i else "left")
@@ -242,5 +242,5 @@ def times(ratio: float, target: float | None = None) -> str:
 
 
 def median(values: Iterable[float]) -> float:
-    """Of a few figures."""
+    """Median of a few figures."""
     return float(statistics.median(values))

@@ -43,43 +43,43 @@ from shell.udp import kernel_drops, open_socket
 
 HOST = "127.0.0.1"
 HEAD = struct.Struct("<qq")
-"""Number, and when it was sent [ns]; the rest of a packet is zeros."""
+"""Head of a packet: its number, and when it was sent [ns]; the rest is zeros."""
 BATCH_NS = MILLISECOND_NS // 4
 SO_TIMESTAMPNS = 35
 QUIET_S = 2
 """Silence after which no packet is on its way: the paper's delay is far shorter."""
 PATIENCE_S = 90.0
-"""For an answer; the longest run takes 60 s."""
+"""Longest wait for an answer [s]; the longest run takes 60 s."""
 TARGET_MS = 1.0
-"""For the median over the runs of the error's p99."""
+"""Target for the median over the runs of the error's p99 [ms]."""
 
 SPAWN = multiprocessing.get_context("spawn")
 
 
 @dataclass(frozen=True)
 class Options:
-    """Of this benchmark."""
+    """Options of this benchmark."""
 
     runs: int = 5
-    """How often to measure."""
+    """Number of runs."""
     seconds: int = 5
-    """How long each time [s]."""
+    """Duration of each run [s]."""
     rate: int = 20_000
-    """Packets per second."""
+    """Number of packets per second."""
     size: int = 600
     """UDP payload of each [B]."""
     realtime: bool = False
-    """Run before all other programs (needs the right to), so that these do not count."""
+    """Whether to run before all other programs (needs the right to), so that these do not count."""
     json: Path | None = None
     """File for the figures."""
 
     @property
     def packets(self) -> int:
-        """Packets in a run."""
+        """Number of packets in a run."""
         return self.rate * self.seconds
 
     def is_bounded(self) -> bool:
-        """Whether a slip of the finger floods nothing."""
+        """Whether the numbers are small enough to flood nothing."""
         few = 1 <= self.runs <= 100 and 1 <= self.seconds <= 60 and 1 <= self.rate <= 100_000
         return few and HEAD.size <= self.size <= 65_507
 
@@ -89,36 +89,36 @@ FULL, QUICK = Options(), Options(runs=1, seconds=1)
 
 @dataclass(frozen=True)
 class Run:
-    """What one run gave."""
+    """Figures of one run."""
 
     sent: int
     received: int
     dropped_before: int
-    """Before netem read them: its receive buffer was full."""
+    """Number of packets dropped before netem read them: its receive buffer was full."""
     dropped_within: int
-    """By netem: its queue was full, or the kernel refused to send."""
+    """Number of packets dropped by netem: its queue was full, or the kernel refused to send."""
     dropped_after: int
-    """After netem had sent them: the receiver's buffer was full."""
+    """Number of packets dropped behind netem: the receiver's buffer was full."""
     measured: int
-    """Packets whose drawn delay is known: those before the first that netem never read."""
+    """Number of packets whose drawn delay is known: all before the first that netem never read."""
     error_ms_p50: float
     error_ms_p99: float
     error_ms_max: float
     netem_ms_p99: float
-    """The error as netem reports it: from due to being handed to the shell."""
+    """Error as netem reports it [ms]: from due to being handed to the driver."""
     netem_cpu: float
-    """Share of a core that it used,"""
+    """Share of a core that netem used."""
     netem_waited: float
-    """and share of the time that it had work but no core to do it on."""
+    """Share of the time that netem had work but no core to do it on."""
     wake_ms_p50: float
-    """How late a process wakes that only sleeps,"""
+    """Median of how late a process woke that only slept in the same seconds [ms]."""
     wake_ms_p99: float
     wake_ms_max: float
-    """in the same seconds."""
+    """Largest lateness of that process [ms]."""
 
 
 def work(task: Callable[..., object], pipe: Connection, *args: object) -> None:
-    """Process: do a task, give its answer, and wait to be killed.
+    """Do a task in this process, give its answer, and wait to be killed.
 
     Ending by itself would take a core for 20 ms, in the middle of the measurement.
     """
@@ -247,14 +247,14 @@ def start_netem(stack: ExitStack, server_port: int, seed: int) -> tuple[subproce
 
 
 def answer(pipe: Connection) -> Any:
-    """What a process has to say."""
+    """Answer of a process, waited for."""
     if not pipe.poll(PATIENCE_S):
         raise TimeoutError("a process of the benchmark does not answer")
     return pipe.recv()
 
 
 def said(report: str, pattern: str) -> str:
-    """What netem says of something; 0 where it says nothing."""
+    """Count that netem reports under a name; 0 where it reports none."""
     found = re.search(pattern, report)
     return found[1] if found else "0"
 
@@ -265,7 +265,7 @@ def scheduled_ns(pid: int) -> NDArray[np.int64]:
 
 
 def drawn_delays_ns(seed: int, count: int) -> NDArray[np.int64]:
-    """What netem drew for the packets of its first client; shape (count,)."""
+    """Delays that netem drew for the packets of its first client [ns]; shape (count,)."""
     from netem.fate import fates
 
     drawn = islice(fates(DirectionConfig(loss=0.0), seed, "downlink", 0), count)
@@ -273,14 +273,14 @@ def drawn_delays_ns(seed: int, count: int) -> NDArray[np.int64]:
 
 
 def first_missing(numbers: NDArray[np.int64]) -> int:
-    """The lowest number that is not among these."""
+    """Lowest number that is not among these."""
     present = np.zeros(numbers.max(initial=-1) + 2, bool)
     present[numbers] = True
     return int(present.argmin())
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """All runs, and the median of each figure over them."""
+    """Figures of all runs, and the median of each over them."""
     seeds = range(1, options.runs + 1)
     runs = [measure_once(options, seed) for seed in progress(seeds, "netem")]
     return {
@@ -296,7 +296,7 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:
-    """A line for every run."""
+    """Table with a row for every run."""
     headings = ["run", "packets\nsent", "\nreceived", "\nlost", "error [ms]\np50", "\np99", "\nmax"]
     headings += ["netem\nCPU", "\nwaited", "machine [ms]\np50", "\np99"]
     rows = [
@@ -319,12 +319,12 @@ def tables(result: Mapping[str, Any]) -> dict[str, Table]:
 
 
 def runs_of(result: Mapping[str, Any]) -> list[Run]:
-    """The runs in the figures of `measure`."""
+    """Runs in the figures of `measure`."""
     return [Run(**run) for run in result["runs"]]
 
 
 def show(result: Mapping[str, Any], options: Options) -> None:
-    """A table with a line for every run, and whether the target is met."""
+    """Print a table with a row for every run, and whether the target is met."""
     runs = runs_of(result)
     tables(result)["netem"].show(f"netem, {options.rate} packets/s of {options.size} B")
     for number, run in enumerate(runs, start=1):
@@ -341,12 +341,12 @@ def show(result: Mapping[str, Any], options: Options) -> None:
 
 
 def lost(run: Run) -> int:
-    """Packets that never came; netem was told to lose none."""
+    """Number of packets that never came; netem was told to lose none."""
     return run.sent - run.received
 
 
 def where(run: Run) -> str:
-    """Where they went."""
+    """Places where packets were lost, in words."""
     places = {
         "unread by netem": run.dropped_before,
         "dropped by netem": run.dropped_within,
@@ -357,7 +357,7 @@ def where(run: Run) -> str:
 
 
 def main() -> int:
-    """Entry point; the exit code."""
+    """Measure as the command line says, and return the exit code."""
     options = tyro.cli(Options, description=__doc__)
     if not options.is_bounded():
         CONSOLE.print("expected 1 to 100 runs, 1 to 60 s, up to 100000 packets/s of 16 to 65507 B")

@@ -31,17 +31,17 @@ class Recorded:
     """The QPs of one vehicle's flight; two a tick, the generator's and the tracker's."""
 
     mpc: MPC
-    """Whose QPs: both solves have the same Hessian."""
+    """MPC of the QPs; both solves have the same Hessian."""
     u_max: Array
-    """shape (axes,)."""
+    """Bounds of the input [m/s]; shape (axes,)."""
     gradient: Array
-    """shape (2, ticks, axes, H)."""
+    """Gradients of the QPs; shape (2, ticks, axes, H)."""
     guess: Array
     """The shifted horizon of the step before [m/s]; shape (2, ticks, axes, H)."""
 
     @property
     def ticks(self) -> int:
-        """How many."""
+        """Number of ticks."""
         return self.gradient.shape[1]
 
     def active(self) -> float:
@@ -60,7 +60,7 @@ class Listener:
         self.asked: list[tuple[Array, Array]] = []
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """See `Solver`."""
+        """Note the problem and solve it (see `Solver`)."""
         self.asked.append((gradient, guess))
         return self._solver.solve(gradient, guess)
 

@@ -14,15 +14,15 @@ from scipy.optimize import lsq_linear
 from shared.model import Array
 
 AT_BOUND = 1e-7
-"""How near to its bound an input counts as being at it, before it is proved [m/s],"""
+"""Distance from its bound within which an input counts as at it, before it is proved [m/s]."""
 ROUNDS_MAX = 10
-"""and how often that may turn out to be wrong."""
+"""Number of times that this may turn out to be wrong."""
 ROUNDING = 1e-11
-"""Of a multiplier, relative to the gradient; of an input, relative to its bound."""
+"""Rounding error of a multiplier relative to the gradient, and of an input to its bound."""
 
 
 class NoReference(Exception):
-    """Nobody found an answer that is proved optimal."""
+    """Error: no answer was found that is proved optimal."""
 
 
 class Reference:

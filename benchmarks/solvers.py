@@ -26,7 +26,7 @@ from shared.config import Scenario
 from shared.model import Array, Flags
 
 TARGETS = {"hot": {"p50": 15.0, "p99": 10.0}, "paced": {"p50": 7.0, "p99": 5.0}}
-"""How many times less than tuned OSQP."""
+"""Targets: tuned OSQP's time over ours, by pace and quantile."""
 PACES = {"hot": HOT, "paced": PACED}
 
 
@@ -37,14 +37,14 @@ class Counts:
     hot: int = 1000
     paced: int = 500
     tuning: int = 100
-    """Ticks of which the best tuning of OSQP is found."""
+    """Number of ticks of which the best tuning of OSQP is found."""
 
 
 FULL, QUICK = Counts(), Counts(hot=100, paced=60, tuning=20)
 
 
 def flights() -> dict[str, Scenario]:
-    """A flight that never meets its bounds, and one that does at every corner."""
+    """Scenarios of a flight that never meets its bounds, and of one that does at every corner."""
     control = {"dt": 0.02, "horizon": 50}
     square = {"shape": "square", "period_s": 6.0}
     return {
@@ -54,7 +54,7 @@ def flights() -> dict[str, Scenario]:
 
 
 def measure(counts: Counts) -> dict[str, Any]:
-    """All contestants on both flights."""
+    """Figures of all contestants on both flights."""
     lateness = Lateness()
     result: dict[str, Any] = {
         name: _measure_flight(name, scenario, counts, lateness)
@@ -114,17 +114,17 @@ class Entry:
         self._answers: dict[int, tuple[tuple[Array, Flags], tuple[Array, Flags]]] = {}
 
     def tick(self, i: int) -> None:
-        """Both solves."""
+        """Solve both problems of tick i."""
         generator, tracker = self._problems[i]
         self._answers[i] = (self._generator.solve(*generator), self._tracker.solve(*tracker))
 
     def inputs(self) -> Array:
-        """What was answered so far [m/s]; shape (2, ticks, axes, H)."""
+        """Inputs answered so far [m/s]; shape (2, ticks, axes, H)."""
         answers = (self._answers[i] for i in sorted(self._answers))
         return np.array([[inputs[0] for inputs, _ in both] for both in answers]).swapaxes(0, 1)
 
     def unsolved(self) -> int:
-        """Problems with no answer so far."""
+        """Number of problems without a solution so far."""
         return sum(not solved[0] for both in self._answers.values() for _, solved in both)
 
 
@@ -156,7 +156,7 @@ def _references(recorded: Recorded) -> Array:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:
-    """A table a flight, and the tunings of OSQP."""
+    """Tables of each flight, of OSQP's tunings and of the targets."""
     headings = ["[µs]"]
     for pace in PACES:
         headings += [f"{pace}\np50", "\np99", "\nratio", "\nof p99"]

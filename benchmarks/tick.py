@@ -34,13 +34,13 @@ from shared.config import Scenario
 from shared.stopwatch import Stopwatch
 
 PERIOD_MS = 20.0
-"""Δt of all flights here [ms]."""
+"""Length Δt of a step of all flights here [ms]."""
 TARGET_TICK, TARGET_FLEET, TARGET_P99_MS = 5.0, 100.0, 20.0
 FIGURE = Path(__file__).parent.parent / "docs" / "scaling.png"
 SETTLE = 50
-"""Ticks before any counts: the vehicles start on the reference, where they will not stay."""
+"""Number of ticks before any counts: vehicles start on the reference, where they do not stay."""
 STAGES = ("estimate", "plan", "solve")
-"""Of the stopwatch, that the target is about."""
+"""Laps of the stopwatch that the target is about."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ class Counts:
     paced: int = 500
     tuning: int = 60
     fleet: int = 1000
-    """Vehicles planned for at once,"""
+    """Number of vehicles planned for at once."""
     fleet_ticks: int = 100
     fleet_sample: int = 20
-    """and how many of them OSQP plans for."""
+    """Number of these that OSQP plans for."""
     crowd: int = 2500
     crowd_ticks: int = 400
     scale: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
@@ -66,7 +66,7 @@ QUICK = Counts(100, 40, 10, 200, 10, 5, 500, 20, (1, 2, 5, 10, 20, 50, 100, 200)
 
 
 def mixes() -> dict[str, Scenario]:
-    """Bounds that are active never, rarely, and in half of the axis problems."""
+    """Scenarios whose bounds are active never, rarely, and in half of the axis problems."""
     control = {"dt": 0.02, "horizon": 50}
 
     def square(period_s: float, u_max: float) -> Scenario:
@@ -79,25 +79,17 @@ def mixes() -> dict[str, Scenario]:
 
 
 def measure(counts: Counts) -> dict[str, Any]:
-    """All of it."""
+    """All figures of this section."""
     lateness = Lateness()
-    flights = solvers.flights()
-    tunings = {
-        name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
-        for name, scenario in flights.items()
-    }
+    tunings = tune(counts, lateness)
     single = {
         name: _single(name, scenario, tunings[name], counts, lateness)
-        for name, scenario in flights.items()
-    }
-    fleets = {
-        name: _fleet(name, scenario, tunings["saturated" if name == "half" else "smooth"], counts)
-        for name, scenario in mixes().items()
+        for name, scenario in solvers.flights().items()
     }
     half = mixes()["half"]
     return {
         "single": single,
-        "fleets": fleets,
+        "fleets": fleets(counts, tunings),
         "crowd": _crowd(half, counts, lateness),
         "scaling": _scaling(half, counts, lateness),
         "memory": {"bytes_per_vehicle": _bytes_per_vehicle(half)},
@@ -107,10 +99,26 @@ def measure(counts: Counts) -> dict[str, Any]:
     }
 
 
+def tune(counts: Counts, lateness: Lateness) -> dict[str, Tuning]:
+    """The fastest tuning of OSQP for each flight of `solvers.flights`."""
+    return {
+        name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
+        for name, scenario in solvers.flights().items()
+    }
+
+
+def fleets(counts: Counts, tunings: Mapping[str, Tuning]) -> dict[str, Any]:
+    """Figures of planning for a fleet in one batch against tuned OSQP, for each of `mixes`."""
+    return {
+        name: _fleet(name, scenario, tunings["saturated" if name == "half" else "smooth"], counts)
+        for name, scenario in mixes().items()
+    }
+
+
 def _single(
     name: str, scenario: Scenario, tuned: Tuning, counts: Counts, lateness: Lateness
 ) -> dict[str, Any]:
-    """From a decoded observation to a packed horizon, one vehicle; two servers side by side."""
+    """Time from a decoded observation to a packed horizon, one vehicle; two servers by turns."""
     ours = Airspace(scenario, 1)
     with solving(tuned.make):
         theirs = Airspace(scenario, 1)
@@ -136,7 +144,7 @@ def _single(
 
 
 def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: Counts) -> dict[str, Any]:
-    """All in one batch, then some of the same problems one after the other by OSQP."""
+    """Figures of planning for all in one batch, then for some of them one by one by OSQP."""
     stopwatch = Stopwatch(time.process_time_ns)
     with listening() as listeners:
         fleet = PlannedFleet(scenario, counts.fleet, stopwatch)
@@ -183,7 +191,7 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: Counts) -> dict
 
 
 def _crowd(scenario: Scenario, counts: Counts, lateness: Lateness) -> dict[str, Any]:
-    """A whole server's tick of many saturated vehicles, by stage [ms]."""
+    """Time of a server's tick of many saturated vehicles, by stage [ms]."""
     space = Airspace(scenario, counts.crowd, Stopwatch(time.process_time_ns))
     spent = space.server.stopwatch.spent_ns
     laps: dict[str, list[int]] = {}
@@ -232,7 +240,7 @@ def _scaling(scenario: Scenario, counts: Counts, lateness: Lateness) -> dict[str
 
 
 def _bytes_per_vehicle(scenario: Scenario) -> float:
-    """How much more a server with room for more vehicles, all in session, takes up."""
+    """Memory that each further vehicle in session takes up in a server [B]."""
     few, many = (_server_bytes(scenario, count) for count in (100, 300))
     return (many - few) / 200
 
@@ -254,7 +262,7 @@ def _server_bytes(scenario: Scenario, count: int) -> int:
 
 
 def draw(result: Mapping[str, Any], file: Path = FIGURE) -> None:
-    """Tick time over vehicles, both on logarithmic axes, with a line of slope 1."""
+    """Draw tick time over vehicles, both on logarithmic axes, with a line of slope 1."""
     counts = [int(count) for count in result["scaling"]]
     ticks_ms = list(result["scaling"].values())
     figure = Figure(figsize=(7.0, 4.5), dpi=150, layout="constrained")
@@ -276,17 +284,11 @@ def draw(result: Mapping[str, Any], file: Path = FIGURE) -> None:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:
-    """One vehicle, the fleets, and the crowd."""
-    shown = {"tick-single": _single_table(result["single"])}
-    rows = []
-    for name, figures in result["fleets"].items():
-        row = [f"{name} ({figures['active']:.0%})"]
-        row += [us(figures[key]["p50_us"]) for key in ("plan", "solve", "osqp")]
-        row += [times(figures["ratio"][key]["p50"], TARGET_FLEET) for key in ("plan", "solve")]
-        rows.append(row)
-    headings = ["bounds active", "ours, planning [µs]", "of it solving", "tuned OSQP, solving"]
-    headings += ["OSQP / planning", "OSQP / solving"]
-    shown["tick-fleet"] = Table(headings, rows)
+    """Tables of one vehicle, the fleets, the crowd, the scaling and the memory."""
+    shown = {
+        "tick-single": _single_table(result["single"]),
+        "tick-fleet": fleet_table(result["fleets"]),
+    }
     rows = [
         [stage, f"{figures['p50_ms']:.2f}", f"{figures['p99_ms']:.2f}"]
         for stage, figures in result["crowd"].items()
@@ -305,6 +307,19 @@ def tables(result: Mapping[str, Any]) -> dict[str, Table]:
         ["", "kB"], [["a server's memory for each vehicle", f"{kilobytes:.1f}"]]
     )
     return shown
+
+
+def fleet_table(fleets: Mapping[str, Any]) -> Table:
+    """Table of planning in one batch against OSQP one by one, with the target."""
+    rows = []
+    for name, figures in fleets.items():
+        row = [f"{name} ({figures['active']:.0%})"]
+        row += [us(figures[key]["p50_us"]) for key in ("plan", "solve", "osqp")]
+        row += [times(figures["ratio"][key]["p50"], TARGET_FLEET) for key in ("plan", "solve")]
+        rows.append(row)
+    headings = ["bounds active", "ours, planning [µs]", "of it solving", "tuned OSQP, solving"]
+    headings += ["OSQP / planning", "OSQP / solving"]
+    return Table(headings, rows)
 
 
 def _single_table(single: Mapping[str, Any]) -> Table:

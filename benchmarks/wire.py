@@ -34,7 +34,7 @@ FULL, QUICK = Counts(), Counts(each=1000)
 
 
 def messages(terms: Terms) -> list[Message]:
-    """One of each type, with numbers as large as those of a real flight."""
+    """One message of each type, with numbers as large as those of a real flight."""
     rng = np.random.default_rng(1)
     now_ns = 86_400 * 10**9 + 123_456_789
     inputs = rng.uniform(-1.0, 1.0, (terms.axes, terms.horizon)).astype(np.float32)
@@ -50,7 +50,7 @@ def messages(terms: Terms) -> list[Message]:
 
 
 def measure(counts: Counts) -> dict[str, Any]:
-    """All types, both ways."""
+    """Figures of all types, both ways."""
     terms = derive("paper-every-step", control={"dt": 0.02, "horizon": 50}).terms()
     lateness, result = Lateness(), {}
     contestants: dict[str, Any] = {NOTHING: lambda _: None}
@@ -68,7 +68,7 @@ def measure(counts: Counts) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:
-    """A line a message."""
+    """Table with a row for each message."""
     rows = []
     for name, figures in result["messages"].items():
         row = [name, str(figures["bytes"])]

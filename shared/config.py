@@ -31,7 +31,7 @@ from shared.terms import Terms
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Duration = Annotated[float, Meta(ge=0, le=3600)]
-"""A time that may be nothing, and is no longer than an hour [s]."""
+"""Time from nothing to an hour [s]."""
 
 
 class ConfigError(Exception):
@@ -39,14 +39,14 @@ class ConfigError(Exception):
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the scenario."""
+    """Base of every table of a scenario."""
 
 
 class ModelConfig(Section, frozen=True):
     """The UAV as both ends know it, eq. (1)-(6)."""
 
     axes: Literal[2, 3] = 2
-    """Fly in the plane or in space."""
+    """Number of axes: 2 to fly in the plane, 3 in space."""
     tau_s: tuple[Positive, ...] = (0.84,)
     """Time constant of the velocity loop [s]: one for all axes, or one each."""
     u_max: tuple[Positive, ...] = (1.6,)
@@ -59,20 +59,19 @@ class ControlConfig(Section, frozen=True):
     dt: Annotated[float, Meta(ge=0.001, le=1)] = 0.05
     """Length of a step, Δt [s]."""
     horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
-    """Steps planned ahead, H."""
+    """Number of steps planned ahead, H."""
     scheme: Literal["committed", "feedback", "predictive", "none"] = "committed"
-    """Delay compensation at both ends: committed inputs, the same with feedback aboard, eq. (11)
-    and (13), or none."""
+    """Delay compensation: committed inputs, these with feedback, eq. (11) and (13), or none."""
     delay_bound: Duration | Literal["auto"] = "auto"
-    """A horizon that comes is in force at most so long after it was made [s]; auto: as was seen."""
+    """Longest time from making a horizon to its being in force [s]; auto: as was seen."""
     observer_s: NonNegative = 4.0
-    """How soon steady wind and a wrong gain are learned, as a time constant [s]; 0: never."""
+    """Time constant of learning steady wind and a wrong gain [s]; 0: they are not learned."""
     trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "cost_gap | silence(1)"
-    """When a horizon is sent: policies that combine with & and |, as in docs/triggers.md."""
+    """Rule for sending a horizon: policies combined with & and |, as in docs/triggers.md."""
     period: Annotated[int, Meta(ge=1, le=policy.PERIOD_MAX)] = 10
-    """Steps from one horizon to the next of the policy `periodic`."""
+    """Number of steps between two horizons of the policy `periodic`."""
     solver: Literal["exact", "osqp"] = "exact"
-    """What solves (9): Riccati active set, exact and fast, or OSQP, the reference."""
+    """Solver of eq. (9): a Riccati active set, exact and fast, or OSQP, the reference."""
     epsilon: NonNegative = 3.6
     """Tolerance ε of eq. (16)."""
     decay_rate: NonNegative = 1.5
@@ -82,15 +81,15 @@ class ControlConfig(Section, frozen=True):
     deviation_m: NonNegative = 0.05
     """Distance from the plan, above which the policy `deviation` sends [m]."""
     state_weight: tuple[NonNegative, NonNegative] = (7.0, 1.0)
-    """Q of eq. (5), on the position and the velocity of every axis."""
+    """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: tuple[NonNegative, NonNegative] = (50.0, 20.0)
-    """P of eq. (5) and (16), on position and velocity."""
+    """Weight P of eq. (5) and (16) on the final position [1/m²] and velocity [s²/m²]."""
     input_weight: Positive = 0.01
-    """R of eq. (5)."""
+    """Weight R of eq. (5) on the input [s²/m²]."""
     change_weight: NonNegative = 0.0
-    """S of eq. (9), on the change against the horizon before."""
+    """Weight S of eq. (9) on the change against the horizon before [s²/m²]."""
     input_reference: bool = False
-    """Let R weigh u - v_ref instead of u, so that it does not ask for standing still."""
+    """Whether R weighs u - v_ref instead of u, so that it does not ask for standing still."""
 
     @property
     def commits(self) -> bool:
@@ -102,19 +101,19 @@ class ReferenceConfig(Section, frozen=True):
     """The desired trajectory."""
 
     shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
-    """What to fly."""
+    """Shape of the desired trajectory."""
     radius_m: Positive = 1.55
     """Half the width of circle, figure-eight and square [m]."""
     period_s: Positive = 27.5
-    """Time for one round of them [s]."""
+    """Time for one round of circle, figure-eight or square [s]."""
     altitude_m: float = 0.0
-    """Their height in 3-D [m]."""
+    """Altitude of circle, figure-eight and square in space [m]."""
     points_m: tuple[tuple[float, ...], ...] = ()
     """Waypoints [m], at least two, or the one point to hover at."""
     speed_mps: Positive = 1.0
     """Speed between waypoints [m/s]."""
     loop: bool = False
-    """Fly the waypoints round and round."""
+    """Whether the waypoints are flown round and round."""
     file: str = ""
     """CSV file with the columns t, x, y (and z), relative to the scenario's own folder."""
 
@@ -123,27 +122,27 @@ class VehicleConfig(Section, frozen=True):
     """The simulated UAV and what it does without fresh orders."""
 
     exhausted: Literal["hold", "brake"] = "brake"
-    """Once a horizon has run out: hold its last input for ever (the paper), or brake and hover."""
+    """Answer to a horizon that has run out: hold its last input (the paper), or brake and hover."""
     brake_mps2: Positive = 2.0
-    """How fast `brake` takes the desired velocity to zero [m/s²]."""
+    """Deceleration of the desired velocity when `brake` stops the vehicle [m/s²]."""
     tau_s: tuple[Positive, ...] = ()
     """True time constant [s], where it differs from the model's; one for all axes, or one each."""
     gain: Positive = 1.0
-    """The velocity that it settles at, over the one that it was told."""
+    """Gain of the velocity loop: velocity settled at over velocity commanded."""
     dead_time_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
-    """How much later an input takes effect [s]."""
+    """Dead time before an input takes effect [s]."""
     start_m: tuple[float, ...] = ()
-    """Where the flight starts, at rest [m]; left out: at the reference's start."""
+    """Position at the start, at rest [m]; left out: that of the reference."""
     wind: NonNegative = 0.0
-    """White acceleration [m/s² per √s]."""
+    """Strength of white acceleration [m/s per √s]."""
     steady_wind_mps: tuple[float, ...] = ()
-    """The velocity that steady wind adds in the long run [m/s], of each axis; left out: none."""
+    """Velocity that steady wind adds in the long run, for each axis [m/s]; left out: none."""
     gust_mps2: NonNegative = 0.0
     """Strength of gusts [m/s²]; 0 for none."""
     gust_every_s: Positive = 10.0
     """Mean time from the end of one gust to the next [s]."""
     gust_s: Positive = 1.0
-    """Length of a gust [s]."""
+    """Mean length of a gust [s]."""
 
 
 class DirectionConfig(Section, frozen=True):
@@ -154,9 +153,9 @@ class DirectionConfig(Section, frozen=True):
     minimum_s: Duration = 0.4
     """The smallest delay [s]."""
     slot_s: Duration = 0.02
-    """Lattice of the paper's delay [s]."""
+    """Length of a slot of the paper's delay [s]."""
     slots_mean: Annotated[float, Meta(ge=0, le=1e6)] = 2.0
-    """Mean number of slots on top."""
+    """Mean number of slots on top of the smallest delay."""
     loss: Annotated[float, Meta(ge=0, le=1)] = 0.1
     """Share of packets lost."""
 
@@ -168,47 +167,47 @@ class DirectionConfig(Section, frozen=True):
 
 
 class NetworkConfig(Section, frozen=True):
-    """What netem does to packets."""
+    """Impairments of the network, both ways."""
 
     uplink: DirectionConfig = DirectionConfig()
-    """Server to vehicle."""
+    """Direction from server to vehicle."""
     downlink: DirectionConfig = DirectionConfig()
-    """Vehicle to server."""
+    """Direction from vehicle to server."""
 
 
 class LinkConfig(Section, frozen=True):
-    """How a session is kept."""
+    """Times by which a session is kept."""
 
     heartbeat_s: Positive = 0.1
-    """The server lets no longer pass without a packet [s]."""
+    """Longest time that the server lets pass without a packet [s]."""
     timeout_s: Positive = 1.0
     """Silence after which the vehicle says HELLO again [s]."""
     connect_s: Positive = 15.0
-    """How long the vehicle waits for its first session before it gives up [s]."""
+    """Time that the vehicle waits for its first session before it gives up [s]."""
 
 
 class SimulationConfig(Section, frozen=True):
-    """What only virtual time has to be told."""
+    """Properties of the computers, which only virtual time has to be told."""
 
     compute_s: Duration = 0.001
     """Time the server takes for a step [s]."""
     clock_offset_s: float = 0.0
-    """The vehicle's clock minus the server's, at the start [s]."""
+    """Offset of the vehicle's clock from the server's at the start [s]."""
     clock_drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
-    """How much faster the vehicle's clock runs [ppm]."""
+    """Drift: how much faster the vehicle's clock runs than the server's [ppm]."""
 
 
 class Scenario(Section, frozen=True):
     """Everything about a flight."""
 
     title: str = ""
-    """What it shows, in a line."""
+    """Title: what the scenario shows, in a line."""
     duration: Annotated[float, Meta(gt=0, le=86400)] = 60.0
     """Length of the flight [s]."""
     settle: NonNegative = 0.0
-    """Start of the flight that RMSE leaves out [s]."""
+    """Time at the start that RMSE leaves out [s]."""
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 1
-    """Of everything random: delays, losses, wind."""
+    """Seed of everything random: delays, losses, wind."""
     model: ModelConfig = ModelConfig()
     control: ControlConfig = ControlConfig()
     reference: ReferenceConfig = ReferenceConfig()
@@ -224,7 +223,7 @@ class Scenario(Section, frozen=True):
 
     @property
     def steps(self) -> int:
-        """Steps in the whole flight."""
+        """Number of steps in the whole flight."""
         return max(1, round(self.duration / self.control.dt))
 
     @property
@@ -246,7 +245,7 @@ class Scenario(Section, frozen=True):
         return np.array(np.broadcast_to(values, self.model.axes), dtype=np.float64)
 
     def terms(self) -> Terms:
-        """What both ends must agree on before a flight."""
+        """Terms that both ends must agree on before a flight."""
         control, vehicle, reference = self.control, self.vehicle, self.reference
         table = Path(reference.file).read_bytes() if reference.shape == "csv" else b""
         return Terms(
@@ -296,11 +295,11 @@ def _digest(content: bytes) -> str:
 
 
 COMPARED = "compare"
-"""Folder of those that `skytether compare` flies."""
+"""Folder of the scenarios that `skytether compare` flies."""
 
 
 def names(folder: str = "") -> list[str]:
-    """The scenarios that come with Skytether, those of a folder of theirs as in `compare/name`."""
+    """Names of the scenarios that come with Skytether; in a folder of theirs, as `compare/name`."""
     return sorted(
         f"{folder}/{file.name}".lstrip("/").removesuffix(".toml")
         for file in (resources.files("scenarios") / folder).iterdir()
@@ -309,7 +308,7 @@ def names(folder: str = "") -> list[str]:
 
 
 def load(name: str) -> Scenario:
-    """A scenario by its name, or from a file by its path (anything that ends in .toml).
+    """Scenario by its name, or from a file by its path (anything that ends in .toml).
 
     Raises:
         ConfigError: it does not exist, or something in it is wrong.
@@ -336,7 +335,7 @@ def check(raw: Mapping[str, Any], source: str) -> Scenario:
 
 
 def to_table(scenario: Scenario) -> dict[str, Any]:
-    """The plain values of a scenario; `check` makes it of them again."""
+    """The plain values of a scenario, from which `check` makes it again."""
     table: dict[str, Any] = msgspec.to_builtins(scenario)
     return table
 
@@ -399,13 +398,13 @@ _PLAIN = {
     "array": "a list",
     "object": "a table",
 }
-"""msgspec's words in a scenario's."""
+"""Words of msgspec's messages, and what stands for them in ours."""
 
 _ERROR = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>[^`]*)`)?", re.DOTALL)
 
 
 def _explain(message: str, raw: Mapping[str, Any]) -> str:
-    """msgspec's message as `key: got …, expected …`."""
+    """Message of msgspec, put as `key: got …, expected …`."""
     found = _ERROR.fullmatch(message)
     assert found is not None
     what, path = found["what"], found["path"] or ""
@@ -430,7 +429,7 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
 
 
 def _choices(kind: Any) -> str:
-    """What a value may be: the words of a Literal, or one of several types."""
+    """Values that are allowed: the words of a Literal, or one of several types."""
     parts = typing.get_args(kind)
     if typing.get_origin(kind) is Literal:
         return " or ".join(map(repr, parts))

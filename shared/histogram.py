@@ -14,7 +14,7 @@ class Histogram:
         self.largest_ns = 0
 
     def add(self, value_ns: int) -> None:
-        """Count one."""
+        """Count one duration [ns]."""
         # Once a packet or step: comparisons cost half of what min() and max() do.
         index = value_ns // self.bin_ns
         self.counts[index if index < BINS else -1] += 1

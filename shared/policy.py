@@ -17,9 +17,9 @@ from typing import Any, Literal
 from shared.hint import hint
 
 TEXT_MAX = 200
-"""Characters of a trigger."""
+"""Largest number of characters of a trigger."""
 PERIOD_MAX = 1_000_000
-"""Steps from one horizon to the next."""
+"""Largest number of steps from one horizon to the next."""
 
 FORM = "policies such as 'state_gap & budget(5, 2) | silence(1)'"
 
@@ -31,7 +31,7 @@ _TOKENS = re.compile(
 
 
 class PolicyError(Exception):
-    """A text is no trigger."""
+    """Error: a text is no trigger."""
 
     def __init__(self, given: str, expected: str) -> None:
         super().__init__(f"got {given!r}, expected {expected}")
@@ -46,13 +46,13 @@ class Parameter:
     name: str
     low: float
     high: float = math.inf
-    """Least and largest value; it is finite in any case."""
+    """Largest value; it is finite in any case."""
     whole: bool = False
     key: str = ""
-    """Of `ControlConfig`: whose value it has where the policy stands without arguments."""
+    """Key of `ControlConfig` whose value it has where the policy stands without arguments."""
 
     def takes(self, value: Any) -> bool:
-        """Whether this may be its value."""
+        """Whether the parameter may have this value."""
         kinds = (int,) if self.whole else (int, float)
         return type(value) in kinds and self.low <= value <= self.high and math.isfinite(value)
 
@@ -63,14 +63,14 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """How a policy is called."""
+    """Name and parameters of a policy."""
 
     parameters: tuple[Parameter, ...] = ()
     committed: bool = False
-    """It compares the committed inputs with the new ones, and so needs that scheme."""
+    """Whether it compares committed inputs with new ones, and so needs a scheme that commits."""
 
     def takes(self, values: Sequence[Any]) -> bool:
-        """Whether these may be its arguments; none may be where a key has the value of each."""
+        """Whether these arguments are allowed; none at all where a key has the value of each."""
         if not values and all(parameter.key for parameter in self.parameters):
             return True
         return len(values) == len(self.parameters) and all(
@@ -108,7 +108,7 @@ class Policy:
 
     name: str
     values: tuple[float, ...]
-    """Its arguments; none where it stands without."""
+    """Arguments as written; empty where the policy stands without."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ def parse(text: str) -> Expression:
 
 
 def policies(expression: Expression) -> Iterator[Policy]:
-    """Those in it, from left to right."""
+    """Policies in a trigger, from left to right."""
     match expression:
         case Policy():
             yield expression

@@ -18,7 +18,7 @@ Rows = NDArray[np.void]
 
 
 def client_columns(axes: int) -> np.dtype[np.void]:
-    """One row a step of the client."""
+    """Columns of the client's part: one row for each step of each vehicle."""
     return np.dtype(
         [
             ("vehicle", "<u2"),
@@ -34,7 +34,7 @@ def client_columns(axes: int) -> np.dtype[np.void]:
 
 
 def server_columns(axes: int) -> np.dtype[np.void]:
-    """One row a tick and vehicle of the server."""
+    """Columns of the server's part: one row for each vehicle and tick."""
     return np.dtype(
         [
             ("vehicle", "<u2"),
@@ -69,7 +69,7 @@ PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
         ("overtaken", "?"),  # by a later packet of the same flow
     ]
 )
-"""One row a packet of netem."""
+"""Columns of netem's part: one row for each packet."""
 
 
 class Recorder:
@@ -82,19 +82,19 @@ class Recorder:
         sink.write(json.dumps(columns.descr).encode() + b"\n")
 
     def append(self, count: int, **values: Any) -> None:
-        """`count` rows; each value is one for all of them, or an array with the rows first."""
+        """Append `count` rows; a value is one for all of them, or an array with the rows first."""
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value
         self._sink.write(rows.tobytes())
 
     def append_row(self, *values: float) -> None:
-        """One row, faster: a value for every column in their order, arrays number by number."""
+        """Append one row, faster: a value for every column in order, arrays number by number."""
         self._sink.write(self._row.pack(*values))
 
 
 def _row(columns: np.dtype[np.void]) -> Struct:
-    """How a row lies in memory."""
+    """Layout of a row in memory."""
     formats = {"u1": "B", "u2": "H", "u4": "I", "i8": "q", "f8": "d", "b1": "?"}
     row = "<"
     for name in columns.names or ():

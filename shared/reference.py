@@ -37,7 +37,7 @@ def _planar(
 
 
 def circle(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
-    """Around the origin, counter-clockwise, from (radius, 0)."""
+    """Circle around the origin, counter-clockwise, from (radius, 0)."""
     w = 2.0 * np.pi / period_s
     return _planar(
         lambda t: (radius_m * np.cos(w * t), -radius_m * w * np.sin(w * t)),
@@ -62,7 +62,7 @@ def figure_eight(radius_m: float, period_s: float, axes: int, altitude_m: float 
 
 
 def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Reference:
-    """Straight lines between points reached at given times.
+    """Path of straight lines between points reached at given times.
 
     Args:
         times_s: rising, from 0; shape (n,).
@@ -86,7 +86,7 @@ def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Refere
 
 
 def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Reference:
-    """Through the points at constant speed; `loop` flies back to the first, and on."""
+    """Path through the points at constant speed; `loop` flies back to the first, and on."""
     points = np.asarray(points_m, dtype=np.float64)
     if loop:
         points = np.concatenate([points, points[:1]])
@@ -95,7 +95,7 @@ def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Refer
 
 
 def square(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
-    """Corners at (±radius, ±radius), one round a period, from (radius, -radius)."""
+    """Square with corners at (±radius, ±radius), one round a period, from (radius, -radius)."""
     corners = np.zeros((4, axes))
     corners[:, :2] = radius_m * np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]])
     corners[:, 2:] = altitude_m
@@ -103,7 +103,7 @@ def square(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0)
 
 
 def hover(point_m: Array) -> Reference:
-    """At one point, for ever; shape (axes,)."""
+    """Rest at one point [m; shape (axes,)], for ever."""
     point = np.asarray(point_m, dtype=np.float64)
 
     def sample(t: Array) -> Array:
@@ -116,7 +116,7 @@ def hover(point_m: Array) -> Reference:
 
 
 def from_csv(path: Path, axes: int) -> Reference:
-    """From a table with the columns t [s], x, y, z [m] (as many as there are axes).
+    """Path from a table with the columns t [s], x, y, z [m] (as many as there are axes).
 
     Raises:
         ValueError: with what is wrong, and in which line.

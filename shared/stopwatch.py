@@ -16,14 +16,14 @@ class Stopwatch:
         self._clock_ns = clock_ns or (lambda: 0)
         self._since_ns = 0
         self.spent_ns: Counter[str] = Counter()
-        """In all laps so far, by name."""
+        """Sum of the laps of each name so far [ns]."""
 
     def start(self) -> None:
-        """The next lap begins."""
+        """Begin a lap."""
         self._since_ns = self._clock_ns()
 
     def lap(self, name: str) -> int:
-        """It ends and the one after it begins; how long it took [ns]."""
+        """End the lap, count it by this name, and begin the next; returns how long it took [ns]."""
         now_ns = self._clock_ns()
         took_ns = now_ns - self._since_ns
         self.spent_ns[name] += took_ns

@@ -17,35 +17,35 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     duration_s: float
     steps: int
-    """Flown by the client."""
+    """Number of steps that the client flew."""
     rmse_x: float | None
-    """Position against the reference, from `settle` on [m]."""
+    """Root mean square of the position error along x, from `settle` on [m]."""
     rmse_y: float | None
     rmse_z: float | None
-    """Only in 3-D."""
+    """Root mean square of the altitude's error [m]; None in the plane."""
     rmse_xy: float | None
     event_ratio: float | None
     """Share of the server's steps that sent a horizon."""
     uplink_packets: int | None
-    """All that entered the network from the server, those it lost too."""
+    """Number of packets that entered the network from the server, lost ones included."""
     uplink_bytes: int | None
-    """Their UDP payload."""
+    """UDP payload of all uplink packets [B]."""
     downlink_packets: int | None
     downlink_bytes: int | None
     lost: int | None
-    """By the network, both ways."""
+    """Number of packets that the network lost, both ways."""
     reordered: int | None
-    """Overtaken by a later packet, both ways."""
+    """Number of packets overtaken by a later one, both ways."""
     stale: int
-    """Discarded at either end because something newer had come before."""
+    """Number of messages discarded at either end because something newer had come before."""
     age_ms_p50: float | None
-    """Age of the observation behind the input being flown, at each step."""
+    """Age of the observation behind the input being flown [ms], over all steps."""
     age_ms_p99: float | None
     solve_ms_p50: float | None
-    """Both MPCs of a step, on the wall clock; never of a virtual flight."""
+    """Wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
     solve_ms_p99: float | None
     deadline_misses: int
-    """Steps that the server or the client slept through."""
+    """Number of steps that the server or the client slept through."""
     secure: bool = False
     """Whether the link was authenticated and encrypted."""
 

@@ -163,7 +163,7 @@ def test_a_flight_longer_than_a_table_of_the_reference_is_as_alone() -> None:
 
 
 def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
-    """Or the bytes sent would tell a run's company."""
+    """Otherwise the bytes sent would depend on the other runs of the batch."""
     sizes = {
         len(encode(Heartbeat(vehicle, (BOOT_ID + opened) % 2**32, 86_400 * 10**9)))
         for vehicle in (1, COMPANY_MAX)
@@ -182,7 +182,7 @@ def test_more_runs_than_share_a_server_are_flown_in_turn() -> None:
 
 
 def test_a_batch_can_be_broken_off() -> None:
-    """It tells the time, and asks whether to go on; what was flown is there."""
+    """A batch tells the time and asks whether to go on; what was flown until then is returned."""
     seconds: list[int] = []
     flown = scenario(duration=60.0)
     runs = fly_batch(flown, range(3), on_second=seconds.append, stopped=lambda: len(seconds) >= 4)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, netem, solvers, tick, wire
+from benchmarks import accuracy, netem, solvers, tick, versions, wire
 from benchmarks.__main__ import DOCUMENT, ROOT, SECTIONS, write
 from benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
 from benchmarks.harness import HOT, PACED, Lateness, Table, interleave, machine, refresh
@@ -34,7 +34,7 @@ TINY = MappingProxyType(
 
 @pytest.fixture(scope="module")
 def results() -> Iterator[dict[str, Any]]:
-    """Of every benchmark, as small as it goes."""
+    """Figures of every benchmark, as small as it goes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tick, "SETTLE", 2)
         patch.setattr(solvers, "TUNINGS", TUNINGS[::8])
@@ -57,7 +57,7 @@ def saturated() -> Recorded:
 def test_every_table_has_its_place_in_the_document(
     results: Mapping[str, Any], tmp_path: Path
 ) -> None:
-    """And is written there, figures and figure beside it; a section not run stays as it was."""
+    """Tables, figures and figure are written; a section that is not run stays as it was."""
     file, figure, document = (tmp_path / name for name in ("a.json", "b.png", "c.md"))
     document.write_text(DOCUMENT.read_text())
     write(results, file, document, figure)
@@ -125,7 +125,7 @@ def test_what_is_not_installed_does_not_compete() -> None:
 def test_the_reference_is_the_same_whoever_finds_it(
     monkeypatch: pytest.MonkeyPatch, saturated: Recorded
 ) -> None:
-    """quadprog or scipy: what is proved is the one optimum."""
+    """By quadprog or by scipy: what is proved is the one optimum."""
     reference = Reference(saturated.mpc.hessian[0], saturated.u_max[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]
@@ -147,6 +147,40 @@ def test_contestants_take_turns_at_the_same_problems() -> None:
     spent = interleave(contest, 2 * HOT.turn, HOT, lateness, "hot")
     assert len({name for name, _ in done[: HOT.turn]}) == 1
     assert {len(durations) for durations in spent.values()} == {2 * (HOT.turn - 1)}
+
+
+def test_a_checkout_is_compared_with_itself(
+    results: Mapping[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Both processes do the same work, and every contest and mix has a row in the table."""
+    tiny = versions.Counts(1, 1, (2,), 1, 3, 1, 1, 0.5)
+    monkeypatch.setattr(versions, "QUICK", tiny)
+    monkeypatch.setattr(tick, "tune", lambda *_: {})
+    monkeypatch.setattr(tick, "fleets", lambda *_: results["tick"]["fleets"])
+    file = tmp_path / "versions.json"
+    assert versions.main([str(ROOT), "--quick", "--json", str(file)]) == 0
+    result = json.loads(file.read_text())
+    assert result["before"] == result["after"]
+    assert result["after"]["folder"] == str(ROOT)
+    assert list(result["contests"]) == [contest.title for contest in versions.contests(tiny)]
+    versus, planning = versions.tables(result).values()
+    assert [row[0] for row in versus.rows] == list(result["contests"])
+    assert len(planning.rows) == len(tick.mixes())
+    for figures in result["contests"].values():
+        assert min(figures[side]["p50"] for side in versions.SIDES) > 0.0
+    assert "vehicle-steps per core-second" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_folder_that_is_no_checkout_is_not_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line says which folder it is."""
+    assert versions.main([str(tmp_path), "--quick"]) == 1
+    expected = f"{tmp_path}: got a folder without benchmarks, expected a checkout\n"
+    assert capsys.readouterr().err == expected
 
 
 def test_a_table_without_a_place_is_an_error() -> None:

@@ -107,7 +107,7 @@ def flew(rmse_xy: float, event_ratio: float, most: float) -> calibration.Values:
 
 
 def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
-    """It is scored by what other seeds may send, where the trigger decides."""
+    """Where the trigger decides, a candidate is scored by what other seeds may send."""
     event, every = weighs("state_gap"), weighs("always")
     assert event.score(flew(0.2, 0.08, 0.09)) == 0.2
     assert event.score(flew(0.2, 0.09, 0.11)) == pytest.approx(0.2 * 1.1**3)
@@ -146,7 +146,7 @@ def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> 
     ],
 )
 def test_a_trigger_has_the_keys_of_the_policies_in_it(trigger: str, keys: list[str]) -> None:
-    """But not of those that are told their own numbers."""
+    """Policies that are written with numbers of their own add no keys."""
     assert [key.key for key in calibration.trigger_keys(trigger)] == keys
 
 
@@ -178,7 +178,7 @@ def test_a_search_begins_where_it_was_told_to() -> None:
 
 
 def test_a_search_told_the_same_proposes_the_same() -> None:
-    """So that a log takes the place of flights."""
+    """A log can therefore take the place of flights."""
     searches = [Search(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1) for _ in range(2)]
     proposed = []
     for search in searches:
@@ -253,7 +253,7 @@ def test_the_smallest_error_is_searched_for_and_shown(
 def test_another_search_in_the_same_folder_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It would be told scores of other flights."""
+    """Another search would be told scores of other flights."""
     argv = [*ARGV, "--out", str(tmp_path)]
     (tmp_path / "log.jsonl").write_text(
         json.dumps({"scenario": "", "free": [], "runs": 2, "population": 4, "sigma": 0.1}) + "\n"
@@ -266,7 +266,7 @@ def test_another_search_in_the_same_folder_is_refused(
 def test_a_log_that_does_not_fit_the_search_is_refused(
     searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its scores belong to other points."""
+    """Such a log's scores belong to other points."""
     settings, generation, _ = (searched / "log.jsonl").read_text().splitlines()
     points = json.loads(generation)
     points[2]["keys"]["reference.radius_m"] *= 1.1

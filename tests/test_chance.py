@@ -1,4 +1,4 @@
-"""shared.chance: streams that are known by their names."""
+"""`shared.chance`: streams that are known by their names."""
 
 import os
 import subprocess

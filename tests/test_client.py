@@ -139,7 +139,7 @@ def test_the_epoch_is_the_moment_the_session_opens() -> None:
 
 
 def test_every_observation_echoes_the_newest_word_of_the_server() -> None:
-    """Its stamp, and when it came: the server's only way to know our clock."""
+    """The stamp and when it came are the server's only way to know the vehicle's clock."""
     server = flying()
     welcomed_ns = server.now_ns
     (first,) = server.wake()

@@ -67,7 +67,7 @@ def test_unequal_delays_err_by_half_their_difference(down_ns: int, up_ns: int) -
 
 
 def test_smallest_delay_of_each_direction_counts() -> None:
-    """They need not belong to the same round trip."""
+    """The smallest delays need not belong to one round trip."""
     clock = ClockMap(1, DT_NS)
     observe(clock, 0, HOUR, down_ns=400 * MS, up_ns=900 * MS)
     observe(clock, 1 * S, HOUR, down_ns=800 * MS, up_ns=400 * MS)
@@ -99,7 +99,7 @@ def test_old_minima_are_forgotten_after_twenty_seconds() -> None:
 
 @pytest.mark.parametrize("silence_s", [20, 25, 40, 1000])
 def test_nothing_is_left_of_before_a_long_silence(silence_s: int) -> None:
-    """Also if not a single observation came meanwhile."""
+    """Everything older is forgotten, even if not a single observation came meanwhile."""
     clock = ClockMap(1, DT_NS)
     listen(clock, times(100, 110), lambda _: 0)
     listen(clock, times(110 + silence_s, 111 + silence_s), lambda _: HOUR)
@@ -108,7 +108,7 @@ def test_nothing_is_left_of_before_a_long_silence(silence_s: int) -> None:
 
 @pytest.mark.parametrize("jump_ns", [HOUR, -HOUR, 100 * MS, -100 * MS])
 def test_offset_follows_a_stepped_clock_within_a_second_and_a_half(jump_ns: int) -> None:
-    """Either clock, either way, once three half seconds in a row know nothing older."""
+    """A step of either clock counts once three half seconds in a row know nothing older."""
     clock = ClockMap(1, DT_NS)
     assert set(listen(clock, times(0, 10), lambda _: 0)) == {0}
     errors = listen(clock, times(10, 30), lambda _: jump_ns)
@@ -117,7 +117,7 @@ def test_offset_follows_a_stepped_clock_within_a_second_and_a_half(jump_ns: int)
 
 
 def test_clock_may_step_at_any_moment_of_a_half_second() -> None:
-    """Then it takes up to half a second more."""
+    """At worst the offset follows half a second later."""
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10.1), lambda _: 0)
     errors = listen(clock, times(10.1, 20), lambda _: HOUR)
@@ -190,7 +190,7 @@ def test_four_packets_are_too_few_to_tell_a_stepped_clock(before_s: int) -> None
 
 
 def test_four_packets_of_before_are_too_few_as_well() -> None:
-    """Their minimum may have been a bad one."""
+    """The minimum of four packets may have been a bad one."""
     four, five = (range(0, count * DT_NS, DT_NS) for count in (4, 5))
     assert after_change(200 * MS, 600 * MS, before=four, since=20) == 300 * MS
     assert after_change(200 * MS, 600 * MS, before=five, since=20) == 400 * MS

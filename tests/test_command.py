@@ -70,17 +70,17 @@ class Process:
         raise AssertionError(f"{pattern!r} was never said; this was: {self.said}")
 
     def address(self) -> str:
-        """What it listens on."""
+        """Address that the process listens on."""
         return self.wait_for(r"listening on (\S+:\d+), waiting for")[1]
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """Its exit code after a signal."""
+        """End the process by a signal; returns its exit code."""
         self.popen.send_signal(number)
         self.said += self._stdout.read().splitlines()
         return self.popen.wait(PATIENCE_S)
 
     def ended(self) -> int:
-        """Its exit code, once it has ended by itself."""
+        """Wait until the process has ended by itself; returns its exit code."""
         self.said += self._stdout.read().splitlines()
         return self.popen.wait(PATIENCE_S)
 
@@ -203,7 +203,7 @@ def test_the_front_door_names_every_command(capfd: pytest.CaptureFixture[str]) -
 
 
 def test_scenarios_are_listed_with_a_line_each(capfd: pytest.CaptureFixture[str]) -> None:
-    """All that come with Skytether."""
+    """Every scenario that comes with Skytether is listed."""
     assert skytether.__main__.main(["scenarios"]) == 0
     lines = capfd.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == config.names()
@@ -229,13 +229,12 @@ def test_help_shows_the_scenario_that_was_named(
 
 
 def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
-    """The same seed, the same file; measured times stay out of it."""
+    """One seed gives one file, byte by byte; measured times stay out of it."""
     files = [tmp_path / "one.json", tmp_path / "two.json"]
+    argv = ["fly", "paper", "--virtual", "--duration", "12", "--seed", "3"]
+    argv += ["--figure", str(tmp_path / "flight.png")]
     for file in files:
-        run = skytether_(
-            *("fly", "paper", "--virtual", "--duration", "12", "--seed", "3"),
-            *("--json", str(file), "--figure", str(tmp_path / "flight.png")),
-        )
+        run = skytether_(*argv, "--json", str(file))
         assert run.returncode == 0, run.stderr
     assert files[0].read_bytes() == files[1].read_bytes()
     summary = json.loads(files[0].read_text())
@@ -316,9 +315,8 @@ def test_three_processes_by_hand(start: Callable[..., Process], tmp_path: Path) 
     address = server.address()
     netem = start("netem", "demo", "--bind", "127.0.0.1:0", "--server", address, *QUICK)
     address = netem.address()
-    client = start(
-        *("client", "demo", "--server", address, "--duration", "3", "--json", str(file), *QUICK)
-    )
+    argv = ["client", "demo", "--server", address, "--duration", "3", "--json", str(file)]
+    client = start(*argv, *QUICK)
     client.wait_for(r"waiting for the server at 127\.0\.0\.1:\d+")
     client.wait_for("session open, flying")
     server.wait_for("vehicle 1 flies, from 127.0.0.1:")

@@ -79,7 +79,7 @@ def test_a_scenario_that_comes_along_is_its_contender_with_weights_that_were_fre
 
 
 def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
-    """It holds what differs from the plant, and where it comes from."""
+    """The file holds what differs from the plant, and where that comes from."""
     contender, case = BY_NAME["committed-gap"], CASES[-1]
     start = contenders.search_start(contender, case, SCALE)
     control = replace(start.control, state_weight=(7.1, 1e-4), cost_gap=12.5)
@@ -153,7 +153,7 @@ ERRORS = st.lists(st.tuples(st.floats(0.01, 10.0), st.floats(0.01, 10.0)), min_s
 def test_a_ratio_lies_in_its_interval_and_goes_with_what_is_compared(
     errors: list[tuple[float, float]], factor: float
 ) -> None:
-    """Of the means; twice the error is twice the ratio, and its interval."""
+    """Ratio of the means; twice the error is twice the ratio, and its interval."""
     ours, theirs = zip(*errors, strict=True)
     found = ratio(flew("paper-event", ours), flew("paper-periodic", theirs))
     more = ratio(flew("paper-event", np.multiply(ours, factor)), flew("paper-periodic", theirs))
@@ -190,7 +190,7 @@ def test_a_bootstrap_is_an_interval_of_students_where_both_apply() -> None:
 
 
 def test_seeds_that_did_not_fly_in_both_are_left_out() -> None:
-    """And fewer than two are no comparison."""
+    """Fewer than two common seeds are no comparison."""
     ours, theirs = flew("paper-event", [1.0, None, 3.0]), flew("paper-periodic", [2.0, 2.0, 2.0])
     found = ratio(ours, theirs)
     assert found is not None
@@ -203,7 +203,7 @@ PERIODIC = flew("committed-periodic", [1.0, 1.1, 1.2])
 
 
 def curve(*points: tuple[float, float, float]) -> list[Flown]:
-    """Of the cost gap: threshold, share of packets, error; the first of them is tuned."""
+    """Curve of the cost gap: threshold, share of packets, error; the first of them is tuned."""
     return [
         flew(
             "committed-gap",
@@ -217,7 +217,7 @@ def curve(*points: tuple[float, float, float]) -> list[Flown]:
 
 
 def test_what_sends_too_much_is_judged_at_the_next_threshold_that_does_not() -> None:
-    """Not at the best of the curve: that would be chosen on the seeds that are reported."""
+    """The best of the curve is not taken: it would be chosen on the seeds that are reported."""
     judged = judge(CLAIM, QUIET, [*curve((1, 0.11, 0.5), (2, 0.09, 0.8), (8, 0.05, 0.7)), PERIODIC])
     assert judged.ours.what.threshold == 2
     assert judged.ratio is not None
@@ -230,7 +230,7 @@ def test_what_sends_too_much_is_judged_at_the_next_threshold_that_does_not() -> 
 
 
 def test_a_claim_holds_with_all_of_its_interval_or_not_at_all() -> None:
-    """And where nothing is asked for, it neither does nor does not."""
+    """Where nothing is asked for, a claim neither holds nor fails."""
     assert not judge(CLAIM, QUIET, [*curve((1, 0.1, 0.95)), PERIODIC]).holds
     wide = flew("committed-gap", [0.1, 0.1, 1.9], threshold=1)
     judged = judge(CLAIM, QUIET, [wide, PERIODIC])
@@ -249,7 +249,7 @@ def test_a_share_of_the_steps_may_be_the_limit() -> None:
 
 
 def test_what_is_claimed_is_what_was_asked_for() -> None:
-    """All of it about contenders and cases that there are."""
+    """Every claim is about contenders and cases that exist."""
     for claim in CLAIMS:
         assert {claim.ours, claim.theirs} <= BY_NAME.keys()
         assert set(claim.at_most) <= {case.name for case in CASES}
@@ -295,7 +295,7 @@ def test_every_contender_gets_the_same_search(tuned: Path) -> None:
 def test_searches_that_are_done_are_not_done_again(
     tuned: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same command reads their logs, and writes the same."""
+    """A repeated command reads their logs, and writes what it wrote before."""
     kept = {path: path.read_bytes() for path in tuned.rglob("*") if path.is_file()}
     monkeypatch.setattr(pool, "share", None)
     assert main([*TUNE, "--scenarios", str(tuned), "--out", str(tuned / "out")]) == 0
@@ -303,7 +303,7 @@ def test_searches_that_are_done_are_not_done_again(
 
 
 def rows(file: Path) -> list[dict[str, str]]:
-    """Of a table."""
+    """Rows of a table."""
     return list(csv.DictReader(file.read_text().splitlines()))
 
 
@@ -351,7 +351,7 @@ def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
 def test_the_second_time_it_only_draws(
     out: Path, tuned: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """And says the same."""
+    """A second run flies nothing, and says what the first one said."""
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     assert main(["compare", "--quick", "--scenarios", str(tuned), "--out", str(out)]) == 0
     said = capsys.readouterr().out

@@ -55,7 +55,7 @@ def test_vehicle_hovers_before_its_first_horizon() -> None:
 
 @pytest.mark.parametrize("step", range(100, 100 + H))
 def test_stage_is_the_step_since_the_horizon_was_made(step: int) -> None:
-    """u(k|k_h): a packet under way for five steps is entered at its fifth stage."""
+    """Input u(k|k_h): a packet under way for five steps is entered at its fifth stage."""
     np.testing.assert_allclose(holding(100).choose(step, HERE), INPUTS[:, step - 100], rtol=1e-7)
 
 

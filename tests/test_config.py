@@ -1,4 +1,4 @@
-"""shared.config: a scenario is right, or it is refused in one line that says what is wrong."""
+"""`shared.config`: a scenario is right, or it is refused in one line that says what is wrong."""
 
 from pathlib import Path
 
@@ -294,7 +294,7 @@ def test_a_horizon_that_just_covers_the_delay_is_right(horizon: int, dt: float) 
 
 @pytest.mark.parametrize("bound", [0.55, "auto"])
 def test_a_delay_bound_is_a_time_or_seen(bound: float | str, tmp_path: Path) -> None:
-    """Either survives being written and read."""
+    """Both forms survive being written and read."""
     scenario = config.check({"control": {"delay_bound": bound}}, "mine.toml")
     assert scenario.control.delay_bound == bound
     path = tmp_path / "copy.toml"
@@ -311,7 +311,7 @@ def test_a_delay_bound_of_the_whole_horizon_is_refused() -> None:
 
 
 def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:
-    """Or with all names, where none is near."""
+    """Where no name is near, all names are given."""
     assert refusal("papr") == "papr: no such scenario; did you mean paper?"
     assert refusal("xyz") == f"xyz: no such scenario; there are {', '.join(config.names())}"
 
@@ -331,7 +331,7 @@ def test_a_file_that_is_no_toml_is_refused(content: bytes, tmp_path: Path) -> No
 
 
 def test_extends_needs_the_name_of_a_scenario(tmp_path: Path) -> None:
-    """Not a number, and not a name that nobody has."""
+    """A number is refused, and so is a name that no scenario has."""
     number = write(tmp_path, "number.toml", "extends = 3")
     assert refusal(number) == f"{number}: extends: got 3, expected the name of a scenario"
     unknown = write(tmp_path, "unknown.toml", 'extends = "papr"')
@@ -383,7 +383,7 @@ def test_what_is_left_out_is_the_default(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", config.names())
 def test_every_scenario_that_comes_with_skytether_can_be_flown(name: str) -> None:
-    """It says in a line what it shows, and has a trajectory in as many axes as its model."""
+    """A scenario says in a line what it shows; its trajectory has as many axes as its model."""
     scenario = config.load(name)
     assert scenario.title
     assert "\n" not in scenario.title
@@ -416,7 +416,7 @@ TRAJECTORY = "t,x,y\n0,1,2\n1,3,4\n"
 
 
 def test_a_trajectory_is_looked_for_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
-    """Also when another one, elsewhere, extends that."""
+    """A scenario elsewhere that extends it finds the trajectory there as well."""
     for folder in ("base", "mine"):
         (tmp_path / folder).mkdir()
     write(tmp_path / "base", "path.csv", TRAJECTORY)
@@ -474,7 +474,7 @@ def test_a_trajectory_that_is_no_text_table_is_refused(tmp_path: Path) -> None:
 
 
 def test_one_value_is_for_all_axes() -> None:
-    """And a list has one for each."""
+    """A list has one value for each axis."""
     scenario = config.check(
         {"model": {"axes": 3, "tau_s": [0.5], "u_max": [1.0, 2.0, 3.0]}}, "mine.toml"
     )
@@ -483,7 +483,7 @@ def test_one_value_is_for_all_axes() -> None:
 
 
 def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> None:
-    """Its time constants are the model's by default."""
+    """The vehicle's time constants are the model's by default."""
     model = {"tau_s": [0.5, 0.6]}
     same = config.check({"model": model}, "mine.toml")
     other = config.check({"model": model, "vehicle": {"tau_s": [0.9]}}, "mine.toml")

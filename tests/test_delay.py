@@ -20,7 +20,7 @@ ROW = np.array([0])
 
 
 def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
-    """d after each sample of one vehicle."""
+    """Delay d after each sample of one vehicle."""
     bound, steps = DelayBound(1, 0.05, most, None), []
     bound.begin(ROW, np.array([first]))
     for sample in delays:
@@ -66,7 +66,7 @@ def test_before_any_sample_it_is_the_guess() -> None:
 
 
 def test_it_rises_at_once_and_no_further_than_most() -> None:
-    """Also for a delay that no horizon has room for."""
+    """A delay that no horizon has room for counts as the most."""
     assert known([9, 10, 14, 50]) == [9, 10, 14, MOST]
 
 
@@ -79,12 +79,12 @@ LONE = [11] * 128 + [30] + [11] * 40
 
 
 def test_a_lone_late_horizon_is_left_behind_step_by_step() -> None:
-    """It holds for as long as it is recent."""
+    """A lone late horizon counts for as long as it is recent."""
     assert known(LONE)[128:] == [30] * 16 + list(range(29, 10, -1)) + [11] * 6
 
 
 def test_a_few_of_a_hundred_are_no_lone_one() -> None:
-    """They hold until the ring has forgotten all but one."""
+    """Several late horizons count until the ring has forgotten all but one."""
     delays = [11] * 128 + [30] * 3 + [11] * 200
     steps = known(delays)[130:]
     assert steps[:127] == [30] * 127
@@ -129,7 +129,7 @@ def test_it_is_what_the_samples_say(delays: list[int], first: int) -> None:
 @quick
 @given(SAMPLES, st.integers(1, MOST))
 def test_it_is_never_below_what_was_seen_recently(delays: list[int], most: int) -> None:
-    """Nor beyond the most, nor below 1; it falls by one at most, and rises to a sample alone."""
+    """Delay d stays within 1 and the most, falls by one at most, and rises only to a sample."""
     steps = known(delays, most=most)
     for count, d in enumerate(steps, 1):
         assert min(max(delays[max(0, count - 16) : count]), most) <= d <= most
@@ -157,7 +157,7 @@ def test_every_vehicle_has_a_bound_of_its_own() -> None:
 
 
 def test_a_vehicle_that_is_forgotten_begins_anew() -> None:
-    """And its neighbour does not."""
+    """The forgotten vehicle's neighbour keeps what is known of it."""
     bound, rows = DelayBound(2, 0.05, MOST, None), np.arange(2)
     for _ in range(200):
         bound.acknowledged(rows, np.array([30, 30]))
@@ -177,7 +177,7 @@ SECONDS = 60.0
 def flown(
     dt_s: float, period: int, seed: int, minima_s: tuple[float, ...] = (0.4,)
 ) -> tuple[list[int], float]:
-    """d at every step of a flight on the paper's uplink, and the share in force later than it.
+    """Delay d at every step on the paper's uplink, and the share in force later than it.
 
     Args:
         period: steps from a horizon to the next.

@@ -34,13 +34,13 @@ STEPS_PER_S = round(1 / config.load("demo").control.dt)
 
 FLIGHT_S = 60
 FAULTY_FLIGHT_S = 75
-"""The faults and what proves their end take 45 s of it."""
+"""Duration of the flight with faults [s]; faults and what proves their end take 45 s of it."""
 FAULT_S = 3.0
-"""More than the demo's `link.timeout_s`, so that the client notices."""
+"""Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client notices."""
 HORIZONS = 10
-"""So many new ones show that orders flow."""
+"""Number of new horizons that shows that orders flow."""
 HOVER_M = 1.58
-"""`rmse_xy` of the demo for a vehicle that stays at its start."""
+"""Error `rmse_xy` of the demo for a vehicle that stays at its start [m]."""
 
 
 def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ class Containers:
     """Length of the flight."""
     project: str = field(default_factory=lambda: f"skytether-test-{secrets.token_hex(4)}")
     ids: dict[str, str] = field(default_factory=dict)
-    """Of the containers, by service; they stay the same from `up` to `down`."""
+    """Identifiers of the containers, by service; they stay the same from `up` to `down`."""
 
     def compose(self, *arguments: str) -> str:
         """What Compose printed."""
@@ -150,11 +150,11 @@ class Containers:
         return self.ids[service]
 
     def network(self, name: str) -> str:
-        """Its name with Docker."""
+        """Name of a network with Docker."""
         return f"{self.project}_{name}"
 
     def inspect(self, service: str) -> dict[str, Any]:
-        """All that Docker knows."""
+        """Description of a container by Docker."""
         return json.loads(self.docker("inspect", self.id(service)))[0]
 
     def state(self, service: str) -> dict[str, Any]:
@@ -167,7 +167,7 @@ class Containers:
         return {name: network["IPAddress"] for name, network in networks.items()}
 
     def said(self, service: str) -> str:
-        """Its log."""
+        """Log of a container."""
         return attempt("docker", "logs", self.id(service))[1]
 
     def inside(self, service: str, *command: str) -> tuple[int, str]:
@@ -227,10 +227,9 @@ class Containers:
     @contextlib.contextmanager
     def squatter(self, network: str) -> Iterator[None]:
         """A stranger who takes the address that a container had in a network."""
-        stranger = self.docker(
-            *("run", "--detach", "--rm", "--network", self.network(network)),
-            *("--entrypoint", "sleep", "skytether", "600"),
-        ).strip()
+        argv = ["run", "--detach", "--rm", "--network", self.network(network)]
+        argv += ["--entrypoint", "sleep", "skytether", "600"]
+        stranger = self.docker(*argv).strip()
         try:
             yield
         finally:
@@ -301,10 +300,9 @@ class Containers:
 
     def ask_for_the_server(self, host: str) -> tuple[int, str]:
         """Exit code and output of another client, where the client is."""
-        return attempt(
-            *("docker", "run", "--rm", "--network", f"container:{self.id('client')}", "skytether"),
-            *("client", "demo", "--id=2", "--link.connect-s=2", f"--server={host}:47001"),
-        )
+        argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}", "skytether"]
+        argv += ["client", "demo", "--id=2", "--link.connect-s=2", f"--server={host}:47001"]
+        return attempt(*argv)
 
 
 @contextlib.contextmanager

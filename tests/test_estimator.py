@@ -21,7 +21,7 @@ SENT = np.array([0])
 
 
 def seen(step: int, state: Array) -> Observation:
-    """Of the one vehicle."""
+    """Observation of the one vehicle."""
     return Observation(1, 1, step, 0, NO_HORIZON, 0, 0, 0, state)
 
 
@@ -31,22 +31,22 @@ def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
 
 
 FORESIGHT = make().foresee(ROW, np.array([-1]))
-"""Of nothing: (12) does not ask what a horizon was computed from."""
+"""Foresight before anything is known: (12) does not ask what a horizon was computed from."""
 
 
 def horizons(inputs: Array) -> Array:
-    """That begin with these inputs of shape (n, axes)."""
+    """Horizons that begin with these inputs [m/s; shape (n, axes)]."""
     return np.repeat(inputs.astype(np.float32)[:, :, None], 3, axis=2)
 
 
 def remember(estimator: Estimator, inputs: Array, *, start: int = 0) -> None:
-    """û(start), û(start + 1), … of the one vehicle; inputs of shape (steps, axes)."""
+    """Remember û(start), û(start + 1), … of the one vehicle; inputs of shape (steps, axes)."""
     for step, u in enumerate(inputs, start):
         estimator.remember(ROW, np.array([step]), FORESIGHT, horizons(u[None]), SENT)
 
 
 def estimate(estimator: Estimator, step: int) -> Array:
-    """x̂(step) of the one vehicle."""
+    """Estimate x̂(step) of the one vehicle."""
     return estimator.estimate(ROW, np.array([step]))[0]
 
 
@@ -74,7 +74,7 @@ def test_estimate_is_the_observation_flown_on(age: int, now: int) -> None:
 
 
 def test_input_of_the_present_step_does_not_count_yet() -> None:
-    """û(k) acts from k on; x̂(k) is before it."""
+    """Input û(k) acts from k on; x̂(k) is before it."""
     estimator = make()
     estimator.observe(0, seen(8, np.ones((2, 2))))
     remember(estimator, np.zeros((10, 2)))
@@ -84,7 +84,7 @@ def test_input_of_the_present_step_does_not_count_yet() -> None:
 
 
 def test_vehicle_hovers_before_anything_was_computed() -> None:
-    """û = 0: the observed velocity dies away with τ."""
+    """With û = 0 the observed velocity dies away with τ."""
     estimator = make()
     x = np.array([[1.0, 2.0], [3.0, -4.0]])
     estimator.observe(0, seen(0, x))
@@ -181,7 +181,7 @@ def test_old_observations_are_out_of_reach(observed: int, now: int, *, within: b
 
 
 def test_vehicle_that_was_never_observed_is_out_of_reach() -> None:
-    """Also at step 0."""
+    """No step of such a vehicle is within reach, step 0 included."""
     assert make().within_reach(ROW, np.array([0])).tolist() == [False]
 
 
@@ -204,7 +204,7 @@ def test_without_compensation_the_observation_is_the_estimate() -> None:
 
 
 def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
-    """Its old observation, its old inputs and its old step are gone; its neighbour's are not."""
+    """The old observation, inputs and step are gone; those of its neighbour are not."""
     estimator = make(2)
     both, x = np.array([0, 1]), np.array([[1.0, 2.0], [3.0, 4.0]])
     for row in both:

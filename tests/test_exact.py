@@ -104,7 +104,7 @@ def test_problems_that_cycle_are_solved_all_the_same(
 def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It is right to rounding, and has a slope all the same: no reason to refuse the answer."""
+    """Such an answer is right to rounding and yet has a slope: no reason to refuse it."""
     monkeypatch.setattr(exact, "PIVOTS_MAX", 0)
     dual = exact.daqp.solve
 

@@ -1,4 +1,4 @@
-"""netem.fate: the delays of eq. (17) as corrected, and fates that depend on their names alone."""
+"""`netem.fate`: the delays of eq. (17) as corrected, and fates that depend on their names alone."""
 
 from itertools import islice
 
@@ -30,7 +30,7 @@ def first_fates(
 
 @pytest.fixture(scope="module")
 def slots() -> NDArray[np.int64]:
-    """m of eq. (17) in sampled delays."""
+    """Number m of slots of eq. (17) in sampled delays."""
     delays = delays_ns(PAPER, stream(17, "test"), SAMPLES)
     slots, rest_ns = np.divmod(delays - 400 * MILLISECOND_NS, 20 * MILLISECOND_NS)
     assert not rest_ns.any(), "a delay off the lattice 0.4 s + 0.02 s · m"
@@ -51,7 +51,7 @@ def test_the_equation_as_printed_is_no_distribution() -> None:
 
 
 def test_delays_do_not_follow_the_equation_as_printed(slots: NDArray[np.int64]) -> None:
-    """Nor its shape, scaled to one over the slots that are frequent enough to tell."""
+    """Even scaled to one, the printed shape does not fit the slots that are frequent enough."""
     m = np.arange(1, TAIL)
     printed = 2.0**m / m
     counts = np.bincount(slots, minlength=TAIL)[1:TAIL]
@@ -87,7 +87,7 @@ def test_the_share_of_lost_packets_is_as_asked(loss: float) -> None:
 
 @pytest.mark.parametrize(("loss", "lost"), [(0.0, 0), (1.0, COUNT)])
 def test_certain_losses_are_certain(loss: float, lost: int) -> None:
-    """None, and all."""
+    """No packet is lost at a rate of 0, and every packet at a rate of 1."""
     assert sum(fate.lost for fate in first_fates(replace(PAPER, loss=loss))) == lost
 
 
@@ -135,7 +135,7 @@ def test_the_delay_model_changes_no_loss(delay: str) -> None:
 
 
 def test_a_higher_loss_rate_loses_the_same_packets_and_more() -> None:
-    """So that a sweep over the rate compares like with like."""
+    """A sweep over the rate therefore compares like with like."""
     few, many = (first_fates(replace(PAPER, loss=loss)) for loss in (0.1, 0.3))
     assert all(more.lost for less, more in zip(few, many, strict=True) if less.lost)
     assert sum(fate.lost for fate in few) < sum(fate.lost for fate in many)

@@ -110,7 +110,7 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
 
 
 def test_a_report_of_many_vehicles_stays_readable() -> None:
-    """It tells of sixteen, and how many more there are."""
+    """A report tells of sixteen vehicles, and how many more there are."""
     vehicles, _ = clients(GUSTY, 20, ("server", 1))
     lines = Fleet(vehicles).report().splitlines()
     assert (len(lines), lines[-1]) == (17, "and 4 more")

@@ -25,7 +25,7 @@ def scenario(name: str, **changes: Any) -> Scenario:
 
 
 def summary(flown: Scenario, flight: Flight) -> Summary:
-    """Of a flight's three parts."""
+    """Summary of a flight's three parts."""
     return summarise(flown, "test", flight.client, flight.server, flight.netem)
 
 

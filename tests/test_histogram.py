@@ -1,4 +1,4 @@
-"""shared.histogram: durations in bins, and quantiles that do not flatter."""
+"""`shared.histogram`: durations in bins, and quantiles that do not flatter."""
 
 from shared.endpoint import MILLISECOND_NS
 from shared.histogram import BINS, Histogram

@@ -1,4 +1,4 @@
-"""netem.link: one direction of the network, and what it counts."""
+"""`netem.link`: one direction of the network, and what it counts."""
 
 import io
 from collections.abc import Iterable
@@ -96,7 +96,7 @@ def test_a_packet_leaves_once() -> None:
 
 
 def test_the_next_due_time_is_that_of_the_earliest_packet() -> None:
-    """And none is due of an empty link."""
+    """Nothing is due of an empty link."""
     link = make_link()
     assert link.next_due_ns() is None
     take(link, make_lane(30, 10), "ab", now_ns=100)
@@ -108,7 +108,7 @@ def test_the_next_due_time_is_that_of_the_earliest_packet() -> None:
 
 
 def test_lost_packets_never_leave_and_are_counted() -> None:
-    """They are packets, but hold no place in the queue."""
+    """Lost packets are counted as packets, but hold no place in the queue."""
     link = make_link()
     take(link, make_lane(0, 0, 0, lost=[0, 2]), "abc")
     assert (link.counts.packets, link.counts.lost, link.depth()) == (3, 2, 1)
@@ -166,7 +166,7 @@ def test_flows_do_not_overtake_each_other() -> None:
 
 
 def test_a_lost_packet_overtakes_nobody() -> None:
-    """It never comes out."""
+    """A lost packet never comes out, so nothing counts as overtaken by it."""
     link = make_link()
     take(link, make_lane(20, 0, lost=[1]), "ab")
     assert give(link, now_ns=20) == "a"
@@ -174,7 +174,7 @@ def test_a_lost_packet_overtakes_nobody() -> None:
 
 
 def test_the_bytes_of_all_packets_are_counted() -> None:
-    """Of lost ones as well: they were sent."""
+    """Lost packets count as well: they were sent."""
     link, lane = make_link(), make_lane(0, 0, lost=[0])
     link.take(Datagram(bytes(600), PEER), lane, now_ns=0)
     link.take(Datagram(b"", PEER), lane, now_ns=0)
@@ -193,7 +193,7 @@ def test_the_added_delay_error_is_how_late_packets_left() -> None:
 
 
 def test_the_delay_histogram_is_of_delays_as_drawn() -> None:
-    """Of those that were forwarded, however late they left."""
+    """Forwarded packets are counted, however late they left."""
     link, ms = make_link(), MILLISECOND_NS
     take(link, make_lane(400 * ms, 440 * ms, 440 * ms, 500 * ms, lost=[3]), "abcd")
     give(link, now_ns=900 * ms)

@@ -319,7 +319,7 @@ def differences(real: Flight, virtual: Flight) -> list[str]:
 async def test_both_worlds_decide_the_same_on_a_network_without_delay(
     control: dict[str, Any],
 ) -> None:
-    """The same scenario over loopback and in virtual time: same events, same inputs, same order.
+    """Over loopback and in virtual time a scenario has equal events and inputs, in one order.
 
     Steps are 0.2 s, and the server ticks in the middle of the vehicle's. Only a pause of the
     machine by 0.1 s can change a decision; then the flight is flown again. No two flights are alike
@@ -348,7 +348,7 @@ async def test_both_worlds_decide_the_same_on_a_network_without_delay(
 async def test_datagrams_dropped_by_the_kernel_are_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """They would look like losses of the network."""
+    """Uncounted, these drops would look like losses of the network."""
     monkeypatch.setattr(udp, "BUFFER_BYTES", 4096)
     driver = Shell(Echo(), LOOPBACK)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
@@ -362,7 +362,7 @@ async def test_datagrams_dropped_by_the_kernel_are_counted(
 
 
 def test_uvloop_is_used_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And asyncio's own loop where it does not."""
+    """Where uvloop does not exist, asyncio's own loop is used."""
     for module in ("uvloop", "asyncio"):
         loop = new_event_loop()
         loop.close()

@@ -82,7 +82,7 @@ def test_very_long_time_constant_stays_exact(tau_s: float) -> None:
 
 
 def test_very_long_time_constant_is_a_double_integrator() -> None:
-    """Then u / τ is an acceleration: p + v Δt + ½ a Δt², v + a Δt."""
+    """For τ → ∞, u / τ is an acceleration: p + v Δt + ½ a Δt², v + a Δt."""
     tau_s, dt, acceleration = 1e7, 0.1, 3.0
     model = discretise(np.array([tau_s]), dt)
     p, v = model.step(np.array([[2.0, -1.0]]), np.array([acceleration * tau_s]))[0]
@@ -97,7 +97,7 @@ def test_very_short_time_constant_follows_at_once() -> None:
 
 
 def test_a_roll_out_is_step_after_step() -> None:
-    """Its first state is where it starts."""
+    """The first state of a roll-out is where it starts."""
     model, rng = discretise(np.array([0.8, 0.3, 1.1]), 0.05), np.random.default_rng(1)
     x, inputs = rng.normal(size=(3, 2)), rng.normal(size=(30, 3))
     states = model.roll_out(x, inputs)

@@ -232,7 +232,7 @@ def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:
 def test_batch_has_the_gradients_of_its_singles(
     seed: int, vehicles: int, input_reference: bool
 ) -> None:
-    """And the predictions."""
+    """Gradients and predictions of a batch are those of its singles."""
     mpc = condense(TWO_TAUS, control(20, input_reference=input_reference), change_weight=0.3)
     x, target, previous = (
         np.stack(some)
@@ -260,7 +260,7 @@ def test_shifted_horizon_repeats_its_last_input() -> None:
 @quick
 @given(st.integers(0, 12), st.integers(0, 12))
 def test_shifting_twice_is_shifting_once_by_the_sum(one: int, other: int) -> None:
-    """So a horizon may be carried over any gaps."""
+    """A horizon may therefore be carried over any gaps."""
     inputs = np.random.default_rng(0).normal(size=(1, 2, 7))
     twice = shift(shift(inputs, np.array([one])), np.array([other]))
     np.testing.assert_array_equal(twice, shift(inputs, np.array([one + other])))

@@ -144,7 +144,7 @@ def test_first_plan_has_no_change_term() -> None:
 
 @pytest.mark.parametrize("gap", [1, 3, H])
 def test_generator_goes_on_from_its_own_prediction(gap: int) -> None:
-    """x_p(k|k-1) ∈ X_p(k-1): where its last inputs lead in as many steps as have passed."""
+    """Prediction x_p(k|k-1) ∈ X_p(k-1): where the last inputs lead in the steps passed."""
     planner = make()
     run(planner, 10, START)
     x = START
@@ -245,7 +245,7 @@ class Unable:
 
 
 def disable(problem: Successive) -> None:
-    """Neither its first solve nor a later one succeeds any more."""
+    """Let every solve of a problem fail from here on, first solves included."""
     problem._solver = problem._first_solver = Unable()
 
 
@@ -295,7 +295,7 @@ def test_first_plan_is_tried_again_until_it_is_solved(monkeypatch: pytest.Monkey
 
 
 def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> None:
-    """Its neighbour is planned for as ever, and it itself goes on, and is solved a step later."""
+    """The neighbour is planned for as ever, and it itself goes on, and is solved a step later."""
     planner, neighbour, rows = make(2), make(), np.array([0, 1])
     plans = []
     for step in (0, 1, 2):
@@ -327,7 +327,7 @@ def test_the_reference_looked_up_is_the_reference(calls: list[list[int]]) -> Non
 
 
 def test_the_reference_is_computed_once_for_a_window_of_steps() -> None:
-    """Not at every step."""
+    """Steps within the window take the reference that was computed before."""
     asked = []
 
     def reference(times: Array) -> Array:

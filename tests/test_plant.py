@@ -172,7 +172,7 @@ def test_steady_gust_settles_at_u_plus_tau_a() -> None:
 
 
 def test_steady_gust_is_integrated_exactly() -> None:
-    """v̇ = (u - v)/τ + a, solved by quadrature over one step."""
+    """Model v̇ = (u - v)/τ + a, solved by quadrature over one step."""
     tau, dt = np.array([0.81, 0.3]), 0.05
     flown = plant(gust_mps2=2.0, gust_every_s=1e-9, gust_s=1e9)
     long = flight(flown, np.zeros((600, 2)))
@@ -186,7 +186,7 @@ def test_steady_gust_is_integrated_exactly() -> None:
 
 
 def test_gust_comes_on_top_of_steady_wind_and_gain() -> None:
-    """It settles at g u + w + τ a, and back at g u + w."""
+    """Velocity settles at g u + w + τ a, and back at g u + w."""
     u, w, tau = np.array([0.5, -1.0]), np.array([0.3, -0.2]), np.array([0.81, 0.3])
     flown = plant(
         gain=0.8, steady_wind_mps=[0.3, -0.2], gust_mps2=2.0, gust_every_s=500.0, gust_s=500.0

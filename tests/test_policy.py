@@ -1,4 +1,4 @@
-"""shared.policy: a text is a trigger, or it is refused in one line; nothing in it is ever run."""
+"""`shared.policy`: a text is a trigger, or it is refused in one line; nothing in it is ever run."""
 
 import string
 
@@ -204,5 +204,5 @@ def written(tree: policy.Expression) -> str:
 
 @given(trees)
 def test_every_combination_can_be_written(tree: policy.Expression) -> None:
-    """And is read as it was meant."""
+    """Each combination is read as it was meant."""
     assert policy.parse(written(tree)) == tree

@@ -51,12 +51,23 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Welcome, u16, u32, u64, u64, stamp, terms()),
     st.builds(
         Observation,
-        *(u16, u32, step, stamp, st.integers(NO_HORIZON, 2**40), step, stamp, stamp),
+        u16,
+        u32,
+        step,
+        stamp,
+        st.integers(NO_HORIZON, 2**40),
+        step,
+        stamp,
+        stamp,
         arrays("<f8", (2, 2), elements=st.floats(allow_nan=False, allow_infinity=False)),
     ),
     st.builds(
         Horizon,
-        *(u16, u32, step, stamp, stamp),
+        u16,
+        u32,
+        step,
+        stamp,
+        stamp,
         arrays(
             "<f4",
             st.tuples(st.just(2), st.integers(40, 80)),
@@ -91,8 +102,13 @@ def test_the_longest_horizon_fits_one_datagram(axes: int) -> None:
     """All numbers at their largest, and as many inputs as the limit allows."""
     longest = INPUTS_MAX // axes
     horizon = Horizon(
-        *(2**16 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**63 - 1),
-        *(np.ones((axes, longest), np.float32), np.ones((axes, FEEDBACK), np.float32)),
+        2**16 - 1,
+        2**32 - 1,
+        2**40,
+        2**63 - 1,
+        2**63 - 1,
+        np.ones((axes, longest), np.float32),
+        np.ones((axes, FEEDBACK), np.float32),
     )
     assert len(encode(horizon)) <= PAYLOAD_BYTES_MAX
 

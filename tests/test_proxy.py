@@ -1,4 +1,4 @@
-"""netem.proxy: an endpoint between clients and a server that reads none of their payloads."""
+"""`netem.proxy`: an endpoint between clients and a server that reads none of their payloads."""
 
 import random
 
@@ -76,7 +76,7 @@ def test_a_stranger_at_a_flows_socket_is_refused() -> None:
 
 
 def test_a_packet_at_a_socket_of_no_flow_is_refused() -> None:
-    """Even if the server sent it."""
+    """Such a packet is refused even if the server sent it."""
     proxy = make_proxy()
     hear(proxy, b"!", SERVER, 1)
     assert (proxy.outbox(), proxy.refused) == ([], 1)
@@ -92,7 +92,7 @@ def test_a_client_too_many_is_refused() -> None:
 
 
 def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client() -> None:
-    """Its socket then carries the new client's answers, and the old one has to wait."""
+    """The flow's socket then carries the new client's answers, and the old one has to wait."""
     proxy = make_proxy(flows=2)
     pass_on(proxy, b"?", ALICE, at=0)
     pass_on(proxy, b"?", BOB, at=1)
@@ -116,7 +116,7 @@ def test_the_servers_packets_keep_a_flow_in_use() -> None:
 
 
 def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() -> None:
-    """And not the one that took it."""
+    """The client that took the place does not get the packet."""
     slow = DirectionConfig(delay="constant", minimum_s=61.0, loss=0.0)
     proxy = make_proxy(uplink=slow, downlink=AT_ONCE, flows=1)
     socket = pass_on(proxy, b"?", ALICE)
@@ -145,14 +145,14 @@ def test_without_delay_packets_are_forwarded_as_they_arrive() -> None:
 
 
 def test_a_duplicate_is_a_packet_of_its_own() -> None:
-    """netem tells no copies apart: each has its own number, and its own fate."""
+    """Copies are not told apart by netem: each has its own number, and its own fate."""
     proxy = make_proxy()
     assert [pass_on(proxy, b"?", ALICE) for _ in range(3)] == [1, 1, 1]
     assert proxy.downlink.counts.packets == 3
 
 
 def test_it_wants_to_be_woken_for_the_next_packet_of_either_direction() -> None:
-    """And then forwards what is due, and no more."""
+    """Once woken it forwards what is due, and no more."""
     slower = replace(IN_20_MS, minimum_s=0.03)
     proxy, ms = make_proxy(uplink=slower, downlink=IN_20_MS), MILLISECOND_NS
     hear(proxy, b"?", ALICE, at=0)

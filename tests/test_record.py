@@ -1,4 +1,4 @@
-"""shared.record: what is written down is what is read back."""
+"""`shared.record`: what is written down is what is read back."""
 
 import io
 import struct
@@ -67,7 +67,7 @@ def test_one_row_is_written_as_many_are(columns: Columns) -> None:
 
 @pytest.mark.parametrize("count", [0, 7, 9])
 def test_a_row_with_too_few_or_too_many_numbers_is_our_own_mistake(count: int) -> None:
-    """It would put all others out of place."""
+    """Such a row would put all others out of place."""
     with pytest.raises(struct.error, match="expected 8 items"):
         Recorder(PACKET_COLUMNS, io.BytesIO()).append_row(*[0] * count)
 
@@ -87,13 +87,13 @@ def test_a_part_without_rows_is_read_as_none(columns: Columns) -> None:
 
 
 def test_a_part_begins_with_its_columns_in_a_line() -> None:
-    """So that a stranger can read it with numpy alone."""
+    """A stranger can therefore read a part with numpy alone."""
     header, _, _ = written(PACKET_COLUMNS).partition(b"\n")
     assert header.startswith(b'[["direction", "|u1"], ["flow", "<u4"], ["number", "<u4"]')
 
 
 def test_one_value_is_broadcast_to_all_rows() -> None:
-    """And a value for each row keeps its place."""
+    """A value for each row keeps its place."""
     sink = io.BytesIO()
     Recorder(PACKET_COLUMNS, sink).append(3, flow=7, number=[4, 5, 6], lost=True)
     rows = parse(sink.getvalue())
@@ -123,7 +123,7 @@ def test_rows_stay_in_the_order_in_which_they_were_appended() -> None:
 
 
 def test_a_misspelt_column_is_our_own_mistake() -> None:
-    """It does not vanish silently."""
+    """A value without a column does not vanish silently."""
     with pytest.raises(ValueError, match="no field of name"):
         Recorder(PACKET_COLUMNS, io.BytesIO()).append(1, no_such_column=1)
 

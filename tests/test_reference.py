@@ -226,7 +226,7 @@ BAD_FILES = [
 
 @pytest.mark.parametrize(("text", "message"), BAD_FILES)
 def test_bad_file_says_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:
-    """And in which line, where it is one line's fault."""
+    """Where it is one line's fault, the error names the line."""
     path = tmp_path / "path.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):

@@ -125,7 +125,7 @@ def test_a_horizon_in_flight_is_in_force_when_it_had_its_time() -> None:
 
 
 def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:
-    """It is counted once, and what it told is forgotten, until it comes after all."""
+    """Such a horizon is counted once, and forgotten until it comes after all."""
     old, lost, late = plans(2, 2 * H, H, H)
     replay = make(small())
     send(replay, 100, old)
@@ -145,7 +145,7 @@ def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:
 
 
 def test_a_vehicle_without_a_horizon_hovers() -> None:
-    """It comes to rest."""
+    """Without a horizon a vehicle comes to rest."""
     replay = make(small())
     see(replay, 5, np.array([[0.0, 1.0], [0.0, 0.0]]), NO_HORIZON)
     seen = replay.foresee(ROW, np.array([40]))
@@ -297,7 +297,7 @@ def test_the_estimate_is_exact_once_every_horizon_has_arrived_or_is_known_lost(
     observe = Replay.observe
 
     def believe(self: Replay, row: int, observation: Observation) -> bool:
-        """All that was sent has arrived."""
+        """Believe that all that was sent has arrived."""
         old = self._stamps[0][(self._stamps[0] + 9 <= observation.step) & (self._stamps[0] > 0)]
         newest = int(old.max(initial=observation.in_force))
         return observe(self, row, observation._replace(in_force=newest))
@@ -351,7 +351,7 @@ def rmse(flown: Scenario, flight: Flight) -> float:
 
 
 def test_it_is_stable_without_the_s_term_where_the_papers_scheme_is_not() -> None:
-    """The same weights, network and seed."""
+    """Both schemes fly with equal weights, network and seed."""
     errors = {}
     for scheme in ("predictive", "committed"):
         flown = scenario(control={"scheme": scheme, "trigger": "always", **TIGHT}, duration=40.0)
@@ -464,7 +464,7 @@ def test_the_vehicle_says_which_horizon_it_flies_and_since_when() -> None:
 
 
 def test_a_budget_is_kept_in_any_window_of_a_flight() -> None:
-    """Also where every step would be worth a packet."""
+    """The budget holds even where every step would be worth a packet."""
     control = {"trigger": "cost_gap & budget(5, 2)", "cost_gap": 0.0, **FIRM}
     flight = fly(scenario(control=control, vehicle={"wind": 0.3}, duration=30.0))
     sent_s = flight.server["step"][flight.server["event"]] * 0.05

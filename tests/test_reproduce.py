@@ -57,7 +57,7 @@ SUMMARY = summarise(PAPER, "paper", flight.fly(replace(PAPER, duration=6.0)).cli
 
 
 def runs(*ratios: float, rmse: float = 1.0) -> list[Summary]:
-    """Of these event ratios."""
+    """Runs with these event ratios."""
     traffic = {"uplink_packets": 10, "uplink_bytes": 400}
     traffic |= {"downlink_packets": 30, "downlink_bytes": 600}
     error = {"rmse_x": rmse, "rmse_y": 2.0 * rmse, "rmse_xy": 3.0 * rmse}
@@ -73,7 +73,7 @@ def test_periodic_sends_at_the_nearest_rate(ratio: float, steps: int) -> None:
 
 
 def test_the_baseline_has_at_each_value_the_rate_that_the_trigger_had_there() -> None:
-    """And all else that belongs to the value."""
+    """All else that belongs to the value is kept."""
     axis = Axis("loss", (0.0, 0.5), ({"network.uplink.loss": 0.0}, {"network.uplink.loss": 0.5}))
     study = Study("loss", "loss", PAPER, axis, 3, 0.0)
     second = study.second({(0.0, EVENT): runs(0.1), (0.5, EVENT): runs(0.25)})
@@ -84,7 +84,7 @@ def test_the_baseline_has_at_each_value_the_rate_that_the_trigger_had_there() ->
 
 
 def test_jitter_grows_while_the_mean_delay_stays() -> None:
-    """Both ways."""
+    """Uplink and downlink keep their mean delay."""
     jitter = {study.name: study for study in studies.curve_studies(PAPER, studies.full(1))}[
         "jitter"
     ]
@@ -174,7 +174,7 @@ class Page(HTMLParser):
         self.close()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Of HTMLParser."""
+        """Take a start tag; see `HTMLParser`."""
         found = dict(attrs)
         if tag not in ("img", "meta"):
             self.open.append(tag)
@@ -187,11 +187,11 @@ class Page(HTMLParser):
             self.tables[self.ids[-1]].append([])
 
     def handle_endtag(self, tag: str) -> None:
-        """Of HTMLParser."""
+        """Take an end tag; see `HTMLParser`."""
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        """Of HTMLParser."""
+        """Take text; see `HTMLParser`."""
         if self.open and self.open[-1] == "td":
             self.tables[self.ids[-1]][-1].append(data)
 
@@ -211,7 +211,7 @@ def test_every_figure_is_there_three_times_and_in_a_size_to_look_at(out: Path) -
 
 
 def test_the_page_opens_offline_and_shows_all(out: Path) -> None:
-    """Its tags are closed in order; every address in it is a picture of its own."""
+    """The page's tags are closed in order; every address in it is a picture of its own."""
     text = (out / "report.html").read_text()
     page = Page(text)
     assert page.open == []

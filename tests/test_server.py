@@ -74,8 +74,15 @@ class Vehicles:
         """An observation that took no time: both clocks run alike, a day apart."""
         stamp_ns = self.now_ns + DAY_NS
         observation = Observation(
-            *(welcome.vehicle, welcome.session, step, stamp_ns, NO_HORIZON, 0),
-            *(self.now_ns, stamp_ns, np.array(state)),
+            welcome.vehicle,
+            welcome.session,
+            step,
+            stamp_ns,
+            in_force=NO_HORIZON,
+            since=0,
+            server_ns=self.now_ns,
+            received_ns=stamp_ns,
+            state=np.array(state),
         )
         assert self.say(observation, sender) == []
 
@@ -255,7 +262,7 @@ def test_no_estimate_without_a_recent_observation() -> None:
 
 
 def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
-    """Its row is free again, and the server comes to rest."""
+    """The vehicle's row is free again, and the server comes to rest."""
     vehicles = Vehicles(scenario())
     vehicles.observe(vehicles.open(), 0)
     vehicles.now_ns += controller.SESSION_NS + vehicles.dt_ns

@@ -36,7 +36,7 @@ def residual(gradient: Array, u: Array) -> float:
 
 
 def test_problems_of_these_tests_touch_the_box_and_leave_it() -> None:
-    """They are worth solving: some inputs at a bound, some between."""
+    """The problems are worth solving: some inputs at a bound, some between."""
     gradient, guess = problems(0, 4)
     u, solved = OsqpSolver(HESSIAN, U_MAX).solve(gradient, guess)
     assert solved.all()
@@ -47,7 +47,7 @@ def test_problems_of_these_tests_touch_the_box_and_leave_it() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 1e4))
 def test_answers_never_leave_the_box(seed: int, size: float) -> None:
-    """Not by a rounding error."""
+    """No input leaves it, not even by a rounding error."""
     u, solved = OsqpSolver(HESSIAN, U_MAX).solve(*problems(seed, 2, size))
     assert solved.all()
     assert (np.abs(u) <= U_MAX[:, None]).all()
@@ -67,7 +67,7 @@ def test_bad_gradient_fails_its_own_vehicle_alone(axis: int, bad: float) -> None
 
 
 def test_bad_guess_is_refused() -> None:
-    """It must not reach the solver's memory either."""
+    """A bad guess does not reach the solver's memory either."""
     gradient, guess = problems(2, 2)
     guess[0, 0, 0] = np.nan
     _, solved = OsqpSolver(HESSIAN, U_MAX).solve(gradient, guess)
@@ -137,7 +137,7 @@ def test_answer_does_not_lean_on_its_guess() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5))
 def test_batch_is_solved_as_its_singles(seed: int, vehicles: int) -> None:
-    """The same bits, alone and in company."""
+    """Answers have equal bits, alone and in company."""
     gradient, guess = problems(seed, vehicles)
     solver = OsqpSolver(HESSIAN, U_MAX)
     u, _ = solver.solve(gradient, guess)

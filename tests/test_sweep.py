@@ -150,7 +150,7 @@ def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
 
 
 def test_a_run_that_never_flew_has_no_error_and_spoils_no_mean() -> None:
-    """It is a row like any other, with nothing in it."""
+    """Such a run is a row like any other, with nothing in it."""
     deaf = replace(PAPER.network.uplink, loss=0.85)
     scenario = replace(
         PAPER,
@@ -237,7 +237,7 @@ def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_pat
 
 
 def test_another_version_is_refused(tmp_path: Path) -> None:
-    """It may fly otherwise."""
+    """Another version may fly otherwise."""
     Journal(tmp_path, ONE, "1").close()
     with pytest.raises(ConfigError, match=r"version: got '2', expected '1'"):
         Journal(tmp_path, ONE, "2")
@@ -294,7 +294,7 @@ def test_a_line_that_is_no_task_is_named(tmp_path: Path) -> None:
 
 
 def command(*argv: str) -> list[str]:
-    """It, as this environment runs it."""
+    """Command line of the program in this environment."""
     return [sys.executable, "-P", "-m", "skytether", *argv]
 
 
@@ -452,19 +452,12 @@ def dask(stack: ExitStack, *argv: str, folder: Path) -> subprocess.Popen[str]:
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
     """A scheduler and two workers, one of them killed on the way."""
     with ExitStack() as stack:
-        scheduler = dask(
-            *(stack, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
-            folder=tmp_path,
-        )
+        local = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+        scheduler = dask(stack, "scheduler", *local, folder=tmp_path)
         assert scheduler.stderr is not None
         at = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
-        workers = [
-            dask(
-                *(stack, "worker", at, "--nthreads", "1", "--no-nanny", "--no-dashboard"),
-                folder=tmp_path,
-            )
-            for _ in range(2)
-        ]
+        single = ("--nthreads", "1", "--no-nanny", "--no-dashboard")
+        workers = [dask(stack, "worker", at, *single, folder=tmp_path) for _ in range(2)]
         for worker in workers:
             assert worker.stderr is not None
             next(line for line in worker.stderr if "Registered to" in line)

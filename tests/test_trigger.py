@@ -241,7 +241,7 @@ def test_budget_binds_a_vehicle_at_its_first_step_too() -> None:
 
 
 def test_packet_that_another_policy_asked_for_takes_what_tokens_there_are() -> None:
-    """And leaves no debt: ten steps after the last of them there is one again."""
+    """Such a packet leaves no debt: ten steps after the last token there is one again."""
     trigger = trigger_of("budget(0.1, 1)", dt=1.0)
     for step in range(26):
         trigger.sent(ROW, np.array([step]), np.zeros(1))
@@ -281,7 +281,7 @@ def test_budget_is_kept_in_every_window(
 def test_budget_is_the_token_bucket_filled_step_by_step(
     walk: list[tuple[int, bool]], rate: float, burst: float
 ) -> None:
-    """b ← min(b + g, burst) at each step by itself, b ← b - 1 when sent."""
+    """Token bucket b ← min(b + g, burst) at each step by itself, b ← b - 1 when sent."""
     tokens, step, sent = burst, 0, []
     for gap, wanted in walk:
         for _ in range(gap):
@@ -309,7 +309,7 @@ def facing(
     cost_gap: float | None = None,
     deviation_m: float | None = None,
 ) -> Situation:
-    """The same situation for n vehicles; what is None is not to be asked for."""
+    """One situation for n vehicles; what is None is not to be asked for."""
     figures = [
         None if value is None else partial(np.full, n, value) for value in (deviation_m, cost_gap)
     ]
@@ -330,7 +330,7 @@ def test_deviation_is_a_distance_above_the_threshold() -> None:
 
 
 def test_cost_gap_may_fire_until_it_is_known() -> None:
-    """Then it is a cost above the threshold."""
+    """Once known, the gap fires where it is above the threshold."""
     for text in ("cost_gap(1)", "cost_gap"):
         trigger = trigger_of(text)
         assert trigger.test(facing(1, fresh=True)).surely.tolist() == [True]
@@ -344,7 +344,7 @@ def test_cost_gap_may_fire_until_it_is_known() -> None:
 
 
 def test_no_solve_is_asked_for_where_it_could_change_nothing() -> None:
-    """Without a token nothing is sent, and after the longest silence something is, whatever it would say."""
+    """Without a token nothing is sent; after the longest silence something is, whatever it says."""
     trigger = trigger_of("cost_gap & budget(1, 1) | silence(2)", capacity=2)
     trigger.test(facing(2, step=0, fresh=True))
     trigger.sent(np.array([0, 1]), np.array([0, 0]), np.zeros(2))
@@ -372,16 +372,24 @@ def test_each_policy_is_told_its_own_error_when_a_packet_goes_out() -> None:
     """V(k_i) of eq. (16) is V, also behind a policy whose cost gap is recorded in its stead."""
     trigger = trigger_of("cost_gap(3) | state_gap(3, 2)")
     situation = Situation(
-        *(ROW, np.array([20]), np.array([False])),
-        *(off_by(10.0), PLANNED, None, lambda: np.array([7.0])),
+        ROW,
+        step=np.array([20]),
+        fresh=np.array([False]),
+        estimate=off_by(10.0),
+        planned=PLANNED,
+        cost_gap=lambda: np.array([7.0]),
     )
     verdict = trigger.test(situation)
     assert verdict.error.tolist() == [7.0]
     trigger.sent(ROW, situation.step, verdict.error)
     for error, event in ((6.6, False), (6.7, True)):  # S = 10·exp(-1) + 3 = 6.679
         later = Situation(
-            *(ROW, np.array([25]), np.array([False])),
-            *(off_by(error), PLANNED, None, lambda: np.zeros(1)),
+            ROW,
+            step=np.array([25]),
+            fresh=np.array([False]),
+            estimate=off_by(error),
+            planned=PLANNED,
+            cost_gap=lambda: np.zeros(1),
         )
         assert trigger.test(later).surely.tolist() == [event]
 
@@ -395,18 +403,18 @@ class Listener:
         self._error = error
 
     def test(self, situation: Situation) -> Verdict:
-        """Fires."""
+        """Fire where the error is positive."""
         figure = np.full(len(situation.rows), self._error)
         return Verdict(figure > 0.0, figure > 0.0, figure, figure)
 
     def sent(self, rows: Indices, step: Indices, error: Array) -> None:  # noqa: ARG002
-        """Keeps it."""
+        """Keep the errors told."""
         self.told += error.tolist()
 
 
 @pytest.mark.parametrize("compares", [(True, True), (False, True), (True, False), (False, False)])
 def test_each_side_is_told_its_own_error_whichever_is_recorded(compares: tuple[bool, bool]) -> None:
-    """And only of the vehicles that were sent to."""
+    """A side is told only of the vehicles that were sent to."""
     left, right = (Listener(5.0 + i, compares=compares[i]) for i in range(2))
     both = Combined(np.logical_and, left, right, 3)
     verdict = both.test(facing(3))
@@ -461,8 +469,13 @@ def encounters(rng: np.random.Generator, rows: Indices, ticks: int) -> Iterator[
         estimate, planned = rng.normal(size=(2, n, 2, 2))
         gap, deviation_m = rng.uniform(0.0, 2.0, (2, n))
         yield Situation(
-            *(rows, step, fresh, estimate * 0.1, planned * 0.1),
-            *(partial(np.copy, deviation_m), partial(np.copy, gap)),
+            rows,
+            step,
+            fresh,
+            estimate * 0.1,
+            planned * 0.1,
+            deviation_m=partial(np.copy, deviation_m),
+            cost_gap=partial(np.copy, gap),
         )
 
 
@@ -526,9 +539,13 @@ def only(situation: Situation, i: int) -> Situation:
     assert deviation_m is not None
     assert cost_gap is not None
     return Situation(
-        *(ROW, situation.step[one], situation.fresh[one]),
-        *(situation.estimate[one], situation.planned[one]),
-        *(lambda: deviation_m()[one], lambda: cost_gap()[one]),
+        ROW,
+        situation.step[one],
+        situation.fresh[one],
+        situation.estimate[one],
+        situation.planned[one],
+        deviation_m=lambda: deviation_m()[one],
+        cost_gap=lambda: cost_gap()[one],
     )
 
 

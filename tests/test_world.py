@@ -49,7 +49,7 @@ def never() -> bool:
 
 @given(offsets, drifts, times)
 def test_a_clock_finds_its_own_time_again(offset_ns: int, drift_ppb: int, time_ns: int) -> None:
-    """world() is the first moment at which the clock shows at least the local time."""
+    """`world()` is the first moment at which the clock shows at least the local time."""
     clock = Clock(offset_ns, drift_ppb)
     local_ns = clock.local(time_ns)
     found = clock.world(local_ns)
@@ -110,7 +110,7 @@ def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
 
 
 def test_a_computing_host_sends_late_and_hears_at_once() -> None:
-    """It is busy for 30 ns after its wake at 50: its word leaves at 80, but it heard one at 60."""
+    """A host woken at 50 is busy for 30 ns: its word leaves at 80, but it heard one at 60."""
     world, busy, other = World(), Probe([50]), Probe([60])
     busy_address = world.add("busy", busy, compute_ns=30)
     other_address = world.add("other", other)
@@ -129,7 +129,7 @@ def test_a_wake_during_computing_comes_late() -> None:
 
 
 def test_at_one_instant_hosts_are_woken_in_the_order_they_were_added() -> None:
-    """Not in the order in which they came to want it, which depends on who else is there."""
+    """Hosts are not woken in the order of asking, which depends on who else is there."""
     world, first, second = World(), Probe([70, 90]), Probe([90])
     there = world.add("there", Probe([]))
     for name, probe in (("first", first), ("second", second)):
