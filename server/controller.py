@@ -17,7 +17,7 @@ from server.estimator import Estimator
 from server.planner import Figures, Planner
 from server.replay import Replay
 from server.scheme import Foresight, Scheme, foresight
-from server.trigger import Verdict, make_trigger
+from server.trigger import Situation, Verdict, make_trigger
 from shared.config import Scenario
 from shared.kernel import B1, I1, kernel
 from shared.model import Array, Flags, Indices
@@ -77,7 +77,7 @@ class Controller:
             if terms.commits
             else Estimator(terms.model, room, self._reach, compensate=terms.indexed)
         )
-        self._planner = Planner(scenario, terms, room, block, stopwatch)
+        self.planner = Planner(scenario, terms, room, block, stopwatch)
         self._trigger = make_trigger(control, room)
         self._found = foresight(block, terms.axes, terms.horizon)
         self._stopwatch = stopwatch
@@ -96,7 +96,7 @@ class Controller:
         """Begin anew with a vehicle in this row, or with a new life of it."""
         self.last_step[row] = -1
         self._scheme.forget(row)
-        self._planner.forget(row)
+        self.planner.forget(row)
         self._trigger.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
@@ -120,9 +120,9 @@ class Controller:
         self.last_step[rows] = step
         self._scheme.foresee(rows, step, found)  # (13)
         stopwatch.lap("estimate")
-        self._planner.plan(rows, step, found)  # (14), (15)
-        figures = self._planner.figures[:n]
-        verdict = self._trigger.test(rows, figures)  # (16)
+        self.planner.plan(rows, step, found)  # (14), (15)
+        figures, planned = self.planner.figures[:n], self.planner.planned[:n]
+        verdict = self._trigger.test(Situation(rows, figures, found.start[:n], planned))  # (16)
         solved = figures["solved"]
         event = verdict.event & solved
         sent = event.nonzero()[0]
@@ -133,8 +133,7 @@ class Controller:
         self._counts["events"] += len(sent)
         self._counts["unsolved"] += n - np.count_nonzero(solved)
         stopwatch.lap("trigger")
-        planned = self._planner.planned[:n]
-        solve_ns = self._planner.solve_ns
+        solve_ns = self.planner.solve_ns
         return Decisions(rows, step, found, figures, planned, verdict, event, sent, solve_ns)
 
 

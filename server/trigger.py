@@ -10,7 +10,7 @@ nothing to fly on with, and fire in every policy but `budget` (E18).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -18,6 +18,19 @@ from server.planner import Figures
 from shared.config import ControlConfig
 from shared.model import Array, Flags, Indices
 from shared.policy import SIGNATURES, Combination, Expression, parse
+
+
+class Situation(NamedTuple):
+    """What a trigger may look at, for n vehicles at one step of each."""
+
+    rows: Indices
+    """The vehicles; shape (n,)."""
+    figures: Figures
+    """What their plans are worth, see `server.planner.FIGURES`; shape (n,)."""
+    estimate: Array
+    """x̂ where planning starts [m, m/s]; shape (n, axes, 2)."""
+    planned: Array
+    """x_p there [m, m/s]; shape (n, axes, 2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +55,8 @@ class Trigger(Protocol):
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row."""
 
-    def test(self, rows: Indices, figures: Figures) -> Verdict:
-        """The verdict on each vehicle.
-
-        Args:
-            rows: the vehicles; shape (n,).
-            figures: what is known of them (`server.planner.FIGURES`); shape (n,).
-        """
+    def test(self, situation: Situation) -> Verdict:
+        """The verdict on each vehicle."""
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         """Take note of vehicles that are sent a horizon at this step: k_i ← k."""
@@ -70,9 +78,9 @@ class Always:
     def forget(self, row: int) -> None:
         """See `Trigger`."""
 
-    def test(self, rows: Indices, figures: Figures) -> Verdict:
+    def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
-        return _timed(np.ones(len(rows), dtype=np.bool_), figures)
+        return _timed(np.ones(len(situation.rows), dtype=np.bool_), situation.figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         """See `Trigger`."""
@@ -91,8 +99,9 @@ class Periodic:
         """See `Trigger`."""
         self._sent_step[row] = 0
 
-    def test(self, rows: Indices, figures: Figures) -> Verdict:
+    def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
+        rows, figures = situation.rows, situation.figures
         due = figures["step"] - self._sent_step[rows] >= self._period
         # What is due at a fresh step stays due until it is sent.
         fresh = figures["fresh"]
@@ -133,9 +142,10 @@ class Budget:
         """See `Trigger`."""
         self._tokens[row], self._step[row] = self._burst, 0
 
-    def test(self, rows: Indices, figures: Figures) -> Verdict:
+    def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
-        return _timed(self._filled(rows, figures) >= 1.0, figures)
+        filled = self._filled(situation.rows, situation.figures)
+        return _timed(filled >= 1.0, situation.figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         """See `Trigger`."""
@@ -168,8 +178,9 @@ class StateGap:
         """See `Trigger`."""
         self._event_step[row], self._event_error[row] = 0, 0.0
 
-    def test(self, rows: Indices, figures: Figures) -> Verdict:
+    def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
+        rows, figures = situation.rows, situation.figures
         step, error, fresh = figures["step"], figures["error"], figures["fresh"]
         if fresh.any():  # V(k_0) = 0
             self._event_step[rows[fresh]], self._event_error[rows[fresh]] = step[fresh], 0.0
@@ -194,10 +205,10 @@ class Above:
     def forget(self, row: int) -> None:
         """See `Trigger`."""
 
-    def test(self, rows: Indices, figures: Figures) -> Verdict:  # noqa: ARG002
+    def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
-        figure = figures[self._name]
-        event = figures["fresh"] | (figure > self._threshold)
+        figure = situation.figures[self._name]
+        event = situation.figures["fresh"] | (figure > self._threshold)
         return Verdict(event, figure, np.full(len(figure), self._threshold))
 
     def sent(self, rows: Indices, figures: Figures) -> None:
@@ -229,9 +240,9 @@ class Combined:
         self._left.forget(row)
         self._right.forget(row)
 
-    def test(self, rows: Indices, figures: Figures) -> Verdict:
+    def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
-        left, right = self._left.test(rows, figures), self._right.test(rows, figures)
+        left, right = self._left.test(situation), self._right.test(situation)
         shown = left if self._left.compares or not self._right.compares else right
         event = self._combine(left.event, right.event)
         return Verdict(event, shown.figure, shown.threshold)

@@ -3,8 +3,7 @@
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import astuple, replace
-from functools import partial
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from server.planner import FIGURES, Figures
 from server.trigger import POLICIES, Combined, Situation, Trigger, Verdict, make_trigger
 from shared import config
 from shared.config import ControlConfig
-from shared.model import Array, Flags, Indices
+from shared.model import Flags, Indices
 from shared.policy import SIGNATURES
 from sim.flight import fly
 
@@ -27,19 +27,35 @@ CONTROL = ControlConfig(
     trigger="state_gap", dt=0.1, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
 )
 ROW = np.array([0])
-PLANNED = np.array([[[1.0, 0.5], [-1.0, 0.0]]])
 
 
-def off_by(error: float) -> Array:
-    """An estimate so far from PLANNED that V = error: on x alone, where P is 50."""
-    estimate = PLANNED.copy()
-    estimate[0, 0, 0] += math.sqrt(error / 50.0)
-    return estimate
+def figures_of(
+    n: int = 1,
+    *,
+    step: int = 50,
+    error: float = 0.0,
+    fresh: bool = False,
+    cost_gap: float = 0.0,
+    deviation_m: float = 0.0,
+) -> Figures:
+    """What is known of n vehicles alike."""
+    return np.array([(step, error, cost_gap, deviation_m, fresh, True)] * n, dtype=FIGURES)
 
 
-def ask(trigger: Trigger, step: int, estimate: Array, *, fresh: bool = False) -> Verdict:
-    """The verdict on one vehicle."""
-    return trigger.test(Situation(ROW, np.array([step]), np.array([fresh]), estimate, PLANNED))
+def facing(rows: Indices, figures: Figures) -> Situation:
+    """A situation of vehicles that are where they were planned to be."""
+    states = np.zeros((len(rows), 2, 2))
+    return Situation(rows, figures, states, states)
+
+
+def ask(trigger: Trigger, step: int, error: float, *, fresh: bool = False) -> Verdict:
+    """The verdict on one vehicle with V = error."""
+    return trigger.test(facing(ROW, figures_of(step=step, error=error, fresh=fresh)))
+
+
+def tell(trigger: Trigger, step: int, error: float = 0.0) -> None:
+    """One vehicle is sent a horizon at this step, with V = error."""
+    trigger.sent(ROW, figures_of(step=step, error=error))
 
 
 def trigger_of(text: str, *, dt: float = 0.1, capacity: int = 1) -> Trigger:
@@ -50,20 +66,13 @@ def trigger_of(text: str, *, dt: float = 0.1, capacity: int = 1) -> Trigger:
 def after_event(step: int, error: float, control: ControlConfig = CONTROL) -> Trigger:
     """Eq. (16), whose last event was at `step`, with V(k_i) = error."""
     trigger = make_trigger(control, 1)
-    trigger.sent(ROW, np.array([step]), np.array([error]))
+    tell(trigger, step, error)
     return trigger
-
-
-def test_error_weighs_position_and_velocity_with_p() -> None:
-    """V = 50·0.2² + 8·0.5² + 50·0.1² + 8·1² = 2 + 2 + 0.5 + 8."""
-    estimate = PLANNED + np.array([[[0.2, -0.5], [-0.1, 1.0]]])
-    for text in ("state_gap", "always", "periodic", "silence(1)", "budget(1, 1)"):
-        assert ask(trigger_of(text), 7, estimate).error == pytest.approx([12.5])
 
 
 def test_threshold_decays_per_second() -> None:
     """E5: five steps of 0.1 s at λ = 2/s leave 10·exp(-1) + 3; per step it would be exp(-10)."""
-    verdict = ask(after_event(20, 10.0), 25, off_by(0.0))
+    verdict = ask(after_event(20, 10.0), 25, 0.0)
     assert verdict.threshold == pytest.approx([10.0 * math.exp(-1.0) + 3.0], rel=1e-12)
 
 
@@ -72,30 +81,30 @@ def test_threshold_depends_on_time_and_not_on_how_it_is_cut() -> None:
     fine = ControlConfig(
         trigger="state_gap", dt=0.05, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
     )
-    one = ask(after_event(20, 10.0), 25, off_by(0.0)).threshold
-    other = ask(after_event(20, 10.0, fine), 30, off_by(0.0)).threshold
+    one = ask(after_event(20, 10.0), 25, 0.0).threshold
+    other = ask(after_event(20, 10.0, fine), 30, 0.0).threshold
     assert one == pytest.approx(other, rel=1e-12)
 
 
 def test_event_is_an_error_above_the_threshold() -> None:
     """S = 10·exp(-1) + 3 = 6.679: 6.6 is quiet, 6.7 is an event."""
     trigger = after_event(20, 10.0)
-    assert ask(trigger, 25, off_by(6.6)).surely.tolist() == [False]
-    assert ask(trigger, 25, off_by(6.7)).surely.tolist() == [True]
+    assert ask(trigger, 25, 6.6).event.tolist() == [False]
+    assert ask(trigger, 25, 6.7).event.tolist() == [True]
 
 
 def test_threshold_is_the_tolerance_long_after() -> None:
     """Nothing of the last event is left."""
-    verdict = ask(after_event(0, 1e6), 10_000, off_by(2.9))
+    verdict = ask(after_event(0, 1e6), 10_000, 2.9)
     assert verdict.threshold.tolist() == [3.0]
-    assert verdict.surely.tolist() == [False]
-    assert ask(after_event(0, 1e6), 10_000, off_by(3.1)).surely.tolist() == [True]
+    assert verdict.event.tolist() == [False]
+    assert ask(after_event(0, 1e6), 10_000, 3.1).event.tolist() == [True]
 
 
 def test_first_step_is_an_event_however_small_the_error() -> None:
     """E18: the vehicle has nothing to fly yet."""
-    verdict = ask(trigger_of("state_gap"), 0, off_by(0.0), fresh=True)
-    assert (verdict.surely.tolist(), verdict.error.tolist()) == ([True], [0.0])
+    verdict = ask(trigger_of("state_gap"), 0, 0.0, fresh=True)
+    assert (verdict.event.tolist(), verdict.figure.tolist()) == ([True], [0.0])
     assert verdict.threshold.tolist() == [3.0]
 
 
@@ -103,31 +112,31 @@ def test_nothing_happens_without_an_event() -> None:
     """Asking is not sending: the threshold goes on from the event before."""
     trigger = after_event(0, 10.0)
     for step in (1, 2, 3):
-        ask(trigger, step, off_by(100.0))
-    assert ask(trigger, 5, off_by(0.0)).threshold == pytest.approx([10 * math.exp(-1.0) + 3.0])
+        ask(trigger, step, 100.0)
+    assert ask(trigger, 5, 0.0).threshold == pytest.approx([10 * math.exp(-1.0) + 3.0])
 
 
 def test_sending_anchors_the_threshold_anew() -> None:
     """S starts at V(k_i) + ε and decays from there."""
     trigger = after_event(0, 10.0)
-    trigger.sent(ROW, np.array([40]), np.array([5.0]))
-    assert ask(trigger, 40, off_by(0.0)).threshold == pytest.approx([8.0])
-    assert ask(trigger, 45, off_by(0.0)).threshold == pytest.approx([5 * math.exp(-1.0) + 3.0])
+    tell(trigger, 40, 5.0)
+    assert ask(trigger, 40, 0.0).threshold == pytest.approx([8.0])
+    assert ask(trigger, 45, 0.0).threshold == pytest.approx([5 * math.exp(-1.0) + 3.0])
 
 
 def test_new_life_forgets_the_events_of_the_old_one() -> None:
     """A vehicle that starts again at step 0 owes nothing to step 5000 of before."""
     trigger = after_event(5000, 1e6)
-    assert ask(trigger, 0, off_by(0.0), fresh=True).threshold.tolist() == [3.0]
+    assert ask(trigger, 0, 0.0, fresh=True).threshold.tolist() == [3.0]
 
 
 def test_new_life_forgets_them_also_if_its_first_horizon_was_not_sent() -> None:
     """The first plan may fail: the next step must not count from an event in the future."""
     trigger = after_event(50, 10.0)
-    ask(trigger, 0, off_by(0.0), fresh=True)
-    verdict = ask(trigger, 1, off_by(4.0))
+    ask(trigger, 0, 0.0, fresh=True)
+    verdict = ask(trigger, 1, 4.0)
     assert verdict.threshold.tolist() == [3.0]
-    assert verdict.surely.tolist() == [True]
+    assert verdict.event.tolist() == [True]
 
 
 @quick
@@ -140,8 +149,8 @@ def test_faster_decay_means_a_lower_threshold(
         ControlConfig(trigger="state_gap", dt=0.1, epsilon=3.0, decay_rate=decay)
         for decay in (rate, rate + more)
     )
-    low = ask(after_event(0, error, fast), steps, PLANNED).threshold[0]
-    high = ask(after_event(0, error, slow), steps, PLANNED).threshold[0]
+    low = ask(after_event(0, error, fast), steps, 0.0).threshold[0]
+    high = ask(after_event(0, error, slow), steps, 0.0).threshold[0]
     assert 3.0 <= low <= high <= error + 3.0
     assert low < high or error * math.exp(-rate * 0.1 * steps) < 1e-9
 
@@ -156,7 +165,7 @@ def test_more_tolerance_means_a_higher_threshold(
         ask(
             after_event(0, error, ControlConfig(trigger="state_gap", epsilon=tolerance)),
             steps,
-            PLANNED,
+            0.0,
         ).threshold[0]
         for tolerance in (epsilon, epsilon + more)
     )
@@ -167,20 +176,20 @@ def test_always_sends_even_without_an_error() -> None:
     """At every step, whatever was sent before."""
     trigger = trigger_of("always")
     for step in range(3):
-        verdict = ask(trigger, step, PLANNED)
-        assert (verdict.surely.tolist(), verdict.threshold.tolist()) == ([True], [0.0])
-        trigger.sent(ROW, np.array([step]), verdict.error)
+        verdict = ask(trigger, step, 0.0)
+        assert (verdict.event.tolist(), verdict.threshold.tolist()) == ([True], [0.0])
+        tell(trigger, step)
 
 
 def events(trigger: Trigger, first: int, last: int, *, unsent: tuple[int, ...] = ()) -> list[int]:
     """The steps at which it wants to send; it does, but for those in `unsent`."""
     wanted = []
     for step in range(first, last + 1):
-        verdict = ask(trigger, step, off_by(100.0), fresh=step == first)
-        if verdict.surely[0]:
+        verdict = ask(trigger, step, 100.0, fresh=step == first)
+        if verdict.event[0]:
             wanted.append(step)
             if step not in unsent:
-                trigger.sent(ROW, np.array([step]), verdict.error)
+                tell(trigger, step)
     return wanted
 
 
@@ -188,8 +197,8 @@ def test_periodic_sends_at_the_first_step_and_every_so_many_after() -> None:
     """Whatever the error; period 1 is every step."""
     assert events(trigger_of("periodic(4)"), 3, 16) == [3, 7, 11, 15]
     assert events(trigger_of("periodic(1)"), 0, 4) == [0, 1, 2, 3, 4]
-    verdict = ask(trigger_of("periodic"), 0, off_by(2.0), fresh=True)
-    assert (verdict.error, verdict.threshold) == (pytest.approx([2.0]), [0.0])
+    verdict = ask(trigger_of("periodic"), 0, 2.0, fresh=True)
+    assert (verdict.figure, verdict.threshold) == (pytest.approx([2.0]), [0.0])
 
 
 def test_periodic_counts_from_what_was_sent() -> None:
@@ -208,11 +217,12 @@ def test_periodic_begins_anew_with_a_new_life() -> None:
 def test_periodic_counts_for_each_vehicle_by_itself() -> None:
     """Two vehicles, last sent to at steps 3 and 5, both at step 7."""
     trigger = trigger_of("periodic(4)", capacity=6)
-    rows, step = np.array([5, 2]), np.array([7, 7])
-    trigger.sent(rows, np.array([3, 5]), np.zeros(2))
-    both = np.repeat(PLANNED, 2, axis=0)
-    verdict = trigger.test(Situation(rows, step, np.array([False, False]), both, both))
-    assert verdict.surely.tolist() == [True, False]
+    rows = np.array([5, 2])
+    told = figures_of(2)
+    told["step"] = [3, 5]
+    trigger.sent(rows, told)
+    verdict = trigger.test(facing(rows, figures_of(2, step=7)))
+    assert verdict.event.tolist() == [True, False]
 
 
 def test_silence_ends_in_time() -> None:
@@ -230,21 +240,38 @@ def test_budget_spends_its_burst_and_then_what_comes_in() -> None:
     assert events(trigger, 1000, 1004) == [1000, 1001, 1004]  # no more than the burst is saved
 
 
-def test_budget_binds_a_vehicle_at_its_first_step_too() -> None:
-    """A hard cap is a hard cap: a new life has the tokens that the old one left, and gains more."""
+def test_budget_binds_a_vehicle_that_begins_anew_too() -> None:
+    """A hard cap is a hard cap: after a gap that no plan reached over it waits for its token."""
     trigger = trigger_of("budget(5, 2)", dt=0.05)
-    assert events(trigger, 5000, 5002) == [5000, 5001]
-    assert events(trigger, 0, 12) == [3, 7, 11]
+    assert events(trigger, 0, 1) == [0, 1]
+    assert events(trigger, 2, 12) == [4, 8, 12]
     for text in ("always", "periodic", "state_gap", "cost_gap", "deviation", "silence(1)"):
-        situation = facing(1, step=3, fresh=True, cost_gap=0.0, deviation_m=0.0)
-        assert trigger_of(text).test(situation).surely.tolist() == [True]
+        verdict = trigger_of(text).test(facing(ROW, figures_of(step=3, fresh=True)))
+        assert verdict.event.tolist() == [True]
+
+
+@pytest.mark.parametrize("text", [name for name in POLICIES if name != "budget"] + ["budget(5, 2)"])
+def test_a_forgotten_vehicle_is_as_one_that_was_never_there(text: str) -> None:
+    """A new life owes nothing to events, packets and tokens of the old one; others keep theirs."""
+    text = {"silence": "silence(1)"}.get(text, text)
+    new, old = trigger_of(text, capacity=2), trigger_of(text, capacity=2)
+    rows = np.array([0, 1])
+    for step in range(5000, 5004):
+        old.sent(rows, figures_of(2, step=step, error=1e6))
+    kept = astuple(old.test(facing(rows[1:], figures_of(step=5003))))
+    old.forget(0)
+    for one, other in zip(
+        astuple(old.test(facing(rows[1:], figures_of(step=5003)))), kept, strict=True
+    ):
+        assert one == other
+    assert events(old, 2, 30) == events(new, 2, 30)
 
 
 def test_packet_that_another_policy_asked_for_takes_what_tokens_there_are() -> None:
     """Such a packet leaves no debt: ten steps after the last token there is one again."""
     trigger = trigger_of("budget(0.1, 1)", dt=1.0)
     for step in range(26):
-        trigger.sent(ROW, np.array([step]), np.zeros(1))
+        tell(trigger, step)
     assert events(trigger, 26, 40) == [35]
 
 
@@ -257,10 +284,10 @@ def packets(trigger: Trigger, walk: list[tuple[int, bool]]) -> list[int]:
     sent, step = [], 0
     for gap, wanted in walk:
         step += gap
-        verdict = ask(trigger, step, PLANNED, fresh=gap > 40)
-        if wanted and verdict.surely[0]:
+        verdict = ask(trigger, step, 0.0, fresh=gap > 40)
+        if wanted and verdict.event[0]:
             sent.append(step)
-            trigger.sent(ROW, np.array([step]), verdict.error)
+            tell(trigger, step)
     return sent
 
 
@@ -301,59 +328,22 @@ def test_without_the_budget_its_cap_is_broken() -> None:
     assert len(packets(trigger_of("always"), walk)) == 100
 
 
-def facing(
-    n: int,
-    *,
-    step: int = 50,
-    fresh: bool = False,
-    cost_gap: float | None = None,
-    deviation_m: float | None = None,
-) -> Situation:
-    """One situation for n vehicles; what is None is not to be asked for."""
-    figures = [
-        None if value is None else partial(np.full, n, value) for value in (deviation_m, cost_gap)
-    ]
-    at = np.repeat(PLANNED, n, axis=0)
-    return Situation(np.arange(n), np.full(n, step), np.full(n, fresh), at, at, *figures)
-
-
 def test_deviation_is_a_distance_above_the_threshold() -> None:
     """In metres; its own key stands in for the argument."""
     for text in ("deviation(0.05)", "deviation"):
         for metres, event in ((0.05, False), (0.051, True)):
-            verdict = trigger_of(text).test(facing(2, deviation_m=metres))
-            assert verdict.surely.tolist() == verdict.perhaps.tolist() == [event, event]
-            assert (verdict.error.tolist(), verdict.threshold.tolist()) == (
-                [metres] * 2,
-                [0.05] * 2,
-            )
+            verdict = trigger_of(text).test(facing(ROW, figures_of(deviation_m=metres)))
+            assert (verdict.event, verdict.figure, verdict.threshold) == ([event], [metres], [0.05])
 
 
-def test_cost_gap_may_fire_until_it_is_known() -> None:
-    """Once known, the gap fires where it is above the threshold."""
+def test_cost_gap_fires_above_the_threshold() -> None:
+    """What flying on costs, against the key or the argument; a fresh vehicle is always sent to."""
     for text in ("cost_gap(1)", "cost_gap"):
         trigger = trigger_of(text)
-        assert trigger.test(facing(1, fresh=True)).surely.tolist() == [True]
-        verdict = trigger.test(facing(1))
-        assert (verdict.surely.tolist(), verdict.perhaps.tolist()) == ([False], [True])
-        assert np.isnan(verdict.error).all()
+        assert trigger.test(facing(ROW, figures_of(fresh=True))).event.tolist() == [True]
         for gap, event in ((1.0, False), (1.1, True)):
-            verdict = trigger.test(facing(1, cost_gap=gap))
-            assert verdict.surely.tolist() == verdict.perhaps.tolist() == [event]
-            assert (verdict.error.tolist(), verdict.threshold.tolist()) == ([gap], [1.0])
-
-
-def test_no_solve_is_asked_for_where_it_could_change_nothing() -> None:
-    """Without a token nothing is sent; after the longest silence something is, whatever it says."""
-    trigger = trigger_of("cost_gap & budget(1, 1) | silence(2)", capacity=2)
-    trigger.test(facing(2, step=0, fresh=True))
-    trigger.sent(np.array([0, 1]), np.array([0, 0]), np.zeros(2))
-    wanted = []
-    for step in (5, 10, 20):
-        verdict = trigger.test(facing(2, step=step))
-        wanted.append((verdict.surely.tolist(), verdict.perhaps.tolist()))
-    no, yes = [False, False], [True, True]
-    assert wanted == [(no, no), (no, yes), (yes, yes)]
+            verdict = trigger.test(facing(ROW, figures_of(cost_gap=gap)))
+            assert (verdict.event, verdict.figure, verdict.threshold) == ([event], [gap], [1.0])
 
 
 def test_figure_for_the_record_is_that_of_the_leftmost_policy_that_has_one() -> None:
@@ -364,63 +354,53 @@ def test_figure_for_the_record_is_that_of_the_leftmost_policy_that_has_one() -> 
         ("state_gap(5, 1) | deviation(2)", 0.0, 5.0),
         ("always & budget(1, 1)", 0.0, 0.0),
     ):
-        verdict = trigger_of(text).test(facing(1, fresh=True, deviation_m=0.5, cost_gap=0.25))
-        assert (verdict.error.tolist(), verdict.threshold.tolist()) == ([error], [threshold])
+        figures = figures_of(fresh=True, deviation_m=0.5, cost_gap=0.25)
+        verdict = trigger_of(text).test(facing(ROW, figures))
+        assert (verdict.figure.tolist(), verdict.threshold.tolist()) == ([error], [threshold])
 
 
-def test_each_policy_is_told_its_own_error_when_a_packet_goes_out() -> None:
+def test_eq_16_counts_from_v_whichever_figure_is_recorded() -> None:
     """V(k_i) of eq. (16) is V, also behind a policy whose cost gap is recorded in its stead."""
     trigger = trigger_of("cost_gap(3) | state_gap(3, 2)")
-    situation = Situation(
-        ROW,
-        step=np.array([20]),
-        fresh=np.array([False]),
-        estimate=off_by(10.0),
-        planned=PLANNED,
-        cost_gap=lambda: np.array([7.0]),
-    )
-    verdict = trigger.test(situation)
-    assert verdict.error.tolist() == [7.0]
-    trigger.sent(ROW, situation.step, verdict.error)
+    figures = figures_of(step=20, error=10.0, cost_gap=7.0)
+    assert trigger.test(facing(ROW, figures)).figure.tolist() == [7.0]
+    trigger.sent(ROW, figures)
     for error, event in ((6.6, False), (6.7, True)):  # S = 10·exp(-1) + 3 = 6.679
-        later = Situation(
-            ROW,
-            step=np.array([25]),
-            fresh=np.array([False]),
-            estimate=off_by(error),
-            planned=PLANNED,
-            cost_gap=lambda: np.zeros(1),
-        )
-        assert trigger.test(later).surely.tolist() == [event]
+        assert ask(trigger, 25, error).event.tolist() == [event]
 
 
 class Listener:
-    """A trigger whose error is its own, and which keeps what it is told."""
+    """A trigger with a figure of its own, which keeps what it is told."""
 
-    def __init__(self, error: float, *, compares: bool) -> None:
+    def __init__(self, figure: float, *, compares: bool) -> None:
         self.compares = compares
-        self.told: list[float] = []
-        self._error = error
+        self.told: list[int] = []
+        self._figure = figure
+
+    def forget(self, row: int) -> None:
+        """Keep the row, too."""
+        self.told.append(-row)
 
     def test(self, situation: Situation) -> Verdict:
-        """Fire where the error is positive."""
-        figure = np.full(len(situation.rows), self._error)
-        return Verdict(figure > 0.0, figure > 0.0, figure, figure)
+        """Fire where the figure is positive."""
+        figure = np.full(len(situation.rows), self._figure)
+        return Verdict(figure > 0.0, figure, figure)
 
-    def sent(self, rows: Indices, step: Indices, error: Array) -> None:  # noqa: ARG002
-        """Keep the errors told."""
-        self.told += error.tolist()
+    def sent(self, rows: Indices, figures: Figures) -> None:  # noqa: ARG002
+        """Keep the rows told."""
+        self.told += rows.tolist()
 
 
 @pytest.mark.parametrize("compares", [(True, True), (False, True), (True, False), (False, False)])
-def test_each_side_is_told_its_own_error_whichever_is_recorded(compares: tuple[bool, bool]) -> None:
-    """A side is told only of the vehicles that were sent to."""
+def test_both_sides_are_told_whichever_is_recorded(compares: tuple[bool, bool]) -> None:
+    """A side is told of the vehicles that were sent to, and of those to forget."""
     left, right = (Listener(5.0 + i, compares=compares[i]) for i in range(2))
-    both = Combined(np.logical_and, left, right, 3)
-    verdict = both.test(facing(3))
-    assert verdict.error.tolist() == [6.0 if compares == (False, True) else 5.0] * 3
-    both.sent(np.array([2, 0]), np.array([50, 50]), verdict.error[:2])
-    assert (left.told, right.told) == ([5.0, 5.0], [6.0, 6.0])
+    both = Combined(np.logical_and, left, right)
+    verdict = both.test(facing(np.arange(3), figures_of(3)))
+    assert verdict.figure.tolist() == [6.0 if compares == (False, True) else 5.0] * 3
+    both.sent(np.array([2, 0]), figures_of(2))
+    both.forget(1)
+    assert left.told == right.told == [2, 0, -1]
 
 
 def test_scenario_names_its_trigger() -> None:
@@ -436,7 +416,7 @@ def test_scenario_names_its_trigger() -> None:
     }
     for name, threshold in thresholds.items():
         trigger = make_trigger(msgspec.structs.replace(control, trigger=name), 1)
-        verdict = trigger.test(facing(1, cost_gap=0.0, deviation_m=0.0))
+        verdict = trigger.test(facing(ROW, figures_of()))
         assert verdict.threshold.tolist() == [threshold]
         if name == "periodic":
             assert events(trigger, 0, 9) == [0, 4, 8]
@@ -459,58 +439,42 @@ def written(tree: Any) -> str:
     return tree if isinstance(tree, str) else f"({written(tree[0])} {tree[1]} {written(tree[2])})"
 
 
-def encounters(rng: np.random.Generator, rows: Indices, ticks: int) -> Iterator[Situation]:
-    """What some vehicles meet at random, in steps of their own; some are new at times."""
-    n, step = len(rows), rng.integers(0, 20, len(rows))
+def encounters(rng: np.random.Generator, n: int, ticks: int) -> Iterator[Figures]:
+    """What n vehicles meet at random, in steps of their own; some are new at times."""
+    step = rng.integers(0, 20, n)
     for tick in range(ticks):
-        fresh = (rng.random(n) < 0.1) | (tick == 0)
+        figures = np.zeros(n, dtype=FIGURES)
         step = np.where(rng.random(n) < 0.05, 0, step + rng.integers(1, 6, n))
-        fresh |= step == 0
-        estimate, planned = rng.normal(size=(2, n, 2, 2))
-        gap, deviation_m = rng.uniform(0.0, 2.0, (2, n))
-        yield Situation(
-            rows,
-            step,
-            fresh,
-            estimate * 0.1,
-            planned * 0.1,
-            deviation_m=partial(np.copy, deviation_m),
-            cost_gap=partial(np.copy, gap),
-        )
+        figures["step"] = step
+        figures["fresh"] = (rng.random(n) < 0.1) | (tick == 0) | (step == 0)
+        for name in ("error", "cost_gap", "deviation_m"):
+            figures[name] = rng.uniform(0.0, 2.0, n)
+        yield figures
 
 
 @quick
 @given(trees, st.integers(0, 2**32 - 1))
 def test_combination_fires_as_its_parts_say(tree: Any, seed: int) -> None:
-    """At every step of a flight; and what is decided without the cost gap stays so with it."""
+    """At every step of a flight; asked again at the same step, it says the same."""
     rng, rows = np.random.default_rng(seed), np.array([2, 0, 3])
     whole = trigger_of(written(tree), capacity=4)
     parts = {leaf: trigger_of(leaf, capacity=4) for leaf in LEAVES}
 
     def expected(tree: Any, verdicts: dict[str, Verdict]) -> Flags:
         if isinstance(tree, str):
-            return verdicts[tree].surely
+            return verdicts[tree].event
         left, right = expected(tree[0], verdicts), expected(tree[2], verdicts)
         return left & right if tree[1] == "&" else left | right
 
-    for situation in encounters(rng, rows, 25):
-        before = whole.test(replace(situation, cost_gap=None))
-        again = whole.test(replace(situation, cost_gap=None))
-        for one, other in zip(astuple(before), astuple(again), strict=True):
+    for figures in encounters(rng, 3, 25):
+        verdict, again = whole.test(facing(rows, figures)), whole.test(facing(rows, figures))
+        for one, other in zip(astuple(verdict), astuple(again), strict=True):
             np.testing.assert_array_equal(one, other)
-        verdict = whole.test(situation)
-        verdicts = {leaf: part.test(situation) for leaf, part in parts.items()}
-        assert verdict.surely.tolist() == verdict.perhaps.tolist()
-        assert verdict.surely.tolist() == expected(tree, verdicts).tolist()
-        assert (before.surely <= verdict.surely).all()
-        assert (verdict.surely <= before.perhaps).all()
-        if "cost_gap" not in written(tree):
-            assert before.surely.tolist() == before.perhaps.tolist()
-        sent = np.flatnonzero(verdict.surely & (rng.random(3) < 0.9))  # not all are solved
-        step = situation.step[sent]
-        whole.sent(rows[sent], step, verdict.error[sent])
-        for leaf, part in parts.items():
-            part.sent(rows[sent], step, verdicts[leaf].error[sent])
+        verdicts = {leaf: part.test(facing(rows, figures)) for leaf, part in parts.items()}
+        assert verdict.event.tolist() == expected(tree, verdicts).tolist()
+        sent = np.flatnonzero(verdict.event & (rng.random(3) < 0.9))  # not all are solved
+        for trigger in (whole, *parts.values()):
+            trigger.sent(rows[sent], figures[sent])
 
 
 @quick
@@ -520,33 +484,16 @@ def test_batch_is_judged_as_its_singles(tree: Any, seed: int) -> None:
     rng, rows = np.random.default_rng(seed), np.array([5, 1, 2])
     together = trigger_of(written(tree), capacity=6)
     singles = [trigger_of(written(tree)) for _ in rows]
-    for situation in encounters(rng, rows, 15):
-        verdict = together.test(situation)
-        sent = np.flatnonzero(verdict.surely)
-        together.sent(rows[sent], situation.step[sent], verdict.error[sent])
+    for figures in encounters(rng, 3, 15):
+        verdict = together.test(facing(rows, figures))
+        sent = np.flatnonzero(verdict.event)
+        together.sent(rows[sent], figures[sent])
         for i, single in enumerate(singles):
-            alone = single.test(only(situation, i))
+            alone = single.test(facing(ROW, figures[i : i + 1]))
             for one, all_ in zip(astuple(alone), astuple(verdict), strict=True):
                 assert one[0] == all_[i]
-            if alone.surely[0]:
-                single.sent(ROW, situation.step[i : i + 1], alone.error)
-
-
-def only(situation: Situation, i: int) -> Situation:
-    """The i-th vehicle of it, in row 0."""
-    one = slice(i, i + 1)
-    deviation_m, cost_gap = situation.deviation_m, situation.cost_gap
-    assert deviation_m is not None
-    assert cost_gap is not None
-    return Situation(
-        ROW,
-        situation.step[one],
-        situation.fresh[one],
-        situation.estimate[one],
-        situation.planned[one],
-        deviation_m=lambda: deviation_m()[one],
-        cost_gap=lambda: cost_gap()[one],
-    )
+            if alone.event[0]:
+                single.sent(ROW, figures[i : i + 1])
 
 
 def test_documented_trigger_flies(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -556,11 +503,11 @@ def test_documented_trigger_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     text = (Path(__file__).parent.parent / "docs" / "triggers.md").read_text()
     (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     exec(example, {})
-    slip = trigger_of("slip(0.5)")
-    estimate = PLANNED + np.array([[[9.0, 0.3], [9.0, 0.5]]])
-    verdict = ask(slip, 3, estimate)
-    assert verdict.surely.tolist() == [True]
-    assert verdict.error == pytest.approx([math.hypot(0.3, 0.5)])
+    estimate = np.array([[[9.0, 0.3], [9.0, 0.5]]])
+    situation = Situation(ROW, figures_of(), estimate, np.zeros((1, 2, 2)))
+    verdict = trigger_of("slip(0.5)").test(situation)
+    assert verdict.event.tolist() == [True]
+    assert verdict.figure == pytest.approx([math.hypot(0.3, 0.5)])
     control = {"scheme": "predictive", "trigger": "slip(0.1) & budget(4, 1) | silence(1)"}
     flown = config.check({"duration": 10.0, "control": control}, "test")
     server = fly(flown).server
