@@ -13,6 +13,7 @@ reaches counts, in whichever module it stands, so that no kernel flies by a rule
 import hashlib
 import inspect
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import numba
@@ -33,7 +34,7 @@ I3 = Annotated[NDArray[np.int64], numba.int64[:, :, ::1]]
 S3 = Annotated[NDArray[np.float32], numba.float32[:, :, ::1]]
 S4 = Annotated[NDArray[np.float32], numba.float32[:, :, :, ::1]]
 B1 = Annotated[NDArray[np.bool_], numba.boolean[::1]]
-"""Contiguous arrays of float64 (F), int64 (I), float32 (S) and bool (B), with their number of axes."""
+"""Contiguous arrays of float64 (F), int64 (I), float32 (S) and bool (B), by their number of axes."""
 
 SCALARS = {int: numba.int64, float: numba.float64, bool: numba.boolean}
 
@@ -53,11 +54,14 @@ def kernel(function: F) -> F:
     hints = get_type_hints(function, include_extras=True)
     hints.pop("return", None)
     signature = tuple(map(_type, hints.values()))
+    dispatcher = numba.njit(error_model="numpy")(function)
     before, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, ",".join(LOCATORS)
-    try:
-        compiled: F = numba.njit([signature], cache=True, error_model="numpy")(function)
-    finally:
-        config.CACHE_LOCATOR_CLASSES = before
+    with suppress(RuntimeError):  # no place can be written to
+        dispatcher.enable_caching()
+    config.CACHE_LOCATOR_CLASSES = before
+    dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    compiled: F = dispatcher
     return compiled
 
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from server import clock as clocks
 from server.clock import ClockMap
 from shared.endpoint import MILLISECOND_NS as MS
 from shared.endpoint import SECOND_NS as S
@@ -52,7 +53,7 @@ def test_equal_delays_give_the_offset_exactly(offset_ns: int, delay_ns: int) -> 
     """To the nanosecond, from the first observation on, whatever the clocks show."""
     clock = ClockMap(1, DT_NS)
     assert observe(clock, 5 * S, offset_ns, down_ns=delay_ns, up_ns=delay_ns) == offset_ns
-    assert clock.bound_ns(ROW).tolist() == [delay_ns]
+    assert clock.bound_ns(0) == delay_ns
 
 
 @quick
@@ -62,7 +63,7 @@ def test_unequal_delays_err_by_half_their_difference(down_ns: int, up_ns: int) -
     clock = ClockMap(1, DT_NS)
     error = observe(clock, 5 * S, HOUR, down_ns=down_ns, up_ns=up_ns) - HOUR
     assert error == (up_ns - down_ns) // 2
-    assert clock.bound_ns(ROW).tolist() == [(up_ns + down_ns) // 2]
+    assert clock.bound_ns(0) == (up_ns + down_ns) // 2
     assert abs(error) <= (up_ns + down_ns + 1) // 2
 
 
@@ -72,7 +73,7 @@ def test_smallest_delay_of_each_direction_counts() -> None:
     observe(clock, 0, HOUR, down_ns=400 * MS, up_ns=900 * MS)
     observe(clock, 1 * S, HOUR, down_ns=800 * MS, up_ns=400 * MS)
     assert clock.offset_ns(ROW).tolist() == [HOUR]
-    assert clock.bound_ns(ROW).tolist() == [400 * MS]
+    assert clock.bound_ns(0) == 400 * MS
 
 
 def test_small_movements_do_not_change_the_offset() -> None:
@@ -91,9 +92,9 @@ def test_old_minima_are_forgotten_after_twenty_seconds() -> None:
     clock = ClockMap(1, DT_NS)
     observe(clock, 0, HOUR, down_ns=100 * MS, up_ns=300 * MS)
     listen(clock, times(0.5, 20), lambda _: HOUR)
-    assert clock.bound_ns(ROW).tolist() == [200 * MS]
+    assert clock.bound_ns(0) == 200 * MS
     listen(clock, times(20, 20.5), lambda _: HOUR)
-    assert clock.bound_ns(ROW).tolist() == [400 * MS]
+    assert clock.bound_ns(0) == 400 * MS
     assert clock.offset_ns(ROW).tolist() == [HOUR]
 
 
@@ -126,16 +127,32 @@ def test_clock_may_step_at_any_moment_of_a_half_second() -> None:
 
 
 @pytest.mark.parametrize("jump_ns", [HOUR, -HOUR])
+@pytest.mark.parametrize("rule", [True, False])
 def test_without_the_step_rule_the_offset_does_not_follow(
-    jump_ns: int, monkeypatch: pytest.MonkeyPatch
+    jump_ns: int, monkeypatch: pytest.MonkeyPatch, *, rule: bool
 ) -> None:
     """Ablation: half of the jump is missing until the window of 20 s has passed."""
-    monkeypatch.setattr(ClockMap, "_drop_stepped", lambda *_: None)
+    monkeypatch.setattr(clocks, "_steps", clocks._steps.py_func)
+    if not rule:
+        monkeypatch.setattr(clocks, "_drop_stepped", lambda *_: None)
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10), lambda _: 0)
     errors = listen(clock, times(10, 31), lambda _: jump_ns)
-    assert set(errors[20 * 2 : 20 * 19]) == {-jump_ns // 2}
+    assert set(errors[20 * 2 : 20 * 19]) == {0 if rule else -jump_ns // 2}
     assert errors[-1] == 0
+
+
+@pytest.mark.parametrize("behind_ns", [0, 1, DT_NS - 1])
+@pytest.mark.parametrize("offset_ns", [0, HOUR, -HOUR])
+def test_steps_are_counted_on_the_vehicle_s_clock(offset_ns: int, behind_ns: int) -> None:
+    """Step k begins at epoch + k Δt of the vehicle, and lasts for Δt."""
+    clock, rows = ClockMap(3, DT_NS), np.array([2, 0])
+    for row, epoch_ns in ((2, 7 * S), (0, -3 * S)):
+        observe(clock, 0, offset_ns, down_ns=0, up_ns=0, row=row)
+        clock.epoch_ns[row] = offset_ns + epoch_ns
+    now_ns = 10 * S + behind_ns
+    assert clock.steps(rows, now_ns).tolist() == [3 * 20, 13 * 20]
+    assert clock.steps(rows[1:], now_ns - S).tolist() == [12 * 20]
 
 
 @quick
@@ -146,7 +163,7 @@ def test_slower_network_is_no_stepped_clock(down_ms: int, up_ms: int) -> None:
     listen(clock, times(0, 10), lambda _: 0)
     slower = {"down_ns": (400 + down_ms) * MS, "up_ns": (400 + up_ms) * MS}
     assert set(listen(clock, times(10, 14), lambda _: 0, **slower)) == {0}
-    assert clock.bound_ns(ROW).tolist() == [400 * MS]
+    assert clock.bound_ns(0) == 400 * MS
 
 
 def after_change(down_ns: int, up_ns: int, *, before: range, since: int) -> int:
@@ -161,7 +178,7 @@ def after_change(down_ns: int, up_ns: int, *, before: range, since: int) -> int:
         down_ns=down_ns,
         up_ns=up_ns,
     )
-    return int(clock.bound_ns(ROW)[0])
+    return clock.bound_ns(0)
 
 
 @pytest.mark.parametrize(("jump_ms", "bound_ms"), [(40, 380), (41, 400)])
@@ -170,7 +187,7 @@ def test_step_is_a_change_by_more_than_40_ms(jump_ms: int, bound_ms: int) -> Non
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10), lambda _: 0)
     listen(clock, times(10, 13), lambda _: jump_ms * MS)
-    assert clock.bound_ns(ROW).tolist() == [bound_ms * MS]
+    assert clock.bound_ns(0) == bound_ms * MS
 
 
 def test_change_that_differs_between_directions_is_no_stepped_clock() -> None:
@@ -209,7 +226,7 @@ def test_forgotten_vehicle_is_measured_anew() -> None:
     listen(clock, times(0, 10), lambda _: HOUR, down_ns=10 * MS, up_ns=10 * MS)
     clock.forget(0)
     assert observe(clock, 10 * S, -HOUR, down_ns=300 * MS, up_ns=300 * MS) == -HOUR
-    assert clock.bound_ns(ROW).tolist() == [300 * MS]
+    assert clock.bound_ns(0) == 300 * MS
 
 
 def test_forgotten_vehicle_adopts_even_a_near_offset() -> None:
@@ -231,7 +248,7 @@ def test_vehicles_have_clocks_of_their_own() -> None:
         together = clock.offset_ns(rows)
     clock.forget(1)
     assert together.tolist() == [HOUR, -7 * HOUR, 5 * MS]
-    assert clock.bound_ns(rows).tolist() == [250 * MS, 100 * MS, 200 * MS]
+    assert [clock.bound_ns(row) for row in (3, 0, 2)] == [250 * MS, 100 * MS, 200 * MS]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -244,5 +261,5 @@ def test_offset_is_right_to_half_a_step_on_the_papers_network(seed: int) -> None
         if rng.random() > 0.1:
             adopted = observe(clock, now, HOUR, down_ns=int(down_ns), up_ns=int(up_ns))
             errors.append(adopted - HOUR)
-            assert clock.bound_ns(ROW)[0] >= 400 * MS
+            assert clock.bound_ns(0) >= 400 * MS
     assert max(np.abs(errors[20:])) < 25 * MS

@@ -9,23 +9,27 @@ from hypothesis import strategies as st
 
 from netem.fate import fates
 from server import delay
-from server.delay import DelayBound
+from server.delay import DelayBound, acknowledge, begin, delay_bound, forget
 from shared.config import DirectionConfig
 from shared.endpoint import seconds_to_ns
 
 quick = settings(max_examples=100, deadline=None)
 
 MOST = 39
-ROW = np.array([0])
+
+
+def estimated(capacity: int = 1, most: int = MOST) -> DelayBound:
+    """Bounds that nobody has given."""
+    return delay_bound(capacity, 0.05, most, None)
 
 
 def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
     """Delay d after each sample of one vehicle."""
-    bound, steps = DelayBound(1, 0.05, most, None), []
-    bound.begin(ROW, np.array([first]))
+    bound, steps = estimated(most=most), []
+    begin(bound, 0, first)
     for sample in delays:
-        bound.acknowledged(ROW, np.array([sample]))
-        steps += bound.steps(ROW).tolist()
+        delay.acknowledge(bound, 0, sample)
+        steps += bound.steps.tolist()
     return steps
 
 
@@ -46,23 +50,28 @@ def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
 )
 def test_a_given_bound_is_rounded_up_to_steps(fixed_s: float, dt_s: float, steps: int) -> None:
     """From 1 to the most there is room for, and whatever is guessed or seen."""
-    bound, rows = DelayBound(3, dt_s, MOST, fixed_s), np.arange(3)
-    assert bound.steps(rows).tolist() == [steps] * 3
-    bound.begin(rows, np.array([5, 20, 90]))
-    for _ in range(50):
-        bound.acknowledged(rows, np.array([1, 30, 90]))
-    bound.forget(1)
-    assert bound.steps(rows).tolist() == [steps] * 3
+    bound = delay_bound(3, dt_s, MOST, fixed_s)
+    for row, guess in enumerate((5, 20, 90)):
+        begin(bound, row, guess)
+    assert bound.steps.tolist() == [steps] * 3
+    for row, sample in enumerate((1, 30, 90)):
+        for _ in range(50):
+            acknowledge(bound, row, sample)
+    assert bound.steps.tolist() == [steps] * 3
+    forget(bound, 1)
+    begin(bound, 1, 7)
+    assert bound.steps.tolist() == [steps] * 3
 
 
 # -- a bound that is estimated --------------------------------------------------------------------
 
 
 def test_before_any_sample_it_is_the_guess() -> None:
-    """Within 1 and the most."""
-    bound = DelayBound(4, 0.05, MOST, None)
-    bound.begin(np.array([3, 0, 1]), np.array([11, 0, 90]))
-    assert bound.steps(np.arange(4)).tolist() == [1, MOST, 1, 11]
+    """Within 1 and the most; 0 says that there is not even a guess."""
+    bound = estimated(4)
+    for row, guess in ((3, 11), (0, 0), (1, 90)):
+        begin(bound, row, guess)
+    assert bound.steps.tolist() == [1, MOST, 0, 11]
 
 
 def test_it_rises_at_once_and_no_further_than_most() -> None:
@@ -100,6 +109,8 @@ def test_either_reason_to_stay_is_needed(
 ) -> None:
     """Ablation: without it, d falls soon after a late horizon, into the next one."""
     guarded = known(delays)
+    monkeypatch.setattr(delay, "acknowledge", acknowledge.py_func)
+    assert known(delays) == guarded
     monkeypatch.setattr(delay, name, value)
     bare = known(delays)
     assert sum(guarded) > sum(bare) + 200
@@ -140,33 +151,34 @@ def test_it_is_never_below_what_was_seen_recently(delays: list[int], most: int) 
 
 
 def test_every_vehicle_has_a_bound_of_its_own() -> None:
-    """A batch equals its singles, in whatever order and however many of them are heard."""
+    """Many together are as each alone, in whatever order and however many of them are heard."""
     rng, vehicles = np.random.default_rng(2), 6
-    bound, rows = DelayBound(vehicles, 0.05, MOST, None), np.arange(vehicles)
-    bound.begin(rows, np.full(vehicles, 12))
-    heard: list[list[int]] = [[] for _ in rows]
+    bound, heard = estimated(vehicles), [list[int]() for _ in range(vehicles)]
+    for row in range(vehicles):
+        begin(bound, row, 12)
     for _ in range(500):
         some = rng.permutation(vehicles)[: rng.integers(vehicles + 1)]
         delays = 8 + some + rng.poisson(0.5, len(some))
-        bound.acknowledged(some, delays)
         for row, sample in zip(some.tolist(), delays.tolist(), strict=True):
+            acknowledge(bound, row, sample)
             heard[row].append(sample)
     expected = [known(delays, first=12)[-1] for delays in heard]
-    assert bound.steps(rows).tolist() == expected
+    assert bound.steps.tolist() == expected
     assert len(set(expected)) > 1
 
 
 def test_a_vehicle_that_is_forgotten_begins_anew() -> None:
     """The forgotten vehicle's neighbour keeps what is known of it."""
-    bound, rows = DelayBound(2, 0.05, MOST, None), np.arange(2)
-    for _ in range(200):
-        bound.acknowledged(rows, np.array([30, 30]))
-    bound.forget(0)
-    assert bound.steps(rows).tolist() == [1, 30]
-    bound.begin(ROW, np.array([14]))
+    bound = estimated(2)
+    for row in (0, 1):
+        for _ in range(200):
+            acknowledge(bound, row, 30)
+    forget(bound, 0)
+    assert bound.steps.tolist() == [0, 30]
+    begin(bound, 0, 14)
     for _ in range(20):
-        bound.acknowledged(ROW, np.array([9]))
-    assert bound.steps(rows).tolist() == [9, 30]
+        acknowledge(bound, 0, 9)
+    assert bound.steps.tolist() == [9, 30]
 
 
 # -- on a network ---------------------------------------------------------------------------------
@@ -193,16 +205,16 @@ def flown(
         fate = part[made * len(minima_s) // steps]
         if not fate.lost:
             arrivals.setdefault(made - (-fate.delay_ns // dt_ns), []).append(made)
-    bound = DelayBound(1, dt_s, round(2.0 / dt_s) - 1, None)
-    bound.begin(ROW, np.array([round(0.4 / dt_s) + 2]))
+    bound = delay_bound(1, dt_s, round(2.0 / dt_s) - 1, None)
+    begin(bound, 0, round(0.4 / dt_s) + 2)
     in_force, bounds, late = -1, [], []
     for step in range(steps):
         made = max(arrivals.get(step, [-1]))
         if made > in_force:
             in_force = made
             late.append(step - made > bounds[made])
-            bound.acknowledged(ROW, np.array([step - made]))
-        bounds += bound.steps(ROW).tolist()
+            delay.acknowledge(bound, 0, step - made)
+        bounds += bound.steps.tolist()
     return bounds, float(np.mean(late))
 
 
@@ -230,6 +242,7 @@ def test_on_the_papers_network_it_is_at_rest(dt_s: float, period: int, seed: int
 def test_without_its_memory_it_chatters(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ablation: five times the changes, and five times the late."""
     steps, late = flown(0.02, 1, seed=0)
+    monkeypatch.setattr(delay, "acknowledge", acknowledge.py_func)
     monkeypatch.setattr(delay, "RECENT", 1)
     monkeypatch.setattr(delay, "LATE", 1.0)
     bare_steps, bare_late = flown(0.02, 1, seed=0)

@@ -1,12 +1,16 @@
 """The model of the UAV, eq. (1)-(4): its discretisation is exact, for every axis and any Δt."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from shared.model import discretise
+from server.model import advance as compiled
+from shared.model import advance, discretise
 
 quick = settings(max_examples=60, deadline=None)
 time_constants = st.floats(0.02, 50.0)
@@ -96,12 +100,26 @@ def test_very_short_time_constant_follows_at_once() -> None:
     np.testing.assert_allclose(x, [[2.0 * 0.5 - 11.0 * 1e-4, 2.0]], rtol=1e-14)
 
 
-def test_a_roll_out_is_step_after_step() -> None:
-    """The first state of a roll-out is where it starts."""
-    model, rng = discretise(np.array([0.8, 0.3, 1.1]), 0.05), np.random.default_rng(1)
-    x, inputs = rng.normal(size=(3, 2)), rng.normal(size=(30, 3))
-    states = model.roll_out(x, inputs)
-    assert states.shape == (30, 3, 2)
-    for state, u in zip(states, inputs, strict=True):
-        np.testing.assert_allclose(state, x, rtol=0, atol=1e-12)
+@pytest.mark.parametrize("step", [advance, compiled])
+def test_one_axis_in_numbers_steps_as_all_in_arrays(step: Callable[..., Any]) -> None:
+    """To the last bit, compiled or not: what a client flies is what the server reckons with."""
+    model, rng = discretise([0.8, 0.3, 1.1], 0.05), np.random.default_rng(1)
+    x, u = rng.normal(size=(3, 2)), rng.normal(size=3)
+    for _ in range(100):
+        singles = [
+            step(axis, *state, float(told))
+            for axis, state, told in zip(model.axes(), x.tolist(), u, strict=True)
+        ]
         x = model.step(x, u)
+        np.testing.assert_array_equal(singles, x)
+
+
+@quick
+@given(st.integers(0, 2**32 - 1))
+def test_a_step_is_the_matrix_equation(seed: int) -> None:
+    """Eq. (4), x(k+1) = A x(k) + B u(k), on each axis."""
+    rng = np.random.default_rng(seed)
+    model = discretise(rng.uniform(0.1, 3.0, 3), 0.05)
+    x, u = rng.normal(size=(3, 2)), rng.normal(size=3)
+    expected = (model.A @ x[..., None])[..., 0] + model.B * u[:, None]
+    np.testing.assert_allclose(model.step(x, u), expected, rtol=0, atol=1e-14)

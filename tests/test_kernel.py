@@ -1,0 +1,65 @@
+"""shared.kernel: machine code on disk is used as long as all that it was made of is the same."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+HELPER = """
+from shared.kernel import inline
+
+FACTOR = 2
+
+@inline
+def scaled(x):
+    return x * FACTOR
+"""
+CALLER = """
+import numpy as np
+from helper import scaled
+from shared.kernel import F1, kernel
+
+@kernel
+def double(values: F1) -> None:
+    for i in range(len(values)):
+        values[i] = scaled(values[i])
+
+values = np.ones(1)
+double(values)
+print(values[0], sum(double.stats.cache_hits.values()))
+"""
+
+
+def run(folder: Path) -> str:
+    """What the caller prints: the result, and whether its machine code came from the disk."""
+    done = subprocess.run(
+        [sys.executable, "caller.py"],
+        cwd=folder,
+        env={"PYTHONPATH": f"{Path(__file__).parent.parent}:{folder}", "HOME": str(folder)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+def test_a_kernel_is_compiled_anew_when_what_it_calls_has_changed(tmp_path: Path) -> None:
+    """A function, and a constant, of another module; left alone, it comes from the disk."""
+    helper = tmp_path / "helper.py"
+    helper.write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER)
+    assert run(tmp_path) == "2.0 0"
+    assert run(tmp_path) == "2.0 1"
+    helper.write_text(HELPER.replace("FACTOR = 2", "FACTOR = 3"))
+    assert run(tmp_path) == "3.0 0"
+    helper.write_text(HELPER.replace("x * FACTOR", "x * FACTOR + 1"))
+    assert run(tmp_path) == "3.0 0"
+    assert run(tmp_path) == "3.0 1"
+
+
+def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path) -> None:
+    """Neither beside the source, nor in a home: it compiles, and keeps nothing."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER)
+    (tmp_path / "__pycache__").write_text("a file, where a folder should be")
+    (tmp_path / ".cache").write_text("likewise")
+    assert run(tmp_path) == "2.0 0"
