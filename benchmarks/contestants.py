@@ -7,7 +7,7 @@ sparse form too (its states start at zero), so that the same gradient makes the 
     minimise  Σ ½ xᵢ₊₁ᵀ Wᵢ xᵢ₊₁ + ½ ρᵢ uᵢ² + gᵢ uᵢ,   xᵢ₊₁ = A xᵢ + B uᵢ,   x₀ = 0,   |uᵢ| ≤ u_max
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import product
@@ -20,12 +20,22 @@ from scipy import sparse
 from scipy.linalg import block_diag
 
 from server.exact import ExactSolver
-from server.mpc import MPC
+from server.mpc import Problem
 from server.solver import OsqpSolver, Solver
 from shared.model import Array, Flags
 
-Factory = Callable[[MPC, Array], Solver]
-"""Sets up a solver for the QPs of one MPC, and u_max of shape (axes,)."""
+Factory = Callable[[Problem], Solver]
+"""Sets up a solver for the QPs of one Hessian."""
+
+
+def by_axis(problem: Problem) -> Iterator[tuple[Array, float]]:
+    """Hessian and bound [m/s] of each axis."""
+    return zip(problem.hessian, problem.mpc.bounds, strict=True)
+
+
+def weights(problem: Problem) -> tuple[Array, Array]:
+    """Weights of the states 1 … H and of the inputs; shape (H, 2) and (H,)."""
+    return problem.mpc.weights.states, problem.mpc.weights.inputs[problem.which]
 
 
 @dataclass(frozen=True)
@@ -39,41 +49,43 @@ class Block:
     axes: slice
 
 
-def condensed(mpc: MPC, u_max: Array) -> list[Block]:
+def condensed(problem: Problem) -> list[Block]:
     """Problems in the inputs alone, one for each axis."""
-    H = mpc.hessian.shape[1]
-    box = sparse.eye(H, format="csc")
-    return [
-        Block(sparse.csc_matrix(hessian), box, np.full(H, -b), np.full(H, b), slice(a, a + 1))
-        for a, (hessian, b) in enumerate(zip(mpc.hessian, u_max, strict=True))
-    ]
+    blocks = []
+    for axis, (hessian, bound) in enumerate(by_axis(problem)):
+        H = len(hessian)
+        box, limit = sparse.eye(H, format="csc"), np.full(H, bound)
+        blocks.append(Block(sparse.csc_matrix(hessian), box, -limit, limit, slice(axis, axis + 1)))
+    return blocks
 
 
-def joint(mpc: MPC, u_max: Array) -> list[Block]:
+def joint(problem: Problem) -> list[Block]:
     """Problem of all axes in the inputs alone; its Hessian is block diagonal."""
-    axes, H = mpc.hessian.shape[:2]
-    bound = np.repeat(u_max, H)
-    hessian = sparse.block_diag(list(mpc.hessian), format="csc")
+    axes, H = problem.hessian.shape[:2]
+    bound = np.repeat(problem.mpc.bounds, H)
+    hessian = sparse.block_diag(list(problem.hessian), format="csc")
     return [Block(hessian, sparse.eye(axes * H, format="csc"), -bound, bound, slice(0, axes))]
 
 
-def with_states(mpc: MPC, u_max: Array) -> list[Block]:
+def with_states(problem: Problem) -> list[Block]:
     """Problem of all axes in inputs and states."""
-    axes, H = mpc.hessian.shape[:2]
-    A, B = mpc.model.A, mpc.model.B
-    weights = [np.tile(mpc.input_weights, axes), np.tile(mpc.weights.ravel(), axes)]
+    axes, H = problem.hessian.shape[:2]
+    A, B = problem.model.A, problem.model.B
+    of_states, of_inputs = weights(problem)
+    diagonal = np.concatenate([np.tile(of_inputs, axes), np.tile(of_states.ravel(), axes)])
     inputs = sparse.block_diag([sparse.kron(sparse.eye(H), B[a][:, None]) for a in range(axes)])
     before = sparse.eye(H, k=-1)
     states = sparse.block_diag([sparse.kron(before, A[a]) - sparse.eye(2 * H) for a in range(axes)])
     box = sparse.hstack([sparse.eye(axes * H), sparse.csc_matrix((axes * H, 2 * axes * H))])
     rows = sparse.vstack([sparse.hstack([inputs, states]), box], format="csc")
-    zero, bound = np.zeros(2 * axes * H), np.repeat(u_max, H)
+    zero, bound = np.zeros(2 * axes * H), np.repeat(problem.mpc.bounds, H)
     limits = np.concatenate([zero, bound])
-    P = sparse.diags(np.concatenate(weights), format="csc")
+    P = sparse.diags(diagonal, format="csc")
     return [Block(P, rows, -limits, limits, slice(0, axes))]
 
 
-FORMS = {"condensed, by axis": condensed, "condensed, jointly": joint, "with states": with_states}
+Form = Callable[[Problem], list[Block]]
+FORMS: dict[str, Form] = {"condensed, by axis": condensed, "condensed, jointly": joint, "with states": with_states}
 
 
 @dataclass(frozen=True)
@@ -88,11 +100,11 @@ class Tuning:
         scaled = f"scaling {self.scaling}"
         return f"{self.form}, eps 1e-6, rho {self.rho:g}, {scaled}, check every 10"
 
-    def make(self, mpc: MPC, u_max: Array) -> Solver:
+    def make(self, problem: Problem) -> Solver:
         """OSQP with this tuning."""
         return Osqp(
-            FORMS[self.form](mpc, u_max),
-            u_max,
+            problem,
+            FORMS[self.form],
             eps_abs=1e-6,
             eps_rel=1e-6,
             rho=self.rho,
@@ -108,12 +120,12 @@ TUNINGS = [Tuning(*choice) for choice in product(FORMS, (1.0, 2.0, 3.0, 5.0), (0
 class Osqp:
     """OSQP through its own interface, warm-started from its own answer of the step before."""
 
-    def __init__(self, blocks: list[Block], u_max: Array, **settings: Any) -> None:
-        self._bound = u_max[:, None]
-        self._problems = []
-        for block in blocks:
-            problem, q = osqp.OSQP(), np.zeros(block.P.shape[0])
-            problem.setup(
+    def __init__(self, problem: Problem, form: Form, **settings: Any) -> None:
+        self._bound = problem.mpc.bounds[:, None]
+        self._blocks = []
+        for block in form(problem):
+            solver, q = osqp.OSQP(), np.zeros(block.P.shape[0])
+            solver.setup(
                 P=sparse.triu(block.P, format="csc"),
                 q=q,
                 A=block.C,
@@ -122,16 +134,16 @@ class Osqp:
                 verbose=False,
                 **settings,
             )
-            self._problems.append((problem, q, block.axes))
+            self._blocks.append((solver, q, block.axes))
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
         """See `Solver`; of one vehicle."""
         inputs, solved = np.empty_like(gradient), True
-        for problem, q, axes in self._problems:
+        for solver, q, axes in self._blocks:
             g = gradient[0, axes].ravel()
             q[: len(g)] = g
-            problem.update(q=q)
-            result = problem.solve(raise_error=False)
+            solver.update(q=q)
+            result = solver.solve(raise_error=False)
             solved = solved and result.info.status_val == osqp.SolverStatus.OSQP_SOLVED
             inputs[0, axes] = result.x[: len(g)].reshape(-1, gradient.shape[2])
         return np.clip(inputs, -self._bound, self._bound), np.array([solved])
@@ -140,10 +152,10 @@ class Osqp:
 class Daqp:
     """DAQP, condensed: a workspace an axis, its active set kept."""
 
-    def __init__(self, mpc: MPC, u_max: Array) -> None:
-        H = mpc.hessian.shape[1]
+    def __init__(self, problem: Problem) -> None:
         self._models = []
-        for hessian, bound in zip(mpc.hessian, u_max, strict=True):
+        for hessian, bound in by_axis(problem):
+            H = len(hessian)
             model, box = daqp.Model(), np.full(H, bound)
             model.setup(hessian, np.zeros(H), np.zeros((0, H)), box, -box)
             self._models.append(model)
@@ -161,15 +173,15 @@ class Daqp:
 class Quadprog:
     """The solver quadprog, condensed: the factor of the Hessian is made once; no warm start."""
 
-    def __init__(self, mpc: MPC, u_max: Array) -> None:
+    def __init__(self, problem: Problem) -> None:
         import quadprog
 
         self._solve = quadprog.solve_qp
-        H = mpc.hessian.shape[1]
+        H = problem.hessian.shape[1]
         # It wants the inverse of the upper factor R, where the Hessian is RᵀR.
-        self._factors = [np.linalg.inv(np.linalg.cholesky(h).T) for h in mpc.hessian]
+        self._factors = [np.linalg.inv(np.linalg.cholesky(h).T) for h in problem.hessian]
         self._rows = np.hstack([np.eye(H), -np.eye(H)])
-        self._limits = [np.full(2 * H, -bound) for bound in u_max]
+        self._limits = [np.full(2 * H, -bound) for bound in problem.mpc.bounds]
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
         """See `Solver`; of one vehicle."""
@@ -183,47 +195,47 @@ class Quadprog:
 class Piqp:
     """PIQP, condensed: an interior point with its default tolerances, without warm start."""
 
-    def __init__(self, mpc: MPC, u_max: Array) -> None:
+    def __init__(self, problem: Problem) -> None:
         import piqp
 
         self._solved = piqp.PIQP_SOLVED
-        self._problems = []
-        for hessian, bound in zip(mpc.hessian, u_max, strict=True):
-            problem, box = piqp.DenseSolver(), np.full(len(hessian), bound)
-            problem.settings.compute_timings = False
-            problem.setup(hessian, np.zeros(len(hessian)), x_l=-box, x_u=box)
-            self._problems.append(problem)
+        self._solvers = []
+        for hessian, bound in by_axis(problem):
+            solver, box = piqp.DenseSolver(), np.full(len(hessian), bound)
+            solver.settings.compute_timings = False
+            solver.setup(hessian, np.zeros(len(hessian)), x_l=-box, x_u=box)
+            self._solvers.append(solver)
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
         """See `Solver`; of one vehicle."""
         inputs, solved = np.empty_like(gradient), True
-        for axis, problem in enumerate(self._problems):
-            problem.update(c=gradient[0, axis])
-            solved = problem.solve() == self._solved and solved
-            inputs[0, axis] = problem.result.x
+        for axis, solver in enumerate(self._solvers):
+            solver.update(c=gradient[0, axis])
+            solved = solver.solve() == self._solved and solved
+            inputs[0, axis] = solver.result.x
         return inputs, np.array([solved])
 
 
 class Hpipm:
     """HPIPM, a Riccati interior point, as it comes with CasADi: all axes in one problem."""
 
-    def __init__(self, mpc: MPC, u_max: Array) -> None:
+    def __init__(self, problem: Problem) -> None:
         import casadi
 
-        axes, H = mpc.hessian.shape[:2]
+        axes, H = problem.hessian.shape[:2]
+        of_states, of_inputs = weights(problem)
         width = 3 * axes  # of a stage: the states of all axes, then their inputs
         columns, states = H * width + 2 * axes, 2 * axes
         rows, diagonal = np.zeros((H * states, columns)), np.zeros(columns)
-        step = np.hstack(
-            [block_diag(*mpc.model.A), block_diag(*mpc.model.B[:, :, None]), -np.eye(states)]
-        )
+        A, B = problem.model.A, problem.model.B
+        step = np.hstack([block_diag(*A), block_diag(*B[:, :, None]), -np.eye(states)])
         limit = np.full(columns, np.inf)
         limit[:states] = 0.0
         for i in range(H):
             at, then = i * width + states, (i + 1) * width
             rows[i * states : (i + 1) * states, i * width : then + states] = step
-            diagonal[at:then], limit[at:then] = mpc.input_weights[i], u_max
-            diagonal[then : then + states] = np.tile(mpc.weights[i], axes)
+            diagonal[at:then], limit[at:then] = of_inputs[i], problem.mpc.bounds
+            diagonal[then : then + states] = np.tile(of_states[i], axes)
         P, C = casadi.DM(sparse.diags(diagonal, format="csc")), casadi.DM(sparse.csc_matrix(rows))
         options = {"N": H, "nx": [states] * (H + 1), "nu": [axes] * H + [0], "ng": [0] * (H + 1)}
         # With CasADi's own 1e8 for "no bound" it does not converge.
@@ -245,20 +257,21 @@ class Hpipm:
 class Ipopt:
     """IPOPT by CasADi, the usual way to write an MPC in Python: an NLP with states."""
 
-    def __init__(self, mpc: MPC, u_max: Array) -> None:
+    def __init__(self, problem: Problem) -> None:
         import casadi
 
-        (block,) = with_states(mpc, u_max)
-        columns, inputs = block.P.shape[0], u_max.size * mpc.hessian.shape[1]
+        (block,) = with_states(problem)
+        columns, H = block.P.shape[0], problem.hessian.shape[1]
+        inputs = problem.mpc.bounds.size * H
         z, g = casadi.SX.sym("z", columns), casadi.SX.sym("g", inputs)
         P, C = casadi.DM(block.P), casadi.DM(block.C[: columns - inputs])
         cost = 0.5 * casadi.bilin(P, z, z) + casadi.dot(g, z[:inputs])
         quiet = {"print_time": False, "error_on_fail": True}
         quiet |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-8}
-        problem = {"x": z, "p": g, "f": cost, "g": casadi.mtimes(C, z)}
-        self._solver = casadi.nlpsol("mpc", "ipopt", problem, quiet)
+        program = {"x": z, "p": g, "f": cost, "g": casadi.mtimes(C, z)}
+        self._solver = casadi.nlpsol("mpc", "ipopt", program, quiet)
         limit = np.full(columns, np.inf)
-        limit[:inputs] = np.repeat(u_max, mpc.hessian.shape[1])
+        limit[:inputs] = np.repeat(problem.mpc.bounds, H)
         self._given = {"lbx": -limit, "ubx": limit, "lbg": 0.0, "ubg": 0.0}
         self._z = np.zeros(columns)
 
@@ -273,7 +286,7 @@ class Ipopt:
 class Nothing:
     """No solver: what the measurement itself takes."""
 
-    def __init__(self, mpc: MPC, u_max: Array) -> None:  # noqa: ARG002 - like any other
+    def __init__(self, problem: Problem) -> None:  # noqa: ARG002 - like any other
         self._solved = np.array([True])
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
@@ -298,8 +311,8 @@ def contestants(tuned: Tuning) -> dict[str, Factory]:
         OURS: ExactSolver,
         NOTHING: Nothing,
         TUNED: tuned.make,
-        "OSQP, defaults": lambda mpc, u_max: Osqp(joint(mpc, u_max), u_max),
-        "OSQP, eps 1e-9": lambda mpc, u_max: OsqpSolver(mpc.hessian, u_max),
+        "OSQP, defaults": lambda problem: Osqp(problem, joint),
+        "OSQP, eps 1e-9": OsqpSolver,
         "DAQP": Daqp,
         **{name: make for name, (package, make) in extra.items() if find_spec(package)},
     }

@@ -50,7 +50,6 @@ HOVERS, UNKNOWN = -1, -2
 RULE = record(*AXIS_FIELDS, ("bound", "f8"), ("gain_p", "f8"), ("gain_v", "f8"))
 """Eq. (4) on one axis, u_max [m/s], and K on position [1/s] and velocity, 0 without feedback."""
 SEEN = record(
-    ("step", "i8"),
     ("in_force", "i8"),
     ("since", "i8"),
     ("base_step", "i8"),
@@ -59,7 +58,7 @@ SEEN = record(
     ("judged", "i8"),
     ("sent", "i8"),
 )
-"""What is known of one vehicle: step, horizon in force, and first step flown with it, of its newest
+"""What is known of one vehicle: horizon in force, and first step flown with it, of its newest
 observation; step and horizon of the one before, or -1; the horizon last seen to have come into
 force; the step up to which horizons were seen in force, or lost, or overtaken; and the number of
 horizons sent so far."""
@@ -95,6 +94,8 @@ class Settings(NamedTuple):
 class Memory(NamedTuple):
     """What is known of every vehicle, and what it was sent."""
 
+    observed: I1
+    """Step of the newest observation, or -1; shape (capacity,)."""
     seen: Annotated[NDArray[np.void], records(SEEN, 1)]
     """Shape (capacity,)."""
     state: Annotated[NDArray[np.void], records(STATE, 2)]
@@ -139,6 +140,7 @@ class Replay:
         )
         room = reach + H
         self._memory = Memory(
+            observed=np.zeros(capacity, dtype=np.int64),
             seen=np.zeros(capacity, dtype=SEEN),
             state=np.zeros((capacity, axes), dtype=STATE),
             sent=np.zeros((capacity, room), dtype=SENT),
@@ -151,7 +153,7 @@ class Replay:
             capacity, terms.dt_s, min(H, INPUTS_MAX // axes - H), fixed_s
         )
         self._clock = clock
-        self.observed_step: Indices = self._memory.seen["step"]
+        self.observed_step: Indices = self._memory.observed
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         for row in range(capacity):
             self.forget(row)
@@ -159,16 +161,17 @@ class Replay:
     def forget(self, row: int) -> None:
         """See `Scheme`."""
         memory = self._memory
-        memory.seen[row] = (-1, NO_HORIZON, 0, -1, NO_HORIZON, NO_HORIZON, 0, 0)
+        memory.observed[row] = -1
+        memory.seen[row] = (NO_HORIZON, 0, -1, NO_HORIZON, NO_HORIZON, 0, 0)
         memory.state["w"][row] = 0.0
         delay.forget(self.delay_bound, row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
         seen, state = self._memory.seen[row], self._memory.state[row]
-        if observation.step <= seen["step"]:
+        if observation.step <= self.observed_step[row]:
             return False
-        seen["step"] = observation.step
+        self.observed_step[row] = observation.step
         seen["in_force"], seen["since"] = observation.in_force, observation.since
         state["p"], state["v"] = observation.state.T
         return True
@@ -315,7 +318,7 @@ def _observe_disturbance(
 ) -> None:
     """Disturbance observer: from the observation before to the newest, where there is a new one."""
     seen = memory.seen[row]
-    begin, end = seen.base_step, seen.step
+    begin, end = seen.base_step, memory.observed[row]
     if end == begin:
         return
     before, after = _number(memory, row, seen.base_in_force), _number(memory, row, seen.in_force)
@@ -381,20 +384,20 @@ def _foresee(
         d = bound.steps[row]
         if settings.decay < 1.0:
             _observe_disturbance(settings, memory, row, d, course, track)
-        seen = memory.seen[row]
+        seen, observed = memory.seen[row], memory.observed[row]
         # Those that had d steps and are not in force have been overtaken, or are lost.
-        first = _first_after(memory, row, max(seen.in_force, seen.step - d))
+        first = _first_after(memory, row, max(seen.in_force, observed - d))
         for number in range(_first_after(memory, row, seen.in_force), first):
             lost += memory.sent[row, number % room].step > seen.judged
-        memory.seen[row].judged = max(seen.judged, seen.step - d)
+        memory.seen[row].judged = max(seen.judged, observed - d)
         flying = _number(memory, row, seen.in_force)
-        legs = _chart(course, memory, row, seen.step, d, flying, range(first, seen.sent))
+        legs = _chart(course, memory, row, observed, d, flying, range(first, seen.sent))
         found.ahead[i] = d
         for axis in range(axes):
             state, rule = memory.state[row, axis], settings.rule[axis]
             _roll(settings, memory, row, axis, course, legs, k + d + H, (state.p, state.v), track)
             # An observation from ahead of k, where clocks disagree, is taken as it is.
-            now, then = k - seen.step, k + d - seen.step
+            now, then = k - observed, k + d - observed
             for j in range(2):
                 found.estimate[i, axis, j] = track.states[max(now, 0), j]
                 found.start[i, axis, j] = track.states[max(then, 0), j]

@@ -1,4 +1,4 @@
-"""Uplink delay compensator, eq. (11): the one place that chooses which input is flown."""
+"""Uplink delay compensator, eq. (11): which horizon is flown, and the rule of flight aboard."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from client.compensator import Compensator
-from shared.config import Scenario, check
-from shared.model import Array, discretise
+from shared.config import check
+from shared.model import Array
 from shared.protocol import FEEDBACK, NO_HORIZON, Horizon, ProtocolError
+from shared.terms import Terms
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -19,7 +20,7 @@ HERE = np.zeros((2, 2))
 """A state; without feedback none matters."""
 
 
-def scenario(*, scheme: str = "predictive", exhausted: str = "hold") -> Scenario:
+def terms(*, scheme: str = "predictive", exhausted: str = "hold") -> Terms:
     """Ten stages of 0.1 s, on a network of no delay."""
     direction = {"delay": "none"}
     return check(
@@ -30,7 +31,7 @@ def scenario(*, scheme: str = "predictive", exhausted: str = "hold") -> Scenario
             "network": {"uplink": direction, "downlink": direction},
         },
         "test",
-    )
+    ).terms()
 
 
 def horizon(step: int, inputs: Array = INPUTS, *, observed_ns: int = 0) -> Horizon:
@@ -40,14 +41,14 @@ def horizon(step: int, inputs: Array = INPUTS, *, observed_ns: int = 0) -> Horiz
 
 def holding(step: int, inputs: Array = INPUTS, **keys: str) -> Compensator:
     """A compensator that has been given one horizon."""
-    compensator = Compensator(scenario(**keys))
+    compensator = Compensator(terms(**keys))
     compensator.offer(horizon(step, inputs), step)
     return compensator
 
 
 def test_vehicle_hovers_before_its_first_horizon() -> None:
     """There is nothing to fly yet."""
-    compensator = Compensator(scenario())
+    compensator = Compensator(terms())
     assert compensator.in_force == NO_HORIZON
     assert compensator.choose(0, HERE).tolist() == [0.0, 0.0]
     assert compensator.choose(1000, HERE).tolist() == [0.0, 0.0]
@@ -68,7 +69,7 @@ def test_held_horizon_flies_its_last_input_for_ever(step: int) -> None:
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
 def test_horizon_for_a_later_step_begins_at_once(exhausted: str) -> None:
     """The server's idea of the step may be ahead: its first input is the nearest there is."""
-    compensator = Compensator(scenario(exhausted=exhausted))
+    compensator = Compensator(terms(exhausted=exhausted))
     compensator.offer(horizon(105), 100)
     np.testing.assert_allclose(compensator.choose(101, HERE), INPUTS[:, 0], rtol=1e-7)
 
@@ -108,7 +109,7 @@ def test_brake_from_a_standstill_stays() -> None:
 
 def test_stale_horizon_is_ignored_after_reordering() -> None:
     """E11: the newest generation wins; what comes after it is counted."""
-    compensator = Compensator(scenario())
+    compensator = Compensator(terms())
     for made in (10, 12, 11, 12, 10):
         compensator.offer(horizon(made, INPUTS + 0.01 * (made - 10), observed_ns=made), 14)
     assert (compensator.in_force, compensator.observed_ns, compensator.stale) == (12, 12, 3)
@@ -119,7 +120,7 @@ def test_stale_horizon_is_ignored_after_reordering() -> None:
 @given(st.permutations(range(5)), st.integers(4, 12))
 def test_order_of_arrival_does_not_matter(order: list[int], step: int) -> None:
     """Once all have arrived, the newest is in force."""
-    compensator = Compensator(scenario())
+    compensator = Compensator(terms())
     for made in order:
         compensator.offer(horizon(made, INPUTS * 0.1 * (made + 1)), 4)
     expected = INPUTS[:, min(step - 4, H - 1)] * 0.5
@@ -181,13 +182,12 @@ def with_feedback(x: Array, disturbance: Array, gain: Array = GAIN) -> Horizon:
 @pytest.mark.parametrize("stage", [0, 1, 5, H - 1])
 def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
     """K times what the state is away from there, onto the input of the stage."""
-    flown = scenario(scheme="feedback")
-    model = discretise(flown.tau_s, flown.control.dt)
+    flown = terms(scheme="feedback")
     x, disturbance = np.array([[0.5, 0.25], [-1.0, 0.125]]), np.array([0.25, -0.5])
     compensator = Compensator(flown)
     compensator.offer(with_feedback(x, disturbance), 100)
     for u in INPUTS[:, :stage].T:
-        x = model.step(x, u + disturbance)
+        x = flown.model.step(x, u + disturbance)
     on_course = compensator.choose(100 + stage, x)
     np.testing.assert_allclose(on_course, INPUTS[:, stage], atol=1e-6)
     away = np.array([[0.02, -0.01], [0.03, 0.04]])
@@ -197,7 +197,7 @@ def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
 
 def test_feedback_stays_within_the_bounds() -> None:
     """However far away the vehicle is."""
-    compensator = Compensator(scenario(scheme="feedback"))
+    compensator = Compensator(terms(scheme="feedback"))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100)
     far = np.array([[1e6, 0.0], [-1e6, 0.0]])
     assert compensator.choose(105, far).tolist() == [-1.8, 0.9]
@@ -206,7 +206,7 @@ def test_feedback_stays_within_the_bounds() -> None:
 @pytest.mark.parametrize("step", [99, 100 + H, 120 + H])
 def test_there_is_no_feedback_where_there_is_no_stage(step: int) -> None:
     """Before the first and after the last: nothing says where the vehicle should be."""
-    compensator, plain = Compensator(scenario(exhausted="brake")), holding(100, exhausted="brake")
+    compensator, plain = Compensator(terms(exhausted="brake")), holding(100, exhausted="brake")
     compensator.offer(with_feedback(HERE, np.zeros(2)), 99)
     near, far = (compensator.choose(step, HERE + away) for away in (0.0, 3.0))
     np.testing.assert_array_equal(near, far)
@@ -215,7 +215,7 @@ def test_there_is_no_feedback_where_there_is_no_stage(step: int) -> None:
 
 def test_feedback_ends_with_its_horizon() -> None:
     """The next may come without."""
-    compensator = Compensator(scenario(scheme="feedback"))
+    compensator = Compensator(terms(scheme="feedback"))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100)
     compensator.offer(horizon(101), 101)
     near, far = (compensator.choose(103, HERE + away) for away in (0.0, 3.0))

@@ -5,19 +5,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from server.clock import ClockMap
+from server.controller import Controller
 from server.estimator import Estimator
-from shared.model import Array, discretise
+from server.scheme import Foresight, foresight
+from shared import config
+from shared.model import Array, Indices, discretise
 from shared.protocol import NO_HORIZON, Observation
+from shared.stopwatch import Stopwatch
 
 quick = settings(max_examples=60, deadline=None)
 
-REACH = 12
+H, REACH = 3, 12
 MODEL = discretise(np.array([0.81, 0.3]), 0.05)
 ROW = np.array([0])
-
-
-SENT = np.array([0])
-"""Length of a horizon, and which were sent; neither is asked for."""
+SENT = np.array([True])
+"""What is sent; (12) does not ask."""
 
 
 def seen(step: int, state: Array) -> Observation:
@@ -30,24 +33,31 @@ def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
     return Estimator(MODEL, capacity, REACH, compensate=compensate)
 
 
-FORESIGHT = make().foresee(ROW, np.array([-1]))
-"""Foresight before anything is known: (12) does not ask what a horizon was computed from."""
-
-
-def horizons(inputs: Array) -> Array:
+def computed(inputs: Array) -> Foresight:
     """Horizons that begin with these inputs [m/s; shape (n, axes)]."""
-    return np.repeat(inputs.astype(np.float32)[:, :, None], 3, axis=2)
+    found = foresight(len(inputs), 2, H)
+    found.horizons[:] = inputs[:, :, None]
+    return found
 
 
 def remember(estimator: Estimator, inputs: Array, *, start: int = 0) -> None:
     """Remember û(start), û(start + 1), … of the one vehicle; inputs of shape (steps, axes)."""
     for step, u in enumerate(inputs, start):
-        estimator.remember(ROW, np.array([step]), FORESIGHT, horizons(u[None]), SENT)
+        estimator.remember(ROW, np.array([step]), computed(u[None]), SENT)
+
+
+def estimates(estimator: Estimator, rows: Indices, step: Indices) -> Array:
+    """Estimates x̂(step), which are where planning starts: d is 0."""
+    found = foresight(len(rows), 2, H)
+    estimator.foresee(rows, step, found)
+    np.testing.assert_array_equal(found.start, found.estimate)
+    assert not found.ahead.any()
+    return found.estimate
 
 
 def estimate(estimator: Estimator, step: int) -> Array:
     """Estimate x̂(step) of the one vehicle."""
-    return estimator.estimate(ROW, np.array([step]))[0]
+    return estimates(estimator, ROW, np.array([step]))[0]
 
 
 def flown(x: Array, inputs: Array) -> Array:
@@ -67,8 +77,7 @@ def test_estimate_is_the_observation_flown_on(age: int, now: int) -> None:
     estimator = make()
     estimator.observe(0, seen(now - age, x))
     remember(estimator, inputs)
-    assert estimator.age(ROW, np.array([now])).tolist() == [age]
-    assert estimator.within_reach(ROW, np.array([now])).tolist() == [True]
+    assert now - estimator.observed_step.tolist()[0] == age
     expected = flown(x, inputs[now - age :])
     np.testing.assert_allclose(estimate(estimator, now), expected, rtol=0, atol=1e-13)
 
@@ -170,21 +179,6 @@ def test_asking_for_estimates_changes_no_later_one() -> None:
     np.testing.assert_array_equal(estimate(asked, 24), estimate(silent, 24))
 
 
-@pytest.mark.parametrize(
-    ("observed", "now", "within"), [(5, 5, True), (5, 17, True), (5, 18, False), (30, 18, True)]
-)
-def test_old_observations_are_out_of_reach(observed: int, now: int, *, within: bool) -> None:
-    """Twelve steps are bridged, thirteen are not; one from ahead of us is as good as new."""
-    estimator = make()
-    estimator.observe(0, seen(observed, np.zeros((2, 2))))
-    assert estimator.within_reach(ROW, np.array([now])).tolist() == [within]
-
-
-def test_vehicle_that_was_never_observed_is_out_of_reach() -> None:
-    """No step of such a vehicle is within reach, step 0 included."""
-    assert make().within_reach(ROW, np.array([0])).tolist() == [False]
-
-
 def test_observation_from_ahead_is_taken_as_it_is() -> None:
     """Where the clocks disagree by a step there is nothing to fly on by."""
     estimator = make()
@@ -210,11 +204,11 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
     for row in both:
         estimator.observe(row, seen(500, x))
     for step in range(480, 501):
-        estimator.remember(both, np.full(2, step), FORESIGHT, horizons(np.ones((2, 2))), SENT)
+        estimator.remember(both, np.full(2, step), computed(np.ones((2, 2))), SENT.repeat(2))
     estimator.forget(0)
-    assert estimator.within_reach(both, np.array([501, 501])).tolist() == [False, True]
+    assert estimator.observed_step.tolist() == [-1, 500]
     assert estimator.observe(0, seen(0, x))
-    here, there = estimator.estimate(both, np.array([3, 501]))
+    here, there = estimates(estimator, both, np.array([3, 501]))
     np.testing.assert_allclose(here, flown(x, np.zeros((3, 2))), rtol=0, atol=1e-13)
     np.testing.assert_allclose(there, flown(x, np.ones((1, 2))), rtol=0, atol=1e-13)
     remember(estimator, np.array([[0.5, 0.75]]))
@@ -225,7 +219,7 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.booleans())
 def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate: bool) -> None:
-    """Each with its own row, steps, gaps and age."""
+    """Each with its own row, steps, gaps and age, to the last bit."""
     rng = np.random.default_rng(seed)
     rows = rng.permutation(8)[:vehicles]
     together = make(8, compensate=compensate)
@@ -234,12 +228,53 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
     for _ in range(30):
         step += rng.integers(1, 4, vehicles)
         u = rng.normal(size=(vehicles, 2)).astype(np.float32)
-        together.remember(rows, step, FORESIGHT, horizons(u), SENT)
+        together.remember(rows, step, computed(u), SENT.repeat(vehicles))
         for i, single in enumerate(singles):
-            single.remember(ROW, step[[i]], FORESIGHT, horizons(u[[i]]), SENT)
+            single.remember(ROW, step[[i]], computed(u[[i]]), SENT)
     for i, (row, single) in enumerate(zip(rows, singles, strict=True)):
         x, observed = rng.normal(size=(2, 2)), int(step[i] + 1 - rng.integers(0, REACH + 1))
         together.observe(int(row), seen(observed, x))
         single.observe(0, seen(observed, x))
     expected = [estimate(single, int(k) + 1) for single, k in zip(singles, step, strict=True)]
-    np.testing.assert_allclose(together.estimate(rows, step + 1), expected, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(estimates(together, rows, step + 1), expected)
+
+
+# -- how long an observation counts --------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=["none", "predictive", "committed", "feedback"])
+def controller(request: pytest.FixtureRequest) -> Controller:
+    """The controller of a vehicle under each scheme, in steps of 0.05 s."""
+    table = config.to_table(config.load("paper"))
+    table["control"] = {**table["control"], "scheme": request.param, "dt": 0.05}
+    flown = config.check(table, "test")
+    return Controller(flown, flown.terms(), 1, ClockMap(1, flown.dt_ns), Stopwatch())
+
+
+@pytest.mark.parametrize(
+    ("observed", "now", "able"), [(5, 5, True), (5, 45, True), (5, 46, False), (60, 46, True)]
+)
+def test_old_observations_are_out_of_reach(
+    controller: Controller, observed: int, now: int, *, able: bool
+) -> None:
+    """Two seconds are bridged, a step more is not; one from ahead of us is as good as new."""
+    controller.forget(0)
+    controller.observe(0, seen(observed, np.zeros((2, 2))))
+    assert controller.able(ROW, np.array([now])).tolist() == [able]
+
+
+def test_vehicle_that_was_never_observed_is_out_of_reach(controller: Controller) -> None:
+    """No step of such a vehicle is within reach, step 0 included; nor of a forgotten one."""
+    controller.observe(0, seen(7, np.zeros((2, 2))))
+    controller.forget(0)
+    able = [controller.able(ROW, np.array([step])).tolist() for step in (0, 7)]
+    assert able == [[False], [False]]
+
+
+def test_every_step_is_decided_once(controller: Controller) -> None:
+    """Neither the step that was decided last, nor one before it, is decided again."""
+    controller.forget(0)
+    controller.observe(0, seen(5, np.zeros((2, 2))))
+    controller.decide(ROW, np.array([7]))
+    able = [controller.able(ROW, np.array([step])).tolist() for step in (6, 7, 8)]
+    assert able == [[False], [False], [True]]
