@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.contestants import by_axis
 from benchmarks.harness import Table, progress
-from benchmarks.problems import derive, listening
+from benchmarks.problems import derive, gradients, listening
 from benchmarks.reference import NoReference, Reference
 from server.exact import ExactSolver
-from server.mpc import MPC, condense
+from server.mpc import LATER, Problem, make_mpc, pose
 from shared.config import Scenario
-from shared.model import Array, discretise
+from shared.model import Array
 from sim.flight import fly
 
 HORIZONS = (1, 30, 50, 100)
@@ -112,18 +113,18 @@ def check(task: Task) -> dict[str, Any]:
     )
     figures |= {"horizon": task.horizon, "error": 0.0}
     figures["kind"] = "flown" if task.reference else "random"
-    for mpc, u_max, gradient, guess in _problems(task):
-        solver = ExactSolver(mpc, u_max)
+    for problem, gradient, guess in _problems(task):
+        solver = ExactSolver(problem)
         inputs, solved = solver.solve(gradient, guess)
-        again, _ = ExactSolver(mpc, u_max).solve(gradient, guess)
-        bound = u_max[:, None]
+        again, _ = ExactSolver(problem).solve(gradient, guess)
+        bound = problem.mpc.bounds[:, None]
         figures["problems"] += gradient.shape[0] * gradient.shape[1]
         figures["active"] += int((np.abs(inputs) >= bound).any(axis=2).sum())
         figures["fallbacks"] += solver.fallbacks
         figures["unsolved"] += int((~solved).sum())
         figures["outside"] += int((np.abs(inputs) > bound).sum())
         figures["other_bits"] += int((inputs.view(np.int64) != again.view(np.int64)).sum())
-        references = [Reference(h, b) for h, b in zip(mpc.hessian, u_max, strict=True)]
+        references = [Reference(hessian, limit) for hessian, limit in by_axis(problem)]
         for vehicle, axis in np.ndindex(*gradient.shape[:2]):
             if not solved[vehicle]:
                 continue
@@ -137,39 +138,30 @@ def check(task: Task) -> dict[str, Any]:
     return figures
 
 
-def _problems(task: Task) -> Iterator[tuple[MPC, Array, Array, Array]]:
-    """MPC, u_max [m/s], gradients and guesses [m/s] of a task."""
+def _problems(task: Task) -> Iterator[tuple[Problem, Array, Array]]:
+    """Problem, gradients and guesses [m/s] of a task."""
     scenario = task.scenario()
     if task.reference:
         with listening() as listeners:
             flight = fly(scenario)
         assert flight.failure is None, flight.failure
-        generator, _, tracker, _ = listeners
-        for listener in (generator, tracker):
-            asked = listener.asked[-task.count :]
-            gradient, guess = (np.concatenate(each) for each in zip(*asked, strict=True))
-            yield listener.mpc, scenario.u_max, gradient, guess
+        _, later = listeners
+        for gradient, guess in zip(*later.heard(task.count), strict=True):
+            yield later.problem, gradient, guess
         return
-    mpc = condense(
-        discretise(scenario.tau_s, task.dt_s),
-        scenario.control,
-        change_weight=scenario.control.change_weight,
-    )
+    terms = scenario.terms()
+    problem = pose(terms.model, make_mpc(terms, scenario.control), LATER)
     where = (task.horizon, round(1000 * task.dt_s), round(1e6 * task.input_weight))
     rng = np.random.default_rng([SEED, *where, round(10 * task.scale)])
-    axes, bound = len(scenario.u_max), scenario.u_max[:, None]
+    axes, bound = terms.axes, problem.mpc.bounds[:, None]
     x = rng.normal(0.0, task.scale, (task.count, axes, 2))
     # Targets that wander off by about as much as a vehicle could fly in the time.
     drift = rng.normal(
         0.0, task.scale * np.sqrt(task.dt_s), (task.count, axes, task.horizon + 1, 2)
     )
     guess = np.clip(rng.normal(0.0, 1.0, (task.count, axes, task.horizon)), -bound, bound)
-    yield (
-        mpc,
-        scenario.u_max,
-        mpc.gradient(x, np.cumsum(drift, axis=2), guess, np.zeros(x.shape[:2])),
-        guess,
-    )
+    calm, target = np.zeros(x.shape[:2]), np.cumsum(drift, axis=2)
+    yield problem, gradients(problem, x, target, guess, calm), guess
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, Table]:

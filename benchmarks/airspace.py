@@ -8,9 +8,10 @@ from collections import deque
 
 import numpy as np
 
+from server.controller import BLOCK
 from server.endpoint import Server
 from server.planner import Planner
-from server.solver import NEAR
+from server.scheme import foresight
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
 from shared.model import Array, Indices, discretise
@@ -54,32 +55,31 @@ class Vehicles:
 
 
 class PlannedFleet:
-    """A planner, and vehicles whose states it knows."""
+    """A planner, and vehicles whose states it knows, planned for a block at a time as in a server.
 
-    def __init__(self, scenario: Scenario, count: int, stopwatch: Stopwatch) -> None:
-        model = discretise(scenario.tau_s, scenario.control.dt)
-        self.planner = Planner(scenario, model, count, stopwatch)
-        self.vehicles = Vehicles(scenario, count)
-        self._rows = np.arange(count)
-        self._plan: Plan | None = None
+    Args:
+        scenario: what they fly.
+        count: how many.
+    """
 
-    def prepare(self) -> None:
-        """Fly the step before, and note what planning is given."""
-        if self._plan is not None:
-            self.vehicles.fly(self._plan.inputs[:, :, 0])
-        step, x = self.vehicles.step, self.vehicles.x
-        planned = self.planner.planned(self._rows, step, x)
-        self._given = (self._rows, step, x, *planned, np.zeros(x.shape[:2]))
+    def __init__(self, scenario: Scenario, count: int) -> None:
+        terms = scenario.terms()
+        self._planner = Planner(scenario, terms, count, BLOCK, Stopwatch())
+        self._found = foresight(BLOCK, terms.axes, terms.horizon)
+        self._vehicles = Vehicles(scenario, count)
+        self._blocks = [
+            np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)
+        ]
 
     def plan(self) -> None:
         """Plan for all vehicles."""
-        self._plan = self.planner.plan(*self._given)
+        for rows in self._blocks:
+            self._found.start[: len(rows)] = self._vehicles.x[rows]
+            self._planner.plan(rows, self._vehicles.step[rows], self._found)
 
-    def active(self, u_max: Array) -> float:
-        """Share of the axis problems that have an input at its bound [u_max: (axes,)]."""
-        mpcs = (self.planner._generator, self.planner._tracker)
-        at_bound = [np.abs(mpc.inputs) >= NEAR * u_max[:, None] for mpc in mpcs]
-        return float(np.mean([some.any(axis=2).mean() for some in at_bound]))
+    def fly(self) -> None:
+        """Fly a step as planned."""
+        self._vehicles.fly(self._planner.inputs[:, :, 0])
 
 
 class Airspace:
@@ -131,7 +131,7 @@ class Airspace:
         sent = len(self.server.outbox())
         if sent:
             assert sent == len(self._sessions), "a vehicle was sent no horizon"
-            planned = self.server._planner._tracker.inputs
+            planned = self.server.controller.planner.inputs
             self._vehicles.fly(planned[:sent, :, 0])
             self._past.append(self._vehicles.x)
             self._due_ns += self._dt_ns

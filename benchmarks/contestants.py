@@ -85,7 +85,11 @@ def with_states(problem: Problem) -> list[Block]:
 
 
 Form = Callable[[Problem], list[Block]]
-FORMS: dict[str, Form] = {"condensed, by axis": condensed, "condensed, jointly": joint, "with states": with_states}
+FORMS: dict[str, Form] = {
+    "condensed, by axis": condensed,
+    "condensed, jointly": joint,
+    "with states": with_states,
+}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ import numpy as np
 
 from server import planner
 from server.exact import ExactSolver
-from server.mpc import MPC
+from server.mpc import FIRST, Problem, gradient, lead
+from server.planner import GENERATOR, TRACKER
 from server.solver import Solver
 from shared import config
 from shared.config import ControlConfig, Scenario
@@ -26,14 +27,38 @@ def derive(name: str, **sections: Any) -> Scenario:
     return config.check(table, "a benchmark")
 
 
+def gradients(
+    problem: Problem, x: Array, target: Array, previous: Array, disturbance: Array
+) -> Array:
+    """g of the QPs of n vehicles; shape (n, axes, H).
+
+    Args:
+        problem: what poses them.
+        x: state at stage 0 [m, m/s]; shape (n, axes, 2).
+        target: desired states at the stages 0 … H [m, m/s]; shape (n, axes, H + 1, 2).
+        previous: horizon before, as seen now [m/s]; shape (n, axes, H).
+        disturbance: what is added to every input on its way [m/s]; shape (n, axes).
+    """
+    mpc, which, found = problem.mpc, problem.which, np.empty(previous.shape)
+    drift, fresh = np.empty((previous.shape[2], 2)), problem.which == FIRST
+    for at in np.ndindex(*previous.shape[:2]):
+        start, w, axis = (float(x[at][0]), float(x[at][1])), float(disturbance[at]), at[1]
+        lead(mpc, axis, start, w, target[at], drift)
+        gradient(mpc, axis, which, w, target[at], previous[at], 0, fresh, drift, found[at])
+    return found
+
+
+def saturated(inputs: Array, problem: Problem) -> float:
+    """Share of the axis problems that have an input at its bound, in inputs (..., axes, H)."""
+    return float((np.abs(inputs) >= problem.mpc.bounds[:, None]).any(axis=-1).mean())
+
+
 @dataclass(frozen=True)
 class Recorded:
     """The QPs of one vehicle's flight; two a tick, the generator's and the tracker's."""
 
-    mpc: MPC
-    """MPC of the QPs; both solves have the same Hessian."""
-    u_max: Array
-    """Bounds of the input [m/s]; shape (axes,)."""
+    problem: Problem
+    """What they have in common."""
     gradient: Array
     """Gradients of the QPs; shape (2, ticks, axes, H)."""
     guess: Array
@@ -47,30 +72,60 @@ class Recorded:
     def active(self) -> float:
         """Share of the axis problems that have an input at its bound."""
         flat = self.gradient.reshape(-1, *self.gradient.shape[2:])
-        inputs, _ = ExactSolver(self.mpc, self.u_max).solve(flat, np.zeros_like(flat))
-        return float((np.abs(inputs) >= self.u_max[:, None]).any(axis=2).mean())
+        inputs, _ = ExactSolver(self.problem).solve(flat, np.zeros_like(flat))
+        return saturated(inputs, self.problem)
 
 
 class Listener:
-    """A solver that notes what it is asked."""
+    """An exact solver that notes what generator and tracker ask it by turns."""
 
-    def __init__(self, solver: Solver, mpc: MPC) -> None:
-        self._solver = solver
-        self.mpc = mpc
-        self.asked: list[tuple[Array, Array]] = []
+    def __init__(self, problem: Problem) -> None:
+        self._solver = ExactSolver(problem)
+        self.problem = problem
+        self._asked: list[tuple[Array, Array]] = []
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """Note the problem and solve it (see `Solver`)."""
-        self.asked.append((gradient, guess))
+        """Note the problems and solve them (see `Solver`)."""
+        self._asked.append((gradient, guess))
         return self._solver.solve(gradient, guess)
+
+    def heard(self, turns: int = 0) -> tuple[Array, Array]:
+        """Gradients and guesses of the last turns, or all; each of shape (2, problems, axes, H).
+
+        The generator's come first, then the tracker's.
+        """
+        asked = self._asked[-2 * turns :]
+        halves = [asked[half::2] for half in (GENERATOR, TRACKER)]
+        gradient, guess = (
+            np.array([np.concatenate([pair[i] for pair in half]) for half in halves])
+            for i in range(2)
+        )
+        return gradient, guess
+
+    def forget(self) -> None:
+        """Forget what was asked."""
+        self._asked.clear()
+
+
+class ByTurns:
+    """Two solvers, one for the generator and one for the tracker: each keeps its warm start."""
+
+    def __init__(self, make: Callable[[Problem], Solver], problem: Problem) -> None:
+        self._next, self._other = make(problem), make(problem)
+
+    def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
+        """Let the one whose turn it is solve (see `Solver`)."""
+        solver = self._next
+        self._next, self._other = self._other, solver
+        return solver.solve(gradient, guess)
 
 
 @contextmanager
-def solving(make: Callable[[MPC, Array], Solver]) -> Iterator[None]:
-    """Planners made meanwhile solve by `make(mpc, u_max)`, whatever their scenario says."""
+def solving(make: Callable[[Problem], Solver]) -> Iterator[None]:
+    """Planners made meanwhile solve by `make(problem)`, whatever their scenario says."""
 
-    def make_solver(control: ControlConfig, mpc: MPC, u_max: Array) -> Solver:  # noqa: ARG001
-        return make(mpc, u_max)
+    def make_solver(control: ControlConfig, problem: Problem) -> Solver:  # noqa: ARG001
+        return make(problem)
 
     with patch.object(planner, "make_solver", make_solver):
         yield
@@ -80,12 +135,12 @@ def solving(make: Callable[[MPC, Array], Solver]) -> Iterator[None]:
 def listening() -> Iterator[list[Listener]]:
     """Planners made meanwhile solve exactly, and are listened to.
 
-    Gives the generator, the generator of a first step, the tracker and that of a first step.
+    Gives the listener to first steps and the one to later steps.
     """
     listeners: list[Listener] = []
 
-    def make(mpc: MPC, u_max: Array) -> Solver:
-        listeners.append(Listener(ExactSolver(mpc, u_max), mpc))
+    def make(problem: Problem) -> Solver:
+        listeners.append(Listener(problem))
         return listeners[-1]
 
     with solving(make):
@@ -97,9 +152,5 @@ def record(scenario: Scenario, ticks: int) -> Recorded:
     with listening() as listeners:
         flight = fly(scenario)
     assert flight.failure is None, flight.failure
-    generator, _, tracker, _ = listeners
-    asked = [listener.asked[-ticks:] for listener in (generator, tracker)]
-    gradient, guess = (
-        np.array([[pair[i][0] for pair in half] for half in asked]) for i in range(2)
-    )
-    return Recorded(generator.mpc, scenario.u_max, gradient, guess)
+    _, later = listeners
+    return Recorded(later.problem, *later.heard(ticks))

@@ -7,7 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, Factory, Tuning, contestants
+from benchmarks.contestants import (
+    NOTHING,
+    OURS,
+    TUNED,
+    TUNINGS,
+    Factory,
+    Tuning,
+    by_axis,
+    contestants,
+)
 from benchmarks.harness import (
     HOT,
     PACED,
@@ -104,7 +113,7 @@ class Entry:
     """One contestant, with a solver for the generator and one for the tracker."""
 
     def __init__(self, make: Factory, recorded: Recorded) -> None:
-        self._generator, self._tracker = (make(recorded.mpc, recorded.u_max) for _ in range(2))
+        self._generator, self._tracker = (make(recorded.problem) for _ in range(2))
         # Cut up beforehand, for that would cost as much as a solve.
         pairs = [
             [(gradient[None], guess[None]) for gradient, guess in zip(*half, strict=True)]
@@ -145,10 +154,7 @@ def tune(
 
 def _references(recorded: Recorded) -> Array:
     """Exact inputs; shape (2, ticks, axes, H)."""
-    references = [
-        Reference(hessian, bound)
-        for hessian, bound in zip(recorded.mpc.hessian, recorded.u_max, strict=True)
-    ]
+    references = [Reference(hessian, bound) for hessian, bound in by_axis(recorded.problem)]
     inputs = np.empty_like(recorded.gradient)
     for half, tick, axis in progress(list(np.ndindex(inputs.shape[:3])), "exact answers"):
         inputs[half, tick, axis] = references[axis].solve(recorded.gradient[half, tick, axis])

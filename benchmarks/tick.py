@@ -29,7 +29,8 @@ from benchmarks.harness import (
     us,
     without_gc,
 )
-from benchmarks.problems import derive, listening, record, solving
+from benchmarks.problems import ByTurns, derive, listening, record, saturated, solving
+from server.exact import ExactSolver
 from shared.config import Scenario
 from shared.stopwatch import Stopwatch
 
@@ -39,7 +40,7 @@ TARGET_TICK, TARGET_FLEET, TARGET_P99_MS = 5.0, 100.0, 20.0
 FIGURE = Path(__file__).parent.parent / "docs" / "scaling.png"
 SETTLE = 50
 """Number of ticks before any counts: vehicles start on the reference, where they do not stay."""
-STAGES = ("estimate", "plan", "solve")
+STAGES = ("estimate", "plan", "trigger")
 """Laps of the stopwatch that the target is about."""
 
 
@@ -120,7 +121,7 @@ def _single(
 ) -> dict[str, Any]:
     """Time from a decoded observation to a packed horizon, one vehicle; two servers by turns."""
     ours = Airspace(scenario, 1)
-    with solving(tuned.make):
+    with solving(lambda problem: ByTurns(tuned.make, problem)):
         theirs = Airspace(scenario, 1)
     spaces = {"ours": ours, "osqp": theirs}
     result: dict[str, Any] = {}
@@ -144,39 +145,46 @@ def _single(
 
 
 def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: Counts) -> dict[str, Any]:
-    """Figures of planning for all in one batch, then for some of them one by one by OSQP."""
-    stopwatch = Stopwatch(time.process_time_ns)
+    """Figures of planning for all in one batch, then for some of them one by one by OSQP.
+
+    A second fleet flies the same, and is listened to: what it asks is given to both solvers alone.
+    """
+    fleet = PlannedFleet(scenario, counts.fleet)
     with listening() as listeners:
-        fleet = PlannedFleet(scenario, counts.fleet, stopwatch)
-    generator, _, tracker, _ = listeners
-    sample = range(0, counts.fleet, max(1, counts.fleet // counts.fleet_sample))
-    mpc, u_max = generator.mpc, scenario.u_max
+        heard = PlannedFleet(scenario, counts.fleet)
+    _, later = listeners
+    exact, sample = (
+        ExactSolver(later.problem),
+        range(0, counts.fleet, max(1, counts.fleet // counts.fleet_sample)),
+    )
     # Each of them has its own, and keeps its own warm start.
-    others = [[tuned.make(mpc, u_max) for _ in range(2)] for _ in sample]
+    others = [[tuned.make(later.problem) for _ in range(2)] for _ in sample]
     plan_ns, solve_ns, theirs_ns, active = [], [], [], []
     with without_gc():
         for tick in progress(range(counts.fleet_ticks + SETTLE), f"fleet, {name}"):
-            fleet.prepare()
-            before_ns, start_ns = stopwatch.spent_ns["solve"], time.process_time_ns()
+            start_ns = time.process_time_ns()
             fleet.plan()
-            ended_ns = time.process_time_ns()
-            spent_ns = stopwatch.spent_ns["solve"] - before_ns
-            asked = [listener.asked[-1] for listener in (generator, tracker)]
-            for listener in listeners:
-                listener.asked.clear()
-            if tick < SETTLE:
-                continue
-            single_ns = []
-            for row, pair in zip(sample, others, strict=True):
-                problems = [tuple(each[row : row + 1] for each in pairs) for pairs in asked]
-                begun_ns = time.process_time_ns()
-                for solver, problem in zip(pair, problems, strict=True):
-                    solver.solve(*problem)
-                single_ns.append(time.process_time_ns() - begun_ns)
-            plan_ns.append(ended_ns - start_ns)
-            solve_ns.append(spent_ns)
-            theirs_ns.append(float(np.mean(single_ns)))
-            active.append(fleet.active(u_max))
+            planned_ns = time.process_time_ns() - start_ns
+            heard.plan()
+            fleet.fly()
+            heard.fly()
+            if tick >= SETTLE:
+                gradient, guess = later.heard()
+                start_ns = time.process_time_ns()
+                answers = [exact.solve(*half)[0] for half in zip(gradient, guess, strict=True)]
+                solve_ns.append(time.process_time_ns() - start_ns)
+                single_ns = []
+                for row, pair in zip(sample, others, strict=True):
+                    one = slice(row, row + 1)
+                    problems = [(gradient[half, one], guess[half, one]) for half in range(2)]
+                    start_ns = time.process_time_ns()
+                    for solver, problem in zip(pair, problems, strict=True):
+                        solver.solve(*problem)
+                    single_ns.append(time.process_time_ns() - start_ns)
+                plan_ns.append(planned_ns)
+                theirs_ns.append(float(np.mean(single_ns)))
+                active.append(saturated(np.array(answers), later.problem))
+            later.forget()
     ours = {
         "plan": figures_us(plan_ns, per=counts.fleet),
         "solve": figures_us(solve_ns, per=counts.fleet),
@@ -317,7 +325,7 @@ def fleet_table(fleets: Mapping[str, Any]) -> Table:
         row += [us(figures[key]["p50_us"]) for key in ("plan", "solve", "osqp")]
         row += [times(figures["ratio"][key]["p50"], TARGET_FLEET) for key in ("plan", "solve")]
         rows.append(row)
-    headings = ["bounds active", "ours, planning [µs]", "of it solving", "tuned OSQP, solving"]
+    headings = ["bounds active", "ours, planning [µs]", "solving alone", "tuned OSQP, solving"]
     headings += ["OSQP / planning", "OSQP / solving"]
     return Table(headings, rows)
 

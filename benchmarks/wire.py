@@ -14,11 +14,11 @@ from shared.protocol import (
     Horizon,
     Message,
     Observation,
-    Terms,
     Welcome,
     decode,
     encode,
 )
+from shared.terms import Terms
 
 NOTHING = "nothing"
 

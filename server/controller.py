@@ -78,6 +78,7 @@ class Controller:
             else Estimator(terms.model, room, self._reach, compensate=terms.indexed)
         )
         self.planner = Planner(scenario, terms, room, block, stopwatch)
+        """Plans of every vehicle."""
         self._trigger = make_trigger(control, room)
         self._found = foresight(block, terms.axes, terms.horizon)
         self._stopwatch = stopwatch

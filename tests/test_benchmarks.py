@@ -126,7 +126,7 @@ def test_the_reference_is_the_same_whoever_finds_it(
     monkeypatch: pytest.MonkeyPatch, saturated: Recorded
 ) -> None:
     """By quadprog or by scipy: what is proved is the one optimum."""
-    reference = Reference(saturated.mpc.hessian[0], saturated.u_max[0])
+    reference = Reference(saturated.problem.hessian[0], saturated.problem.mpc.bounds[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]
     monkeypatch.setattr("benchmarks.reference.find_spec", lambda _: None)

@@ -20,7 +20,7 @@ H, REACH = 3, 12
 MODEL = discretise(np.array([0.81, 0.3]), 0.05)
 ROW = np.array([0])
 SENT = np.array([True])
-"""What is sent; (12) does not ask."""
+"""Which vehicles are sent their horizon; (12) does not ask."""
 
 
 def seen(step: int, state: Array) -> Observation:
@@ -228,7 +228,7 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
     for _ in range(30):
         step += rng.integers(1, 4, vehicles)
         u = rng.normal(size=(vehicles, 2)).astype(np.float32)
-        together.remember(rows, step, computed(u), SENT.repeat(vehicles))
+        together.remember(rows, step, computed(u), rng.random(vehicles) < 0.5)
         for i, single in enumerate(singles):
             single.remember(ROW, step[[i]], computed(u[[i]]), SENT)
     for i, (row, single) in enumerate(zip(rows, singles, strict=True)):

@@ -9,38 +9,46 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
+from benchmarks.problems import gradients
 from server import exact
 from server.exact import ExactSolver
-from server.mpc import MPC, condense
-from server.solver import NEAR, OsqpSolver
+from server.mpc import LATER, Problem, make_mpc, pose
+from server.solver import OsqpSolver
 from shared import config
-from shared.model import Array, discretise
+from shared.model import Array
 
+PAPER = config.load("paper")
 U_MAX = np.array([1.8, 1.0])
 
 
-def mpc(tau_s: tuple[float, ...] = (0.855, 0.3), **control: Any) -> MPC:
+def make(
+    tau_s: tuple[float, ...] = (0.855, 0.3),
+    u_max: tuple[float, ...] = (1.8, 1.0),
+    **control: Any,
+) -> Problem:
     """The paper's problem, with some keys of `control` changed."""
-    settings_ = msgspec.structs.replace(config.load("paper").control, **control)
-    model = discretise(np.array(tau_s), settings_.dt)
-    return condense(model, settings_, change_weight=settings_.change_weight)
+    replace = msgspec.structs.replace
+    model = replace(PAPER.model, tau_s=tau_s, u_max=u_max)
+    scenario = replace(PAPER, model=model, control=replace(PAPER.control, **control))
+    terms = scenario.terms()
+    return pose(terms.model, make_mpc(terms, scenario.control), LATER)
 
 
 ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 1.0)}
 """Long steps and hardly a cost of the input: here sets wander in circles."""
 
 
-def problems(problem: MPC, count: int, scale: float, seed: int) -> tuple[Array, Array]:
+def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Array, Array]:
     """Random gradients, of moving targets and states `scale` away, and random guesses."""
     rng = np.random.default_rng(seed)
     axes, H = problem.hessian.shape[:2]
     x = rng.normal(0.0, scale, (count, axes, 2))
     target = np.cumsum(rng.normal(0.0, 0.2 * scale, (count, axes, H + 1, 2)), axis=2)
     guess = np.clip(rng.normal(0.0, 1.0, (count, axes, H)), -U_MAX[:, None], U_MAX[:, None])
-    return problem.gradient(x, target, guess, np.zeros(x.shape[:2])), guess
+    return gradients(problem, x, target, guess, np.zeros(x.shape[:2])), guess
 
 
-def residual(problem: MPC, inputs: Array, gradient: Array) -> float:
+def residual(problem: Problem, inputs: Array, gradient: Array) -> float:
     """How far inputs are from meeting the optimality conditions, relative to the gradient."""
     slope = np.einsum("akl,nal->nak", problem.hessian, inputs) + gradient
     at_bound = np.abs(inputs) >= U_MAX[:, None]
@@ -52,9 +60,9 @@ def residual(problem: MPC, inputs: Array, gradient: Array) -> float:
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
 def test_it_equals_an_independent_reference(horizon: int, scale: float) -> None:
     """Bounded least squares of scipy, from bounds never to nearly always active."""
-    problem = mpc(horizon=horizon)
+    problem = make(horizon=horizon)
     gradient, guess = problems(problem, 20, scale, seed=horizon)
-    inputs, solved = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    inputs, solved = ExactSolver(problem).solve(gradient, guess)
     assert solved.all()
     for n in range(20):
         for axis, bound in enumerate(U_MAX):
@@ -76,9 +84,9 @@ def test_every_answer_is_optimal_and_within_its_box(
     seed: int, scale: float, horizon: int, *, input_reference: bool, change_weight: float
 ) -> None:
     """The conditions of optimality, on random problems."""
-    problem = mpc(horizon=horizon, input_reference=input_reference, change_weight=change_weight)
+    problem = make(horizon=horizon, input_reference=input_reference, change_weight=change_weight)
     gradient, guess = problems(problem, 10, scale, seed)
-    inputs, solved = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    inputs, solved = ExactSolver(problem).solve(gradient, guess)
     assert solved.all()
     assert (np.abs(inputs) <= U_MAX[:, None]).all()
     assert residual(problem, inputs, gradient) < 1e-10
@@ -91,9 +99,9 @@ def test_problems_that_cycle_are_solved_all_the_same(
     """One input at a time, and without that by DAQP; as exactly either way."""
     if pivots is not None:
         monkeypatch.setattr(exact, "PIVOTS_MAX", pivots)
-    problem = mpc((0.4, 0.6), **ROUGH)
+    problem = make((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
-    solver = ExactSolver(problem, U_MAX)
+    solver = ExactSolver(problem)
     inputs, solved = solver.solve(gradient, guess)
     assert solved.all()
     assert fewest <= solver.fallbacks <= most
@@ -113,9 +121,9 @@ def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
         return answer * (1.0 - 4e-16), *rest
 
     monkeypatch.setattr(exact.daqp, "solve", nearly)
-    problem = mpc((0.4, 0.6), **ROUGH)
+    problem = make((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 100, 3.0, seed=1)
-    solver = ExactSolver(problem, U_MAX)
+    solver = ExactSolver(problem)
     inputs, solved = solver.solve(gradient, guess)
     assert solved.all()
     assert solver.fallbacks > 10
@@ -127,15 +135,15 @@ def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
 ) -> None:
     """A wrong answer of DAQP is not believed: those vehicles keep their guess, others fly on."""
     monkeypatch.setattr(exact, "PIVOTS_MAX", 0)
-    problem = mpc((0.4, 0.6), **ROUGH)
+    problem = make((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
-    right, _ = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    right, _ = ExactSolver(problem).solve(gradient, guess)
 
     def wrong(hessian: Array, *_: object, **__: object) -> tuple[Array, float, int, dict[str, int]]:
         return np.zeros(len(hessian)), 0.0, -4, {"iterations": 9}
 
     monkeypatch.setattr(exact.daqp, "solve", wrong)
-    inputs, solved = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    inputs, solved = ExactSolver(problem).solve(gradient, guess)
     assert 0 < (~solved).sum() < 300
     np.testing.assert_array_equal(inputs[~solved], guess[~solved])
     np.testing.assert_array_equal(inputs[solved], right[solved])
@@ -143,11 +151,11 @@ def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
 
 def test_a_problem_that_is_not_finite_fails_alone() -> None:
     """NaN and infinity for one vehicle each; the third is solved as if it were alone."""
-    problem = mpc()
+    problem = make()
     gradient, guess = problems(problem, 3, 1.0, seed=2)
-    alone, _ = ExactSolver(problem, U_MAX).solve(gradient[2:], guess[2:])
+    alone, _ = ExactSolver(problem).solve(gradient[2:], guess[2:])
     gradient[0, 1, 5], gradient[1, 0, 0] = np.nan, np.inf
-    inputs, solved = ExactSolver(problem, U_MAX).solve(gradient, guess)
+    inputs, solved = ExactSolver(problem).solve(gradient, guess)
     assert solved.tolist() == [False, False, True]
     np.testing.assert_array_equal(inputs[:2], guess[:2])
     np.testing.assert_array_equal(inputs[2:], alone)
@@ -155,9 +163,9 @@ def test_a_problem_that_is_not_finite_fails_alone() -> None:
 
 def test_a_batch_equals_its_singles_on_every_run() -> None:
     """To the last bit, in any company."""
-    problem = mpc()
+    problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=3)
-    solver = ExactSolver(problem, U_MAX)
+    solver = ExactSolver(problem)
     together, _ = solver.solve(gradient, guess)
     for n in range(50):
         alone, _ = solver.solve(gradient[n : n + 1], guess[n : n + 1])
@@ -166,9 +174,9 @@ def test_a_batch_equals_its_singles_on_every_run() -> None:
 
 def test_the_guess_decides_nothing_but_the_time() -> None:
     """Whatever set it starts from, it ends at the one optimum."""
-    problem = mpc()
+    problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=4)
-    solver = ExactSolver(problem, U_MAX)
+    solver = ExactSolver(problem)
     from_guess, _ = solver.solve(gradient, guess)
     from_zero, _ = solver.solve(gradient, np.zeros_like(guess))
     np.testing.assert_allclose(from_guess, from_zero, rtol=0, atol=1e-12)
@@ -176,7 +184,7 @@ def test_the_guess_decides_nothing_but_the_time() -> None:
 
 def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     """The warm start of every saturated flight: one round, though 1.8 has become 1.7999999."""
-    problem = mpc((0.855, 0.855))
+    problem = make((0.855, 0.855))
     u_max = np.array([1.8, 1.8])
     gradient, guess = problems(problem, 20, 10.0, seed=6)
     solver = ExactSolver(problem, u_max)
@@ -193,10 +201,10 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
 
 def test_osqp_agrees_to_its_tolerance() -> None:
     """Both solvers, the same problems."""
-    problem = mpc()
+    problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=5)
-    exactly, _ = ExactSolver(problem, U_MAX).solve(gradient, guess)
-    nearly, solved = OsqpSolver(problem.hessian, U_MAX).solve(gradient, guess)
+    exactly, _ = ExactSolver(problem).solve(gradient, guess)
+    nearly, solved = OsqpSolver(problem).solve(gradient, guess)
     assert solved.all()
     np.testing.assert_allclose(nearly, exactly, rtol=0, atol=1e-6)
 

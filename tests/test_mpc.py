@@ -11,14 +11,18 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 
-from server.mpc import MPC, condense, shift, stationary_gain
+from benchmarks.problems import gradients
+from server.mpc import FIRST, LATER, Problem, add_cost, follow, make_mpc, pose, shifted
+from server.mpc import lead as lead_toward
+from server.mpc import stationary_gain
 from server.solver import OsqpSolver
-from shared.config import ControlConfig
+from shared.config import ControlConfig, ModelConfig, Scenario
 from shared.model import Array, discretise
 
 quick = settings(max_examples=40, deadline=None)
 
-TWO_TAUS = discretise(np.array([0.81, 0.3]), 0.05)
+TAU_S = (0.81, 0.3)
+TWO_TAUS = discretise(TAU_S, 0.05)
 """A vehicle that is not the same on both axes."""
 U_MAX = np.array([1.8, 1.0])
 
@@ -37,40 +41,33 @@ def control(H: int, **keys: object) -> ControlConfig:
     return ControlConfig(horizon=H, **(WEIGHTS | keys))
 
 
+def make(weights: ControlConfig, which: int = LATER, tau_s: tuple[float, ...] = TAU_S) -> Problem:
+    """The QPs of vehicles with these time constants."""
+    u_max = tuple(np.resize(U_MAX, len(tau_s)).tolist())
+    model = ModelConfig(axes=len(tau_s), tau_s=tau_s, u_max=u_max)
+    terms = Scenario(model=model, control=weights).terms()
+    return pose(terms.model, make_mpc(terms, weights), which)
+
+
 def printed_cost(
-    weights: ControlConfig,
-    u: Array,
-    *,
-    change_weight: float,
-    x: Array,
-    target: Array,
-    previous: Array,
+    weights: ControlConfig, u: Array, *, x: Array, target: Array, previous: Array, wind: Array
 ) -> Array:
     """J of (9) of each axis, summed up along a flight of TWO_TAUS; with E6 and E7."""
     Q, P = np.array(weights.state_weight), np.array(weights.terminal_weight)
     H, cost = weights.horizon, np.zeros(len(x))
     for i in range(H):
-        wanted = target[:, i, 1] if weights.input_reference else 0.0
-        cost += (x - target[:, i]) ** 2 @ Q + weights.input_weight * (u[:, i] - wanted) ** 2
+        wanted, given_ = target[:, i, 1] if weights.input_reference else 0.0, u[:, i] + wind
+        cost += (x - target[:, i]) ** 2 @ Q + weights.input_weight * (given_ - wanted) ** 2
         if i <= H - 2:
-            cost += change_weight * (u[:, i] - previous[:, i]) ** 2
-        x = TWO_TAUS.step(x, u[:, i])
+            cost += weights.change_weight * (u[:, i] - previous[:, i]) ** 2
+        x = TWO_TAUS.step(x, given_)
     return cost + (x - target[:, H]) ** 2 @ P
 
 
-def predict(mpc: MPC, x: Array, u: Array) -> Array:
-    """The states at the stages 0 … H, written into rows in another order; (n, axes, H + 1, 2)."""
-    n, axes, H = u.shape
-    states, rows = np.full((n + 2, axes, H + 1, 2), np.nan), np.arange(n, 0, -1)
-    mpc.predict(x, u, np.zeros(x.shape[:2]), states, rows)
-    assert np.isnan(states[[0, -1]]).all()
-    return states[rows]
-
-
-def optimum(mpc: MPC, gradient: Array, u_max: Array) -> Array:
+def optimum(problem: Problem, gradient: Array) -> Array:
     """The bounded QPs of one vehicle by dense least squares: ½ ‖Lᵀu + L⁻¹g‖², 𝓗 = L Lᵀ."""
     answers = []
-    for hessian, g, bound in zip(mpc.hessian, gradient, u_max, strict=True):
+    for hessian, g, bound in zip(problem.hessian, gradient, U_MAX, strict=True):
         L = np.linalg.cholesky(hessian)
         b = -np.linalg.solve(L, g)
         answers.append(lsq_linear(L.T, b, (-bound, bound), method="bvls", tol=1e-14).x)
@@ -89,29 +86,23 @@ def situation(seed: int, H: int, axes: int = 2, size: float = 1.0) -> tuple[Arra
 @pytest.mark.parametrize("H", [1, 2, 6])
 def test_qp_is_the_printed_cost(H: int, change_weight: float, input_reference: bool) -> None:
     """𝓗 and g are the second and first differences of ½ J, which is quadratic: exact."""
-    weights = control(H, input_reference=input_reference)
-    mpc = condense(TWO_TAUS, weights, change_weight=change_weight)
+    weights = control(H, input_reference=input_reference, change_weight=change_weight)
+    problem = make(weights)
     x, target, previous = situation(H, H)
-    unit = np.eye(H)
+    unit, wind = np.eye(H), np.array([0.4, -0.2])
 
     def half_cost(u: Array) -> Array:
-        return 0.5 * printed_cost(
-            weights,
-            np.tile(u, (2, 1)),
-            change_weight=change_weight,
-            x=x,
-            target=target,
-            previous=previous,
-        )
+        both = np.tile(u, (2, 1))
+        return 0.5 * printed_cost(weights, both, x=x, target=target, previous=previous, wind=wind)
 
     still = half_cost(np.zeros(H))
+    g = gradients(problem, x[None], target[None], previous[None], wind[None])[0]
     for i in range(H):
         slope = 0.5 * (half_cost(unit[i]) - half_cost(-unit[i]))
-        gradient = mpc.gradient(x[None], target[None], previous[None], CALM)[0, :, i]
-        np.testing.assert_allclose(gradient, slope, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(g[:, i], slope, rtol=1e-9, atol=1e-9)
         for j in range(H):
             bend = half_cost(unit[i] + unit[j]) - half_cost(unit[i]) - half_cost(unit[j]) + still
-            np.testing.assert_allclose(mpc.hessian[:, i, j], bend, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(problem.hessian[:, i, j], bend, rtol=1e-9, atol=1e-9)
 
 
 @quick
@@ -126,52 +117,82 @@ def test_qp_ranks_any_two_plans_as_the_printed_cost(
         state_weight=tuple(rng.uniform(0, 20, 2)),
         terminal_weight=tuple(rng.uniform(0, 900, 2)),
         input_weight=rng.uniform(0.1, 5),
+        change_weight=rng.uniform(0, 2),
         input_reference=input_reference,
     )
-    S = rng.uniform(0, 2)
-    mpc = condense(TWO_TAUS, weights, change_weight=S)
+    problem = make(weights)
     x, target, previous = situation(seed, H)
     one, other = rng.normal(size=(2, 2, H))
-    g = mpc.gradient(x[None], target[None], previous[None], CALM)[0]
+    wind = rng.normal(size=2)
+    g = gradients(problem, x[None], target[None], previous[None], wind[None])[0]
     values, costs = [], []
     for u in (one, other):
-        values.append(0.5 * np.einsum("ak,akl,al->a", u, mpc.hessian, u) + (g * u).sum(axis=1))
-        cost = printed_cost(weights, u, change_weight=S, x=x, target=target, previous=previous)
+        values.append(0.5 * np.einsum("ak,akl,al->a", u, problem.hessian, u) + (g * u).sum(axis=1))
+        cost = printed_cost(weights, u, x=x, target=target, previous=previous, wind=wind)
         costs.append(0.5 * cost)
     np.testing.assert_allclose(values[0] - values[1], costs[0] - costs[1], rtol=1e-8, atol=1e-7)
 
 
+@quick
+@given(st.integers(0, 2**32 - 1), st.integers(1, 50))
+def test_cost_of_a_change_is_that_of_the_hessian(seed: int, H: int) -> None:
+    """ΔUᵀ 𝓗 ΔU, added up along the horizon and over the axes."""
+    problem, change = make(control(H, change_weight=0.7)), situation(seed, H)[2]
+    cost = 3.0
+    for axis in range(2):
+        cost = add_cost(problem.mpc, axis, change[axis], cost)
+    expected = np.einsum("ak,akl,al->", change, problem.hessian, change)
+    np.testing.assert_allclose(cost - 3.0, expected, rtol=1e-9, atol=1e-9)
+
+
 def test_last_stage_has_no_change_weight() -> None:
     """(9) sums S up to H-2: the horizon before says nothing about stage H-1."""
-    with_s = condense(TWO_TAUS, control(5), change_weight=3.0).hessian
-    without = condense(TWO_TAUS, control(5), change_weight=0.0).hessian
+    with_s = make(control(5, change_weight=3.0)).hessian
+    without = make(control(5, change_weight=0.0)).hessian
     np.testing.assert_allclose(
         with_s - without, [np.diag([3.0, 3.0, 3.0, 3.0, 0.0])] * 2, atol=1e-12
     )
 
 
+def test_first_step_has_no_change_weight() -> None:
+    """E8: its QP is that of a scenario without S, whatever the horizon before."""
+    first, without = make(control(5, change_weight=3.0), FIRST), make(control(5, change_weight=0.0))
+    np.testing.assert_array_equal(first.hessian, without.hessian)
+    x, target, previous = (each[None] for each in situation(1, 5))
+    one, other = (gradients(each, x, target, previous, CALM) for each in (first, without))
+    np.testing.assert_array_equal(one, other)
+
+
 def test_last_input_of_the_horizon_before_changes_nothing() -> None:
-    """For the same reason."""
-    mpc = condense(TWO_TAUS, control(5), change_weight=3.0)
+    """The S-term leaves it out of the gradient, too."""
+    problem = make(control(5, change_weight=3.0))
     x, target, previous = situation(1, 5)
     other = previous.copy()
     other[:, -1] = 99.0
-    one, two = (mpc.gradient(x[None], target[None], u[None], CALM) for u in (previous, other))
+    one, two = (gradients(problem, x[None], target[None], u[None], CALM) for u in (previous, other))
     np.testing.assert_array_equal(one, two)
 
 
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.sampled_from([2, 3]))
 def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int) -> None:
-    """(7): Φx + ΓU is where H single steps lead, stage by stage."""
+    """(7): Φx + ΓU is where H single steps lead, stage by stage; there the follower is led."""
     rng = np.random.default_rng(seed)
-    model = discretise(rng.uniform(0.1, 3.0, axes), 0.05)
-    mpc = condense(model, control(H), change_weight=0.0)
+    problem = make(control(H), tau_s=tuple(rng.uniform(0.1, 3.0, axes).tolist()))
     x, _, u = situation(seed, H, axes)
-    predicted = predict(mpc, x[None], u[None])[0, :, 1:]
+    follower, wind = rng.normal(size=2), 0.3
+    states, drift, toward = np.empty((axes, H + 1, 2)), np.empty((H, 2)), np.empty((H, 2))
+    for axis in range(axes):
+        start = tuple(follower.tolist())
+        follow(
+            problem.mpc, axis, start, wind, tuple(x[axis].tolist()), u[axis], states[axis], drift
+        )
+        lead_toward(problem.mpc, axis, start, wind, states[axis], toward)
+        np.testing.assert_array_equal(drift, toward)
+    np.testing.assert_array_equal(states[:, 0], x)
     for stage in range(H):
-        x = model.step(x, u[:, stage])
-        np.testing.assert_allclose(predicted[:, stage], x, rtol=0, atol=1e-11)
+        x = problem.model.step(x, u[:, stage])
+        np.testing.assert_allclose(states[:, stage + 1], x, rtol=0, atol=1e-11)
 
 
 CASES = [
@@ -188,14 +209,13 @@ def test_solver_finds_the_optimum(
     H: int, size: float, change_weight: float, input_reference: bool
 ) -> None:
     """Within 1e-6 m/s of a dense active-set solver, inside the box and at its sides."""
-    weights = control(H, input_reference=input_reference)
-    mpc = condense(TWO_TAUS, weights, change_weight=change_weight)
+    problem = make(control(H, input_reference=input_reference, change_weight=change_weight))
     x, target, previous = situation(H, H, size=size)
     target = np.cumsum(target, axis=1) / np.sqrt(H)
     previous = np.clip(previous, -U_MAX[:, None], U_MAX[:, None])
-    gradient = mpc.gradient(x[None], target[None], previous[None], CALM)
-    u, solved = OsqpSolver(mpc.hessian, U_MAX).solve(gradient, previous[None])
-    best = optimum(mpc, gradient[0], U_MAX)
+    gradient = gradients(problem, x[None], target[None], previous[None], CALM)
+    u, solved = OsqpSolver(problem).solve(gradient, previous[None])
+    best = optimum(problem, gradient[0])
     at_bound = np.abs(best) == U_MAX[:, None]
     assert solved.tolist() == [True]
     assert at_bound.any() == (size > 1)
@@ -204,10 +224,10 @@ def test_solver_finds_the_optimum(
 
 def test_vehicle_that_is_where_it_shall_be_stays() -> None:
     """At rest on a resting target the best input is none at all."""
-    mpc = condense(TWO_TAUS, control(40), change_weight=0.033)
+    problem, still = make(control(40, change_weight=0.033)), np.zeros((1, 2, 40))
     x = np.array([[[1.5, 0.0], [-2.0, 0.0]]])
-    gradient = mpc.gradient(x, np.repeat(x[:, :, None], 41, axis=2), np.zeros((1, 2, 40)), CALM)
-    u, _ = OsqpSolver(mpc.hessian, U_MAX).solve(gradient, np.zeros((1, 2, 40)))
+    gradient = gradients(problem, x, np.repeat(x[:, :, None], 41, axis=2), still, CALM)
+    u, _ = OsqpSolver(problem).solve(gradient, still)
     np.testing.assert_allclose(u, 0.0, atol=1e-9)
 
 
@@ -219,51 +239,34 @@ def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:
     still = np.zeros((1, 2, 40))
     first = {}
     for reference in (False, True):
-        mpc = condense(TWO_TAUS, control(40, input_reference=reference), change_weight=0.0)
-        gradient = mpc.gradient(target[:, :, 0], target, still, CALM)
-        u, _ = OsqpSolver(mpc.hessian, U_MAX).solve(gradient, still)
+        problem = make(control(40, input_reference=reference, change_weight=0.0))
+        gradient = gradients(problem, target[:, :, 0], target, still, CALM)
+        u, _ = OsqpSolver(problem).solve(gradient, still)
         first[reference] = u[0]
     np.testing.assert_allclose(first[True], np.tile(v[:, None], 40), atol=1e-7)
     assert (np.abs(first[False][:, 0]) < np.abs(v) - 0.01).all()
 
 
-@quick
-@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.booleans())
-def test_batch_has_the_gradients_of_its_singles(
-    seed: int, vehicles: int, input_reference: bool
-) -> None:
-    """Gradients and predictions of a batch are those of its singles."""
-    mpc = condense(TWO_TAUS, control(20, input_reference=input_reference), change_weight=0.3)
-    x, target, previous = (
-        np.stack(some)
-        for some in zip(*(situation(seed + i, 20) for i in range(vehicles)), strict=True)
-    )
-    wind = np.random.default_rng(seed).normal(size=(vehicles, 2))
-    gradients = mpc.gradient(x, target, previous, wind)
-    predictions = predict(mpc, x, previous)
-    for i in range(vehicles):
-        one = slice(i, i + 1)
-        single = mpc.gradient(x[one], target[one], previous[one], wind[one])[0]
-        np.testing.assert_allclose(gradients[i], single, rtol=0, atol=1e-10)
-        single = predict(mpc, x[one], previous[one])[0]
-        np.testing.assert_allclose(predictions[i], single, rtol=0, atol=1e-12)
+def carried(inputs: Array, gap: int, *, fresh: bool = False) -> Array:
+    """A whole horizon, shifted."""
+    return np.array([shifted(inputs, gap, fresh, i) for i in range(len(inputs))])
 
 
 def test_shifted_horizon_repeats_its_last_input() -> None:
-    """(11): each vehicle's own number of steps later, however many."""
-    horizon = np.array([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
-    shifted = shift(np.stack([horizon] * 4), np.array([0, 1, 3, 9]))
-    assert shifted[:, 0].tolist() == [[1, 2, 3, 4], [2, 3, 4, 4], [4, 4, 4, 4], [4, 4, 4, 4]]
-    assert shifted[:, 1].tolist() == [[5, 6, 7, 8], [6, 7, 8, 8], [8, 8, 8, 8], [8, 8, 8, 8]]
+    """(11): so many steps later, however many; a vehicle that begins anew has none before."""
+    horizon = np.array([1.0, 2.0, 3.0, 4.0])
+    later = [carried(horizon, gap).tolist() for gap in (0, 1, 3, 9)]
+    assert later == [[1, 2, 3, 4], [2, 3, 4, 4], [4, 4, 4, 4], [4, 4, 4, 4]]
+    assert carried(horizon, 1, fresh=True).tolist() == [0, 0, 0, 0]
 
 
 @quick
 @given(st.integers(0, 12), st.integers(0, 12))
 def test_shifting_twice_is_shifting_once_by_the_sum(one: int, other: int) -> None:
     """A horizon may therefore be carried over any gaps."""
-    inputs = np.random.default_rng(0).normal(size=(1, 2, 7))
-    twice = shift(shift(inputs, np.array([one])), np.array([other]))
-    np.testing.assert_array_equal(twice, shift(inputs, np.array([one + other])))
+    inputs = np.random.default_rng(0).normal(size=7)
+    twice = carried(carried(inputs, one), other)
+    np.testing.assert_array_equal(twice, carried(inputs, one + other))
 
 
 @quick
