@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from lab.calibration import COLUMNS, TABLE_1, deviations
-from lab.sweep import Axis, Done, Sweep, estimate, interval
+from lab.sweep import Axis, Estimate, Results, Sweep, estimate, interval
 from shared.config import Scenario
 from shared.summary import Summary
 
@@ -27,9 +27,6 @@ METHODS = Axis(
     tuple({f"control.{key}": value for key, value in keys.items()} for keys in COLUMNS.values()),
 )
 """As in Table 1; PERIODIC comes beside them."""
-
-Estimate = tuple[float | None, float | None]
-"""Mean, and half the width of its 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +224,7 @@ Flown = Mapping[tuple[Any, ...], Sequence[Summary]]
 """Runs of each cell of a sweep, by its values."""
 
 
-def flown(plan: Sweep, done: Mapping[tuple[int, int], Done]) -> Flown:
+def flown(plan: Sweep, done: Results) -> Flown:
     """The runs of each cell, by its values."""
     return {values: plan.of_cell(done, cell) for cell, values in enumerate(plan.cells)}
 

@@ -133,7 +133,7 @@ class VehicleConfig(Section, frozen=True):
     start_m: tuple[float, ...] = ()
     """Where the flight starts, at rest [m]; left out: at the reference's start."""
     wind: NonNegative = 0.0
-    """White acceleration [m/s² per √s]."""
+    """Strength of white acceleration [m/s per √s]."""
     steady_wind_mps: tuple[float, ...] = ()
     """The velocity that steady wind adds in the long run [m/s], of each axis; left out: none."""
     gust_mps2: NonNegative = 0.0
@@ -275,20 +275,29 @@ class Scenario(Section, frozen=True):
 
 
 COMPARED = "compare"
-"""Folder of those that `skytether compare` flies."""
+"""The file of the scenarios that `skytether compare` flies."""
 
 
-def names(folder: str = "") -> list[str]:
-    """The scenarios that come with Skytether, those of a folder of theirs as in `compare/name`."""
-    return sorted(
-        f"{folder}/{file.name}".lstrip("/").removesuffix(".toml")
-        for file in (resources.files("scenarios") / folder).iterdir()
-        if file.name.endswith(".toml")
-    )
+def names(file: str = "") -> list[str]:
+    """Names of the scenarios that come with Skytether, or of those in a file of scenarios.
+
+    Args:
+        file: COMPARED, or the path of a file that holds a scenario in each of its tables.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    if file:
+        return [f"{file}/{name}" for name in _toml(_path(file), file)]
+    files = (each.name for each in resources.files("scenarios").iterdir())
+    known = {name.removesuffix(".toml") for name in files if name.endswith(".toml")}
+    return sorted(known - {COMPARED})
 
 
 def load(name: str) -> Scenario:
     """A scenario by its name, or from a file by its path (anything that ends in .toml).
+
+    Behind the name or path of a file of scenarios stands the table: `compare/paper-event-gusts`.
 
     Raises:
         ConfigError: it does not exist, or something in it is wrong.
@@ -325,29 +334,22 @@ def to_toml(scenario: Scenario) -> bytes:
     return msgspec.toml.encode(scenario)
 
 
-def _read(name: str, seen: Mapping[Path, str] = MappingProxyType({})) -> dict[str, Any]:
+def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})) -> dict[str, Any]:
     """The raw table of a scenario, laid over those that it extends; `seen` extend it in turn."""
-    if name.endswith(".toml"):
-        path = Path(name)
-    elif name in (*names(), *names(COMPARED)):
-        path = Path(str(resources.files("scenarios") / f"{name}.toml"))
-    else:
+    file, _, entry = name.rpartition("/")
+    if name.endswith(".toml") or name in names():
+        file, entry = name, ""
+    elif not (entry and (file == COMPARED or file.endswith(".toml"))):
         raise ConfigError(f"{name}: no such scenario; {hint(name, names())}")
-    try:
-        path = path.resolve()
-        content = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{name}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ConfigError(f"{name}: cannot be read: {error}") from None
-    if path in seen:
-        raise ConfigError(
-            f"{seen[path]}: extends: got a circle of {' → '.join([*seen.values(), name])}"
-        )
-    try:
-        raw = tomllib.loads(content.decode())
-    except ValueError as error:
-        raise ConfigError(f"{name}: no valid TOML: {error}") from None
+    path = _path(file)
+    raw = _toml(path, file)
+    if entry:
+        if not isinstance(raw.get(entry), dict):
+            raise ConfigError(f"{name}: no such scenario; {hint(entry, raw)}")
+        raw = raw[entry]
+    if (path, entry) in seen:
+        circle = " → ".join([*seen.values(), name])
+        raise ConfigError(f"{seen[path, entry]}: extends: got a circle of {circle}")
     table = raw.get("reference")
     if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
         table["file"] = str((path.parent / table["file"]).absolute())
@@ -358,7 +360,27 @@ def _read(name: str, seen: Mapping[Path, str] = MappingProxyType({})) -> dict[st
         raise ConfigError(f"{name}: extends: got {base!r}, expected the name of a scenario")
     if base.endswith(".toml"):
         base = str(path.parent / base)
-    return _overlay(_read(base, {**seen, path: name}), raw)
+    return _overlay(_read(base, {**seen, (path, entry): name}), raw)
+
+
+def _path(file: str) -> Path:
+    """Where a file is, by its path or by the name of one that comes with Skytether."""
+    if not file.endswith(".toml"):
+        return Path(str(resources.files("scenarios") / f"{file}.toml"))
+    try:
+        return Path(file).resolve()
+    except ValueError as error:
+        raise ConfigError(f"{file}: cannot be read: {error}") from None
+
+
+def _toml(path: Path, file: str) -> dict[str, Any]:
+    """The raw table of a whole file, which the user calls `file`."""
+    try:
+        return tomllib.loads(path.read_bytes().decode())
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"{file}: no valid TOML: {error}") from None
 
 
 def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
