@@ -358,7 +358,7 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
         return raw
     if not isinstance(base, str):
         raise ConfigError(f"{name}: extends: got {base!r}, expected the name of a scenario")
-    if base.endswith(".toml"):
+    if ".toml" in base:
         base = str(path.parent / base)
     return _overlay(_read(base, {**seen, (path, entry): name}), raw)
 
