@@ -10,8 +10,9 @@ import io
 import itertools
 import math
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -222,7 +223,7 @@ class Sweep:
         """CSV table with a row for each run, cell by cell and by seed."""
         keys = [axis.key for axis in self.axes]
         rows = (
-            [*values, *map(_plain, astuple(run))]
+            [*values, *astuple(run)]
             for cell, values in enumerate(self.cells)
             for run in self.of_cell(done, cell)
         )
@@ -231,14 +232,13 @@ class Sweep:
     def cells_csv(self, done: Results) -> str:
         """CSV table with a row for each cell: means, and half the widths of 95 % intervals."""
         keys = [axis.key for axis in self.axes]
-        names = [name for figure in FIGURES for name in (figure, f"{figure}_ci95")]
         rows = []
         for cell, values in enumerate(self.cells):
             runs = self.of_cell(done, cell)
             flown = sum(run.rmse_xy is not None for run in runs)
-            means = [_plain(part) for figure in FIGURES for part in estimate(runs, figure)]
-            rows.append([*values, len(runs), flown, *means])
-        return to_csv([*keys, "runs", "flown", *names], rows)
+            row = dict(zip(keys, values, strict=True)) | {"runs": len(runs), "flown": flown}
+            rows.append(row | by_name(FIGURES, partial(estimate, runs)))
+        return rows_csv(rows)
 
     def scenario_of(self, *values: Any) -> Scenario:
         """Scenario of the cell with these values."""
@@ -306,9 +306,22 @@ def interval(values: Sequence[float]) -> Estimate:
     return mean, float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
 
 
+def by_name(figures: Iterable[str], estimate_of: Callable[[str], Estimate]) -> dict[str, Any]:
+    """Mean of each figure by its name, and half the width of its interval by NAME_ci95."""
+    found: dict[str, Any] = {}
+    for figure in figures:
+        found[figure], found[f"{figure}_ci95"] = estimate_of(figure)
+    return found
+
+
 def _plain(value: Any) -> Any:
     """A value as CSV has it: true and false as in TOML, nothing for None."""
     return str(value).lower() if isinstance(value, bool) else value
+
+
+def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A table as CSV text, of rows that have all columns by name; at least one."""
+    return to_csv(list(rows[0]), (list(row.values()) for row in rows))
 
 
 def to_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
