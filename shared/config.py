@@ -29,7 +29,7 @@ from shared.protocol import INPUTS_MAX, Terms
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Duration = Annotated[float, Meta(ge=0, le=3600)]
-"""A time that may be nothing, and is no longer than an hour [s]."""
+"""Time of at most an hour, which may be 0 [s]."""
 
 
 class ConfigError(Exception):
@@ -44,7 +44,7 @@ class ModelConfig(Section, frozen=True):
     """The UAV as both ends know it, eq. (1)-(6)."""
 
     axes: Literal[2, 3] = 2
-    """Fly in the plane or in space."""
+    """Number of axes: 2 to fly in the plane, 3 in space."""
     tau_s: tuple[Positive, ...] = (0.84,)
     """Time constant of the velocity loop [s]: one for all axes, or one each."""
     u_max: tuple[Positive, ...] = (1.6,)
@@ -57,38 +57,38 @@ class ControlConfig(Section, frozen=True):
     dt: Annotated[float, Meta(ge=0.001, le=1)] = 0.05
     """Length of a step, Δt [s]."""
     horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
-    """Steps planned ahead, H."""
+    """Number of steps planned ahead, H."""
     scheme: Literal["committed", "feedback", "predictive", "none"] = "committed"
-    """Delay compensation at both ends: committed inputs, the same with feedback aboard, eq. (11)
-    and (13), or none."""
+    """Delay compensation at both ends: committed inputs; feedback, which is committed inputs with
+    feedback aboard; predictive, the paper's eq. (11) and (13); or none."""
     delay_bound: Duration | Literal["auto"] = "auto"
-    """A horizon that comes is in force at most so long after it was made [s]; auto: as was seen."""
+    """Longest time from making a horizon until it is in force [s]; auto: from delays seen."""
     observer_s: NonNegative = 4.0
-    """How soon steady wind and a wrong gain are learned, as a time constant [s]; 0: never."""
+    """Time constant with which steady wind and a wrong gain are learned [s]; 0: never learned."""
     trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "cost_gap | silence(1)"
-    """When a horizon is sent: policies that combine with & and |, as in docs/triggers.md."""
+    """Rule for sending a horizon: policies that combine with & and |, as in docs/triggers.md."""
     period: Annotated[int, Meta(ge=1, le=policy.PERIOD_MAX)] = 10
-    """Steps from one horizon to the next of the policy `periodic`."""
+    """Number of steps from one horizon to the next with the policy `periodic`."""
     solver: Literal["exact", "osqp"] = "exact"
-    """What solves (9): Riccati active set, exact and fast, or OSQP, the reference."""
+    """Solver of (9): exact, an active set with a Riccati pass; or osqp, OSQP as the reference."""
     epsilon: NonNegative = 3.6
     """Tolerance ε of eq. (16)."""
     decay_rate: NonNegative = 1.5
     """Decay rate λ of eq. (16) [1/s]."""
     cost_gap: NonNegative = 1.0
-    """Cost of flying on with what was sent, above which the policy `cost_gap` sends."""
+    """Extra cost of flying on with what was sent, above which the policy `cost_gap` sends."""
     deviation_m: NonNegative = 0.05
     """Distance from the plan, above which the policy `deviation` sends [m]."""
     state_weight: tuple[NonNegative, NonNegative] = (7.0, 1.0)
-    """Q of eq. (5), on the position and the velocity of every axis."""
+    """Weights Q of eq. (5) on position and velocity, for every axis."""
     terminal_weight: tuple[NonNegative, NonNegative] = (50.0, 20.0)
-    """P of eq. (5) and (16), on position and velocity."""
+    """Weights P of eq. (5) and (16) on position and velocity at the end of the horizon."""
     input_weight: Positive = 0.01
-    """R of eq. (5)."""
+    """Weight R of eq. (5) on the input."""
     change_weight: NonNegative = 0.0
-    """S of eq. (9), on the change against the horizon before."""
+    """Weight S of eq. (9) on the change against the horizon before."""
     input_reference: bool = False
-    """Let R weigh u - v_ref instead of u, so that it does not ask for standing still."""
+    """Whether R weighs u - v_ref instead of u, and so does not ask for standing still."""
 
     @property
     def commits(self) -> bool:
@@ -100,42 +100,42 @@ class ReferenceConfig(Section, frozen=True):
     """The desired trajectory."""
 
     shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
-    """What to fly."""
+    """Form of the trajectory."""
     radius_m: Positive = 1.55
     """Half the width of circle, figure-eight and square [m]."""
     period_s: Positive = 27.5
-    """Time for one round of them [s]."""
+    """Time for one round of circle, figure-eight and square [s]."""
     altitude_m: float = 0.0
-    """Their height in 3-D [m]."""
+    """Height of circle, figure-eight and square in space [m]."""
     points_m: tuple[tuple[float, ...], ...] = ()
     """Waypoints [m], at least two, or the one point to hover at."""
     speed_mps: Positive = 1.0
     """Speed between waypoints [m/s]."""
     loop: bool = False
-    """Fly the waypoints round and round."""
+    """Whether the waypoints are flown round and round."""
     file: str = ""
     """CSV file with the columns t, x, y (and z), relative to the scenario's own folder."""
 
 
 class VehicleConfig(Section, frozen=True):
-    """The simulated UAV and what it does without fresh orders."""
+    """The simulated UAV, and what it does without fresh horizons."""
 
     exhausted: Literal["hold", "brake"] = "brake"
-    """Once a horizon has run out: hold its last input for ever (the paper), or brake and hover."""
+    """What follows a horizon that has run out: hold its last input (the paper), or brake."""
     brake_mps2: Positive = 2.0
-    """How fast `brake` takes the desired velocity to zero [m/s²]."""
+    """Rate at which `brake` takes the desired velocity to zero [m/s²]."""
     tau_s: tuple[Positive, ...] = ()
-    """True time constant [s], where it differs from the model's; one for all axes, or one each."""
+    """True time constant [s], one for all axes, or one each; left out: the model's."""
     gain: Positive = 1.0
-    """The velocity that it settles at, over the one that it was told."""
+    """Ratio of the velocity that the vehicle settles at to the desired velocity."""
     dead_time_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
-    """How much later an input takes effect [s]."""
+    """Time until an input takes effect [s]."""
     start_m: tuple[float, ...] = ()
-    """Where the flight starts, at rest [m]; left out: at the reference's start."""
+    """Position where the flight starts, at rest [m]; left out: the reference's start."""
     wind: NonNegative = 0.0
     """Strength of white acceleration [m/s per √s]."""
     steady_wind_mps: tuple[float, ...] = ()
-    """The velocity that steady wind adds in the long run [m/s], of each axis; left out: none."""
+    """Velocity that steady wind adds in the long run [m/s], one for each axis; left out: none."""
     gust_mps2: NonNegative = 0.0
     """Strength of gusts [m/s²]; 0 for none."""
     gust_every_s: Positive = 10.0
@@ -148,15 +148,15 @@ class DirectionConfig(Section, frozen=True):
     """One direction of the network."""
 
     delay: Literal["poisson", "constant", "none"] = "poisson"
-    """Delay of a packet: minimum_s + slot_s · Poisson(slots_mean) (17), minimum_s, or none."""
+    """Law of the delay: minimum_s + slot_s · Poisson(slots_mean) (17), just minimum_s, or none."""
     minimum_s: Duration = 0.4
-    """The smallest delay [s]."""
+    """Smallest delay [s]."""
     slot_s: Duration = 0.02
-    """Lattice of the paper's delay [s]."""
+    """Length of a slot of the poisson delay [s]."""
     slots_mean: Annotated[float, Meta(ge=0, le=1e6)] = 2.0
-    """Mean number of slots on top."""
+    """Mean number of slots that the poisson delay adds."""
     loss: Annotated[float, Meta(ge=0, le=1)] = 0.1
-    """Share of packets lost."""
+    """Share of packets that are lost."""
 
     @property
     def mean_s(self) -> float:
@@ -169,44 +169,44 @@ class NetworkConfig(Section, frozen=True):
     """What netem does to packets."""
 
     uplink: DirectionConfig = DirectionConfig()
-    """Server to vehicle."""
+    """Direction from the server to the vehicle."""
     downlink: DirectionConfig = DirectionConfig()
-    """Vehicle to server."""
+    """Direction from the vehicle to the server."""
 
 
 class LinkConfig(Section, frozen=True):
     """How a session is kept."""
 
     heartbeat_s: Positive = 0.1
-    """The server lets no longer pass without a packet [s]."""
+    """Longest time that the server lets pass without a packet [s]."""
     timeout_s: Positive = 1.0
-    """Silence after which the vehicle says HELLO again [s]."""
+    """Time of silence after which the vehicle says HELLO again [s]."""
     connect_s: Positive = 15.0
-    """How long the vehicle waits for its first session before it gives up [s]."""
+    """Time that the vehicle waits for its first session before it gives up [s]."""
 
 
 class SimulationConfig(Section, frozen=True):
-    """What only virtual time has to be told."""
+    """What is measured in reality, and has to be told in virtual time."""
 
     compute_s: Duration = 0.001
-    """Time the server takes for a step [s]."""
+    """Time that the server takes for a step [s]."""
     clock_offset_s: float = 0.0
-    """The vehicle's clock minus the server's, at the start [s]."""
+    """Offset of the vehicle's clock from the server's at the start [s]."""
     clock_drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
-    """How much faster the vehicle's clock runs [ppm]."""
+    """Rate by which the vehicle's clock is faster than the server's [ppm]."""
 
 
 class Scenario(Section, frozen=True):
     """Everything about a flight."""
 
     title: str = ""
-    """What it shows, in a line."""
+    """Title of the scenario, in a line."""
     duration: Annotated[float, Meta(gt=0, le=86400)] = 60.0
     """Length of the flight [s]."""
     settle: NonNegative = 0.0
-    """Start of the flight that RMSE leaves out [s]."""
+    """Length of the start of the flight that RMSE leaves out [s]."""
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 1
-    """Of everything random: delays, losses, wind."""
+    """Seed of everything random: delays, losses, wind."""
     model: ModelConfig = ModelConfig()
     control: ControlConfig = ControlConfig()
     reference: ReferenceConfig = ReferenceConfig()
@@ -222,7 +222,7 @@ class Scenario(Section, frozen=True):
 
     @property
     def steps(self) -> int:
-        """Steps in the whole flight."""
+        """Number of steps in the whole flight."""
         return max(1, round(self.duration / self.control.dt))
 
     @property

@@ -126,8 +126,11 @@ def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
 def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> None:
     """The position's weight stays, for only ratios matter; so does what is switched off."""
     weights = {
-        *("control.state_weight.1", "control.terminal_weight.0", "control.terminal_weight.1"),
-        *("control.input_weight", "control.change_weight"),
+        "control.state_weight.1",
+        "control.terminal_weight.0",
+        "control.terminal_weight.1",
+        "control.input_weight",
+        "control.change_weight",
     }
     assert {key.key for key in weighs("always").free()} == weights
     own = {"control.epsilon", "control.decay_rate"}
@@ -193,10 +196,8 @@ def test_a_search_told_the_same_proposes_the_same() -> None:
     assert proposed[0] == proposed[1]
 
 
-ARGV = [
-    *("calibrate", "paper", "--free", "reference.radius_m=0.5:5", "model.tau_s.0=0.2:2"),
-    *("--duration", "3", "--settle", "0", "--runs", "2", "--population", "4", "--workers", "1"),
-]
+SHORT = ["--duration", "3", "--settle", "0", "--runs", "2", "--population", "4", "--workers", "1"]
+ARGV = ["calibrate", "paper", *SHORT, "--free", "reference.radius_m=0.5:5", "model.tau_s.0=0.2:2"]
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +240,7 @@ def test_the_smallest_error_is_searched_for_and_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Weights and the trigger's own keys; the first point is the scenario's, the best no worse."""
-    argv = ["calibrate", "paper", "--objective", "rmse", "--packets", "0.3", *ARGV[5:]]
+    argv = ["calibrate", "paper", "--objective", "rmse", "--packets", "0.3", *SHORT]
     assert main([*argv, "--generations", "2", "--out", str(tmp_path)]) == 0
     settings = tomllib.loads((tmp_path / "settings.toml").read_text())
     assert (settings["objective"], settings["packets"]) == ("rmse", 0.3)
@@ -307,7 +308,7 @@ def test_a_trajectory_edited_between_two_calls_is_refused(
     table.write_text("t,x,y\n0,0,0\n5,1,1\n")
     scenario = tmp_path / "mine.toml"
     scenario.write_text('extends = "paper"\nreference = { shape = "csv", file = "path.csv" }\n')
-    argv = ["calibrate", str(scenario), *ARGV[5:], "--out", str(tmp_path / "out")]
+    argv = ["calibrate", str(scenario), *SHORT, "--out", str(tmp_path / "out")]
     argv += ["--free", "model.tau_s.0=0.2:2"]
     assert main([*argv, "--generations", "1"]) == 0
     table.write_text("t,x,y\n0,0,0\n5,1,2\n")

@@ -33,8 +33,19 @@ PAPER = config.load("paper")
 ]
 
 FIGURES = {
-    *("fig2", "fig3", "fig4", "fig5", "fig5-pareto", "estimate-error", "intervals", "solve-times"),
-    *("rmse-loss", "rmse-delay", "rmse-jitter", "rmse-mismatch", "rmse-clock"),
+    "fig2",
+    "fig3",
+    "fig4",
+    "fig5",
+    "fig5-pareto",
+    "estimate-error",
+    "intervals",
+    "solve-times",
+    "rmse-loss",
+    "rmse-delay",
+    "rmse-jitter",
+    "rmse-mismatch",
+    "rmse-clock",
 }
 TABLES = {"table1", "traffic", "real"}
 

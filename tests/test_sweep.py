@@ -28,11 +28,9 @@ from sim import flight
 
 PATIENCE_S = 30.0
 
-SWEEP = [
-    *("sweep", "paper", "--duration", "5", "--settle", "1", "--runs", "60"),
-    *("--grid", "control.epsilon=1:3:2", "--grid", "control.trigger=state_gap,periodic"),
-]
-"""Four cells, three tasks each."""
+SWEEP = ["sweep", "paper", "--duration", "5", "--settle", "1", "--runs", "60"]
+SWEEP += ["--grid", "control.epsilon=1:3:2", "--grid", "control.trigger=state_gap,periodic"]
+"""A sweep of four cells, with three tasks each."""
 TASKS = 12
 TABLES = ("runs.csv", "cells.csv")
 
@@ -64,20 +62,25 @@ def test_a_grid_is_read_as_it_is_meant(text: str, key: str, values: tuple[Any, .
     assert parse_axis(str(axis)) == axis
 
 
+NO_GRIDS = [
+    "control.epsilon",
+    "control.epsilon=",
+    "=1,2",
+    "control.epsilon=1:2",
+    "control.epsilon=1:2:1",
+    "control.epsilon=1:2:3.5",
+    "control.epsilon=a:b:3",
+    "control.epsilon=0:inf:3",
+    "control.epsilon=1,,2",
+    "control.epsilon=[1,2",
+]
 FORM = "expected KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        *(
-            (text, f"--grid: got {text!r}, {FORM}")
-            for text in (
-                *("control.epsilon", "control.epsilon=", "=1,2", "control.epsilon=1:2"),
-                *("control.epsilon=1:2:1", "control.epsilon=1:2:3.5", "control.epsilon=a:b:3"),
-                *("control.epsilon=0:inf:3", "control.epsilon=1,,2", "control.epsilon=[1,2"),
-            )
-        ),
+        *((text, f"--grid: got {text!r}, {FORM}") for text in NO_GRIDS),
         ("seed=1,2", "--grid: got 'seed', expected another key: it counts the runs of a cell"),
         (
             "control.epsilon=1,2,1.0",
@@ -490,7 +493,7 @@ needs_dask = pytest.mark.skipif(
 )
 
 
-def dask(stack: ExitStack, *argv: str, folder: Path) -> subprocess.Popen[str]:
+def dask(stack: ExitStack, argv: list[str], folder: Path) -> subprocess.Popen[str]:
     """A process of a cluster, ended with the stack."""
     process = stack.enter_context(
         subprocess.Popen(
@@ -508,17 +511,12 @@ def dask(stack: ExitStack, *argv: str, folder: Path) -> subprocess.Popen[str]:
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
     """A scheduler and two workers, one of them killed on the way."""
     with ExitStack() as stack:
-        scheduler = dask(
-            *(stack, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
-            folder=tmp_path,
-        )
+        argv = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+        scheduler = dask(stack, argv, tmp_path)
         assert scheduler.stderr is not None
         at = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
         workers = [
-            dask(
-                *(stack, "worker", at, "--nthreads", "1", "--no-nanny", "--no-dashboard"),
-                folder=tmp_path,
-            )
+            dask(stack, ["worker", at, "--nthreads", "1", "--no-nanny", "--no-dashboard"], tmp_path)
             for _ in range(2)
         ]
         for worker in workers:
