@@ -6,13 +6,14 @@ the contender's threshold is moved, which gives a curve of what a packet buys.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
-from lab.sweep import Axis, Sweep, lay
+from lab.keys import flat, lay
+from lab.sweep import Axis, Sweep
 from shared import config
 from shared.config import ConfigError, Scenario
 
@@ -105,51 +106,37 @@ CASES = (
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How much a comparison flies."""
+    """How much a comparison flies; what is not given is as in those that are reported."""
 
     runs: int
     """Number of flights of each contender in each case at each threshold."""
-    cases: Sequence[Case]
-    """Cases that are flown."""
-    every: int
-    """Stride over a contender's factors; it meets the middle one, a factor of 1."""
-    duration: float
-    """Length of a flight [s]."""
-    search_runs: int
-    """Number of flights of each point of a search."""
-    search_duration: float
-    """Length of a flight of a search [s]."""
     generations: int
     """Number of generations of a search."""
-    population: int
+    population: int = 10
     """Number of points in a generation."""
-
-
-def full(runs: int, generations: int) -> Scale:
-    """Scale of a comparison that is reported."""
-    return Scale(
-        runs=runs,
-        cases=CASES,
-        every=1,
-        duration=60.0,
-        search_runs=8,
-        search_duration=32.5,
-        generations=generations,
-        population=10,
-    )
+    search_runs: int = 8
+    """Number of flights of each point of a search."""
+    search_duration: float = 32.5
+    """Length of a flight of a search [s]."""
+    cases: Sequence[Case] = CASES
+    """Cases that are flown."""
+    every: int = 1
+    """Stride over a contender's factors; it meets the middle one, a factor of 1."""
+    duration: float = 60.0
+    """Length of a flight [s]."""
 
 
 def quick(runs: int, generations: int) -> Scale:
     """Scale of a first look, with no more than is asked for."""
     return Scale(
         runs=min(runs, 3),
+        generations=min(generations, 2),
+        population=4,
+        search_runs=2,
+        search_duration=15.0,
         cases=CASES[:3:2],
         every=3,
         duration=15.0,
-        search_runs=2,
-        search_duration=15.0,
-        generations=min(generations, 2),
-        population=4,
     )
 
 
@@ -217,22 +204,8 @@ def _inline(value: Any) -> str:
 
 def differences(scenario: Scenario) -> dict[str, Any]:
     """Keys in the sections of a scenario that differ from PLANT's, with dots, and their values."""
-    here, there = (config.to_table(each) for each in (scenario, config.load(PLANT)))
-    return {
-        f"{section}.{path}": value
-        for section, keys in here.items()
-        if isinstance(keys, dict)
-        for path, value in _leaves(keys)
-        if value != dict(_leaves(there[section]))[path]
-    }
-
-
-def _leaves(table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from ((f"{key}.{path}", leaf) for path, leaf in _leaves(value))
-        else:
-            yield key, value
+    here, there = (dict(flat(config.to_table(each))) for each in (scenario, config.load(PLANT)))
+    return {key: value for key, value in here.items() if "." in key and value != there[key]}
 
 
 # -- what is flown -------------------------------------------------------------------------------

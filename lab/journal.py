@@ -11,13 +11,14 @@ import hashlib
 import os
 import tomllib
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import msgspec
 
+from lab.keys import flat
 from shared.config import ConfigError, Scenario
 
 SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
@@ -64,10 +65,10 @@ class Journal(Generic[E]):
                 raise ConfigError(f"{self.folder}: got {ENTRIES} without {SETTINGS}, expected both")
             write(path, text)
         try:
-            before = dict(_flat(tomllib.loads(path.read_text())))
+            before = dict(flat(tomllib.loads(path.read_text())))
         except ValueError as error:
             raise ConfigError(f"{path}: no valid TOML: {error}") from None
-        now = dict(_flat(tomllib.loads(text.decode())))
+        now = dict(flat(tomllib.loads(text.decode())))
         for key in [*now, *before]:
             if now.get(key) != before.get(key):
                 raise ConfigError(
@@ -127,12 +128,3 @@ def digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
         file: hashlib.blake2b(Path(file).read_bytes(), digest_size=8).hexdigest()
         for file in sorted(files)
     }
-
-
-def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys with dots, and their values."""
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value

@@ -425,20 +425,12 @@ def trade(
             curves.items(), COLOURS[: len(curves)], MARKERS[: len(curves)], strict=True
         ):
             flown = [point for point in points if point.rmse_m]
-            rmse, half = (
-                np.array([(point.rmse_m, point.rmse_half_m or 0.0) for point in flown], np.float64)
-                .reshape(-1, 2)
-                .T
-            )
-            large = [point.tuned for point in flown]
-            for plane, cost in zip(
-                panes,
-                (
-                    np.array([point.packets_per_s for point in flown]),
-                    np.array([point.bytes_per_s for point in flown]),
-                ),
-                strict=True,
-            ):
+            rmse = np.array([point.rmse_m for point in flown], np.float64)
+            half = np.array([point.rmse_half_m or 0.0 for point in flown], np.float64)
+            large = np.array([point.tuned for point in flown], np.bool_)
+            packets = np.array([point.packets_per_s for point in flown])
+            octets = np.array([point.bytes_per_s for point in flown])
+            for plane, cost in zip(panes, (packets, octets), strict=True):
                 style: Any = {"color": colour, "marker": marker, "linestyle": "none"}
                 plane.plot(cost, rmse, color=colour, linewidth=0.8)
                 plane.plot(cost, rmse, **style, markersize=2.5)

@@ -176,6 +176,24 @@ def traffic_table(columns: Mapping[str, Cell]) -> Table:
     return Table("traffic", "Packets and bytes (UDP payload)", says, text, heading, rows)
 
 
+REAL = {
+    "column": ("column", ""),
+    "rmse_xy_udp": ("UDP", ".4f"),
+    "rmse_xy_same_seed": ("same seed", ".4f"),
+    "rmse_xy_virtual": ("virtual", ".4f"),
+    "rmse_xy_virtual_ci95": ("± 95 %", ".4f"),
+    "rmse_xy_least": ("least", ".4f"),
+    "rmse_xy_most": ("most", ".4f"),
+    "event_ratio_udp": ("events, UDP", ".3f"),
+    "event_ratio_virtual": ("virtual", ".3f"),
+    "solve_ms_p50": ("solve p50 [ms]", ".2f"),
+    "solve_ms_p99": ("p99 [ms]", ".2f"),
+    "deadline_misses": ("misses", "d"),
+    "netem_late_ms_p99": ("netem late p99 [ms]", ".2f"),
+}
+"""Columns of `real_table`: heading and format of each."""
+
+
 def real_table(measured: Measured) -> Table:
     """Table of the flights over real UDP beside those in virtual time, by method."""
     study, cells = measured.table
@@ -209,11 +227,7 @@ def real_table(measured: Measured) -> Table:
                 "netem_late_ms_p99": late_ms,
             }
         )
-    specs = {"rmse": ".4f", "event": ".3f", "solve": ".2f", "deadline": "d", "netem": ".2f"}
-    shown = [
-        [as_text(value, specs.get(name.split("_")[0], "")) for name, value in row.items()]
-        for row in rows
-    ]
+    shown = [[as_text(row[name], spec) for name, (_, spec) in REAL.items()] for row in rows]
     says = (
         f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
         f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
@@ -221,21 +235,7 @@ def real_table(measured: Measured) -> Table:
         f"a server's tick falls within a vehicle's step is chance in both, so equal seeds do not "
         f"give equal flights."
     )
-    heading = (
-        "column",
-        "UDP",
-        "same seed",
-        "virtual",
-        "± 95 %",
-        "least",
-        "most",
-        "events, UDP",
-        "virtual",
-        "solve p50 [ms]",
-        "p99 [ms]",
-        "misses",
-        "netem late p99 [ms]",
-    )
+    heading = [heading for heading, _ in REAL.values()]
     title = "RMSE xy [m] over real UDP and in virtual time"
     return Table("real", title, says, rows_csv(rows), heading, shown)
 

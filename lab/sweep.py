@@ -21,6 +21,7 @@ from msgspec.structs import astuple, replace
 from scipy import stats
 
 from lab.journal import digests
+from lab.keys import lay
 from shared import config
 from shared.config import ConfigError, Scenario
 from shared.summary import Summary, summarise
@@ -247,22 +248,6 @@ class Sweep:
     def of_cell(self, done: Results, cell: int) -> list[Summary]:
         """Summaries of a cell's runs, by seed."""
         return [run for chunk in range(self.chunks) for run in done[cell, chunk].runs]
-
-
-def lay(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
-    """Put values into a table, where their keys say, as in `control.epsilon`.
-
-    Raises:
-        ConfigError: a key leads through something that is no table.
-    """
-    for path, value in changes.items():
-        *sections, key = path.split(".")
-        section = table
-        for name in sections:
-            section = section.setdefault(name, {})
-            if not isinstance(section, dict):
-                raise ConfigError(f"--grid: {path}: no such key")
-        section[key] = value
 
 
 FIGURES = (

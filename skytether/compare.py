@@ -62,7 +62,7 @@ def compare(argv: Sequence[str]) -> None:
     command.check_count("--runs", options.runs, 100_000)
     command.check_count("--generations", options.generations, 10**6)
     options.pool.check()
-    scaled = contenders.quick if options.quick else contenders.full
+    scaled = contenders.quick if options.quick else Scale
     scale = scaled(options.runs, options.generations)
     with writing(options.out):
         if options.tune:

@@ -1,4 +1,4 @@
-"""The search for what the paper does not print: what it may change, how it is judged, its journal."""
+"""The search for what the paper does not print: what may change, how it is judged, its journal."""
 
 import json
 import shutil

@@ -30,7 +30,7 @@ from skytether.__main__ import main
 
 PAPER = config.load("paper")
 BY_NAME = {contender.name: contender for contender in CONTENDERS}
-SCALE = contenders.full(100, 40)
+SCALE = contenders.Scale(100, 40)
 QUIET = CASES[0]
 
 
