@@ -305,8 +305,8 @@ def _plain(value: Any) -> Any:
 
 
 def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """A table as CSV text, of rows that have all columns by name; at least one."""
-    return to_csv(list(rows[0]), (list(row.values()) for row in rows))
+    """A table as CSV text, of rows that have all columns by name; empty where there are none."""
+    return to_csv(list(rows[0]), [list(row.values()) for row in rows]) if rows else ""
 
 
 def to_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
