@@ -1,18 +1,18 @@
 """What a search is after: the paper's Table 1, or the smallest error at a share of packets.
 
-An objective flies a point of a search, a scenario, with the same seeds as every other, and says of
-what came out how good it is: the smaller the score, the better.
+An objective (see `lab.search.Objective`) flies a point of a search, a scenario, with the same seeds
+as every other point, and scores what came out: the smaller the score, the better.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any
 
 import numpy as np
 
 from lab import sweep
-from lab.search import Free, plain
+from lab.search import Free, Values, plain
 from shared import config, policy
 from shared.config import Scenario
 from shared.summary import Summary
@@ -22,7 +22,7 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
     "compensation": {"trigger": "always"},
     "compensation and trigger": {},
 }
-"""Of Table 1: what each changes in `control`; all else is the same."""
+"""Keys of `control` that each column of Table 1 changes; all else is the same."""
 
 TABLE_1: Mapping[str, Mapping[str, float]] = {
     "no compensation": {"rmse_x": 0.3724, "rmse_y": 0.3719, "rmse_xy": 0.5263},
@@ -34,28 +34,12 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
         "event_ratio": 0.1,
     },
 }
-"""[m]; and the event ratio that "10 times smaller" means."""
+"""The paper's Table 1 [m], and the event ratio that its "10 times smaller" means."""
 
 TOLERANCE = 0.1
-"""Relative, of every entry; for the event ratio twice that."""
+"""Largest relative deviation of an entry that counts as reproduced; twice that for event ratios."""
 UNFLYABLE = 1e9
-"""Score of a point that no flight survives."""
-
-Values = Mapping[str, Mapping[str, float]]
-"""Figures of a point, by column and name."""
-
-
-class Objective(Protocol):
-    """What is searched for."""
-
-    def free(self) -> Sequence[Free]:
-        """Keys to change unless others are asked for."""
-
-    def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
-        """The figures of a point; runs in a worker."""
-
-    def score(self, values: Values) -> float:
-        """How far they are from what is searched for."""
+"""Score of a point of which a flight fails."""
 
 
 FREE = (
@@ -69,20 +53,24 @@ FREE = (
     Free("model.u_max.0", 0.8, 5.0),
     Free("reference.radius_m", 0.5, 5.0),
 )
-"""What is searched for unless something else is asked for (E4)."""
+"""Keys that a search for Table 1 changes unless others are asked for (E4)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table1:
-    """Every entry of Table 1 as the paper has it."""
+    """The objective that every entry of Table 1 comes out as in the paper."""
+
+    def settings(self) -> Mapping[str, Any]:
+        """Name of the objective, as plain values."""
+        return {"objective": "table1"}
 
     def free(self) -> Sequence[Free]:
-        """See `Objective`."""
+        """Keys to change unless others are asked for."""
         return FREE
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
-        """All columns: means over seeds."""
-        values: dict[str, dict[str, float]] = {}
+        """Means over seeds, for each column of the table."""
+        values: dict[str, dict[str, float | None]] = {}
         for column, changes in COLUMNS.items():
             table = plain(scenario)
             table["control"] |= changes
@@ -91,7 +79,7 @@ class Table1:
         return values
 
     def score(self, values: Values) -> float:
-        """Squares of all deviations; of an entry out of tolerance ten times as much."""
+        """Sum of squared deviations, each ten times as heavy where it is out of tolerance."""
         off = deviations(values)
         if not np.isfinite(list(off.values())).all():
             return UNFLYABLE
@@ -100,21 +88,25 @@ class Table1:
 
 
 def deviations(values: Values) -> dict[tuple[str, str], float]:
-    """How far each entry is off, relatively, by column and name."""
-    return {
-        (column, name): values[column][name] / target - 1.0
+    """Relative deviation of each entry from Table 1, by column and name; NaN for no figure."""
+    found = {
+        (column, name): (values[column][name], target)
         for column, targets in TABLE_1.items()
         for name, target in targets.items()
+    }
+    return {
+        key: math.nan if value is None else value / target - 1.0
+        for key, (value, target) in found.items()
     }
 
 
 def within(name: str, deviation: float) -> bool:
-    """Whether an entry is as near to the paper's as is asked for."""
+    """Whether an entry of this name with this deviation is within tolerance."""
     return abs(deviation) <= TOLERANCE * (2.0 if name == "event_ratio" else 1.0)
 
 
 def is_admissible(values: Values) -> bool:
-    """Whether every entry is."""
+    """Whether every entry of Table 1 is within tolerance."""
     return all(within(name, value) for (_, name), value in deviations(values).items())
 
 
@@ -125,36 +117,40 @@ WEIGHTS = (
     Free("control.input_weight", 1e-4, 1e4),
     Free("control.change_weight", 1e-4, 1e4),
 )
-"""Only ratios matter: the weight on the position stays what it is."""
+"""Weights that are searched for; only ratios matter, so the position's keeps its value."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (Free("control.epsilon", 1e-4, 1e4), Free("control.decay_rate", 1e-2, 1e2)),
     "cost_gap": (Free("control.cost_gap", 1e-6, 1e3),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
 }
-"""Of the policies that look at the flight, so that weights and thresholds decide what they send."""
+"""Keys of each policy that looks at the flight, so that weights decide what it sends, too."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
-"""Of the schemes that have one."""
+"""Keys of the schemes that have a disturbance observer."""
 HERE = "here"
-"""The one column of a point that is flown as it is."""
+"""Name of the one column of a point that is flown as it is."""
 
 
 def trigger_keys(trigger: str) -> Sequence[Free]:
-    """The keys of the policies in a trigger; one that is told its numbers has none."""
+    """Keys of the policies in a trigger; a policy with numbers of its own has none."""
     bare = (each.name for each in policy.policies(policy.parse(trigger)) if not each.values)
     return [key for name in dict.fromkeys(bare) for key in TRIGGER_KEYS.get(name, ())]
 
 
 @dataclass(frozen=True, slots=True)
 class Rmse:
-    """The smallest RMSE xy, where the trigger has a say at no more than a share of packets.
+    """The objective of the smallest RMSE xy, at no more than a share of packets.
 
-    Args:
-        scenario: what is flown, but for the keys that are searched for.
-        packets: most steps that may send, as a share.
+    The share binds only a trigger that looks at the flight.
     """
 
     scenario: Scenario
+    """What is flown, but for the keys that are searched for."""
     packets: float
+    """Largest share of steps that may send."""
+
+    def settings(self) -> Mapping[str, Any]:
+        """Name of the objective and its share of packets, as plain values."""
+        return {"objective": "rmse", "packets": self.packets}
 
     def free(self) -> Sequence[Free]:
         """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
@@ -164,18 +160,20 @@ class Rmse:
         return [key for key in keys if key.of(table) > 0.0]
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
-        """Means over seeds, and how large the share of packets may be with others (95 %)."""
+        """Means over seeds, and the upper end of the event ratio's 95 % interval."""
         runs = sweep.summaries(HERE, scenario, seeds)
-        values = {name: _mean(runs, name) for name in ("rmse_xy", "event_ratio")}
+        rmse, ratio = _mean(runs, "rmse_xy"), _mean(runs, "event_ratio")
         _, half = sweep.estimate(runs, "event_ratio")
-        return {HERE: values | {"event_ratio_most": values["event_ratio"] + (half or 0.0)}}
+        most = None if ratio is None else ratio + (half or 0.0)
+        return {HERE: {"rmse_xy": rmse, "event_ratio": ratio, "event_ratio_most": most}}
 
     def score(self, values: Values) -> float:
         """RMSE xy [m], times the cube of how many times too many packets there may be."""
-        here = values[HERE]
-        over = here["event_ratio_most"] / self.packets if self._binds() else 1.0
-        score = here["rmse_xy"] * max(1.0, over) ** 3
-        return score if math.isfinite(score) else UNFLYABLE
+        rmse, most = values[HERE]["rmse_xy"], values[HERE]["event_ratio_most"]
+        if rmse is None or most is None:
+            return UNFLYABLE
+        over = most / self.packets if self._binds() else 1.0
+        return rmse * max(1.0, over) ** 3
 
     def _binds(self) -> bool:
         """Whether the share of packets follows from what is flown."""
@@ -183,15 +181,7 @@ class Rmse:
         return any(each.name in TRIGGER_KEYS for each in named)
 
 
-ObjectiveName = Literal["table1", "rmse"]
-
-
-def objective(name: ObjectiveName, scenario: Scenario, packets: float) -> Objective:
-    """The objective of a name, see `Rmse` for the rest."""
-    return Rmse(scenario, packets) if name == "rmse" else Table1()
-
-
-def _mean(runs: Sequence[Summary], name: str) -> float:
-    """Mean of a figure; not a number where a run has none, for it did not fly."""
+def _mean(runs: Sequence[Summary], name: str) -> float | None:
+    """Mean of a figure, or None where it is missing in a run, which did not fly."""
     values = [getattr(run, name) for run in runs]
-    return math.nan if None in values else float(np.mean(values))
+    return None if None in values else float(np.mean(values))

@@ -1,4 +1,4 @@
-"""What a comparison of contenders says: tables, ratios that are claimed, curves."""
+"""What comes out of a comparison of contenders: tables, ratios that are claimed, curves."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,22 +11,24 @@ from scipy import stats
 from lab import plates
 from lab.contenders import CASES, CONTENDERS, PACKETS, Case, Flying, Plan
 from lab.plates import Picture
-from lab.report import Drawn, Table, as_text
-from lab.sweep import Done, interval, to_csv
+from lab.report import Drawn, Table, as_interval, as_text
+from lab.sweep import Estimate, Results, by_name, interval, rows_csv, to_csv
 from shared.chance import stream
 from shared.summary import Summary
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """That one contender's RMSE xy is at most so many times another's."""
+    """A claim that one contender's RMSE xy is at most so many times another's."""
 
     ours: str
+    """Name of the one contender."""
     theirs: str
+    """Name of the other."""
     share: float | None = None
-    """Most steps at which ours may send; unless given, it may send no more packets than theirs."""
+    """Largest share of steps at which ours may send; None: no more packets than theirs sends."""
     at_most: Mapping[str, float] = field(default_factory=dict)
-    """By case; where it has none, it is told and not asked for."""
+    """Largest ratio, by case; in cases that it lacks the ratio is reported and not asked for."""
 
 
 NAMES = tuple(case.name for case in CASES)
@@ -45,13 +47,16 @@ CLAIMS = (
 
 
 RMSE, SHARE, PACKETS_UP, BYTES = FIGURES = (
-    *("rmse_xy", "event_ratio"),
-    *("uplink_packets_per_s", "total_bytes_per_s"),
+    "rmse_xy",
+    "event_ratio",
+    "uplink_packets_per_s",
+    "total_bytes_per_s",
 )
+"""Figures that are compared."""
 
 
 def measure(run: Summary, figure: str) -> float | None:
-    """One of FIGURES; None of a run that has not flown."""
+    """One of FIGURES of a run; None where it has not flown."""
     if run.rmse_xy is None:
         return None
     if figure == PACKETS_UP:
@@ -67,29 +72,32 @@ class Flown:
     """The runs of a contender in a case, at one threshold."""
 
     what: Flying
+    """What was flown."""
     runs: Sequence[Summary]
+    """Summary of each flight, by seed."""
 
-    def estimate(self, figure: str) -> tuple[float | None, float | None]:
+    def estimate(self, figure: str) -> Estimate:
         """Mean of one of FIGURES, and half the width of its 95 % interval."""
         values = [measure(run, figure) for run in self.runs]
         return interval([value for value in values if value is not None])
 
     def mean(self, figure: str) -> float:
-        """Not a number where none has flown."""
+        """Mean of one of FIGURES; NaN where nothing has flown."""
         mean, _ = self.estimate(figure)
         return math.nan if mean is None else mean
 
 
-def flown(plan: Plan, done: Mapping[tuple[int, int], Done]) -> list[Flown]:
-    """What came of a plan."""
+def flown(plan: Plan, done: Results) -> list[Flown]:
+    """The runs of each contender at each threshold of a plan."""
     cells = enumerate(plan.flying)
     return [Flown(each, plan.sweep.of_cell(done, cell)) for cell, each in cells]
 
 
 def ratio(ours: Flown, theirs: Flown) -> tuple[float, float, float] | None:
-    """Mean RMSE xy of ours over theirs, seed by seed, and its 95 % interval (bootstrap).
+    """Mean RMSE xy of ours over theirs, and both ends of its 95 % interval.
 
-    None where fewer than two seeds have flown in both.
+    The interval is a bootstrap over pairs of the same seed. The result is None where fewer than two
+    seeds have flown in both.
     """
     errors = [
         (one.rmse_xy, other.rmse_xy)
@@ -111,31 +119,36 @@ def ratio(ours: Flown, theirs: Flown) -> tuple[float, float, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A claim in a case."""
+    """A claim, judged in a case."""
 
     claim: Claim
+    """What is claimed."""
     case: Case
+    """Case in which it is judged."""
     ours: Flown
+    """Runs of our contender, at the threshold that is judged."""
     theirs: Flown
+    """Runs of the other contender, at the threshold that was searched for."""
     ratio: tuple[float, float, float] | None
+    """Ratio of both mean RMSE xy, with both ends of its interval; None where too little flew."""
     sparse: bool
-    """Whether ours sends as little as it has to."""
+    """Whether ours sends no more than it may."""
 
     @property
     def at_most(self) -> float | None:
-        """What is asked for."""
+        """Largest ratio that is asked for; None where none is."""
         return self.claim.at_most.get(self.case.name)
 
     @property
     def holds(self) -> bool | None:
-        """Whether all of the interval is below what is asked for; None where nothing is."""
+        """Whether all of the interval is below what is asked for; None where nothing is asked."""
         if self.at_most is None:
             return None
         return self.sparse and self.ratio is not None and self.ratio[2] <= self.at_most
 
 
 def judge(claim: Claim, case: Case, flown: Sequence[Flown]) -> Judged:
-    """A claim, with ours at the threshold that sends most without sending more than it may."""
+    """Judge a claim, with ours at the threshold that sends most of those allowed."""
 
     def curve(name: str) -> list[Flown]:
         return [each for each in flown if each.what.contender.name == name]
@@ -152,14 +165,15 @@ def judge(claim: Claim, case: Case, flown: Sequence[Flown]) -> Judged:
     return Judged(claim, case, found, theirs, ratio(found, theirs), is_sparse(found))
 
 
-Results = Sequence[tuple[Case, Sequence[Flown]]]
+Compared = Sequence[tuple[Case, Sequence[Flown]]]
+"""Runs of all contenders, case by case."""
 
 
-def draw(results: Results, runs: int) -> Drawn:
-    """All tables and figures.
+def draw(results: Compared, runs: int) -> Drawn:
+    """The report of a comparison.
 
     Args:
-        runs: of each contender, case and threshold.
+        runs: number of flights of each contender in each case at each threshold.
     """
     judged = [judge(claim, case, flown) for case, flown in results for claim in CLAIMS]
     asked = [each.holds for each in judged if each.holds is not None]
@@ -181,24 +195,20 @@ ABOUT = (
 
 
 def tuned(flown: Sequence[Flown]) -> list[Flown]:
-    """The contenders at the thresholds that a search has found."""
+    """Runs at the thresholds that a search has found."""
     return [each for each in flown if each.what.tuned]
 
 
-def contenders_table(results: Results, runs: int) -> Table:
-    """What each came to in each case."""
-    header = ("case", "contender", *_HEADER)
+def contenders_table(results: Compared, runs: int) -> Table:
+    """Table of the figures of each contender in each case."""
+    specs = {RMSE: ".4f", SHARE: ".1%", PACKETS_UP: ".2f", BYTES: ",.0f"}
     rows, lines = [], []
-    specs = (".4f", ".1%", ".2f", ",.0f")
     for case, flown in results:
         for each in tuned(flown):
-            found = [each.estimate(figure) for figure in FIGURES]
-            rows.append([case.name, each.what.contender.name, *_row(each)])
-            cells = [
-                f"{as_text(mean, spec)} ± {as_text(half, spec)}"
-                for (mean, half), spec in zip(found, specs, strict=True)
-            ]
-            lines.append((case.title, each.what.contender.title, *cells))
+            contender = each.what.contender
+            rows.append({"case": case.name, "contender": contender.name} | _row(each))
+            cells = [as_interval(each.estimate(name), spec) for name, spec in specs.items()]
+            lines.append((case.title, contender.title, *cells))
     failed = sum(run.rmse_xy is None for _, flown in results for each in flown for run in each.runs)
     says = (
         f"Means of {runs} flights with 95 % intervals. Bytes are UDP payload, both ways. Where a "
@@ -207,62 +217,73 @@ def contenders_table(results: Results, runs: int) -> Table:
     if failed:
         says += f" {failed} runs never got a session and count in no mean."
     heading = ("case", "contender", "RMSE xy [m]", "steps sent", "packets up /s", "bytes /s")
-    return Table("contenders", "Contenders", says, to_csv(header, rows), heading, lines)
+    return Table("contenders", "Contenders", says, rows_csv(rows), heading, lines)
 
 
-_HEADER = (
-    *("threshold", "runs", "flown"),
-    *(name for figure in FIGURES for name in (figure, f"{figure}_ci95")),
-)
-
-
-def _row(each: Flown) -> list[Any]:
-    """Threshold, runs, those that flew, and every figure with its interval."""
+def _row(each: Flown) -> dict[str, Any]:
+    """Threshold, number of runs and of those that flew, and every figure with its interval."""
     flew = sum(run.rmse_xy is not None for run in each.runs)
-    pairs = [part for figure in FIGURES for part in each.estimate(figure)]
-    return [each.what.threshold, len(each.runs), flew, *pairs]
+    counts = {"threshold": each.what.threshold, "runs": len(each.runs), "flown": flew}
+    return counts | by_name(FIGURES, each.estimate)
 
 
 def ratios_table(judged: Sequence[Judged]) -> Table:
-    """What was claimed."""
-    header = (
-        *("case", "ours", "threshold", "theirs", "ratio", "ratio_low", "ratio_high", "at_most"),
-        *("holds", "event_ratio_ours", "event_ratio_theirs"),
-    )
+    """Table of the ratios that are claimed."""
     rows, lines = [], []
     for each in judged:
         ours, theirs = each.ours.what.contender, each.theirs.what.contender
-        found = each.ratio or (None, None, None)
-        shares = [side.mean(SHARE) for side in (each.ours, each.theirs)]
+        value, low, high = each.ratio or (None, None, None)
+        our_share, their_share = each.ours.mean(SHARE), each.theirs.mean(SHARE)
         rows.append(
-            (
-                *(each.case.name, ours.name, each.ours.what.threshold, theirs.name, *found),
-                *(each.at_most, each.holds, *shares),
-            )
+            {
+                "case": each.case.name,
+                "ours": ours.name,
+                "threshold": each.ours.what.threshold,
+                "theirs": theirs.name,
+                "ratio": value,
+                "ratio_low": low,
+                "ratio_high": high,
+                "at_most": each.at_most,
+                "holds": each.holds,
+                "event_ratio_ours": our_share,
+                "event_ratio_theirs": their_share,
+            }
         )
-        value, low, high = (as_text(part, ".3f") for part in found)
         lines.append(
             (
-                *(each.case.title, ours.title, theirs.title, value, f"{low} … {high}"),
-                *(as_text(each.at_most, ".2f"), {None: "–", True: "yes", False: "no"}[each.holds]),
-                *(as_text(share, ".1%") for share in shares),
+                each.case.title,
+                ours.title,
+                theirs.title,
+                as_text(value, ".3f"),
+                f"{as_text(low, '.3f')} … {as_text(high, '.3f')}",
+                as_text(each.at_most, ".2f"),
+                {None: "–", True: "yes", False: "no"}[each.holds],
+                as_text(our_share, ".1%"),
+                as_text(their_share, ".1%"),
             )
         )
     says = (
         "Mean RMSE xy of ours over theirs, with 95 % intervals (bootstrap over pairs of the same "
         "seed). A ratio holds where all of its interval is below what is asked for, and ours sends "
-        "no more packets than it may. Where it would at the threshold found, it flies at the next "
-        "one of its curve that does not."
+        "no more packets than it may. Where it would send more at the threshold found, it flies at "
+        "the next one of its curve that does not."
     )
     heading = (
-        *("case", "ours", "theirs", "ratio", "95 %", "at most", "holds"),
-        *("steps sent, ours", "theirs"),
+        "case",
+        "ours",
+        "theirs",
+        "ratio",
+        "95 %",
+        "at most",
+        "holds",
+        "steps sent, ours",
+        "theirs",
     )
-    return Table("ratios", "Ratios", says, to_csv(header, rows), heading, lines)
+    return Table("ratios", "Ratios", says, rows_csv(rows), heading, lines)
 
 
-def weights_table(results: Results) -> Table:
-    """What each flies at."""
+def weights_table(results: Compared) -> Table:
+    """Table of the weights and threshold of each contender in each case."""
     keys = list(
         dict.fromkeys(
             key
@@ -282,20 +303,22 @@ def weights_table(results: Results) -> Table:
     )
     lines = [(case.title, one.title, *row) for case, one, row in rows]
     heading = ("case", "contender", *(key.removeprefix("control.") for key in keys))
-    says = "Where nothing stands, it is the plant's own."
+    says = "Empty cells are those of the plant's own scenario."
     return Table("weights", "Weights and thresholds", says, text, heading, lines)
 
 
 def _weights(value: Any) -> str:
-    """A number, or several, and nothing for none."""
+    """A number, or several between commas; an empty text for None."""
     parts = () if value is None else np.atleast_1d(value)
     return ", ".join(f"{part:.4g}" for part in parts)
 
 
 def curves(case: Case, flown: Sequence[Flown]) -> Picture:
-    """What a packet buys in a case."""
-    header = ("contender", "tuned", *_HEADER)
-    rows = [[each.what.contender.name, each.what.tuned, *_row(each)] for each in flown]
+    """Figure of what a packet buys in a case: RMSE xy over what each contender sends."""
+    rows = [
+        {"contender": each.what.contender.name, "tuned": each.what.tuned} | _row(each)
+        for each in flown
+    ]
     drawn = {
         contender.title: [each for each in flown if each.what.contender == contender]
         for contender in CONTENDERS
@@ -310,20 +333,21 @@ def curves(case: Case, flown: Sequence[Flown]) -> Picture:
             f" Of all that send at no more than {PACKETS:.0%} of the steps, the best is "
             f"“{best.what.contender.title}”: {best.mean(RMSE):.4f} m at {best.mean(SHARE):.1%}."
         )
+
+    def bought(each: Flown) -> plates.Bought:
+        rmse_m, half_m = each.estimate(RMSE)
+        return plates.Bought(
+            packets_per_s=each.mean(PACKETS_UP),
+            bytes_per_s=each.mean(BYTES),
+            rmse_m=rmse_m,
+            rmse_half_m=half_m,
+            tuned=each.what.tuned,
+        )
+
     return plates.trade(
         f"trade-{case.name}",
         f"What a packet buys: {case.title}",
         says,
-        {
-            title: [
-                plates.Bought(
-                    *(each.mean(PACKETS_UP), each.mean(BYTES), *each.estimate(RMSE)),
-                    each.what.tuned,
-                )
-                for each in points
-            ]
-            for title, points in drawn.items()
-        },
-        header,
-        rows,
+        {title: list(map(bought, points)) for title, points in drawn.items()},
+        rows_csv(rows),
     )

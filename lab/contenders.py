@@ -1,28 +1,28 @@
-"""What `skytether compare` flies: contenders in all cases, each at its own best weights.
+"""The contenders and cases of `skytether compare`, and the file of the weights that each flies at.
 
-The best weights of a contender in a case are those of its scenario in `scenarios/compare`, which a
-search has found (`search_start`, and `lab.calibration.Rmse`), on seeds that are not flown here.
-Around them its threshold is moved, so that there is a curve of what a packet buys.
+The best weights of a contender in a case are a table of that file, found by a search
+(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. Around them
+the contender's threshold is moved, which gives a curve of what a packet buys.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from lab.sweep import Axis, Sweep, lay
+from lab.keys import flat, lay
+from lab.sweep import Axis, Sweep
 from shared import config
 from shared.config import ConfigError, Scenario
 
 PLANT = "paper"
-"""The scenario whose vehicle, trajectory and network all fly."""
+"""Name of the scenario whose vehicle, trajectory and network all contenders fly."""
 SEARCH_SEED = 1001
-"""The first of a search; those that are compared begin at the plant's."""
+"""First seed of a search; the seeds that are compared begin at the plant's own."""
 PACKETS = 0.1
-"""Most steps that may send, as a share, where a trigger has a say in it."""
+"""Largest share of steps that may send, for a contender whose trigger looks at the flight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,20 +30,21 @@ class Contender:
     """A scheme with a trigger."""
 
     name: str
-    """Of its files."""
+    """Short name, in tables, files and scenarios."""
     title: str
+    """Name as a reader of the report sees it."""
     control: Mapping[str, Any]
-    """Keys that make it what it is."""
+    """Keys of `control` that make up the contender, with the weights its search starts from."""
     threshold: str = ""
-    """The key of `control` that its packets depend on, if any,"""
+    """Key of `control` that decides how many packets are sent; empty where there is none."""
     factors: Sequence[float] = ()
-    """and what it is multiplied with for a curve."""
+    """Multiples of the threshold found, each a point of the curve."""
 
 
 NEAR = (1 / 8, 0.6, 0.8, 1, 5 / 4, 2, 8)
 """Factors of a quadratic threshold."""
 PERIODS = (0.1, 0.2, 0.5, 1, 1.5, 2, 4)
-"""Factors of ten steps."""
+"""Factors of a period of ten steps."""
 PERIODIC = {"trigger": "periodic", "period": 10}
 LOOSE = {
     "state_weight": [7.1, 3.0],
@@ -51,7 +52,7 @@ LOOSE = {
     "input_weight": 0.1,
     "change_weight": 20.0,
 }
-"""Where searches begin with the paper's scheme: near the best of 240 points drawn at random."""
+"""Start of a search with the paper's scheme: near the best of 240 points drawn at random."""
 EVENT = {"trigger": "state_gap", "epsilon": 30.0}
 TIGHT = {
     "state_weight": [7.1, 1.0],
@@ -59,10 +60,12 @@ TIGHT = {
     "input_weight": 0.01,
     "change_weight": 0.01,
 }
-"""And with committed inputs, which need no S-term."""
+"""Start of a search with committed inputs, which need no S-term."""
 COMMITTED = {"scheme": "committed", "observer_s": 2.0} | TIGHT
-"""How soon the observer learns is searched for, too, and may come out as hardly ever."""
+"""Committed inputs; the observer's time constant is searched for and may come out very long."""
 GAP = COMMITTED | {"trigger": "cost_gap", "cost_gap": 2.0}
+BUDGET = GAP | {"trigger": "cost_gap & budget(5, 2)"}
+FEEDBACK = GAP | {"scheme": "feedback"}
 
 CONTENDERS = (
     Contender("paper-every-step", "paper, every step", LOOSE | {"trigger": "always"}),
@@ -71,39 +74,31 @@ CONTENDERS = (
     Contender("committed-every-step", "committed, every step", COMMITTED | {"trigger": "always"}),
     Contender("committed-periodic", "committed, periodic", COMMITTED | PERIODIC, "period", PERIODS),
     Contender("committed-gap", "committed, cost gap", GAP, "cost_gap", NEAR),
+    Contender("committed-budget", "committed, cost gap, ≤ 5 packets/s", BUDGET, "cost_gap", NEAR),
     Contender(
-        "committed-budget",
-        "committed, cost gap, ≤ 5 packets/s",
-        GAP | {"trigger": "cost_gap & budget(5, 2)"},
-        *("cost_gap", NEAR),
-    ),
-    Contender(
-        "feedback-gap",
-        "committed with feedback aboard, cost gap",
-        GAP | {"scheme": "feedback"},
-        *("cost_gap", NEAR),
+        "feedback-gap", "committed with feedback aboard, cost gap", FEEDBACK, "cost_gap", NEAR
     ),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What they fly in."""
+    """What the vehicle meets and the server is not told."""
 
     name: str
+    """Short name, in tables, files and scenarios."""
     title: str
+    """Name as a reader of the report sees it."""
     keys: Mapping[str, Any]
+    """Keys of the scenario, with dots, that differ from the plant's."""
 
 
+GUSTS = {"vehicle.gust_mps2": 1.0, "vehicle.gust_every_s": 10.0, "vehicle.gust_s": 1.0}
 CASES = (
     Case("quiet", "no wind", {}),
-    Case("wind-0.1", "wind of 0.1 m/s² per √s", {"vehicle.wind": 0.1}),
-    Case("wind-0.3", "wind of 0.3 m/s² per √s", {"vehicle.wind": 0.3}),
-    Case(
-        "gusts",
-        "gusts of 1 m/s², 1 s long, every 10 s",
-        {"vehicle.gust_mps2": 1.0, "vehicle.gust_every_s": 10.0, "vehicle.gust_s": 1.0},
-    ),
+    Case("wind-0.1", "wind of 0.1 m/s per √s", {"vehicle.wind": 0.1}),
+    Case("wind-0.3", "wind of 0.3 m/s per √s", {"vehicle.wind": 0.3}),
+    Case("gusts", "gusts of 1 m/s², 1 s long, every 10 s", GUSTS),
     Case("tau-0.75", "true time constant × 0.75", {"vehicle.tau_s": [0.63]}),
     Case("tau-1.25", "true time constant × 1.25", {"vehicle.tau_s": [1.05]}),
 )
@@ -111,39 +106,45 @@ CASES = (
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How much is flown."""
+    """How much a comparison flies; what is not given is as in those that are reported."""
 
     runs: int
-    """Of each contender, case and threshold."""
-    cases: Sequence[Case]
-    every: int
-    """Which of the factors are flown: each so-manieth, the middle one among them."""
-    duration: float
-    """Of a flight [s]."""
-    search_runs: int
-    """Of each point of a search,"""
-    search_duration: float
-    """and how long they are [s]."""
+    """Number of flights of each contender in each case at each threshold."""
     generations: int
-    """Of a search."""
-    population: int
-
-
-def full(runs: int, generations: int) -> Scale:
-    """For print."""
-    return Scale(runs, CASES, 1, 60.0, 8, 32.5, generations, 10)
+    """Number of generations of a search."""
+    population: int = 10
+    """Number of points in a generation."""
+    search_runs: int = 8
+    """Number of flights of each point of a search."""
+    search_duration: float = 32.5
+    """Length of a flight of a search [s]."""
+    cases: Sequence[Case] = CASES
+    """Cases that are flown."""
+    every: int = 1
+    """Stride over a contender's factors; it meets the middle one, a factor of 1."""
+    duration: float = 60.0
+    """Length of a flight [s]."""
 
 
 def quick(runs: int, generations: int) -> Scale:
-    """For a first look."""
-    return Scale(min(runs, 3), CASES[:3:2], 3, 15.0, 2, 15.0, min(generations, 2), 4)
+    """Scale of a first look, with no more than is asked for."""
+    return Scale(
+        runs=min(runs, 3),
+        generations=min(generations, 2),
+        population=4,
+        search_runs=2,
+        search_duration=15.0,
+        cases=CASES[:3:2],
+        every=3,
+        duration=15.0,
+    )
 
 
-# -- what is flown -------------------------------------------------------------------------------
+# -- weights -------------------------------------------------------------------------------------
 
 
 def search_start(contender: Contender, case: Case, scale: Scale) -> Scenario:
-    """Where the search for a contender's weights begins."""
+    """Scenario from which the search for a contender's weights in a case begins."""
     table = config.to_table(config.load(PLANT))
     lay({"duration": scale.search_duration, "seed": SEARCH_SEED}, table)
     lay({f"control.{key}": value for key, value in contender.control.items()}, table)
@@ -151,46 +152,63 @@ def search_start(contender: Contender, case: Case, scale: Scale) -> Scenario:
     return config.check(table, f"{contender.title}, {case.title}")
 
 
-def file_name(contender: Contender, case: Case) -> str:
-    """Of the scenario with its weights."""
-    return f"{contender.name}-{case.name}.toml"
+def entry(contender: Contender, case: Case) -> str:
+    """Name of a contender in a case: of its table in the file of weights."""
+    return f"{contender.name}-{case.name}"
 
 
-def to_file(contender: Contender, case: Case, found: Scenario, how: str) -> bytes:
-    """The scenario with what a search has found, as a file that says but what differs.
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What the search for a contender's weights in a case has found."""
+
+    contender: Contender
+    case: Case
+    scenario: Scenario
+    """Scenario with the weights."""
+    says: str
+    """Error and share of packets on the seeds of the search, in a line."""
+
+
+def to_file(found: Sequence[Found], scale: Scale) -> str:
+    """The file of weights: a table for each contender in each case, with what differs from PLANT.
 
     Args:
-        how: it was found, in a line.
+        scale: what the searches took, which the file says.
     """
-    title = f"{contender.title}, at its best: {case.title}"
-    lines = [f"# {how}", f'title = "{title}"', f'extends = "{PLANT}"']
-    table: dict[str, Any] = {}
-    lay(differences(found), table)
-    for section, keys in table.items():
-        # A number, a text and a list of numbers look the same in JSON and TOML.
-        values = [f"{key} = {json.dumps(value)}" for key, value in keys.items()]
-        lines += ["", f"[{section}]", *values]
-    return "\n".join([*lines, ""]).encode()
+    lines = [
+        "# Scenarios of each contender of `skytether compare` in each case, with the weights and",
+        "# thresholds that `skytether compare --tune` has found for it in",
+        f"# {scale.generations} generations of {scale.population} points,",
+        f"# each flown with {scale.search_runs} seeds from {SEARCH_SEED} on.",
+    ]
+    for each in found:
+        sections: dict[str, Any] = {}
+        lay(differences(each.scenario), sections)
+        lines += [
+            "",
+            f"# {each.says}",
+            f"[{_inline(entry(each.contender, each.case))}]",
+            f"title = {_inline(f'{each.contender.title}, at its best: {each.case.title}')}",
+            f"extends = {_inline(PLANT)}",
+            *(f"{section} = {_inline(keys)}" for section, keys in sections.items()),
+        ]
+    return "\n".join([*lines, ""])
+
+
+def _inline(value: Any) -> str:
+    """A value as TOML has it in a line; numbers, texts and lists are the same in JSON."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {_inline(each)}' for key, each in value.items())} }}"
+    return json.dumps(value, ensure_ascii=False)
 
 
 def differences(scenario: Scenario) -> dict[str, Any]:
-    """The keys in sections that are not the plant's, with dots."""
-    here, there = (config.to_table(each) for each in (scenario, config.load(PLANT)))
-    return {
-        f"{section}.{path}": value
-        for section, keys in here.items()
-        if isinstance(keys, dict)
-        for path, value in _leaves(keys)
-        if value != dict(_leaves(there[section]))[path]
-    }
+    """Keys in the sections of a scenario that differ from PLANT's, with dots, and their values."""
+    here, there = (dict(flat(config.to_table(each))) for each in (scenario, config.load(PLANT)))
+    return {key: value for key, value in here.items() if "." in key and value != there[key]}
 
 
-def _leaves(table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from ((f"{key}.{path}", leaf) for path, leaf in _leaves(value))
-        else:
-            yield key, value
+# -- what is flown -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,14 +217,15 @@ class Flying:
 
     contender: Contender
     threshold: float | None
+    """Value of the contender's threshold; None where it has none."""
     tuned: bool
-    """Whether the threshold is that of its scenario."""
+    """Whether the threshold is the one that the search has found."""
     control: Mapping[str, Any]
-    """What differs from the plant, by keys with dots."""
+    """Keys that differ from the plant's, with dots, and their values."""
 
 
 def flying(contender: Contender, tuned: Scenario, scale: Scale) -> list[Flying]:
-    """A contender at all its thresholds, of which one is tuned."""
+    """A contender at all thresholds of its curve, in rising order; one of them is tuned."""
     keys, key = differences(tuned), contender.threshold
     if not key:
         return [Flying(contender, None, True, keys)]
@@ -220,29 +239,26 @@ def flying(contender: Contender, tuned: Scenario, scale: Scale) -> list[Flying]:
     ]
 
 
-def _load(file: Path) -> Scenario:
-    if not file.exists():
-        raise ConfigError(f"{file}: there is none; `skytether compare --tune` makes it")
-    return config.load(str(file))
-
-
 class Plan:
-    """All contenders in one case.
+    """What all contenders fly in one case.
 
     Args:
-        folder: of the scenarios with their weights.
+        weights: COMPARED, or the path of a file that `to_file` has made.
 
     Raises:
-        ConfigError: one is missing, or wrong.
+        ConfigError: the file cannot be read, or a contender is missing there, or wrong.
     """
 
-    def __init__(self, case: Case, folder: Path, scale: Scale) -> None:
+    def __init__(self, case: Case, weights: str, scale: Scale) -> None:
         self.case = case
-        self.flying = [
-            each
-            for contender in CONTENDERS
-            for each in flying(contender, _load(folder / file_name(contender, case)), scale)
-        ]
+        self.flying: list[Flying] = []
+        known = config.names(weights)
+        for contender in CONTENDERS:
+            name = entry(contender, case)
+            if f"{weights}/{name}" not in known:
+                there_is = "expected every contender in every case, as --tune writes them"
+                raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
+            self.flying += flying(contender, config.load(f"{weights}/{name}"), scale)
         values = tuple((each.contender.name, each.threshold) for each in self.flying)
         changes = tuple(each.control for each in self.flying)
         plant = msgspec.structs.replace(config.load(PLANT), duration=scale.duration)

@@ -15,6 +15,7 @@ from shared.summary import position_error
 from sim.flight import Flight
 
 FORMATS = (".png", ".pdf", ".svg")
+"""Suffixes of files that a picture can be written to."""
 
 
 def check(path: Path) -> None:
@@ -30,11 +31,11 @@ def check(path: Path) -> None:
 
 
 def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
-    """Draw flights side by side: the path over the reference, and beneath it when packets went up.
+    """Draw flights side by side: the path over the reference, and below it when packets went up.
 
     Args:
-        path: of a file in one of FORMATS.
-        flown: scenario and record of each, by title.
+        path: file to write, in one of FORMATS.
+        flown: scenario and record of each flight, by title.
     """
     from matplotlib.figure import Figure  # takes half a second to import
 
@@ -64,19 +65,23 @@ def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
 
 
 def draw_reference(plane: Any, scenario: Scenario, step: Indices) -> None:
-    """Red and dashed, over these steps; one round of what goes round, for dashes to stay dashes."""
+    """Draw the reference, red and dashed, over some steps.
+
+    A closed curve is drawn for one round only, so that the dashes of the next do not fill its gaps.
+    """
     time_s = step * scenario.control.dt
     if scenario.reference.shape in ("circle", "figure-eight", "square"):
         time_s = time_s[time_s - time_s[:1] <= scenario.reference.period_s]
-    plane.plot(*scenario.make_reference()(time_s)[:, :2, 0].T, "r--", label="reference")
+    x, y = scenario.make_reference()(time_s)[:, :2, 0].T
+    plane.plot(x, y, "r--", label="reference")
 
 
 def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
     """Draw a fleet: all paths over the reference, and how the tracking error spreads.
 
     Args:
-        path: of a file in one of FORMATS.
-        client: rows of all vehicles.
+        path: file to write, in one of FORMATS.
+        client: rows of all vehicles' records.
     """
     from matplotlib.figure import Figure
 
@@ -84,9 +89,8 @@ def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
     plane, spread = figure.subplots(1, 2)
     flights = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
     for rows in flights:
-        plane.plot(
-            *rows["state"][:, :2, 0].T, "k-", linewidth=0.6, alpha=max(0.05, 1 / len(flights))
-        )
+        x, y = rows["state"][:, :2, 0].T
+        plane.plot(x, y, "k-", linewidth=0.6, alpha=max(0.05, 1 / len(flights)))
     draw_reference(plane, scenario, np.unique(client["step"]))
     plane.set_aspect("equal", adjustable="datalim")
     plane.set_xlabel("x [m]")
@@ -108,7 +112,7 @@ def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
 
 
 UNITS = {"s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "ppm": "ppm"}
-"""Of a key, by what comes last in its name,"""
+"""Unit of a key, by the last part of its name."""
 OTHER_UNITS = {
     "duration": "s",
     "settle": "s",
@@ -118,25 +122,25 @@ OTHER_UNITS = {
     "control.period": "steps",
     "control.decay_rate": "1/s",
     "model.u_max": "m/s",
-    "vehicle.wind": "m/s² per √s",
+    "vehicle.wind": "m/s per √s",
 }
-"""and of those that do not name it."""
+"""Units of the keys whose names do not end in one."""
 
 
 def label(key: str) -> str:
-    """A key of the scenario, with its unit where it has one."""
+    """Label of a key of the scenario, with the unit where there is one."""
     unit = OTHER_UNITS.get(key) or ("_" in key and UNITS.get(key.rsplit("_", 1)[1]))
     return f"{key} [{unit}]" if unit else key
 
 
 def curve(path: Path, title: str, axis: Axis, name: str, *, means: Array, halves: Array) -> None:
-    """Draw what a sweep over one key gave.
+    """Draw the means of a sweep over one key, with their intervals.
 
     Args:
-        path: of a file in one of FORMATS.
-        name: of what was measured, with its unit.
-        means: one each value, NaN for none; shape (values,).
-        halves: of their intervals; likewise.
+        path: file to write, in one of FORMATS.
+        name: label of the figure that was measured, with its unit.
+        means: mean at each value, NaN for none; shape (values,).
+        halves: half the width of each mean's interval; shape (values,).
     """
     from matplotlib.figure import Figure
 
@@ -159,13 +163,13 @@ def curve(path: Path, title: str, axis: Axis, name: str, *, means: Array, halves
 
 
 def heat_map(path: Path, title: str, axes: tuple[Axis, Axis], name: str, *, means: Array) -> None:
-    """Draw what a sweep over two keys gave.
+    """Draw the means of a sweep over two keys.
 
     Args:
-        path: of a file in one of FORMATS.
-        axes: across and up.
-        name: of what was measured, with its unit.
-        means: NaN for none; shape (values of the first, values of the second).
+        path: file to write, in one of FORMATS.
+        axes: the axis that runs across, and the axis that runs up.
+        name: label of the figure that was measured, with its unit.
+        means: mean in each cell, NaN for none; shape (values across, values up).
     """
     from matplotlib.figure import Figure
 
@@ -184,11 +188,11 @@ def heat_map(path: Path, title: str, axes: tuple[Axis, Axis], name: str, *, mean
 
 
 def _is_scale(axis: Axis) -> bool:
-    """Whether its values are numbers that rise, and not names."""
+    """Whether an axis has numbers that rise, and not names."""
     numbers = all(type(value) in (int, float) for value in axis.values)
     return numbers and all(low < high for low, high in pairwise(axis.values))
 
 
 def _places(axis: Axis) -> Array:
-    """Where its values lie in a picture; shape (values,)."""
+    """Coordinates of an axis' values in a picture; shape (values,)."""
     return np.array(axis.values if _is_scale(axis) else range(len(axis.values)), dtype=np.float64)

@@ -1,113 +1,130 @@
-"""The folder of a sweep: what it is, and every task that is done, safe from any end.
+"""The journal of a long piece of work: its settings, and what is done of it, safe from any end.
 
-`sweep.toml` holds the settings, `runs.jsonl` a line for each task done. A line is on the disk
-before the next is begun; half a line at the end (a killed writer's) is overwritten.
+A journal is a folder. `settings.toml` holds all that the results follow from, `journal.jsonl` a
+line for each entry: its checksum (CRC-32) and the entry itself. A line is on the disk before the
+next is begun. Half a line at the end, left by a writer that was killed, is overwritten; a line that
+was changed is refused.
 """
 
 import fcntl
+import hashlib
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+import zlib
+from collections.abc import Iterable, Mapping
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from lab.sweep import Done, Sweep
-from shared.config import ConfigError
+from lab.keys import flat
+from shared.config import ConfigError, Scenario
 
-SETTINGS, TASKS = "sweep.toml", "runs.jsonl"
+SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
+
+E = TypeVar("E")
 
 
-class Journal:
-    """The tasks done of one sweep, in a folder that is made where it is missing.
+class Journal(Generic[E]):
+    """The entries of one piece of work, in a folder that is made where it is missing.
 
     Args:
-        version: of the program: another one may fly otherwise.
+        folder: where the journal is kept.
+        settings: all that the entries follow from, as plain values; the version is added.
+        kind: type of an entry.
 
     Raises:
-        ConfigError: the folder holds another sweep, something that is none, or one under way.
-        OSError: it cannot be written.
+        ConfigError: the folder holds other work or a line that is no entry, or somebody writes.
+        OSError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, sweep: Sweep, version: str) -> None:
+    def __init__(self, folder: Path, settings: Mapping[str, Any], kind: type[E]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder = folder
-        self._file = os.fdopen(os.open(folder / TASKS, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
-        self.done: dict[tuple[int, int], Done] = {}
-        """By cell and chunk."""
+        self.folder = folder
+        self.entries: list[E] = []
+        """Everything done so far, in the order in which it was done."""
+        self._file = os.fdopen(os.open(folder / ENTRIES, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
         try:
-            self._read({"version": version} | sweep.settings())
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConfigError(f"{folder}: another command is writing there") from None
+            self._agree({"version": metadata.version("skytether"), **settings})
+            self._read(msgspec.json.Decoder(kind))
         except BaseException:
             self.close()
             raise
 
-    def _read(self, settings: Mapping[str, Any]) -> None:
-        """What was done before, so that the next line comes behind it."""
+    def _agree(self, settings: Mapping[str, Any]) -> None:
+        """Write the settings down, or compare them with those that are there."""
+        path = self.folder / SETTINGS
+        text = msgspec.toml.encode(settings)
+        if not path.exists():
+            if os.fstat(self._file.fileno()).st_size:
+                raise ConfigError(f"{self.folder}: got {ENTRIES} without {SETTINGS}, expected both")
+            write(path, text)
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(f"{self._folder}: another sweep is writing there") from None
-        self._agree(settings)
+            before = dict(flat(tomllib.loads(path.read_text())))
+        except ValueError as error:
+            raise ConfigError(f"{path}: no valid TOML: {error}") from None
+        now = dict(flat(tomllib.loads(text.decode())))
+        for key in [*now, *before]:
+            if now.get(key) != before.get(key):
+                raise ConfigError(
+                    f"{self.folder}: {key.removeprefix('scenario.')}: got {now.get(key)!r}, "
+                    f"expected {before.get(key)!r}, to go on there; or another --out"
+                )
+
+    def _read(self, decoder: msgspec.json.Decoder[E]) -> None:
+        """Take the entries that are there, so that the next line comes behind them."""
         whole = 0
         for number, line in enumerate(self._file, start=1):
             if not line.endswith(b"\n"):
                 break
+            content = line[len(sealed(b"")) - 2 : -2]
             try:
-                done = msgspec.json.decode(line, type=Done)
-            except msgspec.MsgspecError as error:
-                what = f"line {number} is no task that was done: {error}"
-                raise ConfigError(f"{self._folder / TASKS}: {what}") from None
-            self.done[done.cell, done.chunk] = done
+                if line != sealed(content):
+                    raise ValueError("its checksum is wrong")
+                self.entries.append(decoder.decode(content))
+            except (ValueError, msgspec.MsgspecError) as error:
+                where = f"{self.folder / ENTRIES}: line {number}"
+                raise ConfigError(f"{where} is not what was written: {error}") from None
             whole += len(line)
         self._file.seek(whole)
         self._file.truncate()
 
-    def _agree(self, settings: Mapping[str, Any]) -> None:
-        """Write the settings down, or find them there."""
-        path = self._folder / SETTINGS
-        if not path.exists():
-            if os.fstat(self._file.fileno()).st_size:
-                raise ConfigError(f"{self._folder}: got {TASKS} without {SETTINGS}, expected both")
-            self.write(SETTINGS, msgspec.toml.encode(settings))
-        try:
-            before = dict(_flat(tomllib.loads(path.read_text())))
-        except ValueError as error:
-            raise ConfigError(f"{path}: no valid TOML: {error}") from None
-        now = dict(_flat(tomllib.loads(msgspec.toml.encode(settings).decode())))
-        for key in [*now, *before]:
-            if now.get(key) != before.get(key):
-                raise ConfigError(
-                    f"{self._folder}: {key.removeprefix('scenario.')}: got {now.get(key)!r}, "
-                    f"expected {before.get(key)!r}, as the sweep there began; or another --out"
-                )
-
-    def append(self, done: Done) -> None:
-        """A task is done, and will be found so whatever happens next."""
-        self._file.write(msgspec.json.encode(done) + b"\n")
+    def append(self, entry: E) -> None:
+        """Keep an entry, whatever happens next."""
+        self._file.write(sealed(msgspec.json.encode(entry)))
         self._file.flush()
         os.fsync(self._file.fileno())
-        self.done[done.cell, done.chunk] = done
-
-    def write(self, name: str, content: bytes) -> None:
-        """A file of the folder, there as a whole or not at all."""
-        path = self._folder / name
-        part = path.with_name(f"{name}.part")
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        self.entries.append(entry)
 
     def close(self) -> None:
-        """Another may write to the folder."""
+        """Let another command write to the folder."""
         self._file.close()
 
 
-def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys with dots, and their values."""
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+def sealed(content: bytes) -> bytes:
+    """A line of a journal: a JSON list of the checksum and of what it is the checksum of."""
+    return b'["%08x",%b]\n' % (zlib.crc32(content), content)
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file as a whole, or not at all."""
+    part = path.with_name(f"{path.name}.part")
+    with part.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
+    """Digest of every file that some scenarios refer to, by its path: a part of their settings."""
+    files = {each.reference.file for each in scenarios if each.reference.shape == "csv"}
+    return {
+        file: hashlib.blake2b(Path(file).read_bytes(), digest_size=8).hexdigest()
+        for file in sorted(files)
+    }

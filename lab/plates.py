@@ -1,4 +1,4 @@
-"""The figures of a report: drawn for print, each with the numbers that it draws and what they say.
+"""The figures of a report, drawn for print, each with its numbers and a sentence on what they say.
 
 Sizes are those of a journal's columns, letters 8 points. Red and dashed is the reference, black the
 vehicle, as in the paper.
@@ -8,6 +8,7 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,31 +16,33 @@ from scipy import stats
 
 from lab.figures import draw_reference
 from lab.studies import EVENT, EVERY, NONE, PERIODIC, Cells, Flown, Study, periodic_wins
-from lab.sweep import estimate, to_csv
+from lab.sweep import by_name, estimate, rows_csv, to_csv
 from shared.config import ControlConfig, DirectionConfig, Scenario
 from shared.model import Array, Indices
 from shared.record import Rows
-from shared.summary import summarise
+from shared.summary import Summary, summarise
 from sim.flight import Flight
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMN, PAGE = 3.5, 7.16
-"""Widths [inch]."""
+"""Width of a figure over one column and over the page [inch]."""
 LETTERS: Any = {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 8}
 LETTERS |= {"axes.grid": True, "grid.alpha": 0.3}
+"""Settings of matplotlib for every figure."""
 STYLES: Mapping[str, Mapping[str, Any]] = {
     NONE: {"color": "0.5", "linestyle": ":", "marker": "s"},
     EVERY: {"color": "black", "linestyle": "-", "marker": "o"},
     EVENT: {"color": "#c1272d", "linestyle": "-", "marker": "^"},
     PERIODIC: {"color": "#0072b2", "linestyle": "--", "marker": "v"},
 }
-"""Of the methods: apart without colour, too."""
+"""Line style of each method; they can be told apart without colour as well."""
 RATIO_LOG = 20.0
-"""Values that differ by more than this are drawn on a logarithmic scale."""
+"""Ratio of largest to smallest value above which a scale is logarithmic."""
 
 Samples = Mapping[str, tuple[Scenario, Sequence[Flight]]]
+"""Scenario and a few flights with their records, by method."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,21 +50,26 @@ class Picture:
     """A figure, ready to be written."""
 
     name: str
-    """Of its files."""
+    """Name of the figure's files."""
     title: str
+    """Heading above the figure."""
     says: str
-    """One or two sentences, with what the numbers come to."""
+    """One or two sentences on what the numbers come to."""
     png: bytes
+    """Drawing for the screen."""
     pdf: bytes
+    """Drawing for print."""
     csv: str
+    """Numbers that are drawn."""
 
     def files(self) -> dict[str, bytes]:
-        """Content by suffix."""
+        """Content of each of the figure's files, by suffix."""
         return {".png": self.png, ".pdf": self.pdf, ".csv": self.csv.encode()}
 
 
 @contextmanager
 def _figure(width: float, height: float) -> "Iterator[Figure]":
+    """An empty figure of some size [inch]."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -69,26 +77,21 @@ def _figure(width: float, height: float) -> "Iterator[Figure]":
         yield Figure(figsize=(width, height), layout="constrained")
 
 
-def _picture(  # noqa: PLR0917
-    figure: "Figure",
-    name: str,
-    title: str,
-    says: str,
-    header: Sequence[str],
-    rows: Sequence[Sequence[Any]],
-) -> Picture:
+def _picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Picture:
+    """A figure, as it is written."""
     png, pdf = io.BytesIO(), io.BytesIO()
     figure.savefig(png, format="png", dpi=220)
     figure.set_layout_engine("none")  # it lies as it should
     figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
-    return Picture(name, title, says, png.getvalue(), pdf.getvalue(), to_csv(header, rows))
+    return Picture(name, title, says, png.getvalue(), pdf.getvalue(), csv)
 
 
 def delay(direction: DirectionConfig, delay_ms: Array) -> Picture:
-    """Fig. 2: the delay (17), and what netem really added.
+    """Fig. 2: the delay (17), and the delay that netem really added.
 
     Args:
-        delay_ms: a row each packet: how long it took over UDP, how long it was drawn to take.
+        delay_ms: time that each packet took over UDP, and time it was drawn to take [ms]; shape
+            (packets, 2).
     """
     took_ms, late_ms = delay_ms[:, 0], delay_ms[:, 0] - delay_ms[:, 1]
     first_ms, slot_ms = direction.minimum_s * 1e3, direction.slot_s * 1e3
@@ -125,12 +128,12 @@ def delay(direction: DirectionConfig, delay_ms: Array) -> Picture:
         for ms, theory, real in zip(fine_ms.tolist(), cdf, took_cdf, strict=True)
     ]
     header = ("delay_ms", "probability", "probability_udp", "cumulative", "cumulative_udp")
-    return _picture(figure, "fig2", "Fig. 2: network delay", says, header, rows)
+    return _picture(figure, "fig2", "Fig. 2: network delay", says, to_csv(header, rows))
 
 
 def paths(samples: Samples) -> Picture:
-    """Fig. 3: without and with compensation, a packet at every step."""
-    rmse, columns = [], []
+    """Fig. 3: the path without and with compensation, a packet at every step."""
+    rmse, positions = [], []
     with _figure(PAGE, 3.9) as figure:
         planes = figure.subplots(1, 2, sharex=True, sharey=True)
         for plane, letter, method in zip(planes, "ab", (NONE, EVERY), strict=True):
@@ -139,20 +142,20 @@ def paths(samples: Samples) -> Picture:
             step, desired, position = _path(scenario, flights[0])
             _draw_path(plane, scenario, step, position)
             plane.set_title(f"({letter}) {method}, a packet at every step")
-            columns += [desired, position]
+            positions.append(position)
         planes[0].legend(loc="center")
     says = (
         f"One flight each, of the same seed. Without compensation the vehicle is {rmse[0]:.3f} m "
         f"off (RMSE xy), with both compensators {rmse[1]:.3f} m."
     )
     header = ("step", "reference_x_m", "reference_y_m", "a_x_m", "a_y_m", "b_x_m", "b_y_m")
-    rows = np.column_stack([step, columns[0], columns[1], columns[3]]).tolist()
+    rows = np.column_stack([step, desired, *positions]).tolist()
     title = "Fig. 3: position without and with delay compensation"
-    return _picture(figure, "fig3", title, says, header, rows)
+    return _picture(figure, "fig3", title, says, to_csv(header, rows))
 
 
 def events(samples: Samples) -> Picture:
-    """Fig. 4: the event trigger's path, and its events beneath."""
+    """Fig. 4: the path with the event trigger, and its events below."""
     scenario, flights = samples[EVENT]
     flight, dt = flights[0], scenario.control.dt
     step, desired, position = _path(scenario, flight)
@@ -174,7 +177,7 @@ def events(samples: Samples) -> Picture:
     header = ("step", "reference_x_m", "reference_y_m", "x_m", "y_m", "event")
     rows = np.column_stack([step, desired, position, sent]).tolist()
     title = "Fig. 4: position with the event trigger, and when it sent"
-    return _picture(figure, "fig4", title, says, header, rows)
+    return _picture(figure, "fig4", title, says, to_csv(header, rows))
 
 
 def _path(scenario: Scenario, flight: Flight) -> tuple[Indices, Array, Array]:
@@ -185,9 +188,10 @@ def _path(scenario: Scenario, flight: Flight) -> tuple[Indices, Array, Array]:
 
 
 def _draw_path(plane: Any, scenario: Scenario, step: Indices, position: Array) -> None:
+    """Draw the path of a flight over its reference."""
     draw_reference(plane, scenario, step)
-    plane.plot(*position.T, "k-", linewidth=0.8, label="UAV")
-    plane.plot(*position[0], "ko", markersize=3, label="start")
+    plane.plot(position[:, 0], position[:, 1], "k-", linewidth=0.8, label="UAV")
+    plane.plot(position[0, 0], position[0, 1], "ko", markersize=3, label="start")
     plane.set_aspect("equal", adjustable="box")
     plane.set_xlabel("x [m]")
     plane.set_ylabel("y [m]")
@@ -197,10 +201,10 @@ DECAY, EPSILON = "decay rate λ [1/s]", "tolerance ε"
 
 
 def maps(flown: Flown, here: ControlConfig) -> Picture:
-    """Fig. 5: RMSE and event ratio over λ × ε.
+    """Fig. 5: RMSE and event ratio over the decay rate λ and the tolerance ε.
 
     Args:
-        here: where the paper has flown.
+        here: the paper's own λ and ε, which a cross marks.
     """
     decay, epsilon, rmse, ratio = _grid(flown)
     with _figure(PAGE, 2.8) as figure:
@@ -221,28 +225,25 @@ def maps(flown: Flown, here: ControlConfig) -> Picture:
         f"and event ratio have a rank correlation of {ranks:.2f}; the paper calls them inversely "
         f"related."
     )
-    header = ("decay_rate", "epsilon", *_MEANS)
-    title = "Fig. 5: control performance and event ratio over λ and ε"
-    return _picture(figure, "fig5", title, says, header, _map_rows(flown))
-
-
-_MEANS = ("rmse_xy", "rmse_xy_ci95", "event_ratio", "event_ratio_ci95")
-
-
-def _map_rows(flown: Flown) -> list[tuple[Any, ...]]:
-    return [
-        (*values, *estimate(runs, "rmse_xy"), *estimate(runs, "event_ratio"))
-        for values, runs in flown.items()
+    rows = [
+        {"decay_rate": decay, "epsilon": epsilon} | by_name(DRAWN, partial(estimate, runs))
+        for (decay, epsilon), runs in flown.items()
     ]
+    title = "Fig. 5: control performance and event ratio over λ and ε"
+    return _picture(figure, "fig5", title, says, rows_csv(rows))
+
+
+DRAWN = ("rmse_xy", "event_ratio")
+"""Figures of the maps, and of the curves beside them."""
 
 
 def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
-    """λ, ε, and mean RMSE and event ratio over both; shapes (λ,), (ε,), (λ, ε), (λ, ε)."""
+    """λ and ε; mean RMSE xy [m] and event ratio over both; shapes (λ,), (ε,), (λ, ε), (λ, ε)."""
     decay, epsilon = (np.unique([values[axis] for values in flown]) for axis in (0, 1))
     shape = (len(decay), len(epsilon))
     rmse, ratio = (
         np.array([estimate(runs, name)[0] for runs in flown.values()], dtype=np.float64)
-        for name in ("rmse_xy", "event_ratio")
+        for name in DRAWN
     )
     return decay, epsilon, rmse.reshape(shape), ratio.reshape(shape)
 
@@ -250,11 +251,10 @@ def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
 def pareto(flown: Flown, periodic: Flown) -> Picture:
     """Fig. 5 as curves: RMSE against event ratio, and periodic sending beside it."""
     decay, _, rmse, ratio = _grid(flown)
-    points = [
-        (steps, *estimate(runs, "event_ratio"), *estimate(runs, "rmse_xy"))
-        for (steps,), runs in periodic.items()
-    ]
-    rates, errors = np.array([(row[1], row[3]) for row in points], dtype=np.float64).T
+    rates, errors = (
+        np.array([estimate(runs, name)[0] for runs in periodic.values()], dtype=np.float64)
+        for name in ("event_ratio", "rmse_xy")
+    )
     with _figure(COLUMN, 3.0) as figure:
         from matplotlib import colormaps
 
@@ -279,15 +279,20 @@ def pareto(flown: Flown, periodic: Flown) -> Picture:
         f"the smaller RMSE in {worse} of {compared} cells; the trigger's is "
         f"{np.mean(rmse[within] / at_rate[within]):.2f} times it on average."
     )
-    header = ("method", "decay_rate", "epsilon", "period", *_MEANS)
-    rows = [(EVENT, *row[:2], None, *row[2:]) for row in _map_rows(flown)]
-    rows += [("periodic", None, None, row[0], *row[3:], *row[1:3]) for row in points]
+
+    def row(method: str, values: Sequence[Any], runs: Sequence[Summary]) -> dict[str, Any]:
+        names = ("decay_rate", "epsilon", "period")
+        means = by_name(DRAWN, partial(estimate, runs))
+        return {"method": method} | dict(zip(names, values, strict=True)) | means
+
+    rows = [row(EVENT, (*values, None), runs) for values, runs in flown.items()]
+    rows += [row("periodic", (None, None, *values), runs) for values, runs in periodic.items()]
     title = "Fig. 5 as curves: what a packet buys"
-    return _picture(figure, "fig5-pareto", title, says, header, rows)
+    return _picture(figure, "fig5-pareto", title, says, rows_csv(rows))
 
 
 def curve(study: Study, cells: Cells) -> Picture:
-    """RMSE of all methods against one thing, with 95 % bands."""
+    """RMSE of all methods against the one thing that changes in a study, with 95 % bands."""
     methods = list(STYLES)
     table = {
         method: np.array(
@@ -322,20 +327,23 @@ def curve(study: Study, cells: Cells) -> Picture:
     )
     if failed:
         says += f" {failed} runs never got a session and count in no mean."
-    header = (study.name, "method", "period", "runs", "flown", *_MEANS)
     rows = [
-        (
-            *(value, method, cell.period, len(cell.runs), sum(run.steps > 0 for run in cell.runs)),
-            *(*cell.estimate("rmse_xy"), *cell.estimate("event_ratio")),
-        )
+        {
+            study.name: value,
+            "method": method,
+            "period": cell.period,
+            "runs": len(cell.runs),
+            "flown": sum(run.steps > 0 for run in cell.runs),
+        }
+        | by_name(DRAWN, cell.estimate)
         for (value, method), cell in cells.items()
     ]
     title = f"RMSE against {study.label.partition(' [')[0]}"
-    return _picture(figure, f"rmse-{study.name}", title, says, header, rows)
+    return _picture(figure, f"rmse-{study.name}", title, says, rows_csv(rows))
 
 
 def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
-    """At how many values periodic sending is better than the trigger, and at how many worse."""
+    """Numbers of values at which periodic sending is better than the trigger, and worse."""
     signs = [
         periodic_wins(cells[value, EVENT], cells[value, PERIODIC]) for value in study.axis.values
     ]
@@ -343,7 +351,7 @@ def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
 
 
 def estimates(samples: Samples) -> Picture:
-    """How far the server's estimate (13) is from the truth."""
+    """Distribution of the error of the server's estimate (13)."""
     shares = np.linspace(0.0, 1.0, 201)
     errors = {
         method: np.concatenate([_estimate_error(flight) for flight in flights])
@@ -367,7 +375,7 @@ def estimates(samples: Samples) -> Picture:
     parts = ("position_m", "velocity_mps")
     header = ("share", *(f"{method}: {part}" for method in quantiles for part in parts))
     rows = np.column_stack([shares, *quantiles.values()]).tolist()
-    return _picture(figure, "estimate-error", "Error of the estimate", says, header, rows)
+    return _picture(figure, "estimate-error", "Error of the estimate", says, to_csv(header, rows))
 
 
 def _estimate_error(flight: Flight) -> Array:
@@ -382,52 +390,47 @@ def _estimate_error(flight: Flight) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Bought:
-    """What packets bought: a point of `trade`."""
+    """A point of `trade`: what is sent, and the error that it leaves."""
 
     packets_per_s: float
-    """Up."""
+    """Packets up per second."""
     bytes_per_s: float
-    """Both ways."""
+    """Bytes per second, both ways."""
     rmse_m: float | None
+    """Mean RMSE xy [m]; None where none flew."""
     rmse_half_m: float | None
-    """Half the width of its 95 % interval."""
+    """Half the width of the 95 % interval of `rmse_m` [m]."""
     tuned: bool
+    """Whether the threshold is the one that was searched for."""
 
 
 COLOURS = ("0.5", "#c1272d", "#e69f00", "black", "#56b4e9", "#0072b2", "#009e73", "#cc79a7")
+"""Colours of the curves of `trade`, in order."""
 MARKERS = "sov^D<P*"
-"""Of the curves of `trade`, in order; apart without colour, too."""
+"""Markers of the curves of `trade`, in order, which tell them apart without colour."""
 
 
-def trade(  # noqa: PLR0917
-    name: str,
-    title: str,
-    says: str,
-    curves: Mapping[str, Sequence[Bought]],
-    header: Sequence[str],
-    rows: Sequence[Sequence[Any]],
+def trade(
+    name: str, title: str, says: str, curves: Mapping[str, Sequence[Bought]], csv: str
 ) -> Picture:
-    """RMSE over what it costs, in packets and in bytes, with 95 % bands."""
+    """RMSE over what is sent, in packets and in bytes, with 95 % bands.
+
+    Args:
+        curves: points of each curve, by its label.
+        csv: the numbers, as `Picture` has them.
+    """
     with _figure(PAGE, 3.9) as figure:
         panes = figure.subplots(1, 2, sharey=True)
         for (label, points), colour, marker in zip(
             curves.items(), COLOURS[: len(curves)], MARKERS[: len(curves)], strict=True
         ):
             flown = [point for point in points if point.rmse_m]
-            rmse, half = (
-                np.array([(point.rmse_m, point.rmse_half_m or 0.0) for point in flown], np.float64)
-                .reshape(-1, 2)
-                .T
-            )
-            large = [point.tuned for point in flown]
-            for plane, cost in zip(
-                panes,
-                (
-                    np.array([point.packets_per_s for point in flown]),
-                    np.array([point.bytes_per_s for point in flown]),
-                ),
-                strict=True,
-            ):
+            rmse = np.array([point.rmse_m for point in flown], np.float64)
+            half = np.array([point.rmse_half_m or 0.0 for point in flown], np.float64)
+            large = np.array([point.tuned for point in flown], np.bool_)
+            packets = np.array([point.packets_per_s for point in flown])
+            octets = np.array([point.bytes_per_s for point in flown])
+            for plane, cost in zip(panes, (packets, octets), strict=True):
                 style: Any = {"color": colour, "marker": marker, "linestyle": "none"}
                 plane.plot(cost, rmse, color=colour, linewidth=0.8)
                 plane.plot(cost, rmse, **style, markersize=2.5)
@@ -442,11 +445,11 @@ def trade(  # noqa: PLR0917
         panes[0].set_ylabel("RMSE xy [m]")
         handles, labels = panes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3)
-    return _picture(figure, name, title, says, header, rows)
+    return _picture(figure, name, title, says, csv)
 
 
 def intervals(samples: Samples) -> Picture:
-    """How many steps lie between two packets of the event trigger."""
+    """Distribution of the time between two packets of the event trigger."""
     scenario, flights = samples[EVENT]
     gaps = np.concatenate(
         [np.diff(flight.server["step"][flight.server["event"]]) for flight in flights]
@@ -470,14 +473,15 @@ def intervals(samples: Samples) -> Picture:
     )
     rows = list(zip(steps.tolist(), (steps * dt).tolist(), counts.tolist(), strict=True))
     title = "Time between two packets"
-    return _picture(figure, "intervals", title, says, ("steps", "seconds", "count"), rows)
+    csv = to_csv(("steps", "seconds", "count"), rows)
+    return _picture(figure, "intervals", title, says, csv)
 
 
 def solve_times(servers: Mapping[str, Rows], dt: float) -> Picture:
-    """How long both MPCs of a step took in the flights over UDP.
+    """Distribution of the time that both MPCs of a step took in the flights over UDP.
 
     Args:
-        servers: rows of the server, by method.
+        servers: rows of the server's records, by method.
         dt: length of a step [s].
     """
     solve_ms = {
@@ -500,4 +504,4 @@ def solve_times(servers: Mapping[str, Rows], dt: float) -> Picture:
     )
     rows = np.column_stack([edges[:-1], edges[1:], *counts.values()]).tolist()
     header = ("from_ms", "to_ms", *counts)
-    return _picture(figure, "solve-times", "Solve times over UDP", says, header, rows)
+    return _picture(figure, "solve-times", "Solve times over UDP", says, to_csv(header, rows))

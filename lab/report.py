@@ -1,10 +1,12 @@
-"""Reports: tables, figures, what they say, in a page that opens offline; and the reproduction's."""
+"""A report, a page of tables and figures that opens offline; and the report of `reproduce`."""
 
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
+
+from msgspec.structs import asdict
 
 from lab import plates
 from lab.calibration import within
@@ -22,7 +24,7 @@ from lab.studies import (
     periodic_wins,
     table_1,
 )
-from lab.sweep import to_csv
+from lab.sweep import Estimate, by_name, rows_csv
 from shared.config import Scenario
 from shared.model import Array
 from shared.summary import summarise
@@ -40,50 +42,69 @@ class Real:
     """A flight over UDP."""
 
     scenario: Scenario
+    """What was flown."""
     flight: Flight
+    """Records of the flight."""
     netem: Mapping[str, Any]
-    """What netem counted, and how late it was."""
+    """Figures of netem: what it counted, and how late it was."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """All that was flown."""
+    """All that a reproduction has flown."""
 
     table: tuple[Study, Cells]
+    """Study of Table 1, and its cells."""
     curves: Sequence[tuple[Study, Cells]]
+    """Study of each curve, and its cells."""
     maps: Flown
+    """Summaries of Fig. 5, by λ and ε."""
     periods: Flown
+    """Summaries of periodic sending beside Fig. 5, by period."""
     delay_ms: Array
+    """Time of each packet over UDP, and time that was drawn for it [ms]; shape (packets, 2)."""
     real: Mapping[str, Real]
-    """By method."""
+    """Flights over UDP, by method."""
     samples: Samples
+    """Flights in virtual time with their whole records, by method."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One of the report: its numbers as CSV, and as they are shown."""
+    """A table of a report: its numbers as CSV, and as they are shown."""
 
     name: str
+    """Name of the table's file."""
     title: str
+    """Heading above the table."""
     says: str
+    """A few sentences on what the numbers come to."""
     csv: str
+    """Numbers in full."""
     heading: Sequence[str]
+    """Headings of the columns that are shown."""
     rows: Sequence[Sequence[str]]
+    """Cells that are shown, row by row."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What the report shows."""
+    """A report, drawn."""
 
     title: str
+    """Heading of the page."""
     about: str
+    """One or two sentences on what was flown."""
     tables: Sequence[Table]
+    """Tables, the most important first."""
     pictures: Sequence[Picture]
+    """Figures."""
     verdict: str
+    """One or two sentences on what came out."""
 
 
 def draw(measured: Measured) -> Drawn:
-    """All tables and figures."""
+    """The report of a reproduction."""
     study, cells = measured.table
     columns = {method: cell for (value, method), cell in cells.items() if value == study.here}
     entries = table_1(columns)
@@ -106,14 +127,18 @@ def draw(measured: Measured) -> Drawn:
 
 
 def paper_table(entries: Sequence[Entry], columns: Mapping[str, Cell]) -> Table:
-    """Table 1, the paper's beside ours."""
+    """Table 1, the paper's figures beside ours."""
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     rows = [
         (
-            *(entry.column, entry.entry, as_text(entry.paper, ".4f"), as_text(entry.here, ".4f")),
-            *(as_text(entry.ci95, ".4f"), as_text(entry.deviation, "+.1%")),
+            each.column,
+            each.entry,
+            as_text(each.paper, ".4f"),
+            as_text(each.here, ".4f"),
+            as_text(each.ci95, ".4f"),
+            as_text(each.deviation, "+.1%"),
         )
-        for entry in entries
+        for each in entries
     ]
     ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
     meet = not periodic_wins(columns[EVENT], columns[PERIODIC])
@@ -124,30 +149,26 @@ def paper_table(entries: Sequence[Entry], columns: Mapping[str, Cell]) -> Table:
         f"every {steps} steps, the rate nearest to the trigger's: against it the event trigger has "
         f"{loss} RMSE xy{', though the intervals meet' if meet else ''}."
     )
-    header = Entry.__struct_fields__
-    text = to_csv(header, [[getattr(entry, name) for name in header] for entry in entries])
+    text = rows_csv([asdict(entry) for entry in entries])
     heading = ("column", "entry", "paper", "here", "± 95 %", "deviation")
     return Table("table1", "Table 1: RMSE to the desired trajectory", says, text, heading, rows)
 
 
 def traffic_table(columns: Mapping[str, Cell]) -> Table:
-    """What the network carries."""
-    found = {method: [cell.estimate(name) for name in TRAFFIC] for method, cell in columns.items()}
-    header = ["column", *(name for figure in TRAFFIC for name in (figure, f"{figure}_ci95"))]
-    text = to_csv(
-        header,
-        [[method, *(part for pair in pairs for part in pair)] for method, pairs in found.items()],
+    """Table of the packets and bytes that entered the network, by method."""
+    text = rows_csv(
+        [{"column": method} | by_name(TRAFFIC, cell.estimate) for method, cell in columns.items()]
     )
     rows = [
-        (method, *(f"{as_text(mean, ',.0f')} ± {as_text(half, ',.0f')}" for mean, half in pairs))
-        for method, pairs in found.items()
+        [method, *(as_interval(cell.estimate(name), ",.0f") for name in TRAFFIC)]
+        for method, cell in columns.items()
     ]
     share = [
         (columns[EVENT].estimate(name)[0] or 0.0) / (columns[EVERY].estimate(name)[0] or 1.0)
         for name in TRAFFIC
     ]
     says = (
-        f"Of a flight, all that entered the network. The paper's “10 times” counts packets on the "
+        f"All that entered the network in a flight. The paper's “10 times” counts packets on the "
         f"uplink alone: there the trigger sends {share[0]:.1%} of what every step takes; of all "
         f"packets, both ways, {share[4]:.1%}, and {share[5]:.1%} of all bytes."
     )
@@ -155,16 +176,30 @@ def traffic_table(columns: Mapping[str, Cell]) -> Table:
     return Table("traffic", "Packets and bytes (UDP payload)", says, text, heading, rows)
 
 
+REAL = {
+    "column": ("column", ""),
+    "rmse_xy_udp": ("UDP", ".4f"),
+    "rmse_xy_same_seed": ("same seed", ".4f"),
+    "rmse_xy_virtual": ("virtual", ".4f"),
+    "rmse_xy_virtual_ci95": ("± 95 %", ".4f"),
+    "rmse_xy_least": ("least", ".4f"),
+    "rmse_xy_most": ("most", ".4f"),
+    "event_ratio_udp": ("events, UDP", ".3f"),
+    "event_ratio_virtual": ("virtual", ".3f"),
+    "solve_ms_p50": ("solve p50 [ms]", ".2f"),
+    "solve_ms_p99": ("p99 [ms]", ".2f"),
+    "deadline_misses": ("misses", "d"),
+    "netem_late_ms_p99": ("netem late p99 [ms]", ".2f"),
+}
+"""Columns of `real_table`: heading and format of each."""
+
+
 def real_table(measured: Measured) -> Table:
-    """Over real UDP beside virtual time."""
+    """Table of the flights over real UDP beside those in virtual time, by method."""
     study, cells = measured.table
     length_s = study.axis.values[1]
-    header = (
-        *("column", "rmse_xy_udp", "rmse_xy_same_seed", "rmse_xy_virtual", "rmse_xy_virtual_ci95"),
-        *("rmse_xy_least", "rmse_xy_most", "event_ratio_udp", "event_ratio_virtual"),
-        *("solve_ms_p50", "solve_ms_p99", "deadline_misses", "netem_late_ms_p99"),
-    )
-    rows, within_range = [], 0
+    rows: list[dict[str, Any]] = []
+    within_range = 0
     for method, real in measured.real.items():
         flight, runs = real.flight, cells[length_s, method].runs
         udp = summarise(real.scenario, method, flight.client, flight.server, flight.netem)
@@ -174,15 +209,25 @@ def real_table(measured: Measured) -> Table:
         least, most = min(errors, default=None), max(errors, default=None)
         if None not in (least, most, udp.rmse_xy):
             within_range += (least or 0.0) <= (udp.rmse_xy or 0.0) <= (most or 0.0)
+        mean, half = cell.estimate("rmse_xy")
         rows.append(
-            (
-                *(method, udp.rmse_xy, runs[0].rmse_xy, *cell.estimate("rmse_xy"), least, most),
-                *(udp.event_ratio, cell.estimate("event_ratio")[0]),
-                *(udp.solve_ms_p50, udp.solve_ms_p99, udp.deadline_misses, late_ms),
-            )
+            {
+                "column": method,
+                "rmse_xy_udp": udp.rmse_xy,
+                "rmse_xy_same_seed": runs[0].rmse_xy,
+                "rmse_xy_virtual": mean,
+                "rmse_xy_virtual_ci95": half,
+                "rmse_xy_least": least,
+                "rmse_xy_most": most,
+                "event_ratio_udp": udp.event_ratio,
+                "event_ratio_virtual": cell.estimate("event_ratio")[0],
+                "solve_ms_p50": udp.solve_ms_p50,
+                "solve_ms_p99": udp.solve_ms_p99,
+                "deadline_misses": udp.deadline_misses,
+                "netem_late_ms_p99": late_ms,
+            }
         )
-    specs = ("", *[".4f"] * 6, ".3f", ".3f", ".2f", ".2f", "d", ".2f")
-    shown = [[as_text(value, spec) for value, spec in zip(row, specs, strict=True)] for row in rows]
+    shown = [[as_text(row[name], spec) for name, (_, spec) in REAL.items()] for row in rows]
     says = (
         f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
         f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
@@ -190,16 +235,13 @@ def real_table(measured: Measured) -> Table:
         f"a server's tick falls within a vehicle's step is chance in both, so equal seeds do not "
         f"give equal flights."
     )
-    heading = (
-        *("column", "UDP", "same seed", "virtual", "± 95 %", "least", "most"),
-        *("events, UDP", "virtual", "solve p50 [ms]", "p99 [ms]", "misses", "netem late p99 [ms]"),
-    )
+    heading = [heading for heading, _ in REAL.values()]
     title = "RMSE xy [m] over real UDP and in virtual time"
-    return Table("real", title, says, to_csv(header, rows), heading, shown)
+    return Table("real", title, says, rows_csv(rows), heading, shown)
 
 
 def verdict(entries: Sequence[Entry], columns: Mapping[str, Cell]) -> str:
-    """The reproduction in two sentences."""
+    """What a reproduction came to, in two sentences."""
     off = {(e.column, e.entry): e.deviation for e in entries if e.deviation is not None}
     near = sum(within(entry, deviation) for (_, entry), deviation in off.items())
     (column, entry), worst = max(off.items(), key=lambda item: abs(item[1]))
@@ -214,6 +256,7 @@ def verdict(entries: Sequence[Entry], columns: Mapping[str, Cell]) -> str:
 
 
 def _rmse(cell: Cell) -> float:
+    """Mean RMSE xy [m]; NaN where nothing was flown."""
     mean = cell.estimate("rmse_xy")[0]
     return float("nan") if mean is None else mean
 
@@ -223,11 +266,17 @@ def as_text(value: Any, spec: str) -> str:
     return "–" if value is None else format(value, spec)
 
 
+def as_interval(estimate: Estimate, spec: str) -> str:
+    """A mean with its interval, as a table shows it."""
+    return " ± ".join(as_text(part, spec) for part in estimate)
+
+
 def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -> str:
-    """The page.
+    """The page of a report.
 
     Args:
-        calls: of the command that made it, the last one last.
+        scenario: what the report is about.
+        calls: facts of each call of the command that made it, the last one last.
     """
     from jinja2 import Environment, StrictUndefined  # takes a tenth of a second to import
 

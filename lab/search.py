@@ -1,38 +1,45 @@
-"""CMA-ES over some keys of a scenario.
+"""A search for the values of some keys of a scenario: CMA-ES, resumable from its journal.
 
-The free keys live on logarithmic scales between bounds. A generation of points is proposed, and how
-each did is told. A search is a function of its settings and of what it was told: told the same
-again, from a log, it goes on where it was broken off.
+The free keys live on logarithmic scales between bounds. A generation of points is proposed, flown
+by whoever is passed in, and scored by an objective. All that a search proposes follows from its
+settings and from the scores it was told: told them again, from its journal, it goes on where it was
+broken off.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 
+from lab.journal import Journal, digests
 from shared import config
 from shared.config import ConfigError, Scenario
+
+SIGMA = 0.1
+"""First step of a search unless another is asked for, as a share of the range of each key."""
 
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """One key of a scenario, as in `control.state_weight.0`, and the bounds of its value."""
+    """A key of a scenario, as in `control.state_weight.0`, and the bounds of its value."""
 
     key: str
     low: float
     high: float
 
     def __str__(self) -> str:
-        """As `parse` reads it."""
+        """KEY=LOW:HIGH, as `parse` reads it."""
         return f"{self.key}={self.low:g}:{self.high:g}"
 
     @classmethod
     def parse(cls, text: str) -> "Free":
-        """KEY=LOW:HIGH.
+        """The free key that a user writes as KEY=LOW:HIGH.
 
         Raises:
-            ConfigError: it is none.
+            ConfigError: the text has another form, or the bounds are impossible.
         """
         key, _, bounds = text.partition("=")
         try:
@@ -44,13 +51,13 @@ class Free:
         return cls(key, low, high)
 
     def of(self, table: Any) -> float:
-        """Its value in the table of a scenario."""
+        """Value of the key in the table of a scenario."""
         for name in self._path():
             table = table[name]
         return float(table)
 
     def put(self, table: Any, value: float) -> None:
-        """Change its value in the table of a scenario."""
+        """Change the value of the key in the table of a scenario."""
         *path, last = self._path()
         for name in path:
             table = table[name]
@@ -60,7 +67,44 @@ class Free:
         return [int(name) if name.isdigit() else name for name in self.key.split(".")]
 
 
-class Search:
+def check_free(free: Sequence[Free], start: Scenario) -> None:
+    """Refuse keys that cannot be searched for.
+
+    Raises:
+        ConfigError: a key is no number of the scenario, or its value is out of its bounds.
+    """
+    for key in free:
+        try:
+            value = key.of(plain(start))
+        except (KeyError, IndexError, TypeError, ValueError):
+            raise ConfigError(
+                f"--free: got {key.key}, expected the key of a number, as in model.tau_s.0"
+            ) from None
+        if not key.low <= value <= key.high:
+            raise ConfigError(
+                f"--free: {key.key}: got the bounds {key.low:g} to {key.high:g}, "
+                f"expected them to hold {value:g}, where the search starts"
+            )
+
+
+def put(scenario: Scenario, values: Mapping[Free, float]) -> Scenario:
+    """A scenario with other values of some keys."""
+    table = plain(scenario)
+    for key, value in values.items():
+        key.put(table, value)
+    return config.check(table, "search")
+
+
+def plain(table: Any) -> Any:
+    """A scenario, or a table of one, as dictionaries and lists that may be changed."""
+    if isinstance(table, Scenario):
+        table = config.to_table(table)
+    if isinstance(table, Mapping):
+        return {name: plain(value) for name, value in table.items()}
+    return [plain(value) for value in table] if isinstance(table, list | tuple) else table
+
+
+class Optimiser:
     """CMA-ES over free keys, from the values of a scenario.
 
     Args:
@@ -89,7 +133,7 @@ class Search:
         self._points: list[Any] = []
 
     def ask(self) -> list[Scenario]:
-        """The next generation; the first begins with the start itself."""
+        """The next generation; the first one begins with the start itself."""
         first = self._search.countiter == 0
         self._points = self._search.ask()
         if first:
@@ -97,7 +141,7 @@ class Search:
         return [self._scenario(point) for point in self._points]
 
     def tell(self, scores: Sequence[float]) -> None:
-        """How each of them did."""
+        """Take the score of each point of the generation that was asked for."""
         self._search.tell(self._points, scores)
 
     def _scenario(self, point: Any) -> Scenario:
@@ -109,42 +153,114 @@ class Search:
         )
 
     def values(self, scenario: Scenario) -> dict[str, float]:
-        """The free keys of a scenario."""
-        return {key.key: key.of(plain(scenario)) for key in self._free}
+        """Values of the free keys in a scenario."""
+        table = plain(scenario)
+        return {key.key: key.of(table) for key in self._free}
 
 
-def put(scenario: Scenario, values: Mapping[Free, float]) -> Scenario:
-    """A scenario with other values of some keys."""
-    table = plain(scenario)
-    for key, value in values.items():
-        key.put(table, value)
-    return config.check(table, "calibration")
+Values = Mapping[str, Mapping[str, float | None]]
+"""Figures of a point, by column and name; None where a flight failed."""
 
 
-def check_free(free: Sequence[Free], start: Scenario) -> None:
-    """Refuse keys that cannot be searched for.
+class Objective(Protocol):
+    """What a search is after."""
 
-    Raises:
-        ConfigError: with the key, and what is there.
-    """
-    for key in free:
-        try:
-            value = key.of(plain(start))
-        except (KeyError, IndexError, TypeError, ValueError):
-            raise ConfigError(
-                f"--free: got {key.key}, expected the key of a number, as in model.tau_s.0"
-            ) from None
-        if not key.low <= value <= key.high:
-            raise ConfigError(
-                f"--free: {key.key}: got the bounds {key.low:g} to {key.high:g}, "
-                f"expected them to hold {value:g}, where the search starts"
-            )
+    def settings(self) -> Mapping[str, Any]:
+        """Name and settings of the objective, as plain values."""
+
+    def free(self) -> Sequence[Free]:
+        """Keys to change unless others are asked for."""
+
+    def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
+        """Figures of a point; called in a worker."""
+
+    def score(self, values: Values) -> float:
+        """Score of a point with these figures; the smaller, the better."""
 
 
-def plain(table: Any) -> Any:
-    """A table whose parts may be changed, of a scenario or of such a table."""
-    if isinstance(table, Scenario):
-        table = config.to_table(table)
-    if isinstance(table, Mapping):
-        return {name: plain(value) for name, value in table.items()}
-    return [plain(value) for value in table] if isinstance(table, list | tuple) else table
+class Point(msgspec.Struct, frozen=True):
+    """A point that was flown."""
+
+    keys: dict[str, float]
+    """Values of the free keys."""
+    values: dict[str, dict[str, float | None]]
+    """Figures, by column and name; None where a flight failed."""
+    score: float
+    """Score, which is the smaller the better the point is."""
+
+
+Generation = list[Point]
+"""Entry of a search's journal."""
+FlyAll = Callable[[Callable[[Scenario], Values], Sequence[Scenario]], Sequence[Values]]
+"""Calls a function with each of some scenarios, and returns the results in their order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """Where a search starts, what it is after, and its effort."""
+
+    start: Scenario
+    objective: Objective
+    free: Sequence[Free]
+    """Keys that change."""
+    runs: int
+    """Number of flights of each point, with seeds that count up from the start's."""
+    population: int
+    """Number of points in a generation."""
+    sigma: float = SIGMA
+    """First step, as a share of the (logarithmic) range of each key."""
+
+    def settings(self) -> dict[str, Any]:
+        """All that the points of the search follow from, as plain values."""
+        return {
+            **self.objective.settings(),
+            "free": list(map(str, self.free)),
+            "runs": self.runs,
+            "population": self.population,
+            "sigma": self.sigma,
+            "files": digests([self.start]),
+            "scenario": config.to_table(self.start),
+        }
+
+    def points(
+        self, journal: Journal[Generation], generations: int, fly_all: FlyAll
+    ) -> Iterator[list[Point]]:
+        """After each generation, all points so far, those that the journal has with them.
+
+        Raises:
+            ConfigError: the journal has points that this search does not propose.
+        """
+        seed = self.start.seed
+        optimiser = Optimiser(
+            self.start, self.free, population=self.population, sigma=self.sigma, seed=seed
+        )
+        fly = partial(self.objective.fly, seeds=range(seed, seed + self.runs))
+        points: list[Point] = []
+        for number in range(generations):
+            proposed = optimiser.ask()
+            keys = [optimiser.values(each) for each in proposed]
+            if number == len(journal.entries):
+                flown = zip(keys, fly_all(fly, proposed), strict=True)
+                journal.append([self._point(here, values) for here, values in flown])
+            generation = journal.entries[number]
+            if [point.keys for point in generation] != keys:
+                raise ConfigError(
+                    f"{journal.folder}: got other points in generation {number + 1}, "
+                    "expected those of this search; or another --out"
+                )
+            points += generation
+            optimiser.tell([point.score for point in generation])
+            yield points
+
+    def _point(self, keys: dict[str, float], values: Values) -> Point:
+        figures = {column: dict(found) for column, found in values.items()}
+        return Point(keys, figures, self.objective.score(values))
+
+    def scenario(self, point: Point) -> Scenario:
+        """The scenario of a point."""
+        return put(self.start, {key: point.keys[key.key] for key in self.free})
+
+
+def best(points: Sequence[Point]) -> Point:
+    """The point with the smallest score."""
+    return min(points, key=lambda point: point.score)

@@ -2,7 +2,7 @@
 
 A study flies all methods over the values of one thing that changes. Its second sweep is the honest
 baseline: at each value, periodic sending with the period nearest to the event trigger's own rate
-there, which the first sweep has to tell.
+at that value, which follows from the first sweep.
 """
 
 import math
@@ -14,11 +14,12 @@ import msgspec
 import numpy as np
 
 from lab.calibration import COLUMNS, TABLE_1, deviations
-from lab.sweep import Axis, Done, Sweep, estimate, interval
+from lab.sweep import Axis, Estimate, Results, Sweep, estimate, interval
 from shared.config import Scenario
 from shared.summary import Summary
 
 SCENARIO = "paper"
+"""Name of the scenario that all studies start from."""
 NONE, EVERY, EVENT = COLUMNS
 PERIODIC = "periodic at equal rate"
 METHODS = Axis(
@@ -26,42 +27,39 @@ METHODS = Axis(
     tuple(COLUMNS),
     tuple({f"control.{key}": value for key, value in keys.items()} for keys in COLUMNS.values()),
 )
-"""As in Table 1; PERIODIC comes beside them."""
-
-Estimate = tuple[float | None, float | None]
-"""Mean, and half the width of its 95 % interval."""
+"""Methods of Table 1, each a column of it; PERIODIC is flown beside them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How much is flown."""
+    """How much a reproduction flies."""
 
     runs: int
-    """Of each column of Table 1."""
+    """Number of flights of each column of Table 1."""
     curve_runs: int
-    """Of each point of a curve."""
+    """Number of flights of each point of a curve."""
     map_runs: int
-    """Of each cell of Fig. 5."""
+    """Number of flights of each cell of Fig. 5."""
     points: int
-    """Of each curve."""
+    """Number of points of each curve."""
     cells: int
-    """Of Fig. 5, along each side."""
+    """Number of cells along each side of Fig. 5."""
     periods: tuple[int, ...]
-    """Of the periodic curve beside it [steps]."""
+    """Periods of the periodic curve beside Fig. 5 [steps]."""
     duration: float
-    """Of a flight [s]."""
+    """Length of a flight in virtual time [s]."""
     real_s: float
-    """Length of a flight over UDP."""
+    """Length of a flight over UDP [s]."""
     real_settle_s: float
-    """Start of it that RMSE leaves out."""
+    """Start of a flight over UDP that RMSE leaves out [s]."""
     sample_runs: int
-    """Flights whose records are looked into."""
+    """Number of flights of each method whose whole records are drawn."""
     delay_packets: int
-    """Sent through netem, each way, to see how long it takes."""
+    """Number of packets sent through netem, each way, to measure their delay."""
 
 
 def full(runs: int) -> Scale:
-    """For print."""
+    """Scale of a reproduction that is reported."""
     return Scale(
         runs=runs,
         curve_runs=-(-runs // 2),
@@ -90,28 +88,32 @@ QUICK = Scale(
     sample_runs=2,
     delay_packets=500,
 )
-"""For a first look."""
+"""Scale of a first look."""
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """All methods over the values of one thing."""
+    """All methods over the values of one thing that changes."""
 
     name: str
+    """Short name, in files."""
     label: str
-    """Of the axis, with its unit."""
+    """Label of the axis, with its unit."""
     scenario: Scenario
+    """What is flown, but for what changes."""
     axis: Axis
+    """Values, and the keys that each changes."""
     runs: int
+    """Number of flights of each method at each value."""
     here: float
-    """The value of the scenario itself."""
+    """Value that the scenario itself has."""
 
     def first(self) -> Sweep:
-        """The methods of Table 1."""
+        """The sweep of the methods of Table 1."""
         return Sweep(SCENARIO, self.scenario, [self.axis, METHODS], self.runs)
 
     def second(self, flown: "Flown") -> Sweep:
-        """Periodic sending, as often as the event trigger did in the first."""
+        """The sweep of periodic sending, as often as the event trigger sent in the first."""
         changes = tuple(
             {**keys, **periodic(period(flown[value, EVENT]))} for value, keys in self.axis.points()
         )
@@ -121,12 +123,12 @@ class Study:
 
 
 def periodic(steps: int) -> Mapping[str, Any]:
-    """The keys of a scenario that sends every so many steps."""
+    """Keys of a scenario that sends every so many steps, and their values."""
     return {"control.trigger": "periodic", "control.period": steps}
 
 
 def period(runs: Sequence[Summary]) -> int:
-    """Steps between packets, at the rate nearest to the mean event ratio of some runs."""
+    """Period whose rate is nearest to the mean event ratio of some runs [steps]."""
     ratio = estimate(runs, "event_ratio")[0]
     if not ratio:  # none of them flew
         return 1
@@ -135,7 +137,7 @@ def period(runs: Sequence[Summary]) -> int:
 
 
 def table_study(scenario: Scenario, scale: Scale) -> Study:
-    """Table 1; and as long as a real flight, to stand beside it."""
+    """Study of Table 1, and of flights as short as those over UDP, to stand beside them."""
     short = {"duration": scale.real_s, "settle": scale.real_settle_s}
     values = (scenario.duration, scale.real_s)
     axis = Axis("duration", values, ({}, short))
@@ -143,7 +145,7 @@ def table_study(scenario: Scenario, scale: Scale) -> Study:
 
 
 def curve_studies(scenario: Scenario, scale: Scale) -> list[Study]:
-    """The literature's usual set: loss, delay, jitter, a wrong model, clocks that differ."""
+    """Studies of the literature's usual set: loss, delay, jitter, a wrong model, other clocks."""
     up, n = scenario.network.uplink, scale.points
     slots_s = up.slot_s * up.slots_mean
 
@@ -207,7 +209,7 @@ def curve_studies(scenario: Scenario, scale: Scale) -> list[Study]:
 
 
 def map_sweep(scenario: Scenario, scale: Scale) -> Sweep:
-    """Fig. 5: λ × ε."""
+    """Sweep of Fig. 5, over the decay rate λ and the tolerance ε."""
     decay = np.linspace(0.5, 5.0, scale.cells).tolist()
     epsilon = np.linspace(0.9, 9.0, scale.cells).tolist()
     axes = [
@@ -218,30 +220,31 @@ def map_sweep(scenario: Scenario, scale: Scale) -> Sweep:
 
 
 def period_sweep(scenario: Scenario, scale: Scale) -> Sweep:
-    """Beside it: periodic sending, from every step to hardly ever."""
+    """Sweep of periodic sending beside Fig. 5, from every step to hardly ever."""
     axis = Axis("control.period", scale.periods, tuple(map(periodic, scale.periods)))
     return Sweep(SCENARIO, scenario, [axis], scale.map_runs)
 
 
 Flown = Mapping[tuple[Any, ...], Sequence[Summary]]
-"""Runs of each cell of a sweep, by its values."""
+"""Summaries of each cell of a sweep, by its values."""
 
 
-def flown(plan: Sweep, done: Mapping[tuple[int, int], Done]) -> Flown:
-    """The runs of each cell, by its values."""
+def flown(plan: Sweep, done: Results) -> Flown:
+    """Summaries of each cell of a sweep, by its values."""
     return {values: plan.of_cell(done, cell) for cell, values in enumerate(plan.cells)}
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """What one method did at one value."""
+    """Flights of one method at one value."""
 
     runs: Sequence[Summary]
+    """Summary of each flight."""
     period: int | None = None
-    """Steps between its packets, where it is periodic."""
+    """Steps between packets, for periodic sending; None for other methods."""
 
     def estimate(self, figure: str) -> Estimate:
-        """Mean and half interval; `total_packets` and `total_bytes` count both directions."""
+        """Estimate of a figure; `total_packets` and `total_bytes` count both directions."""
         if not figure.startswith("total_"):
             return estimate(self.runs, figure)
         what = figure.removeprefix("total_")
@@ -251,9 +254,9 @@ class Cell:
 
 
 def periodic_wins(event: Cell, periodic: Cell) -> int:
-    """1 where periodic sending has the smaller RMSE xy, -1 where it has the larger.
+    """1 where periodic sending has the smaller RMSE xy, -1 where it has the larger one.
 
-    0 where their 95 % intervals meet, or nothing was flown.
+    The result is 0 where the 95 % intervals meet, or nothing was flown.
     """
     (ours, ours_half), (theirs, theirs_half) = (
         cell.estimate("rmse_xy") for cell in (event, periodic)
@@ -265,14 +268,15 @@ def periodic_wins(event: Cell, periodic: Cell) -> int:
 
 
 Cells = Mapping[tuple[float, str], Cell]
-"""Of a study, by value and method; PERIODIC is one of them."""
+"""Cells of a study, by value and method; PERIODIC is one of the methods."""
 
 
-def cells(study: Study, first: Sweep, firstly: Any, second: Sweep, secondly: Any) -> Cells:
-    """Both sweeps of a study together.
+def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly: Results) -> Cells:
+    """Cells of a study, from both of its sweeps.
 
     Args:
-        firstly, secondly: what is done of each.
+        firstly: what is done of the first sweep.
+        secondly: what is done of the second sweep.
     """
     found = {key: Cell(runs) for key, runs in flown(first, firstly).items()}
     periods = [keys["control.period"] for _, keys in second.axes[0].points()]
@@ -286,15 +290,20 @@ def cells(study: Study, first: Sweep, firstly: Any, second: Sweep, secondly: Any
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """One of Table 1."""
+    """An entry of Table 1, the paper's figure beside ours."""
 
     column: str
+    """Method."""
     entry: str
+    """Name of the figure."""
     paper: float | None
+    """The paper's figure; None where it has none."""
     here: float | None
+    """Mean of our flights; None where none flew."""
     ci95: float | None
+    """Half the width of the 95 % interval of `here`."""
     deviation: float | None
-    """Relative."""
+    """Relative deviation of `here` from `paper`; None without the latter."""
 
 
 ENTRIES = ("rmse_x", "rmse_y", "rmse_xy", "event_ratio")
@@ -303,17 +312,17 @@ TRAFFIC = tuple(f"{way}_{what}" for way in WAYS for what in ("packets", "bytes")
 
 
 def table_1(columns: Mapping[str, Cell]) -> list[Entry]:
-    """Table 1, the paper's figures beside ours; PERIODIC is not in the paper."""
+    """Entries of Table 1 for all columns; PERIODIC, which the paper does not have, with them."""
     found = {
         (column, name): cell.estimate(name) for column, cell in columns.items() for name in ENTRIES
     }
     off = deviations(
         {
-            column: {name: found[column, name][0] or math.nan for name in targets}
+            column: {name: found[column, name][0] for name in targets}
             for column, targets in TABLE_1.items()
         }
     )
     return [
-        Entry(column, name, TABLE_1.get(column, {}).get(name), *pair, off.get((column, name)))
-        for (column, name), pair in found.items()
+        Entry(column, name, TABLE_1.get(column, {}).get(name), mean, half, off.get((column, name)))
+        for (column, name), (mean, half) in found.items()
     ]

@@ -1,4 +1,4 @@
-"""Many flights over a grid of scenarios: which there are, what each gives, and what they say.
+"""Sweeps: many flights over a grid of scenarios, their summaries, and the tables of their means.
 
 A sweep is cells × runs. A cell is the scenario with one value from each grid; its runs differ in
 the seed alone, counting up from the scenario's. They are flown in chunks of a fixed size, so that
@@ -10,53 +10,58 @@ import io
 import itertools
 import math
 import tomllib
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import astuple, replace
 from scipy import stats
 
+from lab.journal import digests
+from lab.keys import lay
 from shared import config
 from shared.config import ConfigError, Scenario
 from shared.summary import Summary, summarise
 from sim.flight import fly_batch
 
 CHUNK = 25
-"""Runs of one task."""
+"""Number of runs in a task; the last of a cell may have fewer."""
 FORM = "KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
+"""Form of a grid on the command line."""
 SEED_MAX = 2**32 - 1
+"""Largest seed of a scenario."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One key of the scenario, and the values it takes.
-
-    Where one value is to change other keys, or several, `changes` has these for each value, and the
-    key and its values are but what they are called.
-    """
+    """One key of the scenario, and the values it takes; or a label, and what its values change."""
 
     key: str
+    """Key with dots, or a label where there are `changes`."""
     values: tuple[Any, ...]
+    """Values of the key, or names of the changes."""
     changes: tuple[Mapping[str, Any], ...] = ()
+    """Keys that each value changes, and their values; empty where it changes `key` alone."""
 
     def __str__(self) -> str:
-        """As `parse_axis` reads it; with what each value changes where that is something else."""
+        """KEY=VALUE,VALUE,... as `parse_axis` reads it, or with the changes in place of values."""
         values = self.changes or self.values
         return f"{self.key}={','.join(msgspec.json.encode(value).decode() for value in values)}"
 
     def points(self) -> list[tuple[Any, Mapping[str, Any]]]:
-        """Each value, and the keys that it changes."""
+        """Each value, with the keys that it changes and their values."""
         changes = self.changes or [{self.key: value} for value in self.values]
         return list(zip(self.values, changes, strict=True))
 
 
 def parse_axis(text: str) -> Axis:
-    """A grid as the user writes it: `control.epsilon=0.5:8:10` or `control.scheme=committed,none`.
+    """The grid that a user writes: `control.epsilon=0.5:8:10` or `control.scheme=committed,none`.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the text has another form, or a value twice.
     """
     key, equals, given = (part.strip() for part in text.partition("="))
     wrong = ConfigError(f"--grid: got {text!r}, expected {FORM}")
@@ -78,7 +83,7 @@ def parse_axis(text: str) -> Axis:
 
 
 def _linear(start: str, stop: str, count: str) -> list[float]:
-    """Evenly spaced, ends included; whole numbers where both ends and all between are."""
+    """Evenly spaced values, ends included; whole numbers where both ends and all between are."""
     first, last, n = float(start), float(stop), int(count)
     if n < 2 or not math.isfinite(first - last):
         raise ValueError
@@ -88,7 +93,7 @@ def _linear(start: str, stop: str, count: str) -> list[float]:
 
 
 def _listed(given: str) -> list[Any]:
-    """Values as TOML has them; a bare word is a text."""
+    """Values between commas, as in TOML; a bare word is a text."""
     try:
         return tomllib.loads(f"values = [{given}]")["values"]
     except ValueError:
@@ -106,48 +111,62 @@ def _value(text: str) -> Any:
 
 
 class Task(msgspec.Struct, frozen=True):
-    """Some runs of a cell."""
+    """Some runs of a cell, flown together."""
 
     cell: int
+    """Number of the cell in its sweep, from 0 on."""
     chunk: int
+    """Number of the task in its cell, from 0 on."""
     name: str
-    """Of the scenario."""
+    """Name of the scenario, for the summaries."""
     scenario: Scenario
+    """What is flown, but for the seed."""
     seeds: tuple[int, ...]
+    """Seed of each run."""
 
 
 class Done(msgspec.Struct, frozen=True):
-    """A task's flights."""
+    """What came of a task; an entry of a sweep's journal."""
 
     cell: int
+    """Number of the task's cell."""
     chunk: int
+    """Number of the task in its cell."""
     runs: tuple[Summary, ...]
+    """Summary of each run, in the order of the seeds."""
+
+
+Results = Mapping[tuple[int, int], Done]
+"""What is done of a sweep, by cell and chunk."""
+
+
+def results(entries: Iterable[Done]) -> Results:
+    """What is done of a sweep, from the entries of its journal."""
+    return {(done.cell, done.chunk): done for done in entries}
 
 
 def fly(task: Task) -> Done:
-    """All runs of a task, in virtual time."""
+    """Fly all runs of a task in virtual time."""
     return Done(task.cell, task.chunk, summaries(task.name, task.scenario, task.seeds))
 
 
 def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> tuple[Summary, ...]:
-    """What a scenario of some name gives, seed by seed, in virtual time."""
+    """Summaries of flights of a scenario in virtual time, one a seed."""
+    flown = zip(seeds, fly_batch(scenario, seeds), strict=True)
     return tuple(
-        summarise(
-            msgspec.structs.replace(scenario, seed=seed),
-            *(name, flight.client, flight.server, flight.netem),
-        )
-        for seed, flight in zip(seeds, fly_batch(scenario, seeds), strict=True)
+        summarise(replace(scenario, seed=seed), name, each.client, each.server, each.netem)
+        for seed, each in flown
     )
 
 
 class Sweep:
-    """What is to be flown.
+    """A grid of scenarios, and the number of flights of each.
 
     Args:
-        name: of the scenario.
-        scenario: what is the same everywhere.
-        axes: what is not; the last changes fastest.
-        runs: of each cell.
+        name: name of the scenario, for messages and summaries.
+        scenario: what is the same in all cells.
+        axes: what differs between cells; the last axis changes fastest.
+        runs: number of flights of each cell.
 
     Raises:
         ConfigError: a cell that cannot be flown, or a key given twice.
@@ -164,9 +183,9 @@ class Sweep:
             raise ConfigError(f"seed: got {scenario.seed}, expected at most {most} for {runs} runs")
         points = list(itertools.product(*(axis.points() for axis in axes)))
         self.cells = [tuple(value for value, _ in cell) for cell in points]
-        """The values of each, in the order of the axes."""
+        """Values of each cell, in the order of the axes."""
         self.chunks = -(-runs // CHUNK)
-        """Of each cell."""
+        """Number of tasks of each cell."""
         self._scenarios = [
             self._scenario({key: value for _, changes in cell for key, value in changes.items()})
             for cell in points
@@ -179,7 +198,7 @@ class Sweep:
         return config.check(table, f"{self.name} with {where}" if where else self.name)
 
     def tasks(self) -> Iterator[Task]:
-        """All of it, cell by cell."""
+        """All tasks, cell by cell."""
         first = self.scenario.seed
         for cell, scenario in enumerate(self._scenarios):
             for chunk in range(self.chunks):
@@ -187,83 +206,82 @@ class Sweep:
                 seeds = tuple(first + run for run in runs)
                 yield Task(cell, chunk, self.name, scenario, seeds)
 
-    def todo(self, done: Container[tuple[int, int]]) -> list[Task]:
-        """What is not done yet."""
+    def todo(self, done: Results) -> list[Task]:
+        """Tasks that are not done yet."""
         return [task for task in self.tasks() if (task.cell, task.chunk) not in done]
 
     def settings(self) -> dict[str, Any]:
-        """All that its results follow from, as plain values."""
+        """All that the results follow from, as plain values."""
         return {
             "name": self.name,
             "runs": self.runs,
             "grid": list(map(str, self.axes)),
+            "files": digests(self._scenarios),
             "scenario": config.to_table(self.scenario),
         }
 
-    def runs_csv(self, done: Mapping[tuple[int, int], Done]) -> str:
-        """A row for each run, cell by cell and by its seed."""
+    def runs_csv(self, done: Results) -> str:
+        """CSV table with a row for each run, cell by cell and by seed."""
         keys = [axis.key for axis in self.axes]
         rows = (
-            [*values, *map(_plain, msgspec.structs.astuple(run))]
+            [*values, *astuple(run)]
             for cell, values in enumerate(self.cells)
             for run in self.of_cell(done, cell)
         )
         return to_csv([*keys, *Summary.__struct_fields__], rows)
 
-    def cells_csv(self, done: Mapping[tuple[int, int], Done]) -> str:
-        """A row for each cell: mean of each figure, and half the width of its 95 % interval."""
+    def cells_csv(self, done: Results) -> str:
+        """CSV table with a row for each cell: means, and half the widths of 95 % intervals."""
         keys = [axis.key for axis in self.axes]
-        names = [name for figure in FIGURES for name in (figure, f"{figure}_ci95")]
         rows = []
         for cell, values in enumerate(self.cells):
             runs = self.of_cell(done, cell)
             flown = sum(run.rmse_xy is not None for run in runs)
-            means = [_plain(part) for figure in FIGURES for part in estimate(runs, figure)]
-            rows.append([*values, len(runs), flown, *means])
-        return to_csv([*keys, "runs", "flown", *names], rows)
+            row = dict(zip(keys, values, strict=True)) | {"runs": len(runs), "flown": flown}
+            rows.append(row | by_name(FIGURES, partial(estimate, runs)))
+        return rows_csv(rows)
 
     def scenario_of(self, *values: Any) -> Scenario:
-        """What a cell flies."""
+        """Scenario of the cell with these values."""
         return self._scenarios[self.cells.index(values)]
 
-    def of_cell(self, done: Mapping[tuple[int, int], Done], cell: int) -> list[Summary]:
-        """Its runs, by seed."""
+    def of_cell(self, done: Results, cell: int) -> list[Summary]:
+        """Summaries of a cell's runs, by seed."""
         return [run for chunk in range(self.chunks) for run in done[cell, chunk].runs]
 
 
-def lay(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
-    """Put values where their keys say, as in `control.epsilon`.
-
-    Raises:
-        ConfigError: there cannot be such a key.
-    """
-    for path, value in changes.items():
-        *sections, key = path.split(".")
-        section = table
-        for name in sections:
-            section = section.setdefault(name, {})
-            if not isinstance(section, dict):
-                raise ConfigError(f"--grid: {path}: no such key")
-        section[key] = value
-
-
 FIGURES = (
-    *("rmse_x", "rmse_y", "rmse_z", "rmse_xy", "event_ratio", "uplink_packets", "uplink_bytes"),
-    *("downlink_packets", "downlink_bytes", "lost", "reordered", "stale"),
-    *("age_ms_p50", "age_ms_p99", "deadline_misses"),
+    "rmse_x",
+    "rmse_y",
+    "rmse_z",
+    "rmse_xy",
+    "event_ratio",
+    "uplink_packets",
+    "uplink_bytes",
+    "downlink_packets",
+    "downlink_bytes",
+    "lost",
+    "reordered",
+    "stale",
+    "age_ms_p50",
+    "age_ms_p99",
+    "deadline_misses",
 )
-"""Of a summary, those that make sense as a mean."""
+"""Figures of a summary that make sense as a mean."""
+
+Estimate = tuple[float | None, float | None]
+"""Mean, and half the width of its 95 % interval; None where there are too few values."""
 
 
-def estimate(runs: Iterable[Summary], figure: str) -> tuple[float | None, float | None]:
+def estimate(runs: Iterable[Summary], figure: str) -> Estimate:
     """Mean of a figure over the runs that have it, and half the width of its 95 % interval."""
     return interval([value for run in runs if (value := getattr(run, figure)) is not None])
 
 
-def interval(values: Sequence[float]) -> tuple[float | None, float | None]:
-    """Mean of some values, and half the width of its 95 % interval.
+def interval(values: Sequence[float]) -> Estimate:
+    """Mean of some values, and half the width of its 95 % interval (Student's t).
 
-    Student's t; the first is None where there are no values, the second where fewer than two.
+    The mean is None where there are no values, the interval where there are fewer than two.
     """
     if not values:
         return None, None
@@ -273,13 +291,26 @@ def interval(values: Sequence[float]) -> tuple[float | None, float | None]:
     return mean, float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
 
 
+def by_name(figures: Iterable[str], estimate_of: Callable[[str], Estimate]) -> dict[str, Any]:
+    """Mean of each figure by its name, and half the width of its interval by NAME_ci95."""
+    found: dict[str, Any] = {}
+    for figure in figures:
+        found[figure], found[f"{figure}_ci95"] = estimate_of(figure)
+    return found
+
+
 def _plain(value: Any) -> Any:
-    """As CSV has it: true and false as in TOML, nothing for None."""
+    """A value as CSV has it: true and false as in TOML, nothing for None."""
     return str(value).lower() if isinstance(value, bool) else value
 
 
+def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A table as CSV text, of rows that have all columns by name; empty where there are none."""
+    return to_csv(list(rows[0]), [list(row.values()) for row in rows]) if rows else ""
+
+
 def to_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table as text."""
+    """A table as CSV text."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(header)

@@ -1,1 +1,1 @@
-"""The scenarios that come with Skytether, one TOML file each."""
+"""The scenarios that come with Skytether, a TOML file each; `compare.toml` holds many in tables."""

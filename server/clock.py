@@ -12,7 +12,7 @@ offset is right to within the bound and no better. Step k begins at epoch + k Δ
 import numpy as np
 
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
-from shared.kernel import I1, I2, I3, kernel, part
+from shared.kernel import I1, I2, I3, kernel, part, plain
 from shared.model import Indices
 
 BUCKET_NS = SECOND_NS // 2
@@ -92,7 +92,7 @@ class ClockMap:
 
     def bound_ns(self, row: int) -> int:
         """How far the offset of a vehicle may be off [ns]."""
-        return int(half_trip_ns.py_func(self.minimum, row))
+        return int(plain(half_trip_ns)(self.minimum, row))
 
 
 @part

@@ -132,7 +132,7 @@ class Controller:
             self._trigger.sent(rows[sent], figures[sent])
         self._counts["steps"] += n
         self._counts["events"] += len(sent)
-        self._counts["unsolved"] += n - np.count_nonzero(solved)
+        self._counts["unsolved"] += n - int(np.count_nonzero(solved))
         stopwatch.lap("trigger")
         solve_ns = self.planner.solve_ns
         return Decisions(rows, step, found, figures, planned, verdict, event, sent, solve_ns)

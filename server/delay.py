@@ -35,7 +35,7 @@ class DelayBound(NamedTuple):
     """d of each vehicle, or 0 while nothing is known; shape (capacity,)."""
     samples: I2
     """Newest samples of each [steps], a ring; shape (capacity, SAMPLES)."""
-    count: I1
+    seen: I1
     """Number of samples seen so far; shape (capacity,)."""
     least: int
     """Smallest d."""
@@ -55,14 +55,14 @@ def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) ->
     if fixed_s is not None:
         fixed = -(-seconds_to_ns(fixed_s) // seconds_to_ns(dt_s))
         least = most = min(max(fixed, 1), most)
-    steps, count = np.zeros((2, capacity), dtype=np.int64)
+    steps, seen = np.zeros((2, capacity), dtype=np.int64)
     samples = np.zeros((capacity, SAMPLES), dtype=np.int64)
-    return DelayBound(steps, samples, count, least, most)
+    return DelayBound(steps, samples, seen, least, most)
 
 
 def forget(bound: DelayBound, row: int) -> None:
     """Begin anew with a vehicle, or with a new life of it."""
-    bound.steps[row] = bound.count[row] = 0
+    bound.steps[row] = bound.seen[row] = 0
 
 
 @part
@@ -74,11 +74,11 @@ def begin(bound: DelayBound, row: int, guess: int) -> None:
 @part
 def acknowledge(bound: DelayBound, row: int, delay: int) -> None:
     """Take a sample [steps] of a vehicle into its d, which falls by one at most."""
-    newest = bound.count[row] % SAMPLES
+    newest = bound.seen[row] % SAMPLES
     bound.samples[row, newest] = delay
-    bound.count[row] += 1
+    bound.seen[row] += 1
     d = max(bound.steps[row], min(delay, bound.most))
-    known = min(bound.count[row], SAMPLES)
+    known = min(bound.seen[row], SAMPLES)
     needed, since = 0, known  # samples that need d, and how many came after the last of these
     for slot in range(known):
         if bound.samples[row, slot] >= d:

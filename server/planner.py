@@ -33,7 +33,7 @@ from server.mpc import (
 from server.scheme import Foresight
 from server.solver import OsqpSolver, Solver
 from shared.config import ControlConfig, Scenario
-from shared.kernel import F1, F2, F3, F4, I1, inline, kernel, part, record, records
+from shared.kernel import F1, F2, F3, F4, I1, inline, kernel, part, plain, record, records
 from shared.model import Indices
 from shared.stopwatch import Stopwatch
 from shared.terms import Terms
@@ -133,7 +133,7 @@ class Reference:
         while (page := _missing(self._desired, rows, steps, found)) != EMPTY:
             if np.count_nonzero(held == EMPTY) == 1:
                 held[:] = EMPTY
-            at = _place.py_func(held, page)
+            at = plain(_place)(held, page)
             states = self._sample((page * PAGE + self._steps) * self._dt_s)
             pages[at], held[at] = states.transpose(1, 0, 2), page
         return self._desired

@@ -77,7 +77,7 @@ class ControlConfig(Section, frozen=True):
     decay_rate: NonNegative = 1.5
     """Decay rate λ of eq. (16) [1/s]."""
     cost_gap: NonNegative = 1.0
-    """Cost of flying on with what was sent, above which the policy `cost_gap` sends."""
+    """Extra cost of flying on with what was sent, above which the policy `cost_gap` sends."""
     deviation_m: NonNegative = 0.05
     """Distance from the plan, above which the policy `deviation` sends [m]."""
     state_weight: tuple[NonNegative, NonNegative] = (7.0, 1.0)
@@ -119,14 +119,14 @@ class ReferenceConfig(Section, frozen=True):
 
 
 class VehicleConfig(Section, frozen=True):
-    """The simulated UAV and what it does without fresh orders."""
+    """The simulated UAV, and what it does without fresh horizons."""
 
     exhausted: Literal["hold", "brake"] = "brake"
     """Answer to a horizon that has run out: hold its last input (the paper), or brake and hover."""
     brake_mps2: Positive = 2.0
     """Deceleration of the desired velocity when `brake` stops the vehicle [m/s²]."""
     tau_s: tuple[Positive, ...] = ()
-    """True time constant [s], where it differs from the model's; one for all axes, or one each."""
+    """True time constant [s], one for all axes, or one each; left out: the model's."""
     gain: Positive = 1.0
     """Gain of the velocity loop: velocity settled at over velocity commanded."""
     dead_time_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
@@ -149,15 +149,15 @@ class DirectionConfig(Section, frozen=True):
     """One direction of the network."""
 
     delay: Literal["poisson", "constant", "none"] = "poisson"
-    """Delay of a packet: minimum_s + slot_s · Poisson(slots_mean) (17), minimum_s, or none."""
+    """Law of the delay: minimum_s + slot_s · Poisson(slots_mean) (17), just minimum_s, or none."""
     minimum_s: Duration = 0.4
-    """The smallest delay [s]."""
+    """Smallest delay [s]."""
     slot_s: Duration = 0.02
     """Length of a slot of the paper's delay [s]."""
     slots_mean: Annotated[float, Meta(ge=0, le=1e6)] = 2.0
     """Mean number of slots on top of the smallest delay."""
     loss: Annotated[float, Meta(ge=0, le=1)] = 0.1
-    """Share of packets lost."""
+    """Share of packets that are lost."""
 
     @property
     def mean_s(self) -> float:
@@ -181,7 +181,7 @@ class LinkConfig(Section, frozen=True):
     heartbeat_s: Positive = 0.1
     """Longest time that the server lets pass without a packet [s]."""
     timeout_s: Positive = 1.0
-    """Silence after which the vehicle says HELLO again [s]."""
+    """Time of silence after which the vehicle says HELLO again [s]."""
     connect_s: Positive = 15.0
     """Time that the vehicle waits for its first session before it gives up [s]."""
 
@@ -190,7 +190,7 @@ class SimulationConfig(Section, frozen=True):
     """Properties of the computers, which only virtual time has to be told."""
 
     compute_s: Duration = 0.001
-    """Time the server takes for a step [s]."""
+    """Time that the server takes for a step [s]."""
     clock_offset_s: float = 0.0
     """Offset of the vehicle's clock from the server's at the start [s]."""
     clock_drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
@@ -295,20 +295,29 @@ def _digest(content: bytes) -> str:
 
 
 COMPARED = "compare"
-"""Folder of the scenarios that `skytether compare` flies."""
+"""The file of the scenarios that `skytether compare` flies."""
 
 
-def names(folder: str = "") -> list[str]:
-    """Names of the scenarios that come with Skytether; in a folder of theirs, as `compare/name`."""
-    return sorted(
-        f"{folder}/{file.name}".lstrip("/").removesuffix(".toml")
-        for file in (resources.files("scenarios") / folder).iterdir()
-        if file.name.endswith(".toml")
-    )
+def names(file: str = "") -> list[str]:
+    """Names of the scenarios that come with Skytether, or of those in a file of scenarios.
+
+    Args:
+        file: COMPARED, or the path of a file that holds a scenario in each of its tables.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    if file:
+        return [f"{file}/{name}" for name in _toml(_path(file), file)]
+    files = (each.name for each in resources.files("scenarios").iterdir())
+    known = {name.removesuffix(".toml") for name in files if name.endswith(".toml")}
+    return sorted(known - {COMPARED})
 
 
 def load(name: str) -> Scenario:
     """Scenario by its name, or from a file by its path (anything that ends in .toml).
+
+    Behind the name or path of a file of scenarios stands the table: `compare/paper-event-gusts`.
 
     Raises:
         ConfigError: it does not exist, or something in it is wrong.
@@ -345,29 +354,22 @@ def to_toml(scenario: Scenario) -> bytes:
     return msgspec.toml.encode(scenario)
 
 
-def _read(name: str, seen: Mapping[Path, str] = MappingProxyType({})) -> dict[str, Any]:
+def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})) -> dict[str, Any]:
     """The raw table of a scenario, laid over those that it extends; `seen` extend it in turn."""
-    if name.endswith(".toml"):
-        path = Path(name)
-    elif name in (*names(), *names(COMPARED)):
-        path = Path(str(resources.files("scenarios") / f"{name}.toml"))
-    else:
+    file, _, entry = name.rpartition("/")
+    if name.endswith(".toml") or name in names():
+        file, entry = name, ""
+    elif not (entry and (file == COMPARED or file.endswith(".toml"))):
         raise ConfigError(f"{name}: no such scenario; {hint(name, names())}")
-    try:
-        path = path.resolve()
-        content = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{name}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ConfigError(f"{name}: cannot be read: {error}") from None
-    if path in seen:
-        raise ConfigError(
-            f"{seen[path]}: extends: got a circle of {' → '.join([*seen.values(), name])}"
-        )
-    try:
-        raw = tomllib.loads(content.decode())
-    except ValueError as error:
-        raise ConfigError(f"{name}: no valid TOML: {error}") from None
+    path = _path(file)
+    raw = _toml(path, file)
+    if entry:
+        if not isinstance(raw.get(entry), dict):
+            raise ConfigError(f"{name}: no such scenario; {hint(entry, raw)}")
+        raw = raw[entry]
+    if (path, entry) in seen:
+        circle = " → ".join([*seen.values(), name])
+        raise ConfigError(f"{seen[path, entry]}: extends: got a circle of {circle}")
     table = raw.get("reference")
     if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
         table["file"] = str((path.parent / table["file"]).absolute())
@@ -376,9 +378,29 @@ def _read(name: str, seen: Mapping[Path, str] = MappingProxyType({})) -> dict[st
         return raw
     if not isinstance(base, str):
         raise ConfigError(f"{name}: extends: got {base!r}, expected the name of a scenario")
-    if base.endswith(".toml"):
+    if ".toml" in base:
         base = str(path.parent / base)
-    return _overlay(_read(base, {**seen, path: name}), raw)
+    return _overlay(_read(base, {**seen, (path, entry): name}), raw)
+
+
+def _path(file: str) -> Path:
+    """Where a file is, by its path or by the name of one that comes with Skytether."""
+    if not file.endswith(".toml"):
+        return Path(str(resources.files("scenarios") / f"{file}.toml"))
+    try:
+        return Path(file).resolve()
+    except ValueError as error:
+        raise ConfigError(f"{file}: cannot be read: {error}") from None
+
+
+def _toml(path: Path, file: str) -> dict[str, Any]:
+    """The raw table of a whole file, which the user calls `file`."""
+    try:
+        return tomllib.loads(path.read_bytes().decode())
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"{file}: no valid TOML: {error}") from None
 
 
 def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

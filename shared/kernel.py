@@ -34,7 +34,7 @@ I3 = Annotated[NDArray[np.int64], numba.int64[:, :, ::1]]
 S3 = Annotated[NDArray[np.float32], numba.float32[:, :, ::1]]
 S4 = Annotated[NDArray[np.float32], numba.float32[:, :, :, ::1]]
 B1 = Annotated[NDArray[np.bool_], numba.boolean[::1]]
-"""Contiguous arrays of float64 (F), int64 (I), float32 (S) and bool (B), by their number of axes."""
+"""Contiguous arrays of float64 (F), int64 (I), float32 (S) and bool (B), by number of axes."""
 
 SCALARS = {int: numba.int64, float: numba.float64, bool: numba.boolean}
 
@@ -87,6 +87,12 @@ def inline(function: F) -> F:
     return compiled
 
 
+def plain(function: F) -> F:
+    """The function that a kernel or part was made of, to be called from Python now and then."""
+    original: F = function.py_func  # type: ignore[attr-defined]
+    return original
+
+
 class Reaching:
     """Makes one of numba's cache locators mind everything that a kernel reaches."""
 
@@ -133,7 +139,7 @@ def stamp(function: Callable[..., Any]) -> str:
         for name in each.__code__.co_names:
             value = each.__globals__.get(name)
             if hasattr(value, "py_func"):
-                waiting.append(value.py_func)
+                waiting.append(plain(value))
             elif isinstance(value, int | float | str | tuple | np.dtype):
                 found[f"{place}: {name}"] = repr(value)
     return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()

@@ -177,19 +177,36 @@ def drive(
         write(json, msgspec.json.encode(figures))
 
 
+class Bar(Protocol):
+    """A progress bar."""
+
+    def __call__(self, done: float, text: str = "") -> None:
+        """Show how much is done, in the bar's unit, and what to say of it."""
+
+
 @contextmanager
-def progress(title: str, total_s: float) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr; what is yielded takes the time flown so far [s]."""
+def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
+    """A bar on stderr: title, how much of the total is done, and the time remaining.
+
+    It vanishes at the end, and is not shown where stderr is no terminal.
+    """
     with Progress(
-        TextColumn(title),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
-        TextColumn("{task.completed:.0f} of {task.total:.0f} s"),
+        TextColumn("{task.completed:.0f} of {task.total:.0f} " + unit),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[text]}", markup=False),
         console=Console(stderr=True),
         transient=True,
-    ) as bar:
-        task = bar.add_task("", total=total_s)
-        yield lambda flown_s: bar.update(task, completed=min(flown_s, total_s))
+        speed_estimate_period=600.0,  # a step may take minutes
+        disable=not sys.stderr.isatty(),
+    ) as shown:
+        row = shown.add_task(title, total=total, text="")
+
+        def show(done: float, text: str = "") -> None:
+            shown.update(row, completed=min(done, total), text=text)
+
+        yield show
 
 
 @contextmanager

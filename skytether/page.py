@@ -23,9 +23,11 @@ from shared.config import Scenario
 from shell import command
 
 PAGE = "report.html"
+"""File of the page."""
 CALLS = "calls.jsonl"
-"""A line for each call that has added to the folder, or drawn it anew."""
+"""File with a line for each call that has added to the folder, or drawn it anew."""
 PACKAGES = ("skytether", "numpy", "scipy", "numba", "daqp", "msgpack", "matplotlib")
+"""Packages whose versions the page names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,20 +35,22 @@ class Call:
     """A command under way."""
 
     command: str
+    """Command line."""
     began: datetime
+    """Time of day at which the command began."""
     began_s: float
-    """On a clock that nobody sets."""
+    """Time at which the command began, on a clock that nobody sets [s]."""
 
     @classmethod
     def now(cls, name: str, argv: Sequence[str]) -> "Call":
-        """The command of this name begins."""
+        """A call of the command of this name, which begins now."""
         return cls(shlex.join(["skytether", name, *argv]), datetime.now(UTC), time.monotonic())
 
     def facts(self, runs: int) -> dict[str, Any]:
-        """What a reader has to know about it.
+        """Facts about the call for a reader of the report, as plain values.
 
         Args:
-            runs: that were flown.
+            runs: number of flights that were flown.
         """
         return {
             "command": self.command,
@@ -62,11 +66,11 @@ class Call:
 
 
 def write(out: Path, drawn: Drawn, scenario: Scenario, call: Call, runs: int) -> None:
-    """All files of a report.
+    """Write all files of a report.
 
     Args:
-        scenario: what it is about.
-        runs: flown by this call.
+        scenario: what the report is about.
+        runs: number of flights flown by this call.
 
     Raises:
         OSError: the folder cannot be written.
@@ -93,6 +97,7 @@ def show(table: Table) -> None:
 
 
 def _processor() -> str:
+    """Name of this machine's processor."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -102,7 +107,7 @@ def _processor() -> str:
 
 
 def _commit() -> str | None:
-    """Of the checkout that this runs from, where it is one."""
+    """Commit of the checkout that this runs from; None where it is no checkout."""
     with contextlib.suppress(OSError):
         run = subprocess.run(
             ["git", "describe", "--always", "--abbrev=12", "--dirty"],

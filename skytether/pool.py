@@ -1,11 +1,10 @@
-"""Who flies the flights of a sweep: processes of this machine, or a Dask cluster."""
+"""Who flies the flights of sweeps and searches: processes of this machine, or a Dask cluster."""
 
 import multiprocessing
 import os
 import signal
-import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -23,41 +22,56 @@ from pathlib import Path
 from typing import Annotated, TypeVar
 
 import tyro
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 import lab.sweep
 from lab.journal import Journal
-from lab.sweep import Done, Sweep, Task
+from lab.search import Generation, Point, Search, best
+from lab.sweep import Done, Results, Sweep, Task
 from shell import command
-from shell.command import CommandError
+from shell.command import Bar, CommandError
 from shell.workers import die_with_parent
 
 UNDER_WAY_MAX = 256
-"""Tasks handed out at once: more than any machine has cores, and no more than need be."""
+"""Largest number of tasks handed out at once: more than any machine has cores."""
 POLL_S = 0.2
-"""How soon Ctrl-C is noticed."""
+"""Time after which Ctrl-C is noticed [s]."""
 CONNECT_S = 10.0
-"""How long a scheduler may take to answer."""
-
-Workers = Annotated[int | None, tyro.conf.arg(metavar="N")]
-Scheduler = Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")]
-"""Two options of every command that has a pool."""
+"""Time that a scheduler may take to answer [s]."""
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
-def check(workers: int | None, scheduler: str | None) -> None:
-    """Refuse options that cannot be.
+@dataclass(frozen=True)
+class Flags:
+    """Options of every command that has a pool."""
 
-    Raises:
-        CommandError: with what would do.
-    """
-    if workers is not None:
-        command.check_count("--workers", workers, 1024)
-        if scheduler:
-            raise CommandError("--workers: got --scheduler as well, which has its own", 2)
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Number of processes that fly; one for each core unless given."""
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
+    """Address of a Dask scheduler whose workers fly instead of processes of this machine."""
+
+    def check(self) -> None:
+        """Refuse options that cannot be.
+
+        Raises:
+            CommandError: with what would do.
+        """
+        if self.workers is not None:
+            command.check_count("--workers", self.workers, 1024)
+            if self.scheduler:
+                raise CommandError("--workers: got --scheduler as well, which has its own", 2)
+
+
+PoolFlags = Annotated[Flags, tyro.conf.arg(name="")]
+
+
+class Interrupted(CommandError):
+    """Ctrl-C, after which the same command goes on."""
+
+    def __init__(self, done: float, total: float, unit: str) -> None:
+        said = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
+        super().__init__(f"{said}; the same command goes on from here", 128 + signal.SIGINT)
 
 
 @dataclass(slots=True)
@@ -65,9 +79,11 @@ class Spent:
     """What was flown by this command."""
 
     cpu_s: float = 0.0
+    """CPU time of the workers [s]."""
     steps: int = 0
-    """Of all vehicles."""
+    """Number of steps flown, of all vehicles."""
     runs: int = 0
+    """Number of flights."""
 
 
 @dataclass(slots=True)
@@ -75,111 +91,141 @@ class Crew:
     """Workers, and a bar that shows how far they are."""
 
     executor: Executor
-    bar: Progress
+    bar: Bar
+    total: float
+    """Amount of work that there is, what is done with it."""
+    unit: str
+    """What the work is counted in."""
     interrupted: Callable[[], bool]
+    done: float = 0.0
+    """Amount of work that is done."""
     spent: Spent = field(default_factory=Spent)
 
-    def fly(self, plan: Sweep, journal: Journal, title: str | None = None) -> None:
+    def advance(self, amount: float, text: str = "") -> None:
+        """Count work that is done, and show it."""
+        self.done += amount
+        self.bar(self.done, text)
+
+    def fly(self, plan: Sweep, journal: Journal[Done], text: str = "") -> None:
         """Fly what is not done of a sweep.
 
         Args:
-            title: what is being done, for the bar.
+            text: what the bar says meanwhile.
 
         Raises:
             CommandError: interrupted, or a worker has died.
         """
-        (row,) = self.bar.tasks
-        todo = plan.todo(journal.done)
+        todo = plan.todo(lab.sweep.results(journal.entries))
         before = len(plan.cells) * plan.runs - sum(len(task.seeds) for task in todo)
-        self.bar.update(row.id, completed=row.completed + before, description=title)
+        self.advance(before, text)
 
-        def on_done(_: Task, result: tuple[Done, float]) -> None:
+        def keep(_: int, result: tuple[Done, float]) -> None:
             done, cpu_s = result
             journal.append(done)
             self.spent.cpu_s += cpu_s
             self.spent.steps += sum(run.steps for run in done.runs)
             self.spent.runs += len(done.runs)
-            self.bar.update(row.id, advance=len(done.runs))
+            self.advance(len(done.runs), text)
 
-        if not share(self.executor, work, todo, on_done, self.interrupted):
-            raise CommandError(
-                f"interrupted with {row.completed:.0f} of {row.total:.0f} runs done; "
-                "the same command goes on from here",
-                128 + signal.SIGINT,
-            )
+        self.share(work, todo, keep)
 
-    def flown(self, plan: Sweep, folder: Path, title: str) -> Mapping[tuple[int, int], Done]:
-        """What is done of a sweep, and that is all of it; see `fly`.
+    def flown(self, plan: Sweep, folder: Path, text: str) -> Results:
+        """All results of a sweep, after what was missing has been flown; see `fly`.
 
         Args:
-            folder: of its journal.
+            folder: folder of the sweep's journal.
         """
-        with closing(Journal(folder, plan, metadata.version("skytether"))) as journal:
-            self.fly(plan, journal, title)
-            return journal.done
+        with closing(Journal(folder, plan.settings(), Done)) as journal:
+            self.fly(plan, journal, text)
+            return lab.sweep.results(journal.entries)
+
+    def search(
+        self, search: Search, journal: Journal[Generation], generations: int, text: str = ""
+    ) -> list[Point]:
+        """All points of a search, after what was missing has been flown.
+
+        Args:
+            text: what the bar says before the best score.
+
+        Raises:
+            CommandError: interrupted, or a worker has died.
+            ConfigError: the journal is another search's.
+        """
+        points: list[Point] = []
+        for points in search.points(journal, generations, self.map):
+            self.advance(1, f"{text}best {best(points).score:.4f}")
+        return points
+
+    def map(self, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+        """Results of a function for all items, in their order; see `share`."""
+        results: dict[int, R] = {}
+        self.share(function, items, results.__setitem__)
+        return [results[number] for number in range(len(items))]
+
+    def share(
+        self, function: Callable[[T], R], items: Sequence[T], on_done: Callable[[int, R], None]
+    ) -> None:
+        """Have a function done for all items, in any order.
+
+        Args:
+            on_done: called with the number of an item and its result.
+
+        Raises:
+            CommandError: interrupted, a worker has died, or the cluster has gone.
+        """
+        waiting = iter(enumerate(items))
+        under_way: dict[Future[R], int] = {}
+        while True:
+            try:
+                with _deaf():
+                    for number, item in islice(waiting, UNDER_WAY_MAX - len(under_way)):
+                        under_way[self.executor.submit(function, item)] = number
+                if not under_way:
+                    return
+                ready, _ = wait(under_way, POLL_S, FIRST_COMPLETED)
+                for future in ready:
+                    on_done(under_way.pop(future), future.result())
+            except BrokenExecutor:
+                died = "a worker has died; the same command goes on from here"
+                raise CommandError(died) from None
+            except CancelledError:
+                gone = "the scheduler has gone; the same command goes on from here"
+                raise CommandError(gone) from None
+            if self.interrupted():
+                raise Interrupted(self.done, self.total, self.unit)
 
 
 @contextmanager
-def crew(workers: int | None, scheduler: str | None, title: str, total: int) -> Iterator[Crew]:
+def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator[Crew]:
     """A crew, with a bar on stderr; Ctrl-C ends its work in order.
 
     Args:
-        total: runs that there are, done ones with them.
+        total: amount of work that there is, what is done with it, in the unit.
     """
     with (
         command.interruptible() as interrupted,
-        executors(workers, scheduler) as executor,
-        Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("runs"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            transient=True,
-            speed_estimate_period=600.0,
-            disable=not sys.stderr.isatty(),
-        ) as bar,
+        _executor(flags) as executor,
+        command.progress(title, total, unit) as bar,
     ):
-        bar.add_task(title, total=total)
-        yield Crew(executor, bar, interrupted)
+        yield Crew(executor, bar, total, unit, interrupted)
 
 
-def share(
-    executor: Executor,
-    function: Callable[[T], R],
-    items: Iterable[T],
-    on_done: Callable[[T, R], None],
-    stopped: Callable[[], bool],
-) -> bool:
-    """Have a function done for all items, in any order; False where it was told to stop.
+@contextmanager
+def writing(out: Path) -> Iterator[None]:
+    """Name the file or folder that cannot be written, in one line.
 
     Raises:
-        CommandError: a worker has died, or the cluster has gone.
+        CommandError: something within it raised an OSError.
     """
-    waiting = iter(items)
-    under_way: dict[Future[R], T] = {}
-    while True:
-        try:
-            with _deaf():
-                for item in islice(waiting, UNDER_WAY_MAX - len(under_way)):
-                    under_way[executor.submit(function, item)] = item
-            if not under_way:
-                return True
-            ready, _ = wait(under_way, POLL_S, FIRST_COMPLETED)
-            for future in ready:
-                on_done(under_way.pop(future), future.result())
-        except BrokenExecutor:
-            raise CommandError("a worker has died; the same command goes on from here") from None
-        except CancelledError:
-            raise CommandError("the scheduler has gone; the same command goes on") from None
-        if stopped():
-            return False
+    try:
+        yield
+    except OSError as error:
+        raise CommandError(f"{error.filename or out}: {error.strerror or error}") from None
 
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """A worker that is started within it never hears Ctrl-C, which is for the command alone."""
+    """Keep Ctrl-C, which is for the command alone, from workers that are started within it."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -188,21 +234,20 @@ def _deaf() -> Iterator[None]:
 
 
 def work(task: Task) -> tuple[Done, float]:
-    """Runs in a worker: its flights, and the CPU time they took [s]."""
+    """What came of a task, and the CPU time that it took [s]; called in a worker."""
     began_s = time.thread_time()
     return lab.sweep.fly(task), time.thread_time() - began_s
 
 
-def executors(workers: int | None, scheduler: str | None) -> AbstractContextManager[Executor]:
-    """Processes, one a core unless it is said how many, or a scheduler's workers."""
-    if scheduler:
-        return _cluster(scheduler)
-    return _processes(workers or len(os.sched_getaffinity(0)))
+def _executor(flags: Flags) -> AbstractContextManager[Executor]:
+    if flags.scheduler:
+        return _cluster(flags.scheduler)
+    return _processes(flags.workers or len(os.sched_getaffinity(0)))
 
 
 @contextmanager
 def _processes(count: int) -> Iterator[Executor]:
-    """Processes of this machine, a core each; at the end nothing of them goes on."""
+    """Processes of this machine, a core each; at the end none of them goes on."""
     for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
     pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _start, (os.getpid(),))
@@ -216,7 +261,7 @@ def _processes(count: int) -> Iterator[Executor]:
 
 
 def _start(parent: int) -> None:
-    """Runs in a worker, first."""
+    """Begin a worker, which ends with the command."""
     die_with_parent()
     if os.getppid() != parent:  # it was gone before
         os._exit(1)

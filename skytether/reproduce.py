@@ -1,56 +1,54 @@
 """`skytether reproduce`: the paper's table and figures, and more, flown and put in a report."""
 
+import io
 import json
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import metadata
 from inspect import cleandoc
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 import tyro
 
 from lab import report, studies
-from lab.journal import Journal
+from lab.journal import Journal, write
 from lab.report import Measured
 from lab.studies import EVENT, EVERY, PERIODIC, Cells, Scale, Study
+from lab.sweep import Done
 from shared import config, record
-from shared.config import ConfigError, Scenario
+from shared.config import Scenario
 from shared.model import Array
 from shell import command
 from shell.command import CommandError
 from sim.flight import Flight, fly_batch
-from skytether import delays, page, pool, processes
+from skytether import delays, page, processes
 from skytether.page import Call
-from skytether.pool import Crew, Scheduler, Workers, crew
+from skytether.pool import Crew, Flags, PoolFlags, crew, writing
 
 
 @dataclass(frozen=True)
 class Options:
-    """Of `skytether reproduce`."""
+    """Options of `skytether reproduce`."""
 
     runs: Annotated[int, tyro.conf.arg(metavar="N")] = 100
-    """Flights of each column of Table 1; half as many of each point of a curve, a quarter of each
-    cell of Fig. 5."""
+    """Number of flights of each column of Table 1; each point of a curve has half as many, each
+    cell of Fig. 5 a quarter."""
     out: Path = Path("results")
-    """Folder for the report; what was broken off there goes on."""
+    """Folder for the report; the same command goes on with what it holds."""
     quick: bool = False
-    """A first look, in under a minute: few flights, coarse grids."""
-    workers: Workers = None
-    """Processes; one a core unless given."""
-    scheduler: Scheduler = None
-    """Use the workers of this Dask scheduler instead."""
+    """Take a first look, in under a minute: few flights, coarse grids."""
+    pool: PoolFlags = Flags()
 
 
 def reproduce(argv: Sequence[str]) -> None:
     """Fly the paper's Table 1 and Figures 2 to 5, and what the literature asks for besides.
 
     OUT/report.html has all of it, and opens anywhere; every figure is in OUT as PNG, PDF and CSV.
-    Flights over real UDP stand beside those in virtual time. What is done is kept whatever happens:
-    after Ctrl-C, or worse, the same command goes on; once all is done, it only draws anew.
+    Flights over real UDP stand beside those in virtual time. Everything flown is kept: after
+    Ctrl-C, or a crash, the same command goes on; once all is flown, it only draws anew.
     """
     options = tyro.cli(
         Options,
@@ -59,27 +57,23 @@ def reproduce(argv: Sequence[str]) -> None:
         description=cleandoc(reproduce.__doc__ or ""),
     )
     command.check_count("--runs", options.runs, 100_000)
-    pool.check(options.workers, options.scheduler)
+    options.pool.check()
     scale = studies.full(options.runs)
     if options.quick:
         scale = replace(studies.QUICK, runs=min(options.runs, studies.QUICK.runs))
     scenario = msgspec.structs.replace(config.load(studies.SCENARIO), duration=scale.duration)
     call = Call.now("reproduce", argv)
-    try:
+    with writing(options.out):
         measured, runs = _measure(options, scenario, scale)
         drawn = report.draw(measured)
         page.write(options.out, drawn, scenario, call, runs)
-    except ConfigError as error:
-        raise CommandError(str(error), command.CONFIGURATION) from None
-    except OSError as error:
-        raise CommandError(f"{error.filename or options.out}: {error.strerror or error}") from None
     page.show(drawn.tables[0])
     print(f"{options.out / page.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
 
 
 def _measure(options: Options, scenario: Scenario, scale: Scale) -> tuple[Measured, int]:
-    """All flights, those done before with them; and how many were flown now."""
+    """All flights, those done before with them, and the number of those flown now."""
     table = studies.table_study(scenario, scale)
     curves = studies.curve_studies(scenario, scale)
     maps, periods = studies.map_sweep(scenario, scale), studies.period_sweep(scenario, scale)
@@ -88,11 +82,11 @@ def _measure(options: Options, scenario: Scenario, scale: Scale) -> tuple[Measur
     total += sum(len(plan.cells) * plan.runs for plan in (maps, periods))
     sweeps = options.out / "sweeps"
     # Another reproduction's folder is refused before anything is flown.
-    Journal(sweeps / table.name, table.first(), metadata.version("skytether")).close()
+    Journal(sweeps / table.name, table.first().settings(), Done).close()
     # First what is measured on the clock, while nobody else needs the cores.
     delay_ms = _delays(options.out, scenario, scale)
     real = {method: _really(options.out, table, method, scale) for method in (EVERY, EVENT)}
-    with crew(options.workers, options.scheduler, "Table 1", total) as flyers:
+    with crew(options.pool, "reproducing", total) as flyers:
         table_cells = _fly_study(flyers, sweeps, table, "Table 1")
         curve_cells = [_fly_study(flyers, sweeps, study, f"RMSE, {study.name}") for study in curves]
         map_cells = flyers.flown(maps, sweeps / "fig5", "Fig. 5")
@@ -110,7 +104,7 @@ def _measure(options: Options, scenario: Scenario, scale: Scale) -> tuple[Measur
 
 
 def _fly_study(flyers: Crew, out: Path, study: Study, title: str) -> Cells:
-    """Both its sweeps."""
+    """Fly both sweeps of a study."""
     first = study.first()
     firstly = flyers.flown(first, out / study.name, title)
     second = study.second(studies.flown(first, firstly))
@@ -119,21 +113,22 @@ def _fly_study(flyers: Crew, out: Path, study: Study, title: str) -> Cells:
 
 
 def _delays(out: Path, scenario: Scenario, scale: Scale) -> Array:
-    """How long packets take through netem; see `delays.measure`."""
+    """Time that packets take through netem, as `delays.measure` returns it [ms]."""
     file = out / "delays.npy"
     if not file.exists():
         folder = out / "netem"
         folder.mkdir(exist_ok=True)
         seconds = scale.delay_packets * delays.EVERY_S
+        content = io.BytesIO()
         with command.progress("packets through netem, over UDP", seconds) as on_second:
-            found = delays.measure(scenario, folder, scale.delay_packets, on_second)
-        _keep(file, lambda part: np.save(part, found))
+            np.save(content, delays.measure(scenario, folder, scale.delay_packets, on_second))
+        write(file, content.getvalue())
     kept: Array = np.load(file)
     return kept
 
 
 def _really(out: Path, table: Study, method: str, scale: Scale) -> report.Real:
-    """A flight over UDP, with the scenario's seed."""
+    """A flight over UDP, with the scenario's seed; flown unless it was before."""
     plan = table.first()
     scenario = plan.scenario_of(scale.real_s, method)
     folder = out / "real" / method.replace(" ", "-")
@@ -157,7 +152,7 @@ def _really(out: Path, table: Study, method: str, scale: Scale) -> report.Real:
 def _samples(
     out: Path, table: Study, table_cells: Cells, scale: Scale
 ) -> Mapping[str, tuple[Scenario, Sequence[Flight]]]:
-    """A few flights in virtual time with their whole records, by method."""
+    """Scenario and a few flights in virtual time with their whole records, by method."""
     steps = table_cells[table.here, PERIODIC].period
     samples = {}
     for method in (*studies.METHODS.values, PERIODIC):
@@ -176,21 +171,15 @@ def _samples(
                 for number, flight in enumerate(fly_batch(scenario, seeds))
                 for part in processes.NAMES
             }
-            _keep(file, lambda part, rows=rows: np.savez_compressed(part, **rows))  # type: ignore[misc]
+            content = io.BytesIO()
+            np.savez_compressed(content, **rows)
+            write(file, content.getvalue())
         with np.load(file) as kept:
             samples[method] = (
                 scenario,
                 [
-                    Flight(*(kept[f"{part}{number}"] for part in processes.NAMES))
+                    Flight(**{part: kept[f"{part}{number}"] for part in processes.NAMES})
                     for number in range(scale.sample_runs)
                 ],
             )
     return samples
-
-
-def _keep(file: Path, write: Callable[[Any], None]) -> None:
-    """A file that is there as a whole, or not at all."""
-    part = file.with_name(f"{file.name}.part")
-    with part.open("wb") as sink:
-        write(sink)
-    part.replace(file)

@@ -1,14 +1,18 @@
-"""The search for what the paper does not print: what it may change, how it is judged, its log."""
+"""The search for what the paper does not print: what may change, how it is judged, its journal."""
 
 import json
+import shutil
+import tomllib
 from pathlib import Path
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from lab import calibration
 from lab.calibration import COLUMNS, HERE, TABLE_1, UNFLYABLE, Rmse, Table1
-from lab.search import Free, Search, check_free, put
+from lab.journal import sealed
+from lab.search import Free, Optimiser, Point, Values, check_free, put
 from lab.sweep import interval, summaries
 from shared import config
 from shared.config import ConfigError
@@ -76,7 +80,7 @@ def test_what_cannot_be_searched_for_is_refused(free: Free, said: str) -> None:
     assert str(refused.value).startswith(f"--free: {said}")
 
 
-def off_by(share: float) -> calibration.Values:
+def off_by(share: float) -> Values:
     """The paper's own table, every entry larger by a share."""
     return {
         column: {name: value * (1.0 + share) for name, value in entries.items()}
@@ -100,7 +104,7 @@ def weighs(trigger: str) -> Rmse:
     return Rmse(replace(PAPER, control=replace(PAPER.control, trigger=trigger)), 0.1)
 
 
-def flew(rmse_xy: float, event_ratio: float, most: float) -> calibration.Values:
+def flew(rmse_xy: float | None, event_ratio: float, most: float) -> Values:
     """What a point came to."""
     here = {"rmse_xy": rmse_xy, "event_ratio": event_ratio, "event_ratio_most": most}
     return {HERE: here}
@@ -113,7 +117,7 @@ def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
     assert event.score(flew(0.2, 0.09, 0.11)) == pytest.approx(0.2 * 1.1**3)
     assert event.score(flew(0.1, 0.2, 0.2)) == pytest.approx(0.8)
     assert every.score(flew(0.1, 1.0, 1.0)) == 0.1
-    assert every.score(flew(float("nan"), 1.0, 1.0)) == UNFLYABLE
+    assert every.score(flew(None, 1.0, 1.0)) == UNFLYABLE
     told, clock = weighs("state_gap(3.6, 1.5) & budget(5, 2)"), weighs("periodic(2) | silence(1)")
     assert told.score(flew(0.1, 0.2, 0.2)) == pytest.approx(0.8)
     assert clock.score(flew(0.1, 0.5, 0.5)) == 0.1
@@ -122,8 +126,11 @@ def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
 def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> None:
     """The position's weight stays, for only ratios matter; so does what is switched off."""
     weights = {
-        *("control.state_weight.1", "control.terminal_weight.0", "control.terminal_weight.1"),
-        *("control.input_weight", "control.change_weight"),
+        "control.state_weight.1",
+        "control.terminal_weight.0",
+        "control.terminal_weight.1",
+        "control.input_weight",
+        "control.change_weight",
     }
     assert {key.key for key in weighs("always").free()} == weights
     own = {"control.epsilon", "control.decay_rate"}
@@ -169,7 +176,7 @@ def test_a_point_is_its_flights_with_an_upper_end_of_what_they_send() -> None:
 
 def test_a_search_begins_where_it_was_told_to() -> None:
     """The first point is the scenario itself; all keep within their bounds."""
-    search = Search(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1)
+    search = Optimiser(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1)
     first, *others = search.ask()
     assert search.values(first) == pytest.approx(search.values(PAPER), rel=1e-3)
     for other in others:
@@ -178,8 +185,8 @@ def test_a_search_begins_where_it_was_told_to() -> None:
 
 
 def test_a_search_told_the_same_proposes_the_same() -> None:
-    """A log can therefore take the place of flights."""
-    searches = [Search(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1) for _ in range(2)]
+    """So that a journal takes the place of flights."""
+    searches = [Optimiser(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1) for _ in range(2)]
     proposed = []
     for search in searches:
         for _ in range(3):
@@ -189,10 +196,8 @@ def test_a_search_told_the_same_proposes_the_same() -> None:
     assert proposed[0] == proposed[1]
 
 
-ARGV = [
-    *("calibrate", "paper", "--free", "reference.radius_m=0.5:5", "model.tau_s.0=0.2:2"),
-    *("--duration", "3", "--settle", "0", "--runs", "2", "--population", "4", "--workers", "1"),
-]
+SHORT = ["--duration", "3", "--settle", "0", "--runs", "2", "--population", "4", "--workers", "1"]
+ARGV = ["calibrate", "paper", *SHORT, "--free", "reference.radius_m=0.5:5", "model.tau_s.0=0.2:2"]
 
 
 @pytest.fixture(scope="module")
@@ -203,25 +208,31 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def flown(out: Path) -> list[Point]:
+    """All points in the journal of a search."""
+    lines = map(json.loads, (out / "journal.jsonl").read_text().splitlines())
+    return [msgspec.convert(point, Point) for _, generation in lines for point in generation]
+
+
 def test_the_best_point_of_all_is_kept(searched: Path) -> None:
     """As a scenario that flies."""
-    _, *generations = map(json.loads, (searched / "log.jsonl").read_text().splitlines())
-    points = [point for generation in generations for point in generation]
+    points = flown(searched)
     assert len(points) == 8
-    best = min(points, key=lambda point: point["score"])
+    best = min(points, key=lambda point: point.score)
     found = config.load(str(searched / "best.toml"))
-    assert found.reference.radius_m == best["keys"]["reference.radius_m"]
-    assert found.model.tau_s == (best["keys"]["model.tau_s.0"],)
+    assert found.reference.radius_m == best.keys["reference.radius_m"]
+    assert found.model.tau_s == (best.keys["model.tau_s.0"],)
 
 
-def test_a_search_goes_on_from_its_log_though_a_line_was_cut(
+def test_a_search_goes_on_from_its_journal_though_a_line_was_cut(
     searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Killed while it wrote its second generation, it makes the same log to the last byte."""
-    whole = (searched / "log.jsonl").read_text()
-    (tmp_path / "log.jsonl").write_text(whole[: -len(whole.splitlines()[-1]) // 2])
+    """Killed while it wrote its second generation, it makes the same journal to the last byte."""
+    whole = (searched / "journal.jsonl").read_text()
+    shutil.copy(searched / "settings.toml", tmp_path)
+    (tmp_path / "journal.jsonl").write_text(whole[: -len(whole.splitlines()[-1]) // 2])
     assert main([*ARGV, "--generations", "2", "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "log.jsonl").read_text() == whole
+    assert (tmp_path / "journal.jsonl").read_text() == whole
     assert "of 8 points have every entry within tolerance" in capsys.readouterr().out
 
 
@@ -229,51 +240,82 @@ def test_the_smallest_error_is_searched_for_and_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Weights and the trigger's own keys; the first point is the scenario's, the best no worse."""
-    argv = ["calibrate", "paper", "--objective", "rmse", "--packets", "0.3", *ARGV[5:]]
+    argv = ["calibrate", "paper", "--objective", "rmse", "--packets", "0.3", *SHORT]
     assert main([*argv, "--generations", "2", "--out", str(tmp_path)]) == 0
-    settings, *generations = map(json.loads, (tmp_path / "log.jsonl").read_text().splitlines())
+    settings = tomllib.loads((tmp_path / "settings.toml").read_text())
     assert (settings["objective"], settings["packets"]) == ("rmse", 0.3)
-    points = [point for generation in generations for point in generation]
-    best = min(points, key=lambda point: point["score"])
+    points = flown(tmp_path)
+    best = min(points, key=lambda point: point.score)
     found = config.load(str(tmp_path / "best.toml"))
-    assert found.control.epsilon == best["keys"]["control.epsilon"]
+    assert found.control.epsilon == best.keys["control.epsilon"]
     assert found.control.state_weight == (
         PAPER.control.state_weight[0],
-        best["keys"]["control.state_weight.1"],
+        best.keys["control.state_weight.1"],
     )
-    assert points[0]["keys"]["control.input_weight"] == PAPER.control.input_weight
-    assert best["score"] < points[0]["score"]
+    assert points[0].keys["control.input_weight"] == PAPER.control.input_weight
+    assert best.score < points[0].score
     said = capsys.readouterr().out
-    assert f"{best['values'][HERE]['rmse_xy']:.4f}" in said
-    assert f"{best['values'][HERE]['event_ratio']:.4f}" in said
+    assert f"{best.values[HERE]['rmse_xy']:.4f}" in said
+    assert f"{best.values[HERE]['event_ratio']:.4f}" in said
     assert main([*argv, "--packets", "0.2", "--generations", "2", "--out", str(tmp_path)]) == 2
-    assert "holds a search with another packets" in capsys.readouterr().err
+    assert "packets: got 0.2, expected 0.3, to go on there" in capsys.readouterr().err
 
 
 def test_another_search_in_the_same_folder_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    searched: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Another search would be told scores of other flights."""
-    argv = [*ARGV, "--out", str(tmp_path)]
-    (tmp_path / "log.jsonl").write_text(
-        json.dumps({"scenario": "", "free": [], "runs": 2, "population": 4, "sigma": 0.1}) + "\n"
-    )
-    assert main(argv) == 2
-    said = f"{tmp_path}: holds a search with another scenario; continue that one, or give another"
-    assert capsys.readouterr().err.strip() == f"calibrate: {said} --out"
+    """It would be told scores of other flights."""
+    assert main([*ARGV, "--settle", "1", "--out", str(searched)]) == 2
+    said = f"{searched}: settle: got 1.0, expected 0.0, to go on there; or another --out"
+    assert capsys.readouterr().err.strip() == f"calibrate: {said}"
 
 
-def test_a_log_that_does_not_fit_the_search_is_refused(
+def test_a_journal_that_does_not_fit_the_search_is_refused(
     searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Such a log's scores belong to other points."""
-    settings, generation, _ = (searched / "log.jsonl").read_text().splitlines()
-    points = json.loads(generation)
+    """Its scores belong to other points."""
+    shutil.copy(searched / "settings.toml", tmp_path)
+    _, points = json.loads((searched / "journal.jsonl").read_text().splitlines()[0])
     points[2]["keys"]["reference.radius_m"] *= 1.1
-    (tmp_path / "log.jsonl").write_text(f"{settings}\n{json.dumps(points)}\n")
+    (tmp_path / "journal.jsonl").write_bytes(sealed(json.dumps(points).encode()))
     assert main([*ARGV, "--generations", "2", "--out", str(tmp_path)]) == 2
-    said = f"calibrate: {tmp_path}: generation 1 was another search's; give another --out"
+    said = (
+        f"calibrate: {tmp_path}: got other points in generation 1, "
+        "expected those of this search; or another --out"
+    )
     assert capsys.readouterr().err.strip() == said
+
+
+def test_a_changed_digit_in_a_journal_is_refused(
+    searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A score that was never flown would lead the search, and no other check would notice."""
+    shutil.copy(searched / "settings.toml", tmp_path)
+    file = tmp_path / "journal.jsonl"
+    one, two = (searched / "journal.jsonl").read_text().splitlines(keepends=True)
+    at = two.index('"score":') + 8
+    file.write_text(one + two[:at] + str(9 - int(two[at])) + two[at + 1 :])
+    assert main([*ARGV, "--generations", "2", "--out", str(tmp_path)]) == 2
+    said = f"calibrate: {file}: line 2 is not what was written: its checksum is wrong"
+    assert capsys.readouterr().err.strip() == said
+
+
+def test_a_trajectory_edited_between_two_calls_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Points flown along it and points flown along the one before have no common best."""
+    table = tmp_path / "path.csv"
+    table.write_text("t,x,y\n0,0,0\n5,1,1\n")
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text('extends = "paper"\nreference = { shape = "csv", file = "path.csv" }\n')
+    argv = ["calibrate", str(scenario), *SHORT, "--out", str(tmp_path / "out")]
+    argv += ["--free", "model.tau_s.0=0.2:2"]
+    assert main([*argv, "--generations", "1"]) == 0
+    table.write_text("t,x,y\n0,0,0\n5,1,2\n")
+    assert main([*argv, "--generations", "2"]) == 2
+    said = capsys.readouterr().err
+    assert f"out: files.{table}: got " in said
+    assert said.endswith(", to go on there; or another --out\n")
 
 
 @pytest.mark.parametrize(

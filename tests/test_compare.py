@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from msgspec.structs import replace
 from lab import contenders
 from lab.calibration import Rmse
 from lab.comparison import CLAIMS, Claim, Flown, judge, measure, ratio
-from lab.contenders import CASES, CONTENDERS, Contender, Flying
+from lab.contenders import CASES, CONTENDERS, Contender, Flying, Found
 from shared import config
 from shared.config import COMPARED, Scenario
 from shared.summary import summarise
@@ -29,7 +30,7 @@ from skytether.__main__ import main
 
 PAPER = config.load("paper")
 BY_NAME = {contender.name: contender for contender in CONTENDERS}
-SCALE = contenders.full(100, 40)
+SCALE = contenders.Scale(100, 40)
 QUIET = CASES[0]
 
 
@@ -65,7 +66,7 @@ def test_a_scenario_that_comes_along_is_its_contender_with_weights_that_were_fre
         (contender, case)
         for contender in CONTENDERS
         for case in CASES
-        if f"{COMPARED}/{contenders.file_name(contender, case)}" == f"{name}.toml"
+        if f"{COMPARED}/{contenders.entry(contender, case)}" == name
     ]
     start = contenders.search_start(*pair, SCALE)
     scenario, free = config.load(name), Rmse(start, 0.1).free()
@@ -75,7 +76,14 @@ def test_a_scenario_that_comes_along_is_its_contender_with_weights_that_were_fre
     }
     assert changed <= {key.key.removesuffix(".0").removesuffix(".1") for key in free}
     assert scenario.control.state_weight[0] == PAPER.control.state_weight[0]
+    assert scenario.title == f"{pair[0].title}, at its best: {pair[1].title}"
     assert "compare" not in " ".join(config.names())
+
+
+def test_every_contender_in_every_case_comes_along() -> None:
+    """Under its name, in one file."""
+    pairs = {contenders.entry(contender, case) for contender in CONTENDERS for case in CASES}
+    assert {name.removeprefix("compare/") for name in config.names(COMPARED)} == pairs
 
 
 def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
@@ -84,14 +92,16 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
     start = contenders.search_start(contender, case, SCALE)
     control = replace(start.control, state_weight=(7.1, 1e-4), cost_gap=12.5)
     found = replace(start, control=control)
-    file = tmp_path / contenders.file_name(contender, case)
-    file.write_bytes(contenders.to_file(contender, case, found, "Found."))
-    read = config.load(str(file))
+    file = tmp_path / "mine.toml"
+    file.write_text(contenders.to_file([Found(contender, case, found, "A line.")], SCALE))
+    read = config.load(f"{file}/committed-gap-tau-1.25")
     assert replace(read, title="") == replace(
         found, title="", duration=PAPER.duration, seed=PAPER.seed
     )
-    assert file.read_text().startswith("# Found.\n")
+    assert "# 40 generations of 10 points,\n# each flown with 8 seeds" in file.read_text()
+    assert '# A line.\n["committed-gap-tau-1.25"]\n' in file.read_text()
     assert "radius" not in file.read_text()
+    assert config.names(str(file)) == [f"{file}/committed-gap-tau-1.25"]
 
 
 def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, bool]:
@@ -264,9 +274,9 @@ FLOWN = 120
 
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with quick weights, and the logs of their searches in `out`."""
+    """The folder of quick searches, with the file of the weights that they have found."""
     folder = tmp_path_factory.mktemp("tuned")
-    assert main([*TUNE, "--scenarios", str(folder), "--out", str(folder / "out")]) == 0
+    assert main([*TUNE, "--out", str(folder)]) == 0
     return folder
 
 
@@ -274,20 +284,23 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def out(tuned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a quick comparison."""
     folder = tmp_path_factory.mktemp("compare")
-    assert main(["compare", "--quick", "--scenarios", str(tuned), "--out", str(folder)]) == 0
+    weights = str(tuned / "weights.toml")
+    assert main(["compare", "--quick", "--weights", weights, "--out", str(folder)]) == 0
     return folder
 
 
 def test_every_contender_gets_the_same_search(tuned: Path) -> None:
     """Seeds, points and flights; what it found is its scenario."""
-    logs = sorted((tuned / "out" / "searches").iterdir())
-    assert len(logs) == len(list(tuned.glob("*.toml"))) == 2 * len(CONTENDERS)
-    for log in logs:
-        head, generation = map(json.loads, (log / "log.jsonl").read_text().splitlines())
+    weights, searches = tuned / "weights.toml", list((tuned / "searches").iterdir())
+    assert len(searches) == len(config.names(str(weights))) == 2 * len(CONTENDERS)
+    for folder in searches:
+        head = tomllib.loads((folder / "settings.toml").read_text())
+        (line,) = (folder / "journal.jsonl").read_text().splitlines()
+        _, generation = json.loads(line)
         same = (head["runs"], head["population"], head["sigma"], head["packets"], len(generation))
         assert same == (2, 4, 0.1, 0.1, 4)
         best = min(generation, key=lambda point: point["score"])
-        found = config.load(str(tuned / f"{log.name}.toml"))
+        found = config.load(f"{weights}/{folder.name}")
         assert found.control.input_weight == best["keys"]["control.input_weight"]
         assert found.duration == PAPER.duration
 
@@ -295,10 +308,10 @@ def test_every_contender_gets_the_same_search(tuned: Path) -> None:
 def test_searches_that_are_done_are_not_done_again(
     tuned: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A repeated command reads their logs, and writes what it wrote before."""
+    """The same command reads their journals, and writes the same."""
     kept = {path: path.read_bytes() for path in tuned.rglob("*") if path.is_file()}
-    monkeypatch.setattr(pool, "share", None)
-    assert main([*TUNE, "--scenarios", str(tuned), "--out", str(tuned / "out")]) == 0
+    monkeypatch.setattr(pool.Crew, "share", None)
+    assert main([*TUNE, "--out", str(tuned)]) == 0
     assert {path: path.read_bytes() for path in tuned.rglob("*") if path.is_file()} == kept
 
 
@@ -308,13 +321,14 @@ def rows(file: Path) -> list[dict[str, str]]:
 
 
 def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None:
-    """Means over the seeds from 1 on, of the scenario in the folder."""
+    """Means over the seeds from 1 on, of the scenario in the file of weights."""
     table = rows(out / "contenders.csv")
     assert [row["contender"] for row in table] == [each.name for each in CONTENDERS] * 2
     (row,) = [
         row for row in table if (row["case"], row["contender"]) == ("wind-0.3", "committed-gap")
     ]
-    scenario = replace(config.load(str(tuned / "committed-gap-wind-0.3.toml")), duration=15.0)
+    found = config.load(f"{tuned / 'weights.toml'}/committed-gap-wind-0.3")
+    scenario = replace(found, duration=15.0)
     runs = [
         summarise(scenario, "", each.client, each.server, each.netem)
         for each in flight.fly_batch(scenario, [1, 2, 3])
@@ -353,7 +367,8 @@ def test_the_second_time_it_only_draws(
 ) -> None:
     """A second run flies nothing, and says what the first one said."""
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    assert main(["compare", "--quick", "--scenarios", str(tuned), "--out", str(out)]) == 0
+    weights = str(tuned / "weights.toml")
+    assert main(["compare", "--quick", "--weights", weights, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "2 figures; 0 runs flown" in said
     assert "ratios that are asked for hold" in said
@@ -367,45 +382,56 @@ def test_other_weights_are_another_comparison(
     out: Path, tuned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What was flown with those of before is not mixed with them."""
-    for file in tuned.glob("*.toml"):
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    file = tmp_path / "paper-every-step-quiet.toml"
-    file.write_text(file.read_text().replace("input_weight", "input_weight = 77.0 #"))
-    assert main(["compare", "--quick", "--scenarios", str(tmp_path), "--out", str(out)]) == 2
-    assert "as the sweep there began; or another --out" in capsys.readouterr().err
+    file = tmp_path / "mine.toml"
+    weights = (tuned / "weights.toml").read_text()
+    file.write_text(weights.replace("input_weight = ", "input_weight = 77", 1))
+    assert main(["compare", "--quick", "--weights", str(file), "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"compare: {out / 'sweeps' / 'quiet'}: grid: got [")
+    assert said.endswith("], to go on there; or another --out\n")
 
 
 def test_weights_that_nobody_has_searched_for_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Rather than the plant's own, in silence."""
-    assert main(["compare", "--quick", "--scenarios", str(tmp_path), "--out", str(tmp_path)]) == 2
-    file = tmp_path / "paper-every-step-quiet.toml"
-    said = f"compare: {file}: there is none; `skytether compare --tune` makes it"
+    file = tmp_path / "mine.toml"
+    argv = ["compare", "--quick", "--weights", str(file), "--out", str(tmp_path)]
+    assert main(argv) == 2
+    said = f"compare: {file}: cannot be read: No such file or directory"
+    assert capsys.readouterr().err.strip() == said
+    file.write_text('["paper-every-step-quiet"]\nextends = "paper"\n')
+    assert main(argv) == 2
+    said = (
+        f"compare: {file}: got no table 'paper-event-quiet', "
+        "expected every contender in every case, as --tune writes them"
+    )
     assert capsys.readouterr().err.strip() == said
 
 
 def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is in its log stays there."""
-    argv = [*TUNE[:3], "--generations", "2", "--workers", "1"]
-    argv += ["--scenarios", str(tmp_path / "s"), "--out", str(tmp_path)]
-    log = tmp_path / "searches" / "paper-every-step-quiet" / "log.jsonl"
+    """What is in its journal stays there."""
+    argv = [*TUNE[:3], "--generations", "2", "--workers", "1", "--out", str(tmp_path)]
+    journal = tmp_path / "searches" / "paper-every-step-quiet" / "journal.jsonl"
     with subprocess.Popen(
         [sys.executable, "-P", "-m", "skytether", *argv], stderr=subprocess.PIPE, text=True
     ) as process:
-        while process.poll() is None and not (log.exists() and log.read_text().count("\n") > 1):
+        while process.poll() is None and not (
+            journal.exists() and journal.read_text().count("\n") > 0
+        ):
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=60)
     assert process.returncode == 130, said
-    assert f"of {2 * len(CONTENDERS)} searches done; the same command goes on" in said
-    flown = log.read_text()
+    assert f"of {4 * len(CONTENDERS)} generations done; the same command goes on" in said
+    assert not (tmp_path / "weights.toml").exists()
+    flown = journal.read_text()
     monkeypatch.setattr(compare, "CONTENDERS", CONTENDERS[:2])  # the others take their time
     assert main(argv) == 0
-    assert log.read_text().startswith(flown)
-    assert len(list((tmp_path / "s").iterdir())) == 2 * 2
+    assert journal.read_text().startswith(flown)
+    assert len(config.names(str(tmp_path / "weights.toml"))) == 2 * 2
 
 
 @pytest.mark.parametrize(

@@ -316,6 +316,27 @@ def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:
     assert refusal("xyz") == f"xyz: no such scenario; there are {', '.join(config.names())}"
 
 
+def test_a_file_of_scenarios_holds_one_in_each_table(tmp_path: Path) -> None:
+    """Each is flown by the path of the file and its own name, and laid over what it extends."""
+    path = write(tmp_path, "many.toml", '[one]\nextends = "paper"\nseed = 9\n["two.5"]\nseed = 8')
+    mine = write(tmp_path, "mine.toml", 'extends = "many.toml/one"\nduration = 7.0')
+    assert config.names(str(path)) == [f"{path}/one", f"{path}/two.5"]
+    paper = config.to_table(config.load("paper"))
+    assert config.to_table(config.load(f"{path}/one")) == {**paper, "seed": 9}
+    assert config.to_table(config.load(str(mine))) == {**paper, "seed": 9, "duration": 7.0}
+    assert config.load(f"{path}/two.5").seed == 8
+    with pytest.raises(ConfigError, match=r"many.toml/on: no such scenario; did you mean one\?"):
+        config.load(f"{path}/on")
+
+
+def test_the_compared_scenarios_are_no_scenario_themselves() -> None:
+    """But one of them is, and one that is not there is refused."""
+    assert refusal("compare").startswith("compare: no such scenario; there are demo, ")
+    assert config.load("compare/paper-event-gusts").vehicle.gust_mps2 == 1.0
+    said = "compare/paper-evnt-gusts: no such scenario; did you mean paper-event-gusts?"
+    assert refusal("compare/paper-evnt-gusts") == said
+
+
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     """With the system's reason."""
     path = tmp_path / "none.toml"

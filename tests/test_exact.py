@@ -1,5 +1,7 @@
 """The exact solver: right to rounding, the same whatever came before, and never a guess."""
 
+from collections.abc import Callable
+from types import FunctionType
 from typing import Any
 
 import msgspec
@@ -11,10 +13,12 @@ from scipy.optimize import lsq_linear
 
 from benchmarks.problems import gradients
 from server import exact
-from server.exact import ExactSolver
+from server.exact import ExactSolver, active_set, workspace
 from server.mpc import LATER, Problem, make_mpc, pose
+from server.planner import make_solver
 from server.solver import OsqpSolver
 from shared import config
+from shared.kernel import part
 from shared.model import Array
 
 PAPER = config.load("paper")
@@ -36,6 +40,19 @@ def make(
 
 ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 1.0)}
 """Long steps and hardly a cost of the input: here sets wander in circles."""
+
+
+def active_set_with(**constants: float) -> Callable[..., int]:
+    """`active_set` compiled with other constants than those of its module."""
+    code = exact.active_set.py_func.__code__
+    return part(FunctionType(code, {**vars(exact), **constants}))
+
+
+@pytest.fixture
+def no_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sets that wander are given up at once."""
+    changed = {**vars(exact), "active_set": active_set_with(PIVOTS_MAX=0)}
+    monkeypatch.setattr(exact, "_solve", FunctionType(exact._solve.py_func.__code__, changed))
 
 
 def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Array, Array]:
@@ -92,13 +109,13 @@ def test_every_answer_is_optimal_and_within_its_box(
     assert residual(problem, inputs, gradient) < 1e-10
 
 
-@pytest.mark.parametrize(("pivots", "fewest", "most"), [(None, 0, 5), (0, 100, 600)])
+@pytest.mark.parametrize(("pivots", "fewest", "most"), [(True, 0, 5), (False, 100, 600)])
 def test_problems_that_cycle_are_solved_all_the_same(
-    monkeypatch: pytest.MonkeyPatch, pivots: int | None, fewest: int, most: int
+    request: pytest.FixtureRequest, pivots: bool, fewest: int, most: int
 ) -> None:
     """One input at a time, and without that by DAQP; as exactly either way."""
-    if pivots is not None:
-        monkeypatch.setattr(exact, "PIVOTS_MAX", pivots)
+    if not pivots:
+        request.getfixturevalue("no_pivots")
     problem = make((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
     solver = ExactSolver(problem)
@@ -109,11 +126,11 @@ def test_problems_that_cycle_are_solved_all_the_same(
     assert residual(problem, inputs, gradient) < 1e-10
 
 
+@pytest.mark.usefixtures("no_pivots")
 def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Such an answer is right to rounding and yet has a slope: no reason to refuse it."""
-    monkeypatch.setattr(exact, "PIVOTS_MAX", 0)
     dual = exact.daqp.solve
 
     def nearly(*args: object, **keys: object) -> object:
@@ -130,11 +147,11 @@ def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
     assert residual(problem, inputs, gradient) < 1e-10
 
 
+@pytest.mark.usefixtures("no_pivots")
 def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A wrong answer of DAQP is not believed: those vehicles keep their guess, others fly on."""
-    monkeypatch.setattr(exact, "PIVOTS_MAX", 0)
     problem = make((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
     right, _ = ExactSolver(problem).solve(gradient, guess)
@@ -184,19 +201,20 @@ def test_the_guess_decides_nothing_but_the_time() -> None:
 
 def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     """The warm start of every saturated flight: one round, though 1.8 has become 1.7999999."""
-    problem = make((0.855, 0.855))
-    u_max = np.array([1.8, 1.8])
+    problem = make((0.855, 0.855), (1.8, 1.8))
     gradient, guess = problems(problem, 20, 10.0, seed=6)
-    solver = ExactSolver(problem, u_max)
-    inputs, _ = solver.solve(gradient, guess)
+    inputs, _ = ExactSolver(problem).solve(gradient, guess)
     assert (np.abs(inputs) == 1.8).mean() > 0.5
     rounded = inputs.astype(np.float32).astype(np.float64)
     assert np.abs(rounded).max() < 1.8
-    again, rounds, _ = exact._riccati_active_set(*solver._problem, gradient, rounded, NEAR, 1, 0)
-    assert (rounds == 1).all()
-    np.testing.assert_array_equal(again, inputs)
-    _, rounds, _ = exact._riccati_active_set(*solver._problem, gradient, rounded, 1.0, 1, 0)
-    assert (rounds == exact.CYCLED).any()
+    work, again, more = workspace(problem.mpc), np.empty(problem.hessian.shape[1]), []
+    strict = active_set_with(NEAR=1.0)
+    for at in np.ndindex(20, 2):
+        given_ = (problem.mpc, at[1], LATER, work, gradient[at], rounded[at], 0, False, again)
+        assert active_set(*given_) == 1
+        np.testing.assert_array_equal(again, inputs[at])
+        more.append(strict(*given_))
+    assert max(more) > 1
 
 
 def test_osqp_agrees_to_its_tolerance() -> None:
@@ -211,4 +229,8 @@ def test_osqp_agrees_to_its_tolerance() -> None:
 
 def test_a_scenario_names_its_solver() -> None:
     """Exact is the default; osqp is the reference."""
-    assert config.load("paper").control.solver == "exact"
+    assert PAPER.control.solver == "exact"
+    kinds = {"exact": ExactSolver, "osqp": OsqpSolver}
+    for name, kind in kinds.items():
+        control = msgspec.structs.replace(PAPER.control, solver=name)
+        assert type(make_solver(control, make())) is kind

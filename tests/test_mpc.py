@@ -12,9 +12,18 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 
 from benchmarks.problems import gradients
-from server.mpc import FIRST, LATER, Problem, add_cost, follow, make_mpc, pose, shifted
-from server.mpc import lead as lead_toward
-from server.mpc import stationary_gain
+from server.mpc import (
+    FIRST,
+    LATER,
+    Problem,
+    add_cost,
+    follow,
+    lead,
+    make_mpc,
+    pose,
+    shifted,
+    stationary_gain,
+)
 from server.solver import OsqpSolver
 from shared.config import ControlConfig, ModelConfig, Scenario
 from shared.model import Array, discretise
@@ -187,7 +196,7 @@ def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int
         follow(
             problem.mpc, axis, start, wind, tuple(x[axis].tolist()), u[axis], states[axis], drift
         )
-        lead_toward(problem.mpc, axis, start, wind, states[axis], toward)
+        lead(problem.mpc, axis, start, wind, states[axis], toward)
         np.testing.assert_array_equal(drift, toward)
     np.testing.assert_array_equal(states[:, 0], x)
     for stage in range(H):

@@ -21,7 +21,6 @@ from sim.flight import Flight, fly, fly_batch
 
 H, BOUND = 6, 4
 ROW = np.array([0])
-HERE = np.zeros((2, 2))
 HORIZON_BYTES = 300
 """More than a heartbeat has."""
 

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import pytest
 from msgspec.structs import replace
 
 from lab import figures
-from lab.journal import Journal
+from lab.journal import Journal, sealed
 from lab.sweep import CHUNK, Axis, Done, Sweep, estimate, fly, parse_axis
 from shared import config
 from shared.config import ConfigError
@@ -27,11 +28,9 @@ from sim import flight
 
 PATIENCE_S = 30.0
 
-SWEEP = [
-    *("sweep", "paper", "--duration", "5", "--settle", "1", "--runs", "60"),
-    *("--grid", "control.epsilon=1:3:2", "--grid", "control.trigger=state_gap,periodic"),
-]
-"""Four cells, three tasks each."""
+SWEEP = ["sweep", "paper", "--duration", "5", "--settle", "1", "--runs", "60"]
+SWEEP += ["--grid", "control.epsilon=1:3:2", "--grid", "control.trigger=state_gap,periodic"]
+"""A sweep of four cells, with three tasks each."""
 TASKS = 12
 TABLES = ("runs.csv", "cells.csv")
 
@@ -63,20 +62,25 @@ def test_a_grid_is_read_as_it_is_meant(text: str, key: str, values: tuple[Any, .
     assert parse_axis(str(axis)) == axis
 
 
+NO_GRIDS = [
+    "control.epsilon",
+    "control.epsilon=",
+    "=1,2",
+    "control.epsilon=1:2",
+    "control.epsilon=1:2:1",
+    "control.epsilon=1:2:3.5",
+    "control.epsilon=a:b:3",
+    "control.epsilon=0:inf:3",
+    "control.epsilon=1,,2",
+    "control.epsilon=[1,2",
+]
 FORM = "expected KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        *(
-            (text, f"--grid: got {text!r}, {FORM}")
-            for text in (
-                *("control.epsilon", "control.epsilon=", "=1,2", "control.epsilon=1:2"),
-                *("control.epsilon=1:2:1", "control.epsilon=1:2:3.5", "control.epsilon=a:b:3"),
-                *("control.epsilon=0:inf:3", "control.epsilon=1,,2", "control.epsilon=[1,2"),
-            )
-        ),
+        *((text, f"--grid: got {text!r}, {FORM}") for text in NO_GRIDS),
         ("seed=1,2", "--grid: got 'seed', expected another key: it counts the runs of a cell"),
         (
             "control.epsilon=1,2,1.0",
@@ -227,35 +231,43 @@ OTHERS = {
 }
 
 
+def journal_of(plan: Sweep, folder: Path) -> Journal[Done]:
+    """The journal of a sweep."""
+    return Journal(folder, plan.settings(), Done)
+
+
 @pytest.mark.parametrize(("said", "other"), OTHERS.items(), ids=OTHERS)
 def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_path: Path) -> None:
     """Naming the key, what was given and what the sweep began with."""
-    Journal(tmp_path, ONE, "1").close()
+    journal_of(ONE, tmp_path).close()
     with pytest.raises(ConfigError) as refused:
-        Journal(tmp_path, other, "1")
-    assert str(refused.value) == (f"{tmp_path}: {said}, as the sweep there began; or another --out")
+        journal_of(other, tmp_path)
+    assert str(refused.value) == f"{tmp_path}: {said}, to go on there; or another --out"
 
 
-def test_another_version_is_refused(tmp_path: Path) -> None:
-    """Another version may fly otherwise."""
-    Journal(tmp_path, ONE, "1").close()
-    with pytest.raises(ConfigError, match=r"version: got '2', expected '1'"):
-        Journal(tmp_path, ONE, "2")
+def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may fly otherwise."""
+    journal_of(ONE, tmp_path).close()
+    here = metadata.version("skytether")
+    monkeypatch.setattr(metadata, "version", lambda _: "2")
+    with pytest.raises(ConfigError, match=rf"version: got '2', expected '{here}'"):
+        journal_of(ONE, tmp_path)
 
 
 def test_two_sweeps_do_not_write_to_one_folder(tmp_path: Path) -> None:
     """The second is told; once the first is over, it may."""
-    told = pytest.raises(ConfigError, match="another sweep is writing there")
-    with closing(Journal(tmp_path, ONE, "1")), told:
-        Journal(tmp_path, ONE, "1")
-    Journal(tmp_path, ONE, "1").close()
+    told = pytest.raises(ConfigError, match="another command is writing there")
+    with closing(journal_of(ONE, tmp_path)), told:
+        journal_of(ONE, tmp_path)
+    journal_of(ONE, tmp_path).close()
 
 
 def test_results_without_settings_are_not_taken_for_ours(tmp_path: Path) -> None:
     """Nobody knows what they are of."""
-    (tmp_path / "runs.jsonl").write_text("{}\n")
-    with pytest.raises(ConfigError, match=r"got runs.jsonl without sweep.toml, expected both"):
-        Journal(tmp_path, ONE, "1")
+    (tmp_path / "journal.jsonl").write_text("{}\n")
+    said = "got journal.jsonl without settings.toml, expected both"
+    with pytest.raises(ConfigError, match=said):
+        journal_of(ONE, tmp_path)
 
 
 def done(cell: int) -> Done:
@@ -266,28 +278,75 @@ def done(cell: int) -> Done:
 @pytest.mark.parametrize("cut", [1, 8, 20])
 def test_half_a_line_at_the_end_is_overwritten(cut: int, tmp_path: Path) -> None:
     """A killed writer's last; everything before it is kept."""
-    with closing(Journal(tmp_path, ONE, "1")) as journal:
+    with closing(journal_of(ONE, tmp_path)) as journal:
         journal.append(done(0))
         journal.append(done(1))
-    file = tmp_path / "runs.jsonl"
+    file = tmp_path / "journal.jsonl"
     whole = file.read_bytes()
     file.write_bytes(whole[:-cut])
-    with closing(Journal(tmp_path, ONE, "1")) as journal:
-        assert journal.done == {(0, 0): done(0)}
+    with closing(journal_of(ONE, tmp_path)) as journal:
+        assert journal.entries == [done(0)]
         journal.append(done(1))
     assert file.read_bytes() == whole
-    with closing(Journal(tmp_path, ONE, "1")) as journal:
-        assert journal.done == {(0, 0): done(0), (1, 0): done(1)}
+    with closing(journal_of(ONE, tmp_path)) as journal:
+        assert journal.entries == [done(0), done(1)]
 
 
 def test_a_line_that_is_no_task_is_named(tmp_path: Path) -> None:
     """No kill leaves one behind: somebody has been there."""
-    with closing(Journal(tmp_path, ONE, "1")) as journal:
+    with closing(journal_of(ONE, tmp_path)) as journal:
         journal.append(done(0))
-    with (tmp_path / "runs.jsonl").open("ab") as file:
-        file.write(b"{}\n")
-    with pytest.raises(ConfigError, match=r"runs.jsonl: line 2 is no task that was done"):
-        Journal(tmp_path, ONE, "1")
+    with (tmp_path / "journal.jsonl").open("ab") as file:
+        file.write(sealed(b"{}"))
+    said = r"journal.jsonl: line 2 is not what was written: Object missing required field `cell`"
+    with pytest.raises(ConfigError, match=said):
+        journal_of(ONE, tmp_path)
+
+
+@pytest.mark.parametrize("bit", range(8))
+def test_a_line_with_a_flipped_bit_is_refused(bit: int, tmp_path: Path) -> None:
+    """Wherever it is but in the last line's end, which a killed writer may have left out."""
+    with closing(journal_of(ONE, tmp_path)) as journal:
+        journal.append(done(0))
+        journal.append(done(1))
+    file = tmp_path / "journal.jsonl"
+    whole = file.read_bytes()
+    for place in range(len(whole) - 1):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
+        with pytest.raises(ConfigError, match=r"line \d is not what was written"):
+            journal_of(ONE, tmp_path)
+
+
+def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With file, line, and an exit code of its own."""
+    from skytether.__main__ import main
+
+    argv = ["sweep", "paper", "--duration", "2", "--settle", "0", "--runs", "1", "--workers", "1"]
+    assert main([*argv, "--out", str(tmp_path)]) == 0
+    file = tmp_path / "journal.jsonl"
+    file.write_text(file.read_text().replace('"steps":40', '"steps":41'))
+    capsys.readouterr()
+    assert main([*argv, "--out", str(tmp_path)]) == 2
+    said = f"sweep: {file}: line 1 is not what was written: its checksum is wrong\n"
+    assert capsys.readouterr().err == said
+
+
+def test_a_trajectory_edited_between_two_sweeps_is_refused(tmp_path: Path) -> None:
+    """One cell would hold flights along both, and its mean would be of neither."""
+    paths = [tmp_path / name for name in ("one.csv", "two.csv")]
+    for path in paths:
+        path.write_text("t,x,y\n0,0,0\n5,1,1\n")
+    table = config.to_table(PAPER) | {"reference": {"shape": "csv", "file": str(paths[0])}}
+    grid = parse_axis(f"reference.file={paths[0]},{paths[1]}")
+    plan = Sweep("mine", config.check(table, "mine"), [grid], 3)
+    journal_of(plan, tmp_path / "out").close()
+    journal_of(plan, tmp_path / "out").close()
+    paths[1].write_text("t,x,y\n0,0,0\n5,1,2\n")
+    with pytest.raises(ConfigError) as refused:
+        journal_of(plan, tmp_path / "out")
+    assert str(refused.value).startswith(f"{tmp_path}/out: files.{paths[1]}: got '")
 
 
 # -- the command ---------------------------------------------------------------------------------
@@ -313,7 +372,7 @@ def wait_for(what: Callable[[], bool]) -> None:
 
 def lines(out: Path) -> int:
     """Tasks that are done in a folder."""
-    file = out / "runs.jsonl"
+    file = out / "journal.jsonl"
     return file.read_bytes().count(b"\n") if file.exists() else 0
 
 
@@ -383,10 +442,10 @@ def test_two_keys_make_maps(whole: Path) -> None:
 def test_a_killed_sweep_goes_on_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
     """SIGKILL half-way: its worker ends with it, and the rest gives the same bytes as ever."""
     broken_off(signal.SIGKILL, tmp_path)
-    kept = (tmp_path / "runs.jsonl").read_bytes()
+    kept = (tmp_path / "journal.jsonl").read_bytes()
     resumed = run(*SWEEP, "--out", str(tmp_path), "--workers", "1")
     assert resumed.returncode == 0, resumed.stderr
-    assert (tmp_path / "runs.jsonl").read_bytes().startswith(kept.rpartition(b"\n")[0])
+    assert (tmp_path / "journal.jsonl").read_bytes().startswith(kept.rpartition(b"\n")[0])
     assert lines(tmp_path) == TASKS
     assert tables(tmp_path) == tables(whole)
 
@@ -400,8 +459,8 @@ def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path)
         ended.stderr,
     )
     assert said
-    kept = map(json.loads, (tmp_path / "runs.jsonl").read_text().splitlines())
-    assert sum(len(task["runs"]) for task in kept) == int(said[1])
+    kept = map(json.loads, (tmp_path / "journal.jsonl").read_text().splitlines())
+    assert sum(len(task["runs"]) for _, task in kept) == int(said[1])
 
 
 @pytest.mark.parametrize(
@@ -434,7 +493,7 @@ needs_dask = pytest.mark.skipif(
 )
 
 
-def dask(stack: ExitStack, *argv: str, folder: Path) -> subprocess.Popen[str]:
+def dask(stack: ExitStack, argv: list[str], folder: Path) -> subprocess.Popen[str]:
     """A process of a cluster, ended with the stack."""
     process = stack.enter_context(
         subprocess.Popen(
@@ -452,12 +511,14 @@ def dask(stack: ExitStack, *argv: str, folder: Path) -> subprocess.Popen[str]:
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
     """A scheduler and two workers, one of them killed on the way."""
     with ExitStack() as stack:
-        local = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
-        scheduler = dask(stack, "scheduler", *local, folder=tmp_path)
+        argv = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+        scheduler = dask(stack, argv, tmp_path)
         assert scheduler.stderr is not None
         at = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
-        single = ("--nthreads", "1", "--no-nanny", "--no-dashboard")
-        workers = [dask(stack, "worker", at, *single, folder=tmp_path) for _ in range(2)]
+        workers = [
+            dask(stack, ["worker", at, "--nthreads", "1", "--no-nanny", "--no-dashboard"], tmp_path)
+            for _ in range(2)
+        ]
         for worker in workers:
             assert worker.stderr is not None
             next(line for line in worker.stderr if "Registered to" in line)

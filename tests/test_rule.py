@@ -1,0 +1,212 @@
+"""The rule of flight: in plain numbers, and flown alike by the vehicle and the server's replay."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from client.compensator import Compensator
+from server import model as compiled
+from server.clock import ClockMap
+from server.mpc import stationary_gain
+from server.replay import Replay
+from server.scheme import Foresight, foresight
+from shared import rule
+from shared.config import Scenario, check
+from shared.model import Array
+from shared.protocol import Horizon, Observation
+from shared.rule import bounded, entry, flown, led_back, stage_at
+
+quick = settings(max_examples=200, deadline=None)
+
+# -- in plain numbers ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("step", "stage"), [(97, -3), (100, 0), (107, 7), (10**12, 10**12 - 100)])
+def test_a_stage_is_the_steps_since_the_horizon_was_made(step: int, stage: int) -> None:
+    """Without compensation it is the first, whatever the step."""
+    assert stage_at(step, 100, True) == stage
+    assert stage_at(step, 100, False) == 0
+
+
+@pytest.mark.parametrize(("stage", "index"), [(-3, 0), (0, 0), (4, 4), (9, 9), (10, 9), (999, 9)])
+def test_the_nearest_input_counts_where_a_horizon_has_none(stage: int, index: int) -> None:
+    """The first one before its first stage, and the last one after its last."""
+    assert entry(stage, 10) == index
+
+
+def test_an_input_is_kept_within_the_bound() -> None:
+    """On both sides; what lies within is left as it is."""
+    assert [bounded(u, 1.8) for u in (-5.0, -1.8, 0.1, 1.8, 1.8015)] == [-1.8, -1.8, 0.1, 1.8, 1.8]
+
+
+def test_feedback_leads_back_in_position_and_velocity() -> None:
+    """K (x̄ - x): each gain on its own part."""
+    assert led_back(3.0, 1.5, 0.25, 0.0) == 0.75
+    assert led_back(3.0, 1.5, 0.0, -0.5) == -0.75
+    assert led_back(3.0, 1.5, 0.25, -0.5) == 0.0
+
+
+@pytest.mark.parametrize("stage", [0, 9])
+@pytest.mark.parametrize("brake", [0.0, 0.2])
+@pytest.mark.parametrize(
+    ("told", "back", "u"), [(0.5, 0.0, 0.5), (0.5, 0.25, 0.75), (1.5, 9.0, 1.8), (0.5, -9.0, -1.8)]
+)
+def test_within_the_horizon_feedback_is_added_within_the_bound(
+    stage: int, brake: float, told: float, back: float, u: float
+) -> None:
+    """At its first stage as at its last; nothing is braked there."""
+    assert flown(stage, 10, told, back, 1.0, brake, 1.8) == u
+
+
+@pytest.mark.parametrize(("stage", "brake"), [(-1, 0.0), (-1, 0.2), (10, 0.0), (10**12, 0.0)])
+def test_an_input_is_held_without_feedback_where_the_horizon_has_none(
+    stage: int, brake: float
+) -> None:
+    """Before the first stage, and after the last for ever where nothing is braked."""
+    assert flown(stage, 10, 0.5, 0.25, 1.0, brake, 1.8) == 0.5
+
+
+def test_braking_takes_away_its_part_of_the_speed_at_every_step_until_rest() -> None:
+    """Of 0.5 m/s over all axes 0.125 m/s a step: three quarters, a half, a quarter, nothing."""
+    for told, u in ((0.3, 0.3), (-0.4, -0.4)):
+        braked = [flown(stage, 10, told, 9.0, 0.5, 0.125, 1.8) for stage in range(10, 16)]
+        assert braked == [0.75 * u, 0.5 * u, 0.25 * u, 0.0, 0.0, 0.0]
+    assert flown(10**12, 10, 0.3, 0.0, 0.5, 0.125, 1.8) == 0.0
+    assert flown(10, 10, 0.0, 0.0, 0.0, 0.125, 1.8) == 0.0  # at rest already
+
+
+speeds = st.floats(-3.0, 3.0)
+
+
+@quick
+@given(
+    st.integers(-5, 25),
+    st.integers(1, 12),
+    st.tuples(speeds, speeds, st.floats(0.0, 3.0), st.sampled_from([0.0, 0.1]), st.floats(0.1, 3)),
+)
+def test_compiled_it_says_the_same(
+    stage: int, length: int, numbers: tuple[float, float, float, float, float]
+) -> None:
+    """To the last bit, each function."""
+    assert compiled.flown(stage, length, *numbers) == flown(stage, length, *numbers)
+    assert compiled.led_back(*numbers[:4]) == led_back(*numbers[:4])
+    assert compiled.bounded(numbers[0], numbers[4]) == bounded(numbers[0], numbers[4])
+    assert compiled.entry(stage, length) == entry(stage, length)
+    for indexed in (True, False):
+        assert compiled.stage_at(stage, length, indexed) == stage_at(stage, length, indexed)
+
+
+# -- at both ends --------------------------------------------------------------------------------
+
+H, BOUND = 6, 4
+ROW = np.array([0])
+FIRST = 100
+"""Step that the horizon in force is made for."""
+
+
+def scenario(scheme: str, exhausted: str) -> Scenario:
+    """Six stages of 0.1 s, of which a delay takes up to four."""
+    raw = {
+        "model": {"tau_s": [0.81, 0.3], "u_max": [1.8, 0.9]},
+        "control": {
+            "dt": 0.1,
+            "horizon": H,
+            "delay_bound": 0.1 * BOUND,
+            "scheme": scheme,
+            "trigger": "always",
+            "observer_s": 2.0,
+        },
+        "vehicle": {"exhausted": exhausted, "brake_mps2": 2.0},
+        "network": {"uplink": {"delay": "none"}, "downlink": {"delay": "none"}},
+    }
+    return check(raw, "test")
+
+
+def make_horizon(rng: np.random.Generator, step: int, near: Array, gain: Array) -> Horizon:
+    """A horizon of any length and inputs, some beyond the bound, that leads on from near a state.
+
+    It brings feedback if there is a gain.
+    """
+    bound = np.array([[1.8], [0.9]])
+    inputs = rng.uniform(-1.2, 1.2, (2, rng.integers(H, 2 * H, endpoint=True))) * bound
+    origin = near + 0.1 * rng.normal(size=(2, 2))
+    feedback = np.column_stack([origin, 0.1 * rng.normal(size=2), gain]) if gain.size else gain
+    return Horizon(
+        1, 1, step, 0, 0, inputs.astype(np.float32), feedback=feedback.astype(np.float32)
+    )
+
+
+def send(replay: Replay, horizon: Horizon) -> None:
+    """The server remembers that it has sent a horizon."""
+    found, length = foresight(1, 2, H), horizon.inputs.shape[1]
+    found.ahead[:], found.horizons[0, :, :length] = length - H, horizon.inputs
+    if horizon.feedback.size:
+        found.feedback[0] = horizon.feedback
+    replay.remember(ROW, np.array([horizon.step]), found, np.array([True]))
+
+
+def foresee(replay: Replay, step: int) -> Foresight:
+    """What the server foresees at a step."""
+    found = foresight(1, 2, H)
+    replay.foresee(ROW, np.array([step]), found)
+    return found
+
+
+@quick
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    scheme=st.sampled_from(["committed", "feedback"]),
+    exhausted=st.sampled_from(["hold", "brake"]),
+    age=st.integers(-H, 30),
+    in_flight=st.sets(st.integers(1 - BOUND, 4), max_size=3),
+    later=st.integers(0, 5),
+)
+def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
+    *, seed: int, scheme: str, exhausted: str, age: int, in_flight: set[int], later: int
+) -> None:
+    """To the last bit, before the first stage of a horizon, within, and after the last.
+
+    The vehicle was last seen `age` stages into its horizon; others in flight were made so many
+    steps after that, and come into force when they have had their time. The observer sees that
+    nothing else acts on the vehicle.
+    """
+    setting, rng = scenario(scheme, exhausted), np.random.default_rng(seed)
+    terms = setting.terms()
+    gain = stationary_gain(terms.model, setting.control) if terms.feeds_back else np.zeros((2, 0))
+    vehicle = Compensator(terms)
+    replay = Replay(terms, setting.control, 1, 40, ClockMap(1, terms.dt_ns))
+    seen = FIRST + age
+    begin = min(FIRST, seen)
+    made = {seen + after for after in in_flight if seen + after > FIRST}
+    now = max({seen} | made) + later
+
+    x, states, inputs = rng.normal(size=(2, 2)), [], []
+    arriving = {begin: make_horizon(rng, FIRST, x, gain)}
+    send(replay, arriving[begin])
+    for step in range(begin, now + BOUND + H):
+        if step in made:
+            arriving[step + BOUND] = make_horizon(rng, step, x, gain)
+            send(replay, arriving[step + BOUND])
+        if step in arriving:
+            vehicle.offer(arriving[step], step)
+        if step in {begin, seen}:
+            replay.observe(0, Observation(1, 1, step, 0, FIRST, begin, 0, 0, x))
+            foresee(replay, step)
+        states.append(x)
+        inputs.append(vehicle.choose(step, x))
+        x = terms.model.step(x, inputs[-1])
+
+    found = foresee(replay, now)
+    assert found.ahead.tolist() == [BOUND]
+    assert not found.disturbance.any()
+    np.testing.assert_array_equal(found.estimate[0], states[now - begin])
+    np.testing.assert_array_equal(found.start[0], states[now + BOUND - begin])
+    reckoned = np.concatenate([found.committed[0, :, :BOUND], found.held[0]], axis=1)
+    np.testing.assert_array_equal(reckoned.T, inputs[now - begin :])
+
+
+def test_the_server_compiles_the_very_functions_that_the_vehicle_calls() -> None:
+    """There is one source of the rule."""
+    for name in ("stage_at", "entry", "bounded", "led_back", "flown"):
+        assert getattr(compiled, name).py_func is getattr(rule, name)
