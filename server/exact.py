@@ -97,7 +97,7 @@ def _backward(
 
 
 @part
-def active_set(
+def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and what they share
     mpc: MPC,
     axis: int,
     which: int,

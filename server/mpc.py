@@ -9,7 +9,7 @@ whose Hessian 𝓗 = ΓᵀWΓ + R + S is the same at every step; only the gradie
 target and the horizon before. W holds Q at the stages 1 … H-1 and P at H.
 
 What is done at every step is done in O(H), by recursion along the horizon, on one axis of one
-vehicle. Each vehicle gets the same bits alone as in a batch, which a product with Γ by BLAS does not
+vehicle. A vehicle gets the same bits alone as in a batch, which BLAS, multiplying by Γ, does not
 promise.
 """
 

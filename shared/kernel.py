@@ -137,7 +137,7 @@ def stamp(function: Callable[..., Any]) -> str:
             continue
         found[place] = inspect.getsource(each)
         for name in each.__code__.co_names:
-            value = each.__globals__.get(name)
+            value: Any = each.__globals__.get(name)
             if hasattr(value, "py_func"):
                 waiting.append(plain(value))
             elif isinstance(value, int | float | str | tuple | np.dtype):

@@ -177,7 +177,7 @@ class Run:
         return Flight(client, server, netem, failure, figures)
 
 
-def _fly(  # noqa: PLR0917
+def _fly(
     scenario: Scenario,
     seeds: Sequence[int],
     on_second: Callable[[int], None],
