@@ -33,11 +33,13 @@ from shared.config import Scenario
 from shared.endpoint import (
     MILLISECOND_NS,
     SECOND_NS,
+    VEHICLES_TOLD_MAX,
     Address,
     Datagram,
     Endpoint,
     seconds_to_ns,
 )
+from shared.events import SessionEnded, SessionOpened, SessionRefused
 from shared.histogram import Histogram
 from shared.model import Array, Flags, Indices, discretise
 from shared.protocol import (
@@ -62,8 +64,6 @@ REACH_S = 2.0
 BLOCK = 128
 """Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
-TOLD_MAX = 16
-"""Vehicles that a report tells of one by one."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 
 
@@ -166,8 +166,8 @@ class Server(Endpoint):
 
     def _hello(self, hello: Hello, address: Address, now_ns: int) -> None:
         if hello.terms != self._terms:
-            difference = self._terms.against(hello.terms)
-            self._news.append(f"vehicle {hello.vehicle} flies another scenario: {difference}")
+            differences = self._terms.differences(hello.terms)
+            self._events.append(SessionRefused(vehicle=hello.vehicle, differences=differences))
             self._welcome(hello, 0, address, now_ns)
             return
         for known in (self._sessions, self._welcomed):
@@ -229,7 +229,7 @@ class Server(Endpoint):
         self._scheme.forget(row)
         self._planner.forget(row)
         host, port = session.address
-        self._news.append(f"vehicle {session.vehicle} flies, from {host}:{port}")
+        self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))
         return session
 
     # -- time --------------------------------------------------------------------------------
@@ -247,7 +247,8 @@ class Server(Endpoint):
         tick_ns = self._due_ns + late * self._dt_ns
         self._due_ns = tick_ns + self._dt_ns
         if now_ns >= self._expire_ns:
-            self._expire_ns = now_ns + SECOND_NS
+            # On the grid of its clock: a vehicle is forgotten at the same time in any company.
+            self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             self._expire(now_ns)
         if self._sessions:
             self._tick(tick_ns, now_ns)
@@ -260,7 +261,7 @@ class Server(Endpoint):
             session = self._by_row.pop(row)
             del self._sessions[session.vehicle]
             heappush(self._free_rows, row)
-            self._news.append(f"vehicle {session.vehicle} is gone")
+            self._events.append(SessionEnded(vehicle=session.vehicle))
         if gone:
             self._rows = np.array(sorted(self._by_row), dtype=np.int64)
 
@@ -384,21 +385,17 @@ class Server(Endpoint):
     def _counted(self) -> Counter[str]:
         return Counter({**self.counts, **self._scheme.counts})
 
-    def report(self) -> str:
-        """See `Endpoint`."""
-        counts = ", ".join(f"{value} {name}" for name, value in sorted(self._counted().items()))
-        here = f"{len(self._sessions)} in session, {self.missed} ticks missed"
-        lines = [f"{here}, {counts or 'no steps'}"]
-        for session in islice(self._sessions.values(), TOLD_MAX):
-            step = self._last_step[session.row]
-            bound_ms = self._clock.bound_ns(np.array([session.row]))[0] / MILLISECOND_NS
-            lines.append(f"vehicle {session.vehicle}: step {step}, clock within {bound_ms:.1f} ms")
-        if len(self._sessions) > TOLD_MAX:
-            lines.append(f"and {len(self._sessions) - TOLD_MAX} more")
-        return "\n".join(lines)
-
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
+        each: dict[str, Any] = {}
+        for session in islice(self._sessions.values(), VEHICLES_TOLD_MAX):
+            bound_ns = self._clock.bound_ns(np.array([session.row]))[0]
+            each[f"vehicle {session.vehicle}"] = {
+                "step": int(self._last_step[session.row]),
+                "clock_bound_ms": float(bound_ns) / MILLISECOND_NS,
+            }
+        if len(self._sessions) > VEHICLES_TOLD_MAX:
+            each["and more"] = len(self._sessions) - VEHICLES_TOLD_MAX
         return {
             "vehicles": len(self._sessions),
             "missed": self.missed,
@@ -406,4 +403,5 @@ class Server(Endpoint):
             "tick_ms_p99": self.ticks.quantile_ms(0.99),
             "spent_ns": dict(self.stopwatch.spent_ns),
             "counts": dict(self._counted()),
+            "each": each,
         }

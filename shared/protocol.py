@@ -22,6 +22,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import msgpack
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,6 +54,17 @@ class ProtocolError(Exception):
         self.reason = reason
 
 
+class Difference(msgspec.Struct, frozen=True):
+    """A key of the scenario that two ends do not agree on."""
+
+    key: str
+    """Key of the scenario, as in `control.dt`."""
+    here: str
+    """Value at the end that says so."""
+    there: str
+    """Value at the other end."""
+
+
 class Terms(NamedTuple):
     """What both ends must agree on before a flight."""
 
@@ -64,13 +76,22 @@ class Terms(NamedTuple):
     u_max: tuple[float, ...]
     """Bound (6) of the input per axis [m/s]."""
 
-    def against(self, other: "Terms") -> str:
-        """Where they differ, for the operator of either end."""
-        return ", ".join(
-            f"{name} {mine} against {theirs}"
-            for name, mine, theirs in zip(self._fields, self, other, strict=True)
-            if mine != theirs
+    def differences(self, other: "Terms") -> tuple[Difference, ...]:
+        """Keys of the scenario in which the other end's terms differ from these."""
+        here, there = self._by_key(), other._by_key()
+        return tuple(
+            Difference(key, here[key], there[key]) for key in here if here[key] != there[key]
         )
+
+    def _by_key(self) -> dict[str, str]:
+        """Values as short text, by the scenario's keys."""
+        return {
+            "control.dt": f"{self.dt_ns / 1e9}",
+            "control.horizon": f"{self.horizon}",
+            "model.axes": f"{self.axes}",
+            "model.tau_s": " ".join(map(str, self.tau_s)),
+            "model.u_max": " ".join(map(str, self.u_max)),
+        }
 
 
 class Hello(NamedTuple):
