@@ -69,7 +69,7 @@ class Link:
         self._direction = direction
         self._recorder = recorder
         self._heap: list[tuple[int, int, Datagram, Lane, int, int]] = []
-        """Heap of packets: due time [ns], order of entry, packet, lane, number in it, delay [ns]."""
+        """Heap of due time [ns], order of entry, packet, lane, number in the lane, delay [ns]."""
         self._entered = 0
         self.counts = Counts()
 

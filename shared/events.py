@@ -91,8 +91,8 @@ class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
     """Keys of the scenario that differ."""
 
     def __str__(self) -> str:
-        keys = ", ".join(
-            f"{difference.key} is {difference.here} here, {difference.there} at the other end"
+        keys = "; ".join(
+            f"{difference.key} is {difference.here} here and {difference.there} at the other end"
             for difference in self.differences
         )
         return f"vehicle {self.vehicle} is refused, it flies another scenario: {keys}"

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from shared import chance, config
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS
+from shared.events import SessionEnded
 from shared.protocol import Heartbeat, encode
 from sim import flight
 from sim.flight import BOOT_ID, COMPANY_MAX, Flight, fly, fly_batch
@@ -34,6 +35,7 @@ def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Flight]:
             assert getattr(together, part).tobytes() == getattr(alone, part).tobytes(), part
         assert together.trace_hash() == alone.trace_hash()
         assert together.failure == alone.failure
+        assert together.events == alone.events
     return flights
 
 
@@ -139,6 +141,8 @@ def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:
     )
     flights = assert_as_alone(flown, range(4))
     assert flights[0].figures["server"]["counts"]["dropped: unknown session"] > 0
+    ended = SessionEnded(vehicle=1)
+    assert any(ended in [event for _, _, event in flown.events] for flown in flights)
 
 
 def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
