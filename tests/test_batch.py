@@ -141,8 +141,17 @@ def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:
     )
     flights = assert_as_alone(flown, range(4))
     assert flights[0].figures["server"]["counts"]["dropped: unknown session"] > 0
-    ended = SessionEnded(vehicle=1)
-    assert any(ended in [event for _, _, event in flown.events] for flown in flights)
+
+
+def test_a_session_is_forgotten_at_the_same_time_in_any_company() -> None:
+    """The server looks for those that are gone on the grid of its clock, whoever flies."""
+    rare = {"downlink": {"delay": "none", "loss": 0.9}, "uplink": {"delay": "none", "loss": 0.0}}
+    flown = scenario(
+        duration=300.0, control={"dt": 0.9, "horizon": 3}, network=rare, link={"connect_s": 60.0}
+    )
+    flights = assert_as_alone(flown, range(4))
+    ended = [sum(event == SessionEnded(vehicle=1) for *_, event in run.events) for run in flights]
+    assert sum(ended) >= 3
 
 
 def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:

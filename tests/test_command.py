@@ -375,7 +375,7 @@ def test_a_client_that_is_refused_names_each_key_and_both_values(
 ) -> None:
     """Exit code 2, and one line on stderr; the server says so, too."""
     server = start("server", "demo", "--bind", "127.0.0.1:0")
-    other = ["--control.dt", "0.02", "--control.horizon", "50", "--duration", "3"]
+    other = ["--control.dt", "0.02", "--control.horizon", "50"]
     run = skytether_("client", "demo", "--server", server.address(), *other)
     assert run.returncode == 2
     assert run.stderr == (

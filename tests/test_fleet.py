@@ -116,7 +116,7 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
         "step": 0,
         "steps": 200,
         "missed": 0,
-        "counts": {"dropped: not msgpack": 1},
+        "counts": {"dropped: not a message": 1},
     }
 
 
