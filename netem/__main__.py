@@ -25,8 +25,8 @@ class Options:
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     bind: str = "127.0.0.1:47000"
     """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host stands in brackets,
-    as in [::1]:47000; its socket hears IPv6 alone, even that of [::]. A name means its IPv4 address,
-    if it has one."""
+    as in [::1]:47000; its socket hears IPv6 alone, even that of [::]. A name means its IPv4
+    address, if it has one."""
     server: str = "127.0.0.1:47001"
     """HOST:PORT of the server, of the same family as the clients' addresses or not."""
     log: LogFormat = "text"

@@ -170,16 +170,19 @@ def run(
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
         with contextlib.suppress(asyncio.CancelledError):
-            await _fly(server, netem, client, timeout_s, on_second, on_event)
+            await _fly(
+                server, netem, client, timeout_s=timeout_s, on_second=on_second, on_event=on_event
+            )
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(main())
 
 
-async def _fly(  # noqa: PLR0917
+async def _fly(
     server_command: Sequence[str],
     netem_command: Sequence[str],
     client_command: Sequence[str],
+    *,
     timeout_s: float,
     on_second: Callable[[float], None],
     on_event: OnEvent,

@@ -17,8 +17,10 @@ import pytest
 
 import skytether.__main__
 from shared import config
-from shared.events import Counted, Finished, Flying, Listening
+from shared.endpoint import Address
+from shared.events import Counted, Finished, Flying, Listening, address_text
 from shared.record import client_columns
+from shell import command
 from shell.command import parse
 from shell.log import Line
 from skytether.fly import Options
@@ -162,6 +164,15 @@ def test_a_mistake_is_one_clear_line(
     assert skytether.__main__.main(argv) == code
     said = capfd.readouterr()
     assert said.err.splitlines() == [line]
+
+
+@pytest.mark.parametrize(
+    "address",
+    [("127.0.0.1", 47000), ("netem", 0), ("::1", 47000), ("::", 1), ("fe80::1%eth0", 65535)],
+)
+def test_an_address_is_read_as_it_is_written(address: Address) -> None:
+    """An address of either family, and one by name."""
+    assert command.address("--bind", address_text(*address)) == address
 
 
 @pytest.mark.parametrize(
