@@ -22,15 +22,16 @@ class Line(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def say(event: Event, *, process: str, log: LogFormat) -> None:
-    """Print an event, at once."""
+    """Print an event, at once and in one write: several workers may share the standard output."""
     if log == "json":
         line = Line(process=process, time_ns=time.monotonic_ns(), event=event)
-        print(msgspec.json.encode(line).decode(), flush=True)
-        return
-    lines = [str(event)]
-    if isinstance(event, Counted):
-        lines += rendered(event.figures, indent=2)
-    print("\n".join(f"{process}: {line}" for line in lines), flush=True)
+        text = f"{msgspec.json.encode(line).decode()}\n"
+    else:
+        lines = [str(event)]
+        if isinstance(event, Counted):
+            lines += rendered(event.figures, indent=2)
+        text = "".join(f"{process}: {line}\n" for line in lines)
+    print(text, end="", flush=True)
 
 
 def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:

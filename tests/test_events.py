@@ -1,5 +1,6 @@
 """Events: a sentence for the operator, tagged JSON for a program, figures in columns."""
 
+import io
 import typing
 
 import msgspec
@@ -23,7 +24,7 @@ from shared.events import (
     address_text,
 )
 from shared.protocol import Difference
-from shell.log import Line, rendered, say
+from shell.log import Line, LogFormat, rendered, say
 
 SENTENCES = [
     (
@@ -119,6 +120,23 @@ def test_figures_are_names_and_numbers_in_two_columns() -> None:
         "    step  7",
         "  and more   4",
     ]
+
+
+@pytest.mark.parametrize("log", ["text", "json"])
+def test_an_event_is_one_write(log: LogFormat, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its end of line: workers that share a pipe must not mix up their lines."""
+    written: list[str] = []
+
+    class Pipe(io.StringIO):
+        def write(self, text: str) -> int:
+            """Note what is written, but for nothing."""
+            written.extend([text] if text else [])
+            return len(text)
+
+    monkeypatch.setattr("sys.stdout", Pipe())
+    say(Counted(figures={"missed": 3}), process="server.1", log=log)
+    assert len(written) == 1
+    assert written[0].endswith("\n")
 
 
 def test_a_log_of_text_names_its_process_in_every_line(capfd: pytest.CaptureFixture[str]) -> None:
