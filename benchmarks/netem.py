@@ -17,7 +17,6 @@ import gc
 import json
 import multiprocessing
 import os
-import re
 import signal
 import socket
 import struct
@@ -32,6 +31,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import tyro
 from numpy.typing import NDArray
@@ -39,6 +39,8 @@ from numpy.typing import NDArray
 from benchmarks.harness import CONSOLE, Table, machine, median, progress, quantile_ms, sleep_until
 from shared.config import DirectionConfig
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
+from shared.events import Counted, Listening
+from shell.log import Line
 from shell.udp import kernel_drops, open_socket
 
 HOST = "127.0.0.1"
@@ -196,10 +198,13 @@ def measure_once(options: Options, seed: int) -> Run:
         (heads, arrivals, dropped_after), late_ns = answer(receiver), answer(sleeper)
 
         netem.send_signal(signal.SIGTERM)
-        report, _ = netem.communicate(timeout=PATIENCE_S)
+        log, _ = netem.communicate(timeout=PATIENCE_S)
 
     numbers, stamps = np.frombuffer(heads, "<i8").reshape(-1, 2).T
-    taken = int(said(report, r"downlink: (\d+) packets"))
+    counted = msgspec.json.decode(log.splitlines()[-1], type=Line).event
+    assert isinstance(counted, Counted)
+    downlink = counted.figures["downlink"]
+    taken = downlink["packets"]
     # A packet that netem never read has no number there, and shifts those of all that follow.
     known = sent if taken == sent else first_missing(numbers)
     error_ns = (np.array(arrivals) - stamps - drawn_delays_ns(seed, sent)[numbers])[numbers < known]
@@ -207,14 +212,13 @@ def measure_once(options: Options, seed: int) -> Run:
         sent=sent,
         received=len(numbers),
         dropped_before=sent - taken,
-        dropped_within=int(said(report, r"downlink: .* (\d+) overflowed"))
-        + int(said(report, r"(\d+) datagrams could not be sent")),
+        dropped_within=downlink["overflowed"] + counted.figures["send_errors"],
         dropped_after=dropped_after,
         measured=len(error_ns),
         error_ms_p50=quantile_ms(error_ns, 0.5),
         error_ms_p99=quantile_ms(error_ns, 0.99),
         error_ms_max=quantile_ms(error_ns, 1.0),
-        netem_ms_p99=float(said(report, r"(?s)downlink:.*error:.* p99 ([\d.]+) ms")),
+        netem_ms_p99=downlink["error_ms_p99"],
         netem_cpu=used_ns[0] / SECOND_NS / options.seconds,
         netem_waited=used_ns[1] / SECOND_NS / options.seconds,
         wake_ms_p50=quantile_ms(late_ns, 0.5),
@@ -238,12 +242,15 @@ def start_netem(stack: ExitStack, server_port: int, seed: int) -> tuple[subproce
     """Run netem with the paper's delays and without losses; the process and its port."""
     # -P: without it, a `netem` in the working directory would come first.
     command = [sys.executable, "-P", "-m", "netem", "paper", f"--seed={seed}"]
-    command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--network.downlink.loss=0"]
+    command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--log=json"]
+    command += ["--network.downlink.loss=0"]
     netem = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     stack.callback(netem.wait)
     stack.callback(netem.kill)
     assert netem.stdout is not None
-    return netem, int(said(netem.stdout.readline(), rf"listening on {HOST}:(\d+)"))
+    listening = msgspec.json.decode(netem.stdout.readline(), type=Line).event
+    assert isinstance(listening, Listening)
+    return netem, listening.port
 
 
 def answer(pipe: Connection) -> Any:
@@ -251,12 +258,6 @@ def answer(pipe: Connection) -> Any:
     if not pipe.poll(PATIENCE_S):
         raise TimeoutError("a process of the benchmark does not answer")
     return pipe.recv()
-
-
-def said(report: str, pattern: str) -> str:
-    """Count that netem reports under a name; 0 where it reports none."""
-    found = re.search(pattern, report)
-    return found[1] if found else "0"
 
 
 def scheduled_ns(pid: int) -> NDArray[np.int64]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import tyro
 
 from client.fleet import Fleet
@@ -15,37 +16,45 @@ from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from shared.chance import stream
 from shared.config import Scenario
+from shared.events import SessionRefused
 from shared.record import Recorder, client_columns, parse
 from shared.summary import summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
-from shell.udp import allow_sockets, within_reach_of
+from shell.log import LogFormat
+from shell.udp import allow_sockets
 
 
 @dataclass(frozen=True)
 class Options:
-    """Of `skytether client`."""
+    """Options of `skytether client`."""
 
     scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file; the server's."""
+    """A scenario's name (see `skytether scenarios`) or a .toml file; the same as the server's."""
     server: str = "127.0.0.1:47000"
-    """HOST:PORT where the server is to be met: netem's, or its own."""
+    """HOST:PORT of netem, or of the server itself; an IPv6 host in brackets, as in [::1]:47000."""
     number: Annotated[int, tyro.conf.arg(name="id")] = 1
-    """Number of this vehicle, unlike any other of the server's (0 to 65535)."""
+    """Number of this vehicle (0 to 65535); no two vehicles of a server may have the same."""
     vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Fly so many in this process, numbered from --id on."""
+    """Number of vehicles to fly in this process, numbered from --id on."""
+    log: LogFormat = "text"
+    """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
     """File for the client's part of the record."""
     json: Path | None = None
-    """File for the summary of the flight, as far as the vehicle knows it; of a fleet, for what was
-    counted, and what it cost."""
+    """File for the summary of the flight, as far as the vehicle knows it; of several vehicles, for
+    what was counted, and the CPU time it took."""
     config: ScenarioFlags = Scenario()
 
 
 def fly(argv: Sequence[str]) -> None:
-    """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM."""
+    """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM.
+
+    SIGUSR1 prints what was counted so far. The exit code is 1 where no server answers, and 2 where
+    the server flies another scenario.
+    """
     options = command.parse(Options(), argv, "skytether client", fly.__doc__)
-    scenario, server = options.config, command.address(options.server)
+    scenario, server = options.config, command.address("--server", options.server)
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
@@ -70,21 +79,30 @@ def fly(argv: Sequence[str]) -> None:
         alone = len(clients) == 1
         endpoint = clients[0] if alone else Fleet(clients)
         command.drive(
-            *("client", endpoint, within_reach_of([server]), [server]),
-            f"the server at {options.server}",
+            "client",
+            endpoint,
+            bind=None,
+            peers=[server],
+            waiting_for=f"the server at {options.server}",
+            log=options.log,
             json=None if alone else options.json,
         )
         sink.flush()
         sink.seek(0)
         rows = parse(sink.read())
-    if endpoint.failure:
-        raise CommandError(endpoint.failure)
+    if failure := endpoint.failure:
+        refused = isinstance(failure, SessionRefused)
+        raise CommandError(str(failure), command.CONFIGURATION if refused else command.RUN)
     if alone and len(rows):
-        command.finish(summarise(scenario, options.scenario, rows), "client", options.json)
+        summary = summarise(scenario, options.scenario, rows)
+        if options.log == "text":
+            command.finish(summary, "client", options.json)
+        elif options.json:
+            command.write(options.json, msgspec.json.encode(summary))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; the exit code."""
+    """Run the command; returns its exit code."""
     return command.main(fly, argv, "client")
 
 

@@ -1,14 +1,12 @@
-"""Many vehicles in one process: each a client of its own, with a socket of its own."""
+"""A fleet: many vehicles in one process, each a client of its own with a socket of its own."""
 
 from collections.abc import Sequence
 from heapq import heapify, heappop, heappush
 from typing import Any
 
 from client.vehicle import Client
-from shared.endpoint import Datagram, Endpoint
-
-TOLD_MAX = 16
-"""Vehicles that a report tells of one by one."""
+from shared.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint
+from shared.events import Failure
 
 
 class Fleet(Endpoint):
@@ -19,34 +17,35 @@ class Fleet(Endpoint):
         self._clients = clients
         self._due_ns = [client.next_wake_ns() for client in clients]
         self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns) if due_ns is not None]
-        """When each wants to be woken; an entry that is no longer true stays until its time."""
+        """Wakes that clients have asked for: time and client; one that is no longer wanted stays
+        until its time."""
         heapify(self._heap)
         self._flying = set(range(len(clients)))
 
     @property
     def finished(self) -> bool:
-        """All have."""
+        """Whether every vehicle has finished."""
         return not self._flying
 
     @property
-    def failure(self) -> str | None:
-        """Why some vehicle could not fly."""
+    def failure(self) -> Failure | None:
+        """Event after which the first of the vehicles that failed could not fly."""
         return next((client.failure for client in self._clients if client.failure), None)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """For the client whose socket it came to."""
+        """Give the datagram to the client whose socket it came to."""
         self._clients[datagram.socket].receive(datagram, now_ns=now_ns)
         self._after(datagram.socket)
 
     def next_wake_ns(self) -> int | None:
-        """When the first of them wants to be woken."""
+        """Earliest time at which a client wants to be woken."""
         heap, due_ns = self._heap, self._due_ns
         while heap and due_ns[heap[0][1]] != heap[0][0]:
             heappop(heap)
         return heap[0][0] if heap else None
 
     def wake(self, *, now_ns: int) -> None:
-        """All whose time has come."""
+        """Wake all clients whose time has come."""
         while (due_ns := self.next_wake_ns()) is not None and due_ns <= now_ns:
             _, n = heappop(self._heap)
             self._due_ns[n] = None
@@ -54,11 +53,11 @@ class Fleet(Endpoint):
             self._after(n)
 
     def _after(self, n: int) -> None:
-        """What a client that was driven wants: to send, to say, to be woken."""
+        """Take over what a client that was driven wants sent and said, and its next wake."""
         client = self._clients[n]
         for payload, peer, _ in client.outbox():
             self._out.append(Datagram(payload, peer, n))
-        self._news += [f"vehicle {client.vehicle}: {line}" for line in client.news()]
+        self._events += client.events()
         if client.finished:
             self._flying.discard(n)
         due_ns = client.next_wake_ns()
@@ -66,12 +65,10 @@ class Fleet(Endpoint):
             heappush(self._heap, (due_ns, n))
         self._due_ns[n] = due_ns
 
-    def report(self) -> str:
-        """See `Endpoint`."""
-        lines = [f"vehicle {client.vehicle}: {client.report()}" for client in self._clients]
-        more = [f"and {len(lines) - TOLD_MAX} more"] if len(lines) > TOLD_MAX else []
-        return "\n".join(lines[:TOLD_MAX] + more)
-
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
-        return {"missed": sum(client.missed for client in self._clients)}
+        told = self._clients[:VEHICLES_TOLD_MAX]
+        each: dict[str, Any] = {f"vehicle {client.vehicle}": client.figures() for client in told}
+        if len(self._clients) > len(told):
+            each["and more"] = len(self._clients) - len(told)
+        return {"missed": sum(client.missed for client in self._clients), "each": each}

@@ -1,16 +1,28 @@
-"""The client: at every step, fly the chosen input, report the state, and stay in touch.
+"""The client: at every step, fly the chosen input, send the state, and stay in touch.
 
-Its clock is the flight's clock: the epoch is the moment its session opened, step k begins at
-epoch + k Δt, and every stamp that control uses is read here. A lost server changes nothing in that:
-the vehicle flies on along its horizon, then as `vehicle.exhausted` says, and says HELLO meanwhile.
+The client's clock is the flight's clock: the epoch is the moment its session opened, step k begins
+at epoch + k Δt, and every stamp that control uses is read here. A lost server changes nothing in
+that: the vehicle flies on along its horizon, then as `vehicle.exhausted` says, and says HELLO
+meanwhile.
 """
 
 from collections import Counter
+from typing import Any
 
 from client.compensator import Compensator
 from client.plant import Plant
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
+from shared.events import (
+    Failure,
+    Finished,
+    Flying,
+    NoAnswer,
+    ServerHeard,
+    ServerRestarted,
+    ServerSilent,
+    SessionRefused,
+)
 from shared.protocol import (
     Heartbeat,
     Hello,
@@ -24,18 +36,18 @@ from shared.protocol import (
 from shared.record import Recorder
 
 HELLO_NS = SECOND_NS
-"""Between two HELLOs while nobody answers."""
+"""Time between two HELLOs while nobody answers."""
 
 
 class Client(Endpoint):
     """One vehicle.
 
     Args:
-        scenario: must be the server's, as far as it makes the terms of a flight.
+        scenario: the server's, as far as it makes the terms of a flight.
         plant: what flies.
-        server: where the server is to be met, directly or through netem.
-        vehicle: its number, unlike that of any other vehicle of the server.
-        boot_id: a number that no other life of this vehicle has had.
+        server: address of the server, or of the netem before it.
+        vehicle: number of the vehicle, unlike that of any other vehicle of the server.
+        boot_id: number that no other life of this vehicle has had.
         recorder: takes one row a step.
     """
 
@@ -63,33 +75,35 @@ class Client(Endpoint):
         self._recorder = recorder
 
         self._hello_due_ns: int | None = 0
-        """When to say HELLO next; None while the server is heard."""
+        """Time of the next HELLO; None while the server is heard."""
         self._began_ns: int | None = None
         self._session: int | None = None
         self._server_boot_id: int | None = None
         self._echo = (0, 0)
-        """Newest `server_ns`, and when it came."""
+        """Newest `server_ns` [server's clock], and the time it came."""
         self._epoch_ns: int | None = None
         self._step = 0
-        """The step that comes next,"""
+        """Step that comes next."""
         self._flown = 0
-        """and the one whose state the plant is in."""
+        """Step at whose start the plant's state is."""
         self._input = self._compensator.choose(0, plant.state())
         """Desired velocity flown now [m/s]; shape (axes,)."""
-        self.failure: str | None = None
-        """Why there can be no flight."""
+        self.failure: Failure | None = None
+        """Event after which there can be no flight."""
         self.missed = 0
+        """Steps slept through."""
         self.counts: Counter[str] = Counter()
+        """Number of horizons received, and of datagrams dropped, by reason."""
 
     @property
     def finished(self) -> bool:
-        """Flown to the end, or never."""
+        """Whether the flight has ended, or cannot begin."""
         return self.failure is not None or self._step >= self._steps
 
     # -- datagrams ---------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """WELCOME, HORIZON and HEARTBEAT of this session; anything else is dropped and counted."""
+        """Take WELCOME, HORIZON and HEARTBEAT of this session; drop and count anything else."""
         try:
             match decode(datagram.payload, self._terms):
                 case Welcome() as welcome:
@@ -109,30 +123,34 @@ class Client(Endpoint):
         if (welcome.vehicle, welcome.boot_id) != (self.vehicle, self._boot_id):
             raise ProtocolError("for another life")
         if welcome.terms != self._terms:
-            if self._session is None:
-                difference = ", ".join(map(str, self._terms.differences(welcome.terms)))
-                self.failure = f"the server flies another scenario: {difference}"
+            if self._session is None and self.failure is None:
+                differences = self._terms.differences(welcome.terms)
+                self._fail(SessionRefused(vehicle=self.vehicle, differences=differences))
             raise ProtocolError("other terms")
         if self._server_boot_id not in (None, welcome.server_boot_id):
-            self._news.append("the server has restarted")
+            self._events.append(ServerRestarted(vehicle=self.vehicle))
         self._session, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._heard(welcome, now_ns)
         if self._epoch_ns is None:
             self._epoch_ns = now_ns
-            self._news.append("session open, flying")
+            self._events.append(Flying(vehicle=self.vehicle))
 
     def _heard(self, message: Welcome | Horizon | Heartbeat, now_ns: int) -> None:
         if (message.vehicle, message.session) != (self.vehicle, self._session):
             raise ProtocolError("unknown session")
         if self._hello_due_ns is not None and self._epoch_ns is not None:
-            self._news.append("the server is heard again")
+            self._events.append(ServerHeard(vehicle=self.vehicle))
         self._hello_due_ns = None
         self._echo = (message.server_ns, now_ns)
+
+    def _fail(self, failure: Failure) -> None:
+        self.failure = failure
+        self._events.append(failure)
 
     # -- time --------------------------------------------------------------------------------
 
     def next_wake_ns(self) -> int | None:
-        """The next step or the next HELLO, whichever comes first."""
+        """Start of the next step; before the first, the time of the next HELLO."""
         if self.finished:
             return None
         if self._epoch_ns is None:
@@ -140,21 +158,21 @@ class Client(Endpoint):
         return self._epoch_ns + self._step * self._dt_ns
 
     def wake(self, *, now_ns: int) -> None:
-        """Steps that are due, and HELLO where nobody is heard."""
+        """Fly the step that is due, and say HELLO where nobody is heard."""
         if self._began_ns is None:
             self._began_ns = now_ns
         if self._epoch_ns is None:
             if now_ns - self._began_ns > self._connect_ns:
                 host, port = self._server
                 waited_s = (now_ns - self._began_ns) / SECOND_NS
-                self.failure = f"no answer from {host}:{port} in {waited_s:.0f} s"
+                self._fail(NoAnswer(vehicle=self.vehicle, host=host, port=port, waited_s=waited_s))
                 return
         elif now_ns < self._epoch_ns + self._step * self._dt_ns:
             return
         else:
             self._fly(now_ns, self._epoch_ns)
             if self._hello_due_ns is None and now_ns - self._echo[1] > self._timeout_ns:
-                self._news.append("the server is silent")
+                self._events.append(ServerSilent(vehicle=self.vehicle))
                 self._hello_due_ns = now_ns
         if self._hello_due_ns is not None and now_ns >= self._hello_due_ns:
             self._hello_due_ns = now_ns + HELLO_NS
@@ -167,8 +185,12 @@ class Client(Endpoint):
         for _ in range(self._flown, present):
             self._plant.advance(self._input)
         self._flown, self._step = present, present + 1
+        if self.finished:
+            finished = Finished(vehicle=self.vehicle, steps=self._steps, missed=self.missed)
+            self._events.append(finished)
         state, stamp_ns = self._plant.state(), epoch_ns + present * self._dt_ns
         self._input = self._compensator.choose(present, state)
+        server_ns, received_ns = self._echo
         assert self._session is not None
         self._send(
             Observation(
@@ -178,7 +200,8 @@ class Client(Endpoint):
                 stamp_ns,
                 self._compensator.in_force,
                 self._compensator.since,
-                *self._echo,
+                server_ns,
+                received_ns,
                 state,
             )
         )
@@ -199,7 +222,11 @@ class Client(Endpoint):
     def _send(self, message: Hello | Observation) -> None:
         self._out.append(Datagram(encode(message), self._server))
 
-    def report(self) -> str:
+    def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
-        counts = ", ".join(f"{value} {name}" for name, value in sorted(self.counts.items()))
-        return f"step {self._step} of {self._steps}, {self.missed} missed, {counts or 'no packets'}"
+        return {
+            "step": self._step,
+            "steps": self._steps,
+            "missed": self.missed,
+            "counts": dict(self.counts),
+        }

@@ -1,1 +1,1 @@
-"""The bad network between them: a UDP proxy that delays, reorders and loses what it never reads."""
+"""netem: the bad network between clients and a server, a UDP proxy that never reads its packets."""

@@ -13,46 +13,61 @@ from shared.config import Scenario
 from shared.record import PACKET_COLUMNS, Recorder
 from shell import command
 from shell.command import ScenarioFlags, ScenarioName
+from shell.log import LogFormat
 from shell.udp import allow_sockets
 
 
 @dataclass(frozen=True)
 class Options:
-    """Of `skytether netem`."""
+    """Options of `skytether netem`."""
 
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     bind: str = "127.0.0.1:47000"
-    """HOST:PORT where clients find it; port 0 takes a free one."""
+    """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host stands in brackets,
+    as in [::1]:47000; its socket hears IPv6 alone, even that of [::]. A name means its IPv4
+    address, if it has one."""
     server: str = "127.0.0.1:47001"
-    """HOST:PORT of the server."""
+    """HOST:PORT of the server, of the same family as the clients' addresses or not."""
+    log: LogFormat = "text"
+    """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
-    """File for the fate of every packet."""
+    """File for netem's part of the record: the fate of every packet."""
     flows: Annotated[int, tyro.conf.arg(metavar="N")] = FLOWS_MAX
-    """Clients at once; each takes a socket."""
+    """Most clients at once; each takes a socket."""
     json: Path | None = None
-    """File for what was counted, and what it cost."""
+    """File for what was counted, and the CPU time it took."""
     config: ScenarioFlags = Scenario()
 
 
 def emulate(argv: Sequence[str]) -> None:
-    """Delay, reorder and lose datagrams between clients and a server; statistics at SIGUSR1."""
+    """Delay, reorder and lose datagrams between clients and a server, until SIGINT or SIGTERM.
+
+    SIGUSR1 prints what was counted so far.
+    """
     options = command.parse(Options(), argv, "skytether netem", emulate.__doc__)
     command.check_count("--flows", options.flows, 65_536)
     allow_sockets(1 + options.flows)
     sink = command.open_record(options.record) if options.record else None
-    server = command.address(options.server)
+    server = command.address("--server", options.server)
+    bind = command.address("--bind", options.bind)
     recorder = Recorder(PACKET_COLUMNS, sink) if sink else None
     endpoint = Proxy(options.config, server=server, flows=options.flows, recorder=recorder)
-    bind = command.address(options.bind)
-    waiting_for = f"clients of {options.server}"
-    command.drive("netem", endpoint, bind, [server], waiting_for, json=options.json)
+    command.drive(
+        "netem",
+        endpoint,
+        bind=bind,
+        peers=[server],
+        waiting_for=f"clients of {options.server}",
+        log=options.log,
+        json=options.json,
+    )
     if sink:
         sink.close()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; the exit code."""
+    """Run the command; returns its exit code."""
     return command.main(emulate, argv, "netem")
 
 

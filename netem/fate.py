@@ -1,4 +1,4 @@
-"""What becomes of packets: how long each is delayed, and which are lost.
+"""Fates of packets: how long each is delayed, and which are lost.
 
 The paper's delay, eq. (17) as corrected (E1, E2), is 0.4 s + 0.02 s · m with m Poisson of mean 2.
 The fate of a packet depends on the seed, its direction, its flow and its number in them, and on
@@ -17,14 +17,16 @@ from shared.config import DirectionConfig
 from shared.endpoint import seconds_to_ns
 
 BLOCK = 256
-"""Fates drawn at once; drawing them singly costs forty times as much."""
+"""Number of fates drawn at once; drawing them singly costs forty times as much."""
 
 
 class Fate(NamedTuple):
-    """Of one packet."""
+    """Fate of one packet."""
 
     delay_ns: int
+    """Delay in this direction [ns], drawn for a lost packet, too."""
     lost: bool
+    """Whether it is lost."""
 
 
 def delays_ns(

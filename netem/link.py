@@ -1,8 +1,9 @@
-"""One direction of the network: a bounded heap of (due_ns, number, packet), and its statistics."""
+"""A link: one direction of the network, a bounded heap of packets by due time, and statistics."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
+from typing import Any
 
 from netem.fate import Fate
 from shared.endpoint import MILLISECOND_NS, Datagram
@@ -10,10 +11,12 @@ from shared.histogram import Histogram
 from shared.record import Recorder
 
 QUEUE_MAX = 65536
-"""Packets under way in one direction; more are dropped, and counted apart from losses."""
+"""Most packets under way in one direction; more are dropped, and counted apart from losses."""
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
+"""Width of the bins in which delays are counted [ns]: the lattice of the paper's delay."""
 ERROR_BIN_NS = MILLISECOND_NS // 50
+"""Width of the bins in which errors of delays are counted [ns]."""
 
 
 @dataclass(slots=True)
@@ -21,29 +24,37 @@ class Lane:
     """One flow in one direction."""
 
     flow: int
+    """Number of the flow, from 0."""
     fates: Iterator[Fate]
+    """Fates of its packets, in their order."""
     taken: int = 0
-    """Packets so far, lost ones with them."""
+    """Number of packets so far, lost ones included."""
     newest_out: int = -1
-    """Highest number that has left."""
+    """Highest number of a packet that has left, or -1."""
 
 
 @dataclass(slots=True)
 class Counts:
-    """What happened in one direction."""
+    """Statistics of one direction."""
 
     packets: int = 0
+    """Packets that entered, whatever became of them."""
     bytes: int = 0
+    """UDP payload of these [B]."""
     forwarded: int = 0
+    """Packets that have left."""
     lost: int = 0
+    """Packets whose fate was to be lost."""
     reordered: int = 0
-    """Overtaken by a later packet of their flow."""
+    """Packets overtaken by a later one of their flow."""
     overflowed: int = 0
+    """Packets dropped because QUEUE_MAX were under way."""
     depth_max: int = 0
+    """Most packets that were under way at once."""
     delay: Histogram = field(default_factory=lambda: Histogram(DELAY_BIN_NS))
-    """As drawn, of forwarded packets."""
+    """Delays of forwarded packets, as drawn."""
     error: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN_NS))
-    """How much later than that they left."""
+    """Times by which forwarded packets left later than drawn."""
 
 
 class Link:
@@ -58,12 +69,12 @@ class Link:
         self._direction = direction
         self._recorder = recorder
         self._heap: list[tuple[int, int, Datagram, Lane, int, int]] = []
-        """Due time and order of entry, then packet, lane, number in it, and delay."""
+        """Heap of due time [ns], order of entry, packet, lane, number in the lane, delay [ns]."""
         self._entered = 0
         self.counts = Counts()
 
     def take(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> None:
-        """A packet enters, addressed to where it is to come out."""
+        """Take a packet that enters, addressed to where it is to come out."""
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         delay_ns, lost = next(lane.fates)
         lane.taken += 1
@@ -86,7 +97,7 @@ class Link:
                 counts.depth_max = depth + 1
 
     def give(self, *, now_ns: int) -> list[Datagram]:
-        """The packets that are due."""
+        """Packets that are due, which so leave."""
         heap, counts, out = self._heap, self.counts, []
         while heap and heap[0][0] <= now_ns:
             due_ns, _, datagram, lane, number, delay_ns = heappop(heap)
@@ -107,9 +118,27 @@ class Link:
         return out
 
     def next_due_ns(self) -> int | None:
-        """When the next packet is due."""
+        """Time at which the next packet is due, or None."""
         return self._heap[0][0] if self._heap else None
 
     def depth(self) -> int:
-        """Packets under way."""
+        """Number of packets under way."""
         return len(self._heap)
+
+    def figures(self) -> dict[str, Any]:
+        """Statistics by name, as in `Endpoint.figures`."""
+        counts = self.counts
+        return {
+            "packets": counts.packets,
+            "bytes": counts.bytes,
+            "forwarded": counts.forwarded,
+            "lost": counts.lost,
+            "reordered": counts.reordered,
+            "overflowed": counts.overflowed,
+            "queue": self.depth(),
+            "queue_max": counts.depth_max,
+            "delays": counts.delay.by_bin(),
+            "error_ms_p50": counts.error.quantile_ms(0.5),
+            "error_ms_p99": counts.error.quantile_ms(0.99),
+            "error_ms_max": counts.error.largest_ns / MILLISECOND_NS,
+        }

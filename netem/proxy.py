@@ -1,43 +1,47 @@
 """netem: a UDP proxy that stands for the network and never decodes what it carries.
 
-Clients send to its bound socket. Each client address is a flow with a socket of its own towards the
-server, so that the server's answers find their way back. Uplink is server to client, downlink
-client to server, as in the paper.
+Clients send to netem's bound socket. Each client address is a flow with a socket of its own towards
+the server, so that the server's answers find their way back. Uplink is server to client, downlink
+is client to server, as in the paper.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
 from netem.fate import fates
-from netem.link import Counts, Lane, Link
+from netem.link import Lane, Link
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
+from shared.events import FlowOpened
 from shared.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
-"""Clients at once, unless more are asked for; a packet of a further one is dropped and counted."""
+"""Most clients at once, unless another number is asked for; packets of others are dropped and
+counted."""
 IDLE_NS = 60 * SECOND_NS
-"""A flow without a packet for so long gives its place, and its socket, to a new client."""
+"""Time without a packet after which a flow gives its place and its socket to a new client."""
 
 
 @dataclass(slots=True)
 class Flow:
-    """One client address."""
+    """One client address and what belongs to it."""
 
     client: Address
     socket: int
+    """Number of its socket towards the server, from 1."""
     uplink: Lane
     downlink: Lane
     used_ns: int
+    """Time of its newest packet, either way."""
 
 
 class Proxy(Endpoint):
     """Delays, reorders and loses datagrams between clients and one server.
 
     Args:
-        scenario: its `network` and `seed`.
-        server: where the server is.
-        flows: clients at once, a socket each.
+        scenario: `network` and `seed` of it are used.
+        server: address of the server.
+        flows: most clients at once, a socket each.
         recorder: takes one row a packet.
     """
 
@@ -59,10 +63,10 @@ class Proxy(Endpoint):
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
         self.refused = 0
-        """Packets of clients beyond the last flow, and of strangers at a flow's socket."""
+        """Packets of clients for which there is no flow, and of strangers at a flow's socket."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """A packet enters the network."""
+        """Take a packet that enters the network."""
         payload, peer, socket = datagram
         if socket == 0:
             flow = self._by_client.get(peer) or self._open(peer, now_ns)
@@ -81,7 +85,7 @@ class Proxy(Endpoint):
         self._forward(now_ns)
 
     def wake(self, *, now_ns: int) -> None:
-        """Packets that are due leave it."""
+        """Let out the packets that are due."""
         self._forward(now_ns)
 
     def _forward(self, now_ns: int) -> None:
@@ -89,7 +93,7 @@ class Proxy(Endpoint):
         self._out += self.downlink.give(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """When the next packet is due."""
+        """Time at which the next packet is due."""
         up_ns, down_ns = self.uplink.next_due_ns(), self.downlink.next_due_ns()
         if up_ns is None or (down_ns is not None and down_ns < up_ns):
             return down_ns
@@ -114,41 +118,15 @@ class Proxy(Endpoint):
             now_ns,
         )
         self._by_client[client] = self._by_socket[socket] = flow
-        self._news.append(f"flow {number} for {client[0]}:{client[1]}")
+        host, port = client
+        self._events.append(FlowOpened(flow=number, host=host, port=port))
         return flow
-
-    def report(self) -> str:
-        """See `Endpoint`."""
-        return "\n".join(
-            [
-                f"{len(self._by_socket)} flows, {self.refused} packets refused",
-                _describe("uplink", self.uplink.counts, self.uplink.depth()),
-                _describe("downlink", self.downlink.counts, self.downlink.depth()),
-            ]
-        )
 
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
-        figures: dict[str, Any] = {"flows": len(self._by_socket), "refused": self.refused}
-        for name, link in (("uplink", self.uplink), ("downlink", self.downlink)):
-            counts = link.counts
-            figures[name] = {
-                "packets": counts.packets,
-                "bytes": counts.bytes,
-                "lost": counts.lost,
-                "overflowed": counts.overflowed,
-                "error_ms_p99": counts.error.quantile_ms(0.99),
-            }
-        return figures
-
-
-def _describe(name: str, counts: Counts, depth: int) -> str:
-    error = counts.error
-    return (
-        f"{name}: {counts.packets} packets, {counts.forwarded} forwarded, {counts.lost} lost, "
-        f"{counts.reordered} reordered, {counts.overflowed} overflowed, "
-        f"queue {depth} (at most {counts.depth_max})\n"
-        f"  delay: {counts.delay}\n"
-        f"  added-delay error: p50 {error.quantile_ms(0.5):.2f} ms, "
-        f"p99 {error.quantile_ms(0.99):.2f} ms, largest {error.largest_ns / 1e6:.2f} ms"
-    )
+        return {
+            "flows": len(self._by_socket),
+            "refused": self.refused,
+            "uplink": self.uplink.figures(),
+            "downlink": self.downlink.figures(),
+        }

@@ -18,35 +18,43 @@ from shared.record import Recorder, server_columns
 from shared.stopwatch import Stopwatch
 from shell import command, workers
 from shell.command import CommandError, ScenarioFlags, ScenarioName
+from shell.log import LogFormat
 from shell.udp import AddressError
 
 
 @dataclass(frozen=True)
 class Options:
-    """Of `skytether server`."""
+    """Options of `skytether server`."""
 
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     bind: str = "127.0.0.1:47001"
-    """HOST:PORT to listen on; port 0 takes a free one."""
+    """HOST:PORT to listen on; port 0 takes a free one. An IPv6 host stands in brackets, as in
+    [::1]:47001; its socket hears IPv6 alone, even that of [::]. A name means its IPv4 address, if
+    it has one."""
+    log: LogFormat = "text"
+    """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
     """File for the server's part of the record."""
     vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = VEHICLES_MAX
-    """Room for so many vehicles at once, in each worker."""
+    """Most vehicles at once, in each worker."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Processes that share the address and the vehicles, one a core; each writes files of its own,
-    numbered, as in RECORD.1."""
+    """Number of processes that share the address and the vehicles, one a core; with several, each
+    writes files of its own, numbered, as in RECORD.1."""
     json: Path | None = None
-    """File for what was counted, and what it cost."""
+    """File for what was counted, and the CPU time it took."""
     config: ScenarioFlags = Scenario()
 
 
 def serve(argv: Sequence[str]) -> None:
-    """Plan for every vehicle that says HELLO, until SIGINT or SIGTERM."""
+    """Plan for every vehicle that asks for it, until SIGINT or SIGTERM.
+
+    SIGUSR1 prints what was counted so far.
+    """
     options = command.parse(Options(), argv, "skytether server", serve.__doc__)
     command.check_count("--vehicles", options.vehicles, 65_536)
     command.check_count("--workers", options.workers, 64)
-    bind = command.address(options.bind)
+    bind = command.address("--bind", options.bind)
     if options.workers == 1:
         _work(options, bind, "")
         return
@@ -61,7 +69,7 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _work(options: Options, bind: Address | socket, suffix: str) -> None:
-    """One worker; its files have names that end in `suffix`."""
+    """Run one worker, whose files have names that end in `suffix`."""
 
     def own(path: Path | None) -> Path | None:
         return path and path.with_name(path.name + suffix)
@@ -78,7 +86,10 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
     )
     command.drive(
         f"server{suffix}",
-        *(endpoint, bind, (), "vehicles"),
+        endpoint,
+        bind=bind,
+        waiting_for="vehicles",
+        log=options.log,
         json=own(options.json),
         stopwatch=stopwatch,
     )
@@ -87,7 +98,7 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; the exit code."""
+    """Run the command; returns its exit code."""
     return command.main(serve, argv, "server")
 
 

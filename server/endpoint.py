@@ -15,11 +15,13 @@ from shared.config import Scenario
 from shared.endpoint import (
     MILLISECOND_NS,
     SECOND_NS,
+    VEHICLES_TOLD_MAX,
     Address,
     Datagram,
     Endpoint,
     seconds_to_ns,
 )
+from shared.events import SessionEnded, SessionOpened, SessionRefused
 from shared.histogram import Histogram
 from shared.protocol import (
     Heartbeat,
@@ -36,8 +38,6 @@ from shared.stopwatch import Stopwatch
 
 VEHICLES_MAX = 64
 """Vehicles at once, unless room is made for more."""
-TOLD_MAX = 16
-"""Vehicles that a report tells of one by one."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
@@ -105,8 +105,7 @@ class Server(Endpoint):
             number = self._sessions.welcome(hello, address).number
         else:
             differences = self._terms.differences(hello.terms)
-            told = ", ".join(map(str, differences))
-            self._news.append(f"vehicle {hello.vehicle} flies another scenario: {told}")
+            self._events.append(SessionRefused(vehicle=hello.vehicle, differences=differences))
         welcome = Welcome(hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, self._terms)
         self._out.append(Datagram(encode(welcome), address))
 
@@ -135,7 +134,7 @@ class Server(Endpoint):
         self._clock.forget(session.row)
         self.controller.forget(session.row)
         host, port = session.address
-        self._news.append(f"vehicle {session.vehicle} flies, from {host}:{port}")
+        self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))
         return session
 
     # -- time --------------------------------------------------------------------------------
@@ -154,9 +153,10 @@ class Server(Endpoint):
         tick_ns = self._due_ns + late * dt_ns
         self._due_ns = tick_ns + dt_ns
         if now_ns >= self._expire_ns:
-            self._expire_ns = now_ns + SECOND_NS
+            # On the grid of its clock: a vehicle is forgotten at the same time in any company.
+            self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             for session in self._sessions.expire(now_ns):
-                self._news.append(f"vehicle {session.vehicle} is gone")
+                self._events.append(SessionEnded(vehicle=session.vehicle))
         if len(self._sessions):
             self._tick(tick_ns, now_ns)
         else:
@@ -235,21 +235,16 @@ class Server(Endpoint):
         """Events that were counted, by name."""
         return self._dropped + self.controller.counts
 
-    def report(self) -> str:
-        """See `Endpoint`."""
-        counts = ", ".join(f"{value} {name}" for name, value in sorted(self.counts.items()))
-        here = f"{len(self._sessions)} in session, {self.missed} ticks missed"
-        lines = [f"{here}, {counts or 'no steps'}"]
-        for session in self._sessions.first(TOLD_MAX):
-            step = self.controller.last_step[session.row]
-            bound_ms = self._clock.bound_ns(session.row) / MILLISECOND_NS
-            lines.append(f"vehicle {session.vehicle}: step {step}, clock within {bound_ms:.1f} ms")
-        if len(self._sessions) > TOLD_MAX:
-            lines.append(f"and {len(self._sessions) - TOLD_MAX} more")
-        return "\n".join(lines)
-
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
+        each: dict[str, Any] = {}
+        for session in self._sessions.first(VEHICLES_TOLD_MAX):
+            each[f"vehicle {session.vehicle}"] = {
+                "step": int(self.controller.last_step[session.row]),
+                "clock_bound_ms": self._clock.bound_ns(session.row) / MILLISECOND_NS,
+            }
+        if len(self._sessions) > VEHICLES_TOLD_MAX:
+            each["and more"] = len(self._sessions) - VEHICLES_TOLD_MAX
         return {
             "vehicles": len(self._sessions),
             "missed": self.missed,
@@ -257,4 +252,5 @@ class Server(Endpoint):
             "tick_ms_p99": self.ticks.quantile_ms(0.99),
             "spent_ns": dict(self.stopwatch.spent_ns),
             "counts": dict(self.counts),
+            "each": each,
         }

@@ -1,20 +1,30 @@
 """The one idea: server, client and netem are endpoints, driven by datagrams and time only.
 
-An endpoint opens no socket, reads no clock, draws no unseeded number and prints nothing.
-`shell.driver` drives one on real UDP sockets; `sim.world` drives many in virtual time.
+An endpoint opens no socket, reads no clock, draws no unseeded number and prints nothing. It
+speaks in three ways: by datagrams (`outbox`), by typed events (`events`), and by numbers when it
+is asked for them (`figures`). `shell.driver` drives one on real UDP sockets; `sim.world` drives
+many in virtual time.
 """
 
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from shared.events import Event
+
 Address = tuple[str, int]
+"""Host and port of a UDP socket. The host is a name, an IPv4 address or an IPv6 address without
+brackets, as in `fe80::1%eth0` where it needs a scope."""
 
 SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000
 
-NEWS_MAX = 64
-"""News kept until the driver reads it; older news gives way."""
+EVENTS_MAX = 1024
+"""Events kept until the driver reads them; older ones give way."""
+
+VEHICLES_TOLD_MAX = 16
+"""Vehicles that `figures` tells of one by one."""
 
 
 def seconds_to_ns(seconds: float) -> int:
@@ -26,10 +36,11 @@ class Datagram(NamedTuple):
     """One UDP datagram as an endpoint sees it."""
 
     payload: bytes
+    """UDP payload."""
     peer: Address
-    """Who sent it, or for whom it is."""
+    """Address of the sender, or of the receiver."""
     socket: int = 0
-    """Which of the endpoint's own sockets it uses; 0 is the one that is bound."""
+    """Number of the endpoint's own socket that it uses; 0 is the one that is bound."""
 
 
 class Endpoint(ABC):
@@ -37,26 +48,22 @@ class Endpoint(ABC):
 
     def __init__(self) -> None:
         self._out: list[Datagram] = []
-        self._news: deque[str] = deque(maxlen=NEWS_MAX)
+        self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
 
     @abstractmethod
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """A datagram arrived. Never raises for anything a peer can put into it."""
+        """Take a datagram that arrived. Never raises for anything a peer can put into it."""
 
     @abstractmethod
     def wake(self, *, now_ns: int) -> None:
-        """The time asked for has come (drivers may be late, and may be early)."""
+        """Do what is due now (drivers may be late, and may be early)."""
 
     @abstractmethod
     def next_wake_ns(self) -> int | None:
-        """When to be woken, or None: only a datagram matters now."""
-
-    @abstractmethod
-    def report(self) -> str:
-        """What was counted so far, as a few lines for the operator."""
+        """Time of the next wake, or None: only a datagram matters now."""
 
     def figures(self) -> dict[str, Any]:
-        """The same as numbers, by name, for a program."""
+        """Numbers counted so far, by name; a nested dictionary is a group of them."""
         return {}
 
     @property
@@ -65,12 +72,14 @@ class Endpoint(ABC):
         return False
 
     def outbox(self) -> list[Datagram]:
-        """What is to be sent; each datagram is handed out once."""
+        """Datagrams to be sent; each is handed out once."""
         out, self._out = self._out, []
         return out
 
-    def news(self) -> list[str]:
-        """What the operator should hear; each line is handed out once."""
-        news = list(self._news)
-        self._news.clear()
-        return news
+    def events(self) -> Sequence[Event]:
+        """Events since the last call; each is handed out once."""
+        if not self._events:
+            return ()
+        events = tuple(self._events)
+        self._events.clear()
+        return events

@@ -1,12 +1,17 @@
-"""How long things took: counts of durations, in as much memory for many as for few."""
+"""Histograms of durations, which take as much memory for many as for few."""
 
 from shared.endpoint import MILLISECOND_NS
 
 BINS = 500
+"""Number of bins of a histogram."""
 
 
 class Histogram:
-    """Counts of durations in bins of equal width; the last bin takes all that is longer."""
+    """Counts of durations in bins of equal width; the last bin takes all that is longer.
+
+    Args:
+        bin_ns: width of a bin [ns].
+    """
 
     def __init__(self, bin_ns: int) -> None:
         self.bin_ns = bin_ns
@@ -22,7 +27,7 @@ class Histogram:
             self.largest_ns = value_ns
 
     def quantile_ms(self, share: float) -> float:
-        """Upper edge of the bin in which this share of all lies below [ms]; 0 without any."""
+        """Upper edge of the bin in which the quantile of this share lies [ms]; 0 without any."""
         wanted, seen = share * sum(self.counts), 0
         for index, count in enumerate(self.counts):
             seen += count
@@ -30,10 +35,10 @@ class Histogram:
                 return min((index + 1) * self.bin_ns, self.largest_ns) / MILLISECOND_NS
         return self.largest_ns / MILLISECOND_NS
 
-    def __str__(self) -> str:
-        bins = [
-            f"{index * self.bin_ns / MILLISECOND_NS:g} ms: {count}"
+    def by_bin(self) -> dict[str, int]:
+        """Counts by the lower edge of the bin, as in `20 ms`; bins without any are left out."""
+        return {
+            f"{index * self.bin_ns / MILLISECOND_NS:g} ms": count
             for index, count in enumerate(self.counts)
             if count
-        ]
-        return ", ".join(bins) or "empty"
+        }

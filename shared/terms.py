@@ -9,11 +9,13 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
+import msgspec
+
 from shared.endpoint import SECOND_NS
 from shared.model import Model, discretise
 
 
-class Difference(NamedTuple):
+class Difference(msgspec.Struct, frozen=True):
     """A term on which two ends disagree."""
 
     key: str
@@ -22,9 +24,6 @@ class Difference(NamedTuple):
     """Value at the end that tells it."""
     there: str
     """Value at the other end."""
-
-    def __str__(self) -> str:
-        return f"{self.key}: {self.here} here, {self.there} there"
 
 
 class Terms(NamedTuple):

@@ -1,9 +1,10 @@
-"""What every Skytether command has in common: its arguments, its one line for a mistake, its table.
+"""Commands: what all of them have in common, from arguments to the one line for a mistake.
 
 A command's options are a dataclass with a field `scenario` for the name and a field `config` for
 the scenario itself, whose every key is a flag: the file comes first, flags lie over it.
 """
 
+import ipaddress
 import os
 import signal
 import sys
@@ -12,10 +13,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from inspect import cleandoc
 from pathlib import Path
 from socket import socket
-from typing import Annotated, BinaryIO, Protocol, TypeVar
+from typing import Annotated, Any, BinaryIO, Protocol, TypeVar
 
 import msgspec
 import tyro
@@ -27,13 +29,15 @@ from rich.text import Text
 from shared import config
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint
+from shared.events import Counted, Listening, Plaintext
 from shared.stopwatch import Stopwatch
 from shared.summary import Summary
 from shell.driver import Shell, run
-from shell.udp import AddressError, is_loopback
+from shell.log import LogFormat, say
+from shell.udp import AddressError
 
 CONFIGURATION, RUN = 2, 1
-"""Exit codes: the command asked for something impossible, or it went wrong on the way."""
+"""Exit codes: what the command asked for is impossible, or something went wrong on the way."""
 
 ScenarioName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
 ScenarioFlags = Annotated[Scenario, tyro.conf.arg(name="")]
@@ -63,7 +67,7 @@ O = TypeVar("O", bound=Options)  # noqa: E741 - the options of one command
 
 
 def parse(defaults: O, argv: Sequence[str], prog: str, help_: str | None) -> O:
-    """The options of a command line, laid over the scenario it names.
+    """Parse a command line; returns its options, laid over the scenario it names.
 
     Raises:
         CommandError: the scenario cannot be flown.
@@ -89,30 +93,46 @@ def parse(defaults: O, argv: Sequence[str], prog: str, help_: str | None) -> O:
     return replace(options, config=checked)  # type: ignore[type-var]
 
 
-def address(text: str) -> Address:
-    """HOST:PORT as an address.
+def address(flag: str, text: str) -> Address:
+    """Address that a flag was given as HOST:PORT, with an IPv6 host in brackets.
 
     Raises:
         CommandError: it is none.
     """
-    host, colon, port = text.rpartition(":")
-    if not (host and colon and port.isascii() and port.isdigit() and int(port) < 65536):
-        raise CommandError(f"got the address {text!r}, expected HOST:PORT", CONFIGURATION)
+    host, _, port = text.rpartition(":")
+    bracketed = host.startswith("[") and host.endswith("]")
+    host = host[1:-1] if bracketed else host
+    if not (
+        host
+        and bracketed == (":" in host)
+        and (not bracketed or _is_ipv6(host))
+        and (port.isascii() and port.isdigit() and int(port) < 65536)
+    ):
+        expected = "expected HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
+        raise CommandError(f"{flag}: got {text!r}, {expected}", CONFIGURATION)
     return host, int(port)
 
 
+def _is_ipv6(host: str) -> bool:
+    try:
+        ipaddress.IPv6Address(host)
+    except ValueError:
+        return False
+    return True
+
+
 def check_count(flag: str, given: int, most: int) -> None:
-    """Refuse a number of things that cannot be.
+    """Refuse a number of things that is less than 1 or more than `most`.
 
     Raises:
-        CommandError: with what would do.
+        CommandError: with the flag, what it was given and what was expected.
     """
     if not 1 <= given <= most:
         raise CommandError(f"{flag}: got {given}, expected 1 to {most}", CONFIGURATION)
 
 
 def open_record(path: Path) -> BinaryIO:
-    """A file for a part of the record.
+    """Open a file for a part of the record.
 
     Raises:
         CommandError: it cannot be written.
@@ -124,57 +144,59 @@ def open_record(path: Path) -> BinaryIO:
 
 
 def drive(
-    prog: str,
+    process: str,
     endpoint: Endpoint,
-    bind: Address | socket,
-    peers: Sequence[Address],
-    waiting_for: str,
     *,
+    bind: Address | socket | None,
+    peers: Sequence[Address] = (),
+    waiting_for: str,
+    log: LogFormat,
     json: Path | None = None,
     stopwatch: Stopwatch | None = None,
 ) -> None:
     """Run one endpoint as a process until it has finished or is told to stop.
 
     Args:
-        prog: what it is called in what it says.
-        json: file for its figures in the end, with the CPU time it took.
+        process: name of the process in its log.
+        endpoint: what to run.
+        bind, peers, stopwatch: see `Shell`.
+        waiting_for: whose datagrams it waits for, for the operator.
+        log: form of its log on stdout.
+        json: file for its last figures.
 
     Raises:
         CommandError: it cannot start, or the file cannot be written.
     """
-
-    def say(text: str) -> None:
-        for line in text.splitlines():
-            print(f"{prog}: {line}", flush=True)
-
     try:
         shell = Shell(endpoint, bind, peers, stopwatch)
     except AddressError as error:
         raise CommandError(str(error)) from None
+    tell = partial(say, process=process, log=log)
+    began_s = time.process_time()
 
     def start() -> None:
         host, port = shell.address
-        say(f"listening on {host}:{port}, waiting for {waiting_for}")
-        if not all(map(is_loopback, (shell.address, *peers))):
-            say("plaintext and unauthenticated: only for a network that you trust")
+        tell(Listening(host=host, port=port, waiting_for=waiting_for))
+        if not shell.is_local:
+            tell(Plaintext())
 
-    def report() -> None:
-        say(endpoint.report())
-        if drops := shell.kernel_drops():
-            say(f"{drops} datagrams dropped by the kernel: its receive buffer was full")
-        if shell.send_errors:
-            say(f"{shell.send_errors} datagrams could not be sent")
-
-    began_s = time.process_time()
-    run([shell], on_start=start, on_news=say, on_report=report)
-    report()
-    if json:
-        figures = endpoint.figures() | {
+    def figures() -> dict[str, Any]:
+        return endpoint.figures() | {
             "cpu_s": time.process_time() - began_s,
             "kernel_drops": shell.kernel_drops(),
             "send_errors": shell.send_errors,
         }
-        write(json, msgspec.json.encode(figures))
+
+    run(
+        [shell],
+        on_start=start,
+        on_event=tell,
+        on_usr1=lambda: tell(Counted(figures=figures())),
+    )
+    last = figures()
+    tell(Counted(figures=last))
+    if json:
+        write(json, msgspec.json.encode(last))
 
 
 class Bar(Protocol):
@@ -188,7 +210,8 @@ class Bar(Protocol):
 def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
     """A bar on stderr: title, how much of the total is done, and the time remaining.
 
-    It vanishes at the end, and is not shown where stderr is no terminal.
+    It vanishes at the end, and is not shown where stderr is no terminal. What is printed on stderr
+    meanwhile is shown above the bar.
     """
     with Progress(
         TextColumn("{task.description}", markup=False),
@@ -211,7 +234,7 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Within it Ctrl-C only makes true what is yielded, so that work may end in order."""
+    """Let Ctrl-C end work in order; yields what tells whether it has been pressed."""
     interrupted = threading.Event()
     before = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
     try:
@@ -221,7 +244,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 
 def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, prog: str) -> int:
-    """Run a command; its exit code. What went wrong is one line on stderr."""
+    """Run a command, with one line on stderr for what went wrong; returns its exit code."""
     try:
         command(sys.argv[1:] if argv is None else argv)
     except CommandError as error:
@@ -239,7 +262,7 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
 
 
 def show(table: Table) -> None:
-    """Print a table: a number cut off would be worse than a line too long."""
+    """Print a table in full width: a number cut off would be worse than a line too long."""
     Console(width=max(Console().width, Console(width=1000).measure(table).maximum)).print(table)
 
 
@@ -258,7 +281,7 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
 
 
 def write(path: Path, json: bytes) -> None:
-    """A file of indented JSON.
+    """Write a file of indented JSON.
 
     Raises:
         CommandError: it cannot be written.
@@ -270,7 +293,7 @@ def write(path: Path, json: bytes) -> None:
 
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
-    """Name and value of what the summary knows."""
+    """Rows of the table: names and values of what the summary knows."""
     s = summary
     rows = [
         ("steps", f"{s.steps} in {s.duration_s:g} s"),

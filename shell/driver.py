@@ -1,7 +1,8 @@
 """The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
 
-All of asyncio and signals is in here and in `shell.timer`, all of sockets in `shell.udp`. It
-knows nothing of control or of the protocol: datagrams and time go in, datagrams and news come out.
+All of asyncio and signals is in here and in `shell.timer`, all of sockets in `shell.udp`. The
+shell knows nothing of control or of the protocol: datagrams and time go in, datagrams and events
+come out.
 """
 
 import asyncio
@@ -14,19 +15,28 @@ from collections.abc import Callable, Sequence
 from socket import socket
 
 from shared.endpoint import Address, Datagram, Endpoint
+from shared.events import Event
 from shared.stopwatch import Stopwatch
 from shell.timer import make_timer
-from shell.udp import Names, kernel_drops, open_socket, within_reach_of
+from shell.udp import (
+    Names,
+    from_kernel,
+    is_loopback,
+    kernel_drops,
+    open_socket,
+    to_kernel,
+    within_reach_of,
+)
 
 BURST_MAX = 128
-"""Datagrams read from one socket before timers and other sockets have their turn."""
+"""Most datagrams read from one socket before timers and other sockets have their turn."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
-"""Names are looked up again so often, off the loop: a restarted host may have a new address."""
+"""Time after which names are looked up again [s]: a restarted host may have a new address."""
 
 
 def new_event_loop() -> asyncio.AbstractEventLoop:
-    """A uvloop where it exists, else asyncio's own."""
+    """An event loop: uvloop's where it exists, else asyncio's own."""
     try:
         import uvloop
     except ImportError:
@@ -39,10 +49,11 @@ class Shell:
 
     Args:
         endpoint: what to drive.
-        bind: address of its socket 0, where port 0 takes a free one, or that socket itself. Other
-            sockets open as it uses them.
-        peers: addresses it will send to; where they are names they are looked up here, and the
-            endpoint sees the name in place of whatever address it stands for.
+        bind: address of its socket 0, where port 0 takes a free one, or that socket itself; None
+            takes a free port from which the peers can be reached. Other sockets open as the
+            endpoint uses them.
+        peers: addresses the endpoint will send to, names or numbers; the endpoint sees each as it
+            is written here, in place of whatever the kernel calls it.
         stopwatch: measures receiving and sending.
 
     Raises:
@@ -52,24 +63,33 @@ class Shell:
     def __init__(
         self,
         endpoint: Endpoint,
-        bind: Address | socket,
+        bind: Address | socket | None,
         peers: Sequence[Address] = (),
         stopwatch: Stopwatch | None = None,
     ) -> None:
         self.endpoint = endpoint
         self._stopwatch = stopwatch or Stopwatch()
         self.send_errors = 0
+        """Number of datagrams that could not be sent."""
         self._drops = 0
+        """Number of datagrams that the kernel dropped at sockets now closed."""
         self._names = Names(peers)
-        self._elsewhere = within_reach_of(peers)
-        self._sockets = {0: bind if isinstance(bind, socket) else open_socket(bind)}
-        self.address: Address = self._sockets[0].getsockname()
+        self._elsewhere = within_reach_of(self._names.numbers())
+        bound = bind if isinstance(bind, socket) else open_socket(bind or self._elsewhere)
+        self._sockets = {0: bound}
+        self.address = from_kernel(bound.getsockname())
+        """Address of socket 0."""
 
-    async def run(self, on_news: Callable[[str], None] = lambda _: None) -> None:
+    @property
+    def is_local(self) -> bool:
+        """Whether no other machine can reach it, nor be reached."""
+        return is_loopback(self.address) and is_loopback(self._elsewhere)
+
+    async def run(self, on_event: Callable[[Event], None] = lambda _: None) -> None:
         """Drive the endpoint until it has finished, or this task is cancelled."""
         self._loop = asyncio.get_running_loop()
         self._done = self._loop.create_future()
-        self._on_news = on_news
+        self._on_event = on_event
         self._armed: int | None = None
         self._timer = make_timer(self._loop, self._wake)
         for number in self._sockets:
@@ -88,7 +108,7 @@ class Shell:
             self._sockets.clear()
 
     def kernel_drops(self) -> int:
-        """Datagrams the kernel dropped because a receive buffer was full (0 where it won't say)."""
+        """Number of datagrams that the kernel dropped because a receive buffer was full."""
         return self._drops + sum(map(kernel_drops, self._sockets.values()))
 
     def _listen(self, number: int) -> None:
@@ -101,13 +121,14 @@ class Shell:
             for _ in range(BURST_MAX):
                 stopwatch.start()
                 try:
-                    payload, peer = receive(DATAGRAM_BYTES_MAX)
+                    payload, sender = receive(DATAGRAM_BYTES_MAX)
+                    peer = name(from_kernel(sender))
                 except BlockingIOError:
                     break
                 except OSError:  # an earlier packet of ours found the peer's port closed
                     continue
                 stopwatch.lap("receive")
-                hear(Datagram(payload, name(peer), number), now_ns=clock_ns())
+                hear(Datagram(payload, peer, number), now_ns=clock_ns())
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
             self._after()
 
@@ -121,14 +142,14 @@ class Shell:
             self._after()
 
     def _after(self) -> None:
-        """Send what the endpoint wants sent, say its news, arm its timer."""
+        """Send what the endpoint wants sent, hand on its events, arm its timer."""
         endpoint = self.endpoint
         self._stopwatch.start()
         for datagram in endpoint.outbox():
             self._send(datagram)
         self._stopwatch.lap("send")
-        for line in endpoint.news():
-            self._on_news(line)
+        for event in endpoint.events():
+            self._on_event(event)
         due_ns = endpoint.next_wake_ns()
         if due_ns != self._armed:
             self._armed = due_ns
@@ -143,12 +164,12 @@ class Shell:
             if sock is None:
                 sock = self._sockets[number] = open_socket(self._elsewhere)
                 self._listen(number)
-            sock.sendto(payload, self._names.number(peer))
+            sock.sendto(payload, to_kernel(self._names.number(peer)))
         except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet
             self.send_errors += 1
 
     async def _keep_resolving(self) -> None:
-        while self._names:
+        while self._names.may_change:
             await asyncio.sleep(RESOLVE_EVERY_S)
             found: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
             # No executor: it would be waited for at the end, and where a name is gone a look-up
@@ -171,15 +192,15 @@ def run(
     shells: list[Shell],
     *,
     on_start: Callable[[], None] = lambda: None,
-    on_news: Callable[[str], None] = lambda _: None,
-    on_report: Callable[[], None] = lambda: None,
+    on_event: Callable[[Event], None] = lambda _: None,
+    on_usr1: Callable[[], None] = lambda: None,
 ) -> None:
     """Drive several endpoints in this process until all have finished, or SIGINT or SIGTERM comes.
 
     Args:
         on_start: called once signals are heeded and the endpoints are about to be driven.
-        on_news: called with each line of news.
-        on_report: called at SIGUSR1.
+        on_event: called with each event of an endpoint.
+        on_usr1: called at SIGUSR1.
     """
     # Everything imported so far lives on; without this, a collection of it pauses for 13 ms.
     gc.collect()
@@ -187,10 +208,10 @@ def run(
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
-        task = asyncio.gather(*(shell.run(on_news) for shell in shells))
+        task = asyncio.gather(*(shell.run(on_event) for shell in shells))
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
-        loop.add_signal_handler(signal.SIGUSR1, on_report)
+        loop.add_signal_handler(signal.SIGUSR1, on_usr1)
         on_start()
         with contextlib.suppress(asyncio.CancelledError):
             await task

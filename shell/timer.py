@@ -18,7 +18,7 @@ _TFD_TIMER_ABSTIME = 1
 
 
 class Timer(Protocol):
-    """Calls back once per `set`, at or after the absolute time given."""
+    """Timer that calls back once per `set`, at or after the absolute time given."""
 
     def set(self, due_ns: int | None) -> None:
         """Arm for `due_ns` [ns; CLOCK_MONOTONIC], in place of what was set before; None disarms."""
@@ -100,7 +100,7 @@ class LoopTimer:
 
 
 def make_timer(loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> Timer:
-    """The best timer this system has."""
+    """Make the most exact timer that this system has."""
     try:
         return KernelTimer(loop, callback)
     except OSError:

@@ -1,4 +1,9 @@
-"""Sockets and names, as the shell needs them; all blocking calls about addresses are in here."""
+"""Sockets and names, as the shell needs them; all blocking calls about addresses are in here.
+
+An address of this machine or of a peer is `(host, port)` everywhere else. In here it meets the
+kernel's own: for IPv6 a tuple of four, whose scope (the interface of a link-local address) becomes
+part of the host, as in `fe80::1%eth0`.
+"""
 
 import contextlib
 import ipaddress
@@ -6,14 +11,16 @@ import resource
 import socket
 import struct
 from collections.abc import Iterable
+from typing import Any
 
 from shared.endpoint import Address
+from shared.events import address_text
 
 BUFFER_BYTES = 4 * 1024 * 1024
-"""The default receive buffer holds 166 datagrams of 600 B."""
+"""Size of a socket's buffers [B]: the default receive buffer holds 166 datagrams of 600 B."""
 
 SPARE_FILES = 64
-"""Open files beside the sockets."""
+"""Number of open files beside the sockets."""
 
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 
@@ -23,8 +30,15 @@ class AddressError(OSError):
 
 
 def within_reach_of(peers: Iterable[Address]) -> Address:
-    """What to bind a socket to that talks to these: a free port, on loopback if all are there."""
-    return ("127.0.0.1" if all(map(is_loopback, peers)) else "0.0.0.0", 0)
+    """Address to bind a socket to that talks to these: a free port, on loopback if all are there.
+
+    Args:
+        peers: numeric addresses of one family; without any, IPv4 is assumed.
+    """
+    peers = list(peers)
+    six = any(":" in host for host, _ in peers)
+    loopback, anywhere = ("::1", "::") if six else ("127.0.0.1", "0.0.0.0")
+    return (loopback if all(map(is_loopback, peers)) else anywhere, 0)
 
 
 def is_loopback(address: Address) -> bool:
@@ -33,32 +47,63 @@ def is_loopback(address: Address) -> bool:
 
 
 def open_socket(address: Address, *, shared: bool = False) -> socket.socket:
-    """A non-blocking UDP socket with large buffers.
+    """A non-blocking UDP socket with large buffers; one of IPv6 hears IPv6 alone.
 
     Args:
+        address: a name or a number, of either family.
         shared: several sockets may have this address; the kernel deals out peers among them.
 
     Raises:
         AddressError: the address cannot be bound.
     """
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        sock.setblocking(False)
-        if shared:
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        for plain, forced in (
-            (socket.SO_RCVBUF, _SO_RCVBUFFORCE),
-            (socket.SO_SNDBUF, _SO_SNDBUFFORCE),
-        ):
-            sock.setsockopt(socket.SOL_SOCKET, plain, BUFFER_BYTES)
-            with contextlib.suppress(OSError):  # over the system's limit, for those who may
-                sock.setsockopt(socket.SOL_SOCKET, forced, BUFFER_BYTES)
-        sock.bind(address)
+        if not _is_numeric(address[0]):
+            address = look_up(address)
+        six = ":" in address[0]
+        sock = socket.socket(socket.AF_INET6 if six else socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            _prepare(sock, shared=shared)
+            sock.bind(to_kernel(address))
+        except OSError:
+            sock.close()
+            raise
     except OSError as error:
-        sock.close()
-        reason = f"cannot listen on {address[0]}:{address[1]}: {error.strerror}"
-        raise AddressError(reason) from None
+        reason = error.strerror or error
+        raise AddressError(f"cannot listen on {address_text(*address)}: {reason}") from None
     return sock
+
+
+def _prepare(sock: socket.socket, *, shared: bool) -> None:
+    sock.setblocking(False)
+    if sock.family == socket.AF_INET6:
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+    if shared:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    for plain, forced in (
+        (socket.SO_RCVBUF, _SO_RCVBUFFORCE),
+        (socket.SO_SNDBUF, _SO_SNDBUFFORCE),
+    ):
+        sock.setsockopt(socket.SOL_SOCKET, plain, BUFFER_BYTES)
+        with contextlib.suppress(OSError):  # over the system's limit, for those who may
+            sock.setsockopt(socket.SOL_SOCKET, forced, BUFFER_BYTES)
+
+
+def from_kernel(address: tuple[Any, ...]) -> Address:
+    """Address as the kernel gives it, without its IPv6 flow, and with a scope in the host."""
+    if len(address) == 2:
+        return address
+    host, port, _, scope = address
+    return (f"{host}%{socket.if_indextoname(scope)}" if scope else host, port)
+
+
+def to_kernel(address: Address) -> tuple[Any, ...]:
+    """Numeric address as the kernel takes it.
+
+    Raises:
+        OSError: there is no such interface as its scope.
+    """
+    host, percent, scope = address[0].partition("%")
+    return (host, address[1], 0, socket.if_nametoindex(scope)) if percent else address
 
 
 def allow_sockets(count: int) -> None:
@@ -71,7 +116,7 @@ def allow_sockets(count: int) -> None:
 
 
 def kernel_drops(sock: socket.socket) -> int:
-    """Datagrams dropped because the receive buffer was full; 0 where the system won't say."""
+    """Number of datagrams dropped because the receive buffer was full; 0 where nobody says."""
     try:
         info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
     except OSError:
@@ -80,31 +125,38 @@ def kernel_drops(sock: socket.socket) -> int:
 
 
 class Names:
-    """Which numbers stand for the names of peers, as far as is known now.
+    """Numeric addresses of peers, which an endpoint knows as the user has written them.
 
     Raises:
         AddressError: one of them cannot be found.
     """
 
     def __init__(self, peers: Iterable[Address]) -> None:
-        self._names = [peer for peer in peers if not _is_numeric(peer[0])]
         self._numbers: dict[Address, Address] = {}
         self._by_number: dict[Address, Address] = {}
-        for name in self._names:
+        for peer in peers:
             try:
-                self.learn({name: look_up(name)})
+                self.learn({peer: look_up(peer)})
             except OSError as error:
-                raise AddressError(f"cannot find {name[0]}: {error.strerror}") from None
+                reason = error.strerror or error
+                raise AddressError(f"cannot find {peer[0]}: {reason}") from None
+        self._names = [peer for peer in self._numbers if not _is_numeric(peer[0])]
 
-    def __bool__(self) -> bool:
+    @property
+    def may_change(self) -> bool:
+        """Whether some peers are known by name, whose number may become another."""
         return bool(self._names)
 
+    def numbers(self) -> list[Address]:
+        """Numeric addresses of all peers."""
+        return list(self._numbers.values())
+
     def number(self, peer: Address) -> Address:
-        """Where to send to."""
+        """Numeric address of a peer."""
         return self._numbers.get(peer, peer)
 
     def name(self, number: Address) -> Address:
-        """Who has sent: the peer by its name, where it has one."""
+        """Peer with a numeric address, as the user has written it."""
         return self._by_number.get(number, number)
 
     def look_up(self) -> dict[Address, Address]:
@@ -116,20 +168,20 @@ class Names:
         return found
 
     def learn(self, found: dict[Address, Address]) -> None:
-        """From now on these numbers stand for these names."""
+        """Let these numbers stand for these peers from now on."""
         self._numbers |= found
         self._by_number = {number: name for name, number in self._numbers.items()}
 
 
 def look_up(peer: Address) -> Address:
-    """The numeric address of a named one; blocks.
+    """Numeric address of a name or number, of IPv4 where a name has one of each family; blocks.
 
     Raises:
         OSError: it cannot be found.
     """
-    found = socket.getaddrinfo(*peer, socket.AF_INET, socket.SOCK_DGRAM)
-    host, port = found[0][4][:2]
-    return str(host), int(port)
+    found = socket.getaddrinfo(*peer, type=socket.SOCK_DGRAM)
+    four = [entry for entry in found if entry[0] == socket.AF_INET]
+    return from_kernel((four or found)[0][4])
 
 
 def _is_numeric(host: str) -> bool:

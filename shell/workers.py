@@ -16,25 +16,28 @@ from multiprocessing.connection import wait
 from socket import socket
 
 from shared.endpoint import Address
-from shell.udp import open_socket
+from shell.udp import from_kernel, open_socket
 
 FORK = multiprocessing.get_context("fork")
-"""What has been imported and compiled is there at once, and in memory only once."""
+"""Way to start a worker: what is imported and compiled is there at once, and in memory once."""
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+"""Signals that are passed on to every worker."""
 
 
 def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
-    """Let `count` processes work until the first of them ends; the worst of their exit codes.
+    """Let `count` processes work until the first of them ends; returns the worst exit code.
 
     Args:
-        bind: their address; port 0 takes a free one.
-        work: what each does with its number, from 1, and its socket.
+        count: number of processes.
+        bind: address of all of them; port 0 takes a free one.
+        work: called in each process with its number, from 1, and its socket.
 
     Raises:
         AddressError: the address cannot be bound.
     """
     sockets = [open_socket(bind, shared=True)]
-    sockets += [open_socket(sockets[0].getsockname(), shared=True) for _ in range(count - 1)]
+    address = from_kernel(sockets[0].getsockname())
+    sockets += [open_socket(address, shared=True) for _ in range(count - 1)]
     children = [
         FORK.Process(target=_work, args=(work, number, sockets, os.getpid()))
         for number in range(1, count + 1)
@@ -78,7 +81,7 @@ def _work(
 
 
 def die_with_parent() -> None:
-    """Runs in a child: should its parent be killed outright, nothing of it goes on."""
+    """Ask the kernel to end this process with SIGTERM once its parent is gone; runs in a child."""
     pr_set_pdeathsig = 1
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)

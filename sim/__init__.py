@@ -1,1 +1,1 @@
-"""The same endpoints in virtual time."""
+"""Virtual time: the endpoints that fly over UDP, on a clock that jumps from event to event."""

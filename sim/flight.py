@@ -1,4 +1,4 @@
-"""One scenario flown in virtual time: scenario + seed → World → record.
+"""Flights in virtual time: scenario + seed → World → record and events.
 
 **A run is the same in any company.** Runs of a batch share one server, which solves for all of them
 at once, and nothing else: each has a network, winds and clocks of its own, from its seed. Three
@@ -6,14 +6,16 @@ things make their records equal, to the last bit, to those of the runs one by on
 ticks lie on the grid of its clock, whoever flies, and the phase that a seed draws is when its
 vehicles start. What the server computes delays what it sends, not what it hears, and it is woken
 after everybody else (`sim.world`). And what differs from run to run, vehicle and session number,
-takes as many bytes on the wire in any of them.
+takes as many bytes on the wire in any of them. Events are equal as well, once the vehicles of each
+run are numbered from 1.
 """
 
 import hashlib
 import io
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -24,6 +26,7 @@ from server.endpoint import Server
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, seconds_to_ns
+from shared.events import Event, Failure, VehicleEvent
 from shared.record import (
     PACKET_COLUMNS,
     Recorder,
@@ -36,27 +39,44 @@ from shared.stopwatch import Stopwatch
 from sim.world import Clock, World
 
 MIDNIGHT_NS = 86_400 * SECOND_NS
-"""What the server's clock shows at the start, about: no stamp may become negative."""
+"""Time that the server's clock shows at the start [ns]: no stamp may become negative."""
 BOOT_ID = 2**63 + 2**31
-"""Of every endpoint: as long on the wire as a random one, and so are the sessions' numbers."""
+"""Boot id of every endpoint: as long on the wire as a random one, and so are session numbers."""
 SERVER: Address = ("server", 0)
 COMPANY_MAX = 100
-"""Runs that share a server. More would be no faster, and a vehicle's number takes one byte."""
+"""Most runs that share a server; more would be no faster, and a vehicle's number takes one byte."""
+EVENTS_MAX = 65_536
+"""Events kept of a flight; older ones give way."""
+
+
+class FlightEvent(NamedTuple):
+    """An event of a flight."""
+
+    time_ns: int
+    """Time of the world [ns]."""
+    host: str
+    """Name of the host that says it: "server", "netem SEED" or "client SEED.VEHICLE"."""
+    event: Event
 
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """The record of a flight, in its three parts (see `shared.record`)."""
+    """A flight: its record in three parts (see `shared.record`), and what was said of it."""
 
     client: Rows
     server: Rows
     netem: Rows
-    failure: str | None = None
+    failure: Failure | None = None
+    """Event after which a vehicle could not fly, the first vehicle's that has one."""
     figures: Mapping[str, Any] = field(default_factory=dict)
-    """Of the endpoints "server" and "netem" (see `Endpoint.figures`); in a batch, at its end."""
+    """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); of a flight in a
+    batch, those at the end of the batch."""
+    events: tuple[FlightEvent, ...] = ()
+    """Events of the run's own endpoints, and those of the server about its vehicles, in their
+    order; empty for a flight over real UDP."""
 
     def trace_hash(self) -> str:
-        """Equal for two flights that went the same to the last bit."""
+        """Hash of the record, equal for two flights that went the same to the last bit."""
         parts = (self.client, self.server, self.netem)
         return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
@@ -75,8 +95,10 @@ def fly(
     anywhere within their steps, as they do in life.
 
     Args:
-        vehicles: how many, numbered from 1, all with the same plan and winds of their own.
-        stopwatch: measures the server; its clock makes the record one of a kind.
+        scenario: what to fly.
+        vehicles: number of vehicles, numbered from 1, all with the same plan and winds of their
+            own.
+        stopwatch: measures the server; what it measures differs from flight to flight.
         on_second: called with the time flown [s], once a second of it.
         stopped: asked often; once it says so, the flight is broken off.
     """
@@ -98,7 +120,8 @@ def fly_batch(
     depends on when it began), runs are flown one by one.
 
     Args:
-        seeds: no two alike; they take the place of the scenario's.
+        scenario: what to fly.
+        seeds: seeds in place of the scenario's, no two alike.
         on_second, stopped: see `fly`; the time begins anew every COMPANY_MAX runs.
     """
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
@@ -111,7 +134,11 @@ class Run:
     """The vehicles of one seed and their network, in a world with others.
 
     Args:
-        number: from 0; its vehicles' numbers follow those of the runs before.
+        world: where its hosts are added.
+        scenario: what to fly, with the run's seed.
+        server: the server of all runs.
+        number: number of the run, from 0; its vehicles' numbers follow those of the runs before.
+        vehicles: number of its vehicles.
     """
 
     def __init__(
@@ -128,6 +155,9 @@ class Run:
             recorder=Recorder(PACKET_COLUMNS, self._sinks[1]),
         )
         netem_at = world.add(f"netem {scenario.seed}", self.netem)
+        self.hosts = [netem_at[0]]
+        """Names of its hosts."""
+        self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
         simulation = scenario.simulation
         clock = Clock(
             MIDNIGHT_NS + seconds_to_ns(simulation.clock_offset_s),
@@ -145,13 +175,27 @@ class Run:
             )
             for vehicle in range(1, vehicles + 1)
         ]
-        for client in self._clients:
-            name = f"client {client.vehicle}"
-            on_finished = self._one_has_finished
-            world.add(name, client, clock=clock, start_ns=start_ns, on_finished=on_finished)
+        for vehicle, client in enumerate(self._clients, start=1):
+            host, _ = world.add(
+                f"client {scenario.seed}.{vehicle}",
+                client,
+                clock=clock,
+                start_ns=start_ns,
+                on_finished=self._one_has_finished,
+            )
+            self.hosts.append(host)
         self.flying = vehicles
+        """Number of vehicles that have not finished."""
         self._ends: tuple[int | None, int | None] = None, None
         """Rows of the server and bytes of netem by the time the last vehicle had finished."""
+
+    def hear(self, time_ns: int, host: str, event: Event) -> None:
+        """Keep an event of its own, as if it were alone, until its last vehicle has finished."""
+        if not self.flying:
+            return
+        if isinstance(event, VehicleEvent):
+            event = msgspec.structs.replace(event, vehicle=event.vehicle - self._before)
+        self._events.append(FlightEvent(time_ns, host, event))
 
     def _one_has_finished(self) -> None:
         self.flying -= 1
@@ -159,10 +203,10 @@ class Run:
             self._ends = self._server.counts["steps"], self._sinks[1].tell()
 
     def flight(self, server_rows: Rows) -> Flight:
-        """Its record, as if it had been alone.
+        """Make its flight, as if it had been alone.
 
         Args:
-            server_rows: of all runs.
+            server_rows: the server's part of the record, of all runs.
         """
         rows_end, bytes_end = self._ends
         client = parse(self._sinks[0].getvalue()).copy()
@@ -173,8 +217,10 @@ class Run:
         for rows in (client, server):
             rows["vehicle"] -= self._before
         failure = next((client.failure for client in self._clients if client.failure), None)
+        if failure:
+            failure = msgspec.structs.replace(failure, vehicle=failure.vehicle - self._before)
         figures = {"server": self._server.figures(), "netem": self.netem.figures()}
-        return Flight(client, server, netem, failure, figures)
+        return Flight(client, server, netem, failure, figures, tuple(self._events))
 
 
 def _fly(
@@ -185,7 +231,14 @@ def _fly(
     vehicles: int = 1,
     stopwatch: Stopwatch | None = None,
 ) -> list[Flight]:
-    world, sink = World(), io.BytesIO()
+    def on_event(time_ns: int, host: str, event: Event) -> None:
+        if host == SERVER[0]:
+            assert isinstance(event, VehicleEvent)
+            runs[(event.vehicle - 1) // vehicles].hear(time_ns, host, event)
+        else:
+            run_of[host].hear(time_ns, host, event)
+
+    world, sink = World(on_event), io.BytesIO()
     server = Server(
         scenario,
         boot_id=BOOT_ID,
@@ -197,6 +250,7 @@ def _fly(
         Run(world, msgspec.structs.replace(scenario, seed=seed), server, number, vehicles)
         for number, seed in enumerate(seeds)
     ]
+    run_of = {host: run for run in runs for host in run.hosts}
     # Added last, it is woken last: it has heard all there is to hear at that instant.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)

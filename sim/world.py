@@ -1,11 +1,12 @@
-"""Virtual time: any number of endpoints on one clock that jumps from event to event.
+"""Virtual time: any number of endpoints on one clock that jumps from instant to instant.
 
 Between endpoints a datagram takes no time (delays are netem's business, and netem is an endpoint
 here as well). Every host has a clock of its own, with offset and drift, and may take time to
 compute when it is woken: what it then sends leaves, and it can be woken again, only once it is
-done. It hears all along, so that what one host costs another delays nobody who only talks to it.
-Time is integer nanoseconds, and whatever happens at one instant happens in a fixed order: the same
-inputs give the same events everywhere, and hosts that never meet do not change each other's.
+done. It hears all along, so that its computing for one peer does not delay another that only talks
+to it. Time is integer nanoseconds, and whatever happens at one instant happens in a fixed order:
+the same inputs give the same outcome everywhere, and hosts that never meet do not change each
+other's.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 
 from shared.endpoint import Address, Datagram, Endpoint
+from shared.events import Event
 
 BILLION = 1_000_000_000
 
@@ -22,15 +24,16 @@ class Clock:
     """A host's monotonic clock, as a function of the world's time."""
 
     offset_ns: int = 0
+    """Time that it shows at time 0 of the world [ns]."""
     drift_ppb: int = 0
-    """How much faster it runs than the world's [10⁻⁹]."""
+    """Rate by which it runs faster than the world's [10⁻⁹]."""
 
     def local(self, time_ns: int) -> int:
-        """What it shows at a time of the world."""
+        """Time that it shows at a time of the world."""
         return self.offset_ns + time_ns + time_ns * self.drift_ppb // BILLION
 
     def world(self, local_ns: int) -> int:
-        """The first time of the world at which it shows at least this."""
+        """First time of the world at which it shows at least this time."""
         passed_ns = local_ns - self.offset_ns
         return passed_ns - passed_ns * self.drift_ppb // (BILLION + self.drift_ppb)
 
@@ -43,11 +46,15 @@ class Host:
     endpoint: Endpoint
     clock: Clock
     turn: int
-    """At one instant hosts are woken in the order in which they were added, from 1."""
+    """Place in the order in which hosts are woken at one instant, from 1: that of being added."""
     compute_ns: int
+    """Time that it works whenever it is woken [ns]."""
     busy_until_ns: int
+    """Time of the world until which it works, and cannot be woken."""
     on_finished: Callable[[], None] | None
+    """Callback for the end of the endpoint, until it has been called."""
     armed_ns: int | None = None
+    """Time of the world at which it is to be woken, or None."""
 
 
 ARRIVAL = 0
@@ -55,14 +62,23 @@ ARRIVAL = 0
 
 
 class World:
-    """Hosts, and what happens to them."""
+    """Hosts, and what happens to them.
 
-    def __init__(self) -> None:
+    Args:
+        on_event: called with the time of the world, the host's name and the event, for each event
+            of every endpoint, before the end of that endpoint is told.
+    """
+
+    def __init__(self, on_event: Callable[[int, str, Event], None] = lambda *_: None) -> None:
         self.now_ns = 0
+        """Time of the world [ns]."""
+        self._on_event = on_event
         self._hosts: dict[str, Host] = {}
-        self._events: list[tuple[int, int, int, Host, Datagram | None]] = []
-        """Time, turn, order of entry; to whom, and what arrives."""
+        self._agenda: list[tuple[int, int, int, Host, Datagram | None]] = []
+        """Heap of what will happen: time, turn, order of entry, host, and the datagram that arrives
+        there, or None for a wake."""
         self._scheduled = 0
+        """Number of entries so far."""
 
     def add(
         self,
@@ -74,15 +90,18 @@ class World:
         compute_ns: int = 0,
         on_finished: Callable[[], None] | None = None,
     ) -> Address:
-        """A new host, called like no other.
+        """Add a host.
 
         Args:
-            start_ns: it is not woken before this time of the world.
-            compute_ns: how long it works whenever it is woken.
+            name: name of the host, unlike any other's.
+            endpoint: what runs on it.
+            clock: its clock.
+            start_ns: time of the world before which it is not woken.
+            compute_ns: time that it works whenever it is woken [ns].
             on_finished: called once, when the endpoint has just finished.
 
         Returns:
-            its address.
+            Address of the host.
         """
         assert name not in self._hosts
         turn = len(self._hosts) + 1
@@ -93,8 +112,8 @@ class World:
 
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""
-        while self._events and not until():
-            time_ns, _, _, host, datagram = heappop(self._events)
+        while self._agenda and not until():
+            time_ns, _, _, host, datagram = heappop(self._agenda)
             if time_ns > limit_ns:
                 return
             self.now_ns = time_ns
@@ -105,7 +124,7 @@ class World:
 
     def _at(self, time_ns: int, turn: int, host: Host, datagram: Datagram | None) -> None:
         self._scheduled += 1
-        heappush(self._events, (time_ns, turn, self._scheduled, host, datagram))
+        heappush(self._agenda, (time_ns, turn, self._scheduled, host, datagram))
 
     def _arm(self, host: Host) -> None:
         due_ns = host.endpoint.next_wake_ns()
@@ -130,12 +149,14 @@ class World:
         self._after(host, self.now_ns)
 
     def _after(self, host: Host, leaves_ns: int) -> None:
-        """Its datagrams leave; then it waits again."""
+        """Let its datagrams leave, hand on its events, and arm its next wake."""
         for payload, (name, socket), source in host.endpoint.outbox():
             receiver = self._hosts.get(name)
             if receiver is not None:
                 arrived = Datagram(payload, (host.name, source), socket)
                 self._at(leaves_ns, ARRIVAL, receiver, arrived)
+        for event in host.endpoint.events():
+            self._on_event(self.now_ns, host.name, event)
         self._arm(host)
         if host.on_finished is not None and host.endpoint.finished:
             host.on_finished()

@@ -1,4 +1,4 @@
-"""The front door: the `skytether` command."""
+"""The `skytether` command: it hands each subcommand to the module that has it."""
 
 import sys
 from collections.abc import Sequence
@@ -14,16 +14,16 @@ USAGE = """usage: skytether COMMAND ...
 Flies a UAV over a bad network: a server plans, a client flies, and netem, between them, delays,
 reorders and loses their packets.
 
-  fly [SCENARIO]        one flight, with everything it needs; the place to start
+  fly [SCENARIO]        one flight, with everything it needs; the command to start with
   fleet [SCENARIO]      many vehicles on one server, and what each costs it
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
   reproduce             the paper's table and figures, and more, as a report
   compare               schemes and triggers on the same seeds, each at its best weights
   calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
   scenarios             what can be flown
-  server [SCENARIO]     one process by hand: plan for vehicles
-  netem [SCENARIO]      one process by hand: be the network
-  client [SCENARIO]     one process by hand: be a vehicle
+  server [SCENARIO]     one process by hand: plans for vehicles
+  netem [SCENARIO]      one process by hand: the network
+  client [SCENARIO]     one process by hand: a vehicle
 
 Each has a --help of its own. `skytether fly demo` flies a demonstration."""
 
@@ -50,11 +50,12 @@ COMMANDS = {
     "netem": "netem.__main__:emulate",
     "client": "client.__main__:fly",
 }
-"""Imported when called for: a network need not wait for what a server compiles."""
+"""Function of each subcommand, imported once it is called: netem need not wait for what a server
+compiles."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; the exit code."""
+    """Run the command; returns its exit code."""
     argv = sys.argv[1:] if argv is None else argv
     if not argv or argv[0] in ("-h", "--help"):
         print(USAGE)

@@ -1,4 +1,4 @@
-"""How long packets really take through netem, over UDP on loopback."""
+"""Measurement of how long packets really take through netem, over UDP on loopback."""
 
 import asyncio
 import time
@@ -9,39 +9,40 @@ import numpy as np
 
 from netem.fate import fates
 from shared.config import Scenario, to_toml
-from shared.endpoint import MILLISECOND_NS
+from shared.endpoint import MILLISECOND_NS, Address
+from shared.events import address_text
 from shared.model import Array
 from skytether.processes import started
 
 EVERY_S = 0.002
-"""Between packets."""
+"""Time between packets [s]."""
 BYTES = 350
-"""Of a packet: as long as a horizon."""
+"""Size of a packet [B]: that of a horizon."""
 LAST_S = 1.0
-"""How long the last packets are waited for, beyond the mean delay."""
+"""Time for which the last packets are waited for, beyond the mean delay [s]."""
 
 
 class _End(asyncio.DatagramProtocol):
-    """One end: notes when each packet came that the other end stamped and numbered."""
+    """One end: notes when each packet comes that the other end has stamped and numbered."""
 
     def __init__(self, answers: bool) -> None:
         self._answers = answers
         self._sent = 0
         self.delays_ns: dict[int, int] = {}
-        """Of each packet that came, by its number."""
+        """Delay of each packet that came [ns], by its number."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Of asyncio."""
+        """See `asyncio.DatagramProtocol`."""
         self.transport = transport
 
-    def send(self, peer: tuple[str, int]) -> None:
-        """The next packet."""
+    def send(self, peer: Address) -> None:
+        """Send the next packet."""
         stamp = self._sent.to_bytes(8) + time.monotonic_ns().to_bytes(8)
         self.transport.sendto(stamp.ljust(BYTES, b"."), peer)  # type: ignore[attr-defined]
         self._sent += 1
 
-    def datagram_received(self, data: bytes, peer: tuple[str, int]) -> None:
-        """Of asyncio."""
+    def datagram_received(self, data: bytes, peer: Address) -> None:
+        """See `asyncio.DatagramProtocol`."""
         now_ns = time.monotonic_ns()
         number, sent_ns = int.from_bytes(data[:8]), int.from_bytes(data[8:16])
         self.delays_ns[number] = now_ns - sent_ns
@@ -55,12 +56,13 @@ def measure(
     """Send packets through netem, and as many back as come.
 
     Args:
-        folder: for the scenario that netem is given.
-        packets: to be sent.
+        scenario: `network` and `seed` of it are used.
+        folder: folder for the scenario file that netem is given.
+        packets: number of packets to send.
         on_second: called with the time that it takes so far [s], often.
 
     Returns:
-        A row each packet that came: how long it took, and how long it was drawn to take [ms].
+        Delays of the packets that came, as measured and as drawn [ms]; shape (packets, 2).
 
     Raises:
         CommandError: netem failed.
@@ -77,10 +79,9 @@ async def _measure(
     here = ("127.0.0.1", 0)
     back, server = await loop.create_datagram_endpoint(lambda: _End(True), local_addr=here)
     forth, client = await loop.create_datagram_endpoint(lambda: _End(False), local_addr=here)
-    host, port = back.get_extra_info("sockname")
-    arguments = (str(file), "--bind", "127.0.0.1:0", "--server", f"{host}:{port}")
+    at = address_text(*back.get_extra_info("sockname"))
     try:
-        async with started("netem", *arguments) as netem:
+        async with started("netem", str(file), "--bind", "127.0.0.1:0", "--server", at) as netem:
             began_s = loop.time()
             for number in range(packets):
                 await asyncio.sleep(began_s + number * EVERY_S - loop.time())

@@ -29,71 +29,72 @@ from sim import flight
 from skytether import processes
 
 STAGES = ("receive", "decode", "observe", "estimate", "trigger", "plan", "solve", "encode", "send")
-"""Of the server's work, in the order in which they come; `record` is the price of watching."""
+"""Stages of the server's work, in their order; `record`, the price of watching, is left out."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Of `skytether fleet`."""
+    """Options of `skytether fleet`."""
 
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
     vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 20
-    """How many."""
+    """Number of vehicles."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Processes of the server, which share the vehicles."""
+    """Number of the server's processes, which share the vehicles."""
     virtual: bool = False
-    """Fly in virtual time, all in this process."""
+    """Fly in virtual time: everything in this process, as fast as it can."""
     json: Path | None = None
-    """File for the summary."""
+    """File for the summary of the flight."""
     figure: Path | None = None
-    """File for a picture of it (.png, .pdf or .svg)."""
+    """File for a picture of the flight (.png, .pdf or .svg)."""
     config: ScenarioFlags = Scenario()
 
 
 class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What a fleet flew, and what that cost; None is what was not measured."""
+    """Summary of a fleet's flight, and of what it cost; None is what was not measured."""
 
     scenario: str
     seed: int
     vehicles: int
     workers: int
     duration_s: float
-    """Flown by the longest flight."""
+    """Time flown by the vehicle that flew longest [s]."""
     steps: int
-    """Flown by all vehicles,"""
+    """Steps flown by all vehicles."""
     server_steps: int
-    """and planned for by the server."""
+    """Steps that the server has planned for."""
     event_ratio: float
     rmse_xy: tuple[float, float, float] | None
-    """Smallest, median and largest of the vehicles [m]."""
+    """Smallest, median and largest RMSE of the vehicles [m]."""
     uplink_packets_per_s: float
-    """From the server into the network,"""
+    """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
-    """and from the vehicles."""
+    """Packets from the vehicles into the network [1/s]."""
     lost: int
-    """By the network, both ways."""
+    """Packets that the network lost, both ways."""
     dropped: int
-    """By kernels and full queues, which no network was asked for."""
+    """Packets that kernels and full queues dropped, which no scenario asks for."""
     tick_ms_p50: float
-    """How long a tick of the server took, all vehicles together, of the slowest worker."""
+    """Time that a tick of the server took, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float
+    """Time that one tick in a hundred exceeded, in the slowest worker [ms]."""
     server_missed: int
-    """Ticks that a worker slept through,"""
+    """Ticks that workers slept through."""
     client_missed: int
-    """steps that vehicles slept through,"""
+    """Steps that vehicles slept through."""
     machine_missed: int | None
-    """and those that a process which only sleeps would have, in the same time."""
+    """Steps that a thread which only sleeps slept through in the same time."""
     machine_late_ms_max: float | None
-    """How late that one woke at worst."""
+    """Largest delay with which that thread woke [ms]."""
     server_cpu_us: dict[str, float]
-    """Of the server, a vehicle and step [µs]: stages on the wall clock, `total` in CPU time."""
+    """Time of the server for a vehicle and step [µs]: stages on the wall clock, `total` of CPU."""
     client_cpu_us: float | None
-    """Of the vehicles' process, for a vehicle and step [µs]."""
+    """CPU time of the vehicles' process for a vehicle and step [µs]."""
     netem_cpu_us: float | None
-    """Of netem, for a packet [µs]."""
+    """CPU time of netem for a packet [µs]."""
     vehicle_steps_per_core_s: float | None
-    """In virtual time: flown in a second of CPU time, with everything included."""
+    """Steps of vehicles flown in a second of CPU time, everything included; in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,21 +103,24 @@ class Flown:
 
     client: Rows
     servers: list[dict[str, Any]]
-    """A worker each."""
+    """Figures of each worker of the server."""
     netem: dict[str, Any]
+    """Figures of netem."""
     processes: dict[str, dict[str, Any]]
-    """Of "client" and "netem", where these are processes."""
+    """Figures of "client" and "netem", where these are processes."""
     machine: "Metronome | None" = None
+    """Measure of what the machine took, over real UDP."""
     cpu_s: float | None = None
-    """Of everything together, in virtual time."""
+    """CPU time of everything together [s], in virtual time."""
 
 
 def fleet(argv: Sequence[str]) -> None:
     """Fly many vehicles on one server, each over a network of its own.
 
     Server, netem and all vehicles are three processes on loopback, or everything flies in virtual
-    time in this one. What the server's work cost is told for one vehicle and one step. Ctrl-C ends
-    the flight and still shows what was flown.
+    time in one. The cost of the server's work is shown for one vehicle and one step. Every key of
+    the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight and still shows
+    what was flown.
     """
     options = command.parse(Options(), argv, "skytether fleet", fleet.__doc__)
     command.check_count("--vehicles", options.vehicles, 65_535)
@@ -150,9 +154,12 @@ def _virtually(options: Options, on_second: Callable[[float], None]) -> Flown:
             stopped=interrupted,
         )
     if flown.failure:
-        raise CommandError(flown.failure)
+        raise CommandError(str(flown.failure))
     return Flown(
-        *(flown.client, [flown.figures["server"]], flown.figures["netem"], {}),
+        client=flown.client,
+        servers=[flown.figures["server"]],
+        netem=flown.figures["netem"],
+        processes={},
         cpu_s=time.process_time() - began_s,
     )
 
@@ -161,7 +168,8 @@ def _really(options: Options, on_second: Callable[[float], None]) -> Flown:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder, Metronome(options) as machine:
         parts = Path(folder)
         processes.run(
-            *(options.config, parts),
+            options.config,
+            parts,
             on_second=on_second,
             vehicles=options.vehicles,
             workers=options.workers,
@@ -175,7 +183,7 @@ def _really(options: Options, on_second: Callable[[float], None]) -> Flown:
 
 
 class Metronome:
-    """A thread that only sleeps, step by step: what it misses, the machine has taken."""
+    """A thread that only sleeps, step by step: whatever it misses, the machine has taken."""
 
     def __init__(self, options: Options) -> None:
         self._dt_s = options.config.control.dt

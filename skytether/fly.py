@@ -1,5 +1,6 @@
-"""`skytether fly`: one flight, over real UDP or in virtual time, and what came of it."""
+"""`skytether fly`: one flight, over real UDP or in virtual time, and its summary."""
 
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import msgspec
 from lab import figures
 from shared import config, record
 from shared.config import ConfigError, Scenario
+from shared.events import Event, ServerHeard, ServerRestarted, ServerSilent
 from shared.summary import Summary, summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -19,18 +21,18 @@ from skytether import processes
 
 @dataclass(frozen=True)
 class Options:
-    """Of `skytether fly`."""
+    """Options of `skytether fly`."""
 
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     virtual: bool = False
-    """Fly in virtual time: the same endpoints, reproducible, many times faster."""
+    """Fly in virtual time: the same code in one process, reproducible, many times faster."""
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
-    """File for a picture of it (.png, .pdf or .svg)."""
+    """File for a picture of the flight (.png, .pdf or .svg)."""
     beside: str | None = None
-    """Another scenario, flown in virtual time for as long and with the same seed, to compare."""
+    """Another scenario to compare with, flown in virtual time with the same duration and seed."""
     config: ScenarioFlags = Scenario()
 
 
@@ -50,7 +52,7 @@ def fly(argv: Sequence[str]) -> None:
     with command.progress(f"flying {title}", scenario.duration) as on_second:
         flown = (_virtually if options.virtual else _really)(scenario, on_second)
     if flown.failure:
-        raise CommandError(flown.failure)
+        raise CommandError(str(flown.failure))
     if not len(flown.client):
         raise CommandError("ended before the first step")
     flights = {title: (scenario, flown)}
@@ -86,6 +88,12 @@ def _virtually(scenario: Scenario, on_second: Callable[[float], None]) -> flight
 def _really(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
         parts = Path(folder)
-        processes.run(scenario, parts, on_second=on_second)
+        processes.run(scenario, parts, on_second=on_second, on_event=_tell)
         client, server, netem = (record.read(parts / part) for part in processes.NAMES)
         return flight.Flight(client, server, netem)
+
+
+def _tell(event: Event) -> None:
+    """Show what may happen to the link in flight, above the progress bar."""
+    if isinstance(event, ServerSilent | ServerHeard | ServerRestarted):
+        print(event, file=sys.stderr)

@@ -1,43 +1,55 @@
-"""A flight over real UDP: server, netem and client as three processes on loopback."""
+"""A flight over real UDP: server, netem and client as three processes on loopback.
+
+Each process writes its events as JSON on its standard output (`--log json`); they are all that is
+known here of what goes on in it. Anything else that it prints, a traceback or its one line for a
+mistake, is kept for its last words.
+"""
 
 import asyncio
 import contextlib
-import re
 import signal
 import sys
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import msgspec
 
 from shared.config import Scenario, to_toml
 from shared.endpoint import Address
+from shared.events import Counted, Event, Flying, Listening, address_text
 from shell.command import CommandError
 from shell.driver import new_event_loop
+from shell.log import Line
 from shell.workers import die_with_parent
 
 NAMES = ("client", "server", "netem")
-"""Of the processes, and of their parts of the record."""
+"""Names of the processes, and of their parts of the record."""
 
 START_S = 30.0
-"""How long a process may take to say what it listens on."""
+"""Longest time that a process may take until it listens [s]."""
 GRACE_S = 30.0
-"""How much longer than planned a flight may take, beside the time to connect."""
+"""Longest time that a flight may take beyond its duration and the time to connect [s]."""
 STOP_S = 5.0
-"""How long it may take to end once it is told to."""
+"""Longest time that a process may take to end once it is told to [s]."""
 LINES_MAX = 20
-"""Last lines kept of what a process said, for when it fails."""
+"""Number of last lines kept of what a process said, for when it fails."""
 
-_LISTENING = re.compile(r"listening on (\S+):(\d+),")
+OnEvent = Callable[[Event], None]
+_DECODER = msgspec.json.Decoder(Line)
 
 
 @dataclass(slots=True)
 class Child:
-    """One of the three."""
+    """A process that was started, and what it has said."""
 
     name: str
     process: asyncio.subprocess.Process
-    said: list[str]
+    said: deque[str] = field(default_factory=lambda: deque(maxlen=LINES_MAX))
+    """Last lines, those of events as sentences."""
     address: Address = ("", 0)
+    """Address that it listens on."""
 
     def last_words(self) -> str:
         """Why it ended, in its own words."""
@@ -45,25 +57,43 @@ class Child:
 
 
 @contextlib.asynccontextmanager
-async def started(name: str, *arguments: str) -> AsyncIterator[Child]:
-    """One process that listens, ended with the block: asked first, then killed.
+async def started(
+    name: str, *arguments: str, on_event: OnEvent = lambda _: None
+) -> AsyncIterator[Child]:
+    """Start a process that listens; at the end of the block it is told to end, then killed.
+
+    Args:
+        name: module to run.
+        arguments: its command line, beside `--log json`.
+        on_event: called with each of its events.
 
     Raises:
         CommandError: it ended, or did not come to listen.
     """
     process = await asyncio.create_subprocess_exec(
-        # -P: a folder called like one of ours, where the user happens to be, is not ours.
-        *(sys.executable, "-P", "-m", name, *arguments),
+        sys.executable,
+        "-P",  # a folder called like one of ours, where the user happens to be, is not ours
+        "-m",
+        name,
+        *arguments,
+        "--log",
+        "json",
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
         # Ctrl-C is for the command alone: it ends its children in order.
         start_new_session=True,
         preexec_fn=die_with_parent,
     )
-    child = Child(name, process, [])
+    child = Child(name, process)
     assert process.stdout is not None
-    listening = asyncio.get_running_loop().create_future()
-    reader = asyncio.create_task(_read(child, process.stdout, listening))
+    listening: asyncio.Future[Address] = asyncio.get_running_loop().create_future()
+
+    def hear(event: Event) -> None:
+        if isinstance(event, Listening) and not listening.done():
+            listening.set_result((event.host, event.port))
+        on_event(event)
+
+    reader = asyncio.create_task(_read(child, process.stdout, hear))
     try:
         done, _ = await asyncio.wait(
             (listening, reader), timeout=START_S, return_when=asyncio.FIRST_COMPLETED
@@ -84,14 +114,16 @@ async def started(name: str, *arguments: str) -> AsyncIterator[Child]:
         await reader
 
 
-async def _read(
-    child: Child, stream: asyncio.StreamReader, listening: asyncio.Future[Address]
-) -> None:
+async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -> None:
     async for line in stream:
-        child.said = [*child.said, line.decode(errors="replace").rstrip()][-LINES_MAX:]
-        found = _LISTENING.search(child.said[-1])
-        if found and not listening.done():
-            listening.set_result((found[1], int(found[2])))
+        try:
+            said = _DECODER.decode(line)
+        except (msgspec.DecodeError, UnicodeDecodeError):  # no event: a traceback, or a mistake
+            child.said.append(line.decode(errors="replace").rstrip())
+            continue
+        if not isinstance(said.event, Counted):  # numbers are no reason for an end
+            child.said.append(f"{said.process}: {said.event}")
+        on_event(said.event)
 
 
 def run(
@@ -99,6 +131,7 @@ def run(
     parts: Path,
     *,
     on_second: Callable[[float], None],
+    on_event: OnEvent = lambda _: None,
     vehicles: int = 1,
     workers: int = 1,
     watched: bool = True,
@@ -106,10 +139,12 @@ def run(
     """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
 
     Args:
+        scenario: what to fly.
         parts: the folder, for a record of each process and, as `.json`, its figures.
         on_second: called with the time flown [s], several times a second.
-        vehicles: how many, all in one process.
-        workers: processes of the server.
+        on_event: called with each event of the client.
+        vehicles: number of vehicles, all in one process.
+        workers: number of processes of the server.
         watched: whether server and netem record, too.
 
     Raises:
@@ -119,14 +154,14 @@ def run(
     file.write_bytes(to_toml(scenario))
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
 
-    def common(name: str, *, recorded: bool) -> tuple[str, ...]:
-        part = ("--record", str(parts / name)) if recorded else ()
-        return (name, str(file), "--json", str(parts / f"{name}.json"), *part)
+    def common(name: str, *, recorded: bool) -> list[str]:
+        part = ["--record", str(parts / name)] if recorded else []
+        return [name, str(file), "--json", str(parts / f"{name}.json"), *part]
 
-    fleet = ("--vehicles", str(vehicles))
-    server = (*common("server", recorded=watched), *fleet, "--workers", str(workers))
-    netem = (*common("netem", recorded=watched), "--flows", str(vehicles))
-    client = (*common("client", recorded=True), *fleet)
+    fleet = ["--vehicles", str(vehicles)]
+    server = [*common("server", recorded=watched), *fleet, "--workers", str(workers)]
+    netem = [*common("netem", recorded=watched), "--flows", str(vehicles)]
+    client = [*common("client", recorded=True), *fleet]
 
     async def main() -> None:
         task = asyncio.current_task()
@@ -135,7 +170,9 @@ def run(
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
         with contextlib.suppress(asyncio.CancelledError):
-            await _fly(server, netem, client, timeout_s, on_second)
+            await _fly(
+                server, netem, client, timeout_s=timeout_s, on_second=on_second, on_event=on_event
+            )
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(main())
@@ -145,23 +182,31 @@ async def _fly(
     server_command: Sequence[str],
     netem_command: Sequence[str],
     client_command: Sequence[str],
+    *,
     timeout_s: float,
     on_second: Callable[[float], None],
+    on_event: OnEvent,
 ) -> None:
+    loop = asyncio.get_running_loop()
+    flying_s: float | None = None
+
+    def hear(event: Event) -> None:
+        nonlocal flying_s
+        if isinstance(event, Flying) and flying_s is None:
+            flying_s = loop.time()
+        on_event(event)
+
     anywhere = ("--bind", "127.0.0.1:0")
     async with (
         started(*server_command, *anywhere) as server,
-        started(*netem_command, *anywhere, "--server", _text(server.address)) as netem,
-        started(*client_command, "--server", _text(netem.address)) as client,
+        started(*netem_command, *anywhere, "--server", address_text(*server.address)) as netem,
+        started(*client_command, "--server", address_text(*netem.address), on_event=hear) as client,
     ):
-        loop = asyncio.get_running_loop()
-        began_s, flying_s = loop.time(), None
+        began_s = loop.time()
         ended = [asyncio.create_task(child.process.wait()) for child in (client, netem, server)]
         try:
             while not any(task.done() for task in ended):
                 await asyncio.wait(ended, timeout=0.2, return_when=asyncio.FIRST_COMPLETED)
-                if flying_s is None and any("flying" in line for line in client.said):
-                    flying_s = loop.time()
                 on_second(0.0 if flying_s is None else loop.time() - flying_s)
                 if loop.time() - began_s > timeout_s:
                     raise CommandError(f"the flight has not ended in {timeout_s:.0f} s")
@@ -172,7 +217,3 @@ async def _fly(
             code = child.process.returncode
             if code is not None and (code != 0 or child is not client):
                 raise CommandError(child.last_words())
-
-
-def _text(address: Address) -> str:
-    return f"{address[0]}:{address[1]}"

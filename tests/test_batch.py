@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from shared import chance, config
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS
+from shared.events import SessionEnded
 from shared.protocol import Heartbeat, encode
 from sim import flight
 from sim.flight import BOOT_ID, COMPANY_MAX, Flight, fly, fly_batch
@@ -34,6 +35,7 @@ def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Flight]:
             assert getattr(together, part).tobytes() == getattr(alone, part).tobytes(), part
         assert together.trace_hash() == alone.trace_hash()
         assert together.failure == alone.failure
+        assert together.events == alone.events
     return flights
 
 
@@ -139,6 +141,17 @@ def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:
     )
     flights = assert_as_alone(flown, range(4))
     assert flights[0].figures["server"]["counts"]["dropped: unknown session"] > 0
+
+
+def test_a_session_is_forgotten_at_the_same_time_in_any_company() -> None:
+    """The server looks for those that are gone on the grid of its clock, whoever flies."""
+    rare = {"downlink": {"delay": "none", "loss": 0.9}, "uplink": {"delay": "none", "loss": 0.0}}
+    flown = scenario(
+        duration=300.0, control={"dt": 0.9, "horizon": 3}, network=rare, link={"connect_s": 60.0}
+    )
+    flights = assert_as_alone(flown, range(4))
+    ended = [sum(event == SessionEnded(vehicle=1) for *_, event in run.events) for run in flights]
+    assert sum(ended) >= 3
 
 
 def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:

@@ -12,8 +12,18 @@ from shared import config
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram
+from shared.events import (
+    Finished,
+    Flying,
+    NoAnswer,
+    ServerHeard,
+    ServerRestarted,
+    ServerSilent,
+    SessionRefused,
+)
 from shared.protocol import (
     NO_HORIZON,
+    Difference,
     Heartbeat,
     Hello,
     Horizon,
@@ -110,7 +120,10 @@ def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
         if server.client.finished:
             break
         server.wake()
-    assert server.client.failure == "no answer from server:0 in 16 s"
+    failure = NoAnswer(vehicle=4, host="server", port=0, waited_s=16.0)
+    assert server.client.failure == failure
+    assert server.client.events() == (failure,)
+    assert str(failure) == "vehicle 4: no answer from server:0 in 16 s"
     assert server.client.next_wake_ns() is None
 
 
@@ -120,8 +133,12 @@ def test_another_scenario_at_the_server_ends_the_client_with_the_difference() ->
     server.wake()
     server.welcome(terms=server.terms._replace(dt_ns=20_000_000))
     assert server.client.finished
-    expected = "the server flies another scenario: dt_ns 20000000 against 50000000"
-    assert server.client.failure == expected
+    failure = SessionRefused(
+        vehicle=4, differences=(Difference("control.dt", here="0.05", there="0.02"),)
+    )
+    assert server.client.failure == failure
+    assert server.client.events() == (failure,)
+    assert str(failure).endswith(": control.dt is 0.05 here and 0.02 at the other end")
 
 
 def test_the_epoch_is_the_moment_the_session_opens() -> None:
@@ -203,9 +220,9 @@ def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
     hellos = [message for message in said if isinstance(message, Hello)]
     assert len(said) - len(hellos) == 65
     assert len(hellos) == 3
-    assert server.client.news()[-1] == "the server is silent"
+    assert server.client.events()[-1] == ServerSilent(vehicle=4)
     server.say(Heartbeat(4, 7, 1))
-    assert server.client.news() == ["the server is heard again"]
+    assert server.client.events() == (ServerHeard(vehicle=4),)
     (only,) = server.wake()
     assert isinstance(only, Observation)
     assert only.stamp_ns == epoch_ns + 65 * server.dt_ns
@@ -220,7 +237,7 @@ def test_a_restarted_server_is_flown_with_in_its_new_session() -> None:
     (said,) = server.wake()
     assert isinstance(said, Observation)
     assert (said.session, said.step) == (8, 1)
-    assert "the server has restarted" in server.client.news()
+    assert server.client.events() == (Flying(vehicle=4), ServerRestarted(vehicle=4))
     server.session = 7
     server.horizon(1, 1.0)
     assert server.client.counts == {"dropped: unknown session": 1}
@@ -242,6 +259,7 @@ def test_the_flight_ends_after_its_duration() -> None:
         assert not server.client.finished
         server.wake()
     assert server.client.finished
+    assert server.client.events()[-1] == Finished(vehicle=4, steps=200, missed=0)
     assert server.client.next_wake_ns() is None
     assert server.rows()["step"].tolist() == list(range(200))
 

@@ -12,16 +12,23 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+import msgspec
 import pytest
 
 import skytether.__main__
 from shared import config
+from shared.endpoint import Address
+from shared.events import Counted, Finished, Flying, Listening, address_text
 from shared.record import client_columns
+from shell import command
 from shell.command import parse
+from shell.log import Line
 from skytether.fly import Options
 
 PATIENCE_S = 30.0
 """How long a test waits for something before it gives up."""
+
+EXPECTED = "expected HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
 
 QUICK = [
     *("--network.uplink.delay", "constant", "--network.downlink.delay", "constant"),
@@ -73,6 +80,15 @@ class Process:
         """Address that the process listens on."""
         return self.wait_for(r"listening on (\S+:\d+), waiting for")[1]
 
+    def counted(self, name: str) -> int:
+        """A number that it has counted, asked for by SIGUSR1; 0 where there is none of it."""
+        self.popen.send_signal(signal.SIGUSR1)
+        self.wait_for("counted so far:")
+        first = len(self.said)
+        self.wait_for("send_errors")  # the last line
+        found = [re.search(rf": +{name} +(\d+)$", line) for line in self.said[first:]]
+        return next((int(match[1]) for match in found if match), 0)
+
     def end(self, number: int = signal.SIGTERM) -> int:
         """End the process by a signal; returns its exit code."""
         self.popen.send_signal(number)
@@ -118,7 +134,20 @@ def start() -> Iterator[Callable[..., Process]]:
             2,
             "fly: flight.gif: expected a file in .png, .pdf, .svg",
         ),
-        (["server", "--bind", "47001"], 2, "server: got the address '47001', expected HOST:PORT"),
+        (["server", "--bind", "47001"], 2, "server: --bind: got '47001', " + EXPECTED),
+        (["server", "--bind", "::1:47001"], 2, "server: --bind: got '::1:47001', " + EXPECTED),
+        (["server", "--bind", "[::1]"], 2, "server: --bind: got '[::1]', " + EXPECTED),
+        (["netem", "--server", "[name]:1"], 2, "netem: --server: got '[name]:1', " + EXPECTED),
+        (
+            ["client", "--server", "[1::2::3]:4"],
+            2,
+            "client: --server: got '[1::2::3]:4', " + EXPECTED,
+        ),
+        (
+            ["client", "--server", "[::1]:65536"],
+            2,
+            "client: --server: got '[::1]:65536', " + EXPECTED,
+        ),
         (["client", "--id", "-1"], 2, "client: --id: got -1, expected 0 to 65535"),
         (
             ["netem", "--server", "nobody.invalid:1"],
@@ -135,6 +164,15 @@ def test_a_mistake_is_one_clear_line(
     assert skytether.__main__.main(argv) == code
     said = capfd.readouterr()
     assert said.err.splitlines() == [line]
+
+
+@pytest.mark.parametrize(
+    "address",
+    [("127.0.0.1", 47000), ("netem", 0), ("::1", 47000), ("::", 1), ("fe80::1%eth0", 65535)],
+)
+def test_an_address_is_read_as_it_is_written(address: Address) -> None:
+    """An address of either family, and one by name."""
+    assert command.address("--bind", address_text(*address)) == address
 
 
 @pytest.mark.parametrize(
@@ -180,7 +218,7 @@ def test_an_unreachable_server_is_named() -> None:
     """The client waits as long as the scenario says, then ends with exit code 1."""
     run = skytether_("client", "demo", "--server", "127.0.0.1:9", "--link.connect-s", "0.5")
     assert run.returncode == 1
-    assert run.stderr == "client: no answer from 127.0.0.1:9 in 1 s\n"
+    assert run.stderr == "client: vehicle 1: no answer from 127.0.0.1:9 in 1 s\n"
 
 
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:
@@ -308,29 +346,70 @@ def test_ctrl_c_ends_the_flight_and_still_shows_it(tmp_path: Path) -> None:
     assert not any(Path(f"/proc/{pid}").exists() for pid in children)
 
 
-def test_three_processes_by_hand(start: Callable[..., Process], tmp_path: Path) -> None:
-    """`python -m server`, `netem` and `client` say what they listen on, report, and end cleanly."""
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", pytest.param("[::1]", marks=pytest.mark.ipv6)], ids=["IPv4", "IPv6"]
+)
+def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_path: Path) -> None:
+    """`python -m server`, `netem` and `client` say what they listen on, count, and end cleanly."""
     file = tmp_path / "summary.json"
-    server = start("server", "demo", "--bind", "127.0.0.1:0", *QUICK)
+    server = start("server", "demo", "--bind", f"{host}:0", *QUICK)
     address = server.address()
-    netem = start("netem", "demo", "--bind", "127.0.0.1:0", "--server", address, *QUICK)
+    netem = start("netem", "demo", "--bind", f"{host}:0", "--server", address, *QUICK)
     address = netem.address()
     argv = ["client", "demo", "--server", address, "--duration", "3", "--json", str(file)]
     client = start(*argv, *QUICK)
-    client.wait_for(r"waiting for the server at 127\.0\.0\.1:\d+")
+    client.wait_for(rf"waiting for the server at {re.escape(host)}:\d+")
     client.wait_for("session open, flying")
-    server.wait_for("vehicle 1 flies, from 127.0.0.1:")
+    server.wait_for(rf"vehicle 1 flies, from {re.escape(host)}:\d+")
     netem.popen.send_signal(signal.SIGUSR1)
-    netem.wait_for(r"uplink: \d+ packets, \d+ forwarded, 0 lost, 0 reordered, 0 overflowed, queue")
-    netem.wait_for(r"delay: 20 ms: \d+")
-    netem.wait_for("added-delay error: p50")
+    for pattern in (
+        *("counted so far:", r"flows +1$", "uplink$", r"  forwarded +\d+$", r"  lost +0$"),
+        *(r"  overflowed +0$", r"  queue +\d+$", r"  delays$", r"    20 ms +\d+$"),
+        *(r"  error_ms_p50 +[\d.]+$", "downlink$"),
+    ):
+        netem.wait_for(pattern)
     assert client.ended() == 0
     assert netem.end() == 0
     assert server.end(signal.SIGINT) == 0
-    assert any("added-delay error" in line for line in netem.said[-2:])
+    for process in (server, netem, client):
+        assert not any("plaintext" in line for line in process.said)
+    assert any("error_ms_p99" in line for line in netem.said[-20:])
     summary = json.loads(file.read_text())
     assert summary["steps"] + summary["deadline_misses"] == 60
     assert summary["event_ratio"] is None
+
+
+def test_a_client_that_is_refused_names_each_key_and_both_values(
+    start: Callable[..., Process],
+) -> None:
+    """Exit code 2, and one line on stderr; the server says so, too."""
+    server = start("server", "demo", "--bind", "127.0.0.1:0")
+    other = ["--control.dt", "0.02", "--control.horizon", "50"]
+    run = skytether_("client", "demo", "--server", server.address(), *other)
+    assert run.returncode == 2
+    assert run.stderr == (
+        "client: vehicle 1 is refused, it flies another scenario: control.dt is 0.02 here and 0.05 "
+        "at the other end; control.horizon is 50 here and 40 at the other end\n"
+    )
+    server.wait_for("vehicle 1 is refused, .* control.dt is 0.05 here and 0.02 at the other end")
+    assert server.end() == 0
+
+
+def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> None:
+    """And nothing else; each with the process and CLOCK_MONOTONIC, in the order of time."""
+    server = start("server", "demo", "--bind", "127.0.0.1:0")
+    argv = ["--server", server.address(), "--duration", "0.5", "--log", "json", *QUICK]
+    began_ns = time.monotonic_ns()
+    run = skytether_("client", "demo", *argv)
+    assert run.returncode == 0, run.stderr
+    lines = [msgspec.json.decode(line, type=Line) for line in run.stdout.splitlines()]
+    kinds = [type(line.event) for line in lines]
+    assert kinds == [Listening, Flying, Finished, Counted]
+    assert {line.process for line in lines} == {"client"}
+    times_ns = [began_ns, *(line.time_ns for line in lines), time.monotonic_ns()]
+    assert times_ns == sorted(times_ns)
+    assert json.loads(run.stdout.splitlines()[1])["event"] == {"type": "Flying", "vehicle": 1}
+    assert server.end() == 0
 
 
 @pytest.mark.parametrize("victim", ["server", "netem", "client"])
@@ -360,13 +439,9 @@ def test_the_other_two_survive_a_kill_and_restart(
     else:
         running["client"].wait_for("the server is heard again|the server has restarted")
 
-    def horizons() -> int:
-        running["client"].popen.send_signal(signal.SIGUSR1)
-        return int(running["client"].wait_for(r"(\d+) horizons|missed, no packets")[1] or 0)
-
-    before = horizons()
+    before = running["client"].counted("horizons")
     deadline = time.monotonic() + PATIENCE_S
-    while horizons() < before + 10:
+    while running["client"].counted("horizons") < before + 10:
         assert time.monotonic() < deadline
         time.sleep(0.1)
     for name in ("client", "netem", "server"):

@@ -70,7 +70,7 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
         for service in SERVICES:
             assert three.state(service)["ExitCode"] == 0, three.said(service)
         last_words = three.said("client").rsplit("flying", 1)[1]
-        assert 0 < number(r"step (\d+)", last_words) < FLIGHT_S * STEPS_PER_S
+        assert 0 < number("step", last_words) < FLIGHT_S * STEPS_PER_S
         say("SIGTERM ended all three with 0")
 
 
@@ -180,37 +180,37 @@ class Containers:
 
     # -- the flight --------------------------------------------------------------------------
 
-    def report(self, service: str) -> str:
-        """The line of counts that a process gives at SIGUSR1."""
-        pattern = {"client": r"step \d+ of .*", "server": r"\d+ in session, .*"}[service]
+    def figures(self, service: str) -> str:
+        """The lines of figures that a process prints at SIGUSR1, up to the last of them."""
+        pattern = r"(?s)counted so far:.*?send_errors +\d+"
         before = len(re.findall(pattern, self.said(service)))
         self.docker("kill", "--signal", "USR1", self.id(service))
         new = until(
-            f"a report of the {service}", lambda: re.findall(pattern, self.said(service))[before:]
+            f"figures of the {service}", lambda: re.findall(pattern, self.said(service))[before:]
         )
         return str(new[-1])
 
     def flies(self) -> None:
         """Wait until orders reach the vehicle, newly made ones."""
         until("the session", lambda: self.has_said("server", "vehicle 1 flies"))
-        first = self.report("client")
+        first = self.figures("client")
         # A second later netem holds nothing that it held until now.
-        second = self.report_of(r"step (\d+)", number(r"step (\d+)", first) + STEPS_PER_S)
-        server = self.report("server")
-        last = self.report_of(r"(\d+) horizons", number(r"(\d+) horizons", second) + HORIZONS)
-        events = r"(\d+) events"
-        assert number(events, self.report("server")) > number(events, server)
-        say(f"orders reach the vehicle: {first} ... {last}")
+        second = self.figures_with("step", number("step", first) + STEPS_PER_S)
+        server = self.figures("server")
+        last = self.figures_with("horizons", number("horizons", second) + HORIZONS)
+        assert number("events", self.figures("server")) > number("events", server)
+        counts = [number("horizons", figures) for figures in (first, last)]
+        say(f"orders reach the vehicle: {counts[0]} ... {counts[1]}")
 
-    def report_of(self, pattern: str, least: int) -> str:
-        """The first report of the client that counts so many of something."""
+    def figures_with(self, name: str, least: int) -> str:
+        """The first figures of the client that count so many of something."""
 
         def enough() -> str | None:
             assert self.state("client")["Status"] == "running", "the flight has ended too soon"
-            report = self.report("client")
-            return report if number(pattern, report) >= least else None
+            figures = self.figures("client")
+            return figures if number(name, figures) >= least else None
 
-        return until(f"{pattern}: {least}", enough)
+        return until(f"{name}: {least}", enough)
 
     @contextlib.contextmanager
     def fault(self, what: str) -> Iterator[None]:
@@ -219,8 +219,8 @@ class Containers:
         say(what)
         yield
         began_s = time.monotonic()
-        for news in ("the server is silent", "the server is heard again"):
-            until(news, partial(self.has_said, "client", news, since=before))
+        for event in ("the server is silent", "the server is heard again"):
+            until(event, partial(self.has_said, "client", event, since=before))
         say(f"the server is heard again, {time.monotonic() - began_s:.1f} s after the repair")
         self.flies()
 
@@ -374,9 +374,9 @@ def run(*command: str, more_env: Mapping[str, str] = MappingProxyType({})) -> st
     return done.stdout
 
 
-def number(pattern: str, report: str) -> int:
-    """What a report counts; nothing is 0."""
-    found = re.search(pattern, report)
+def number(name: str, figures: str) -> int:
+    """What figures count under a name; 0 where there is none of it."""
+    found = re.search(rf"(?m): +{name} +(\d+)$", figures)
     return int(found[1]) if found else 0
 
 

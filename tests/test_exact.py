@@ -207,14 +207,17 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     assert (np.abs(inputs) == 1.8).mean() > 0.5
     rounded = inputs.astype(np.float32).astype(np.float64)
     assert np.abs(rounded).max() < 1.8
-    work, again, more = workspace(problem.mpc), np.empty(problem.hessian.shape[1]), []
-    strict = active_set_with(NEAR=1.0)
+    work, again = workspace(problem.mpc), np.empty(problem.hessian.shape[1])
+
+    def rounds(solve: Callable[..., int], at: tuple[int, ...]) -> int:
+        g, guessed = gradient[at], rounded[at]
+        return solve(problem.mpc, at[1], LATER, work, g, guessed, 0, False, again)
+
     for at in np.ndindex(20, 2):
-        given_ = (problem.mpc, at[1], LATER, work, gradient[at], rounded[at], 0, False, again)
-        assert active_set(*given_) == 1
+        assert rounds(active_set, at) == 1
         np.testing.assert_array_equal(again, inputs[at])
-        more.append(strict(*given_))
-    assert max(more) > 1
+    strict = active_set_with(NEAR=1.0)
+    assert max(rounds(strict, at) for at in np.ndindex(20, 2)) > 1
 
 
 def test_osqp_agrees_to_its_tolerance() -> None:

@@ -22,6 +22,7 @@ from shared import config
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram
+from shared.events import NoAnswer
 from shared.record import Recorder, Rows, client_columns, parse
 from shell import workers
 from sim.world import Clock, World
@@ -96,24 +97,34 @@ def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() ->
     assert fleet.failure is None
     fleet.wake(now_ns=20 * SECOND_NS)
     assert fleet.finished
-    assert fleet.failure == "no answer from nowhere:1 in 19 s"
+    failures = [
+        NoAnswer(vehicle=number, host="nowhere", port=1, waited_s=19.0) for number in (1, 2, 3)
+    ]
+    assert fleet.failure == failures[0]
+    assert fleet.events() == tuple(failures)
+    assert str(failures[1]) == "vehicle 2: no answer from nowhere:1 in 19 s"
     assert fleet.next_wake_ns() is None
 
 
 def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -> None:
-    """Counted there, and told under its name."""
+    """Counted there, and shown under its number."""
     vehicles, _ = clients(GUSTY, 2, ("server", 1))
     fleet = Fleet(vehicles)
     fleet.receive(Datagram(b"?", ("server", 1), 1), now_ns=0)
     assert [client.counts.total() for client in vehicles] == [0, 1]
-    assert fleet.report().splitlines()[1].startswith("vehicle 2: step 0 of 200")
+    assert fleet.figures()["each"]["vehicle 2"] == {
+        "step": 0,
+        "steps": 200,
+        "missed": 0,
+        "counts": {"dropped: not a message": 1},
+    }
 
 
-def test_a_report_of_many_vehicles_stays_readable() -> None:
-    """A report tells of sixteen vehicles, and how many more there are."""
+def test_figures_of_many_vehicles_stay_readable() -> None:
+    """Figures tell of sixteen vehicles, and of how many more there are."""
     vehicles, _ = clients(GUSTY, 20, ("server", 1))
-    lines = Fleet(vehicles).report().splitlines()
-    assert (len(lines), lines[-1]) == (17, "and 4 more")
+    each = Fleet(vehicles).figures()["each"]
+    assert (len(each), each["and more"]) == (17, 4)
 
 
 # -- the command ---------------------------------------------------------------------------------

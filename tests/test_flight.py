@@ -10,6 +10,7 @@ import pytest
 
 from shared import config
 from shared.config import Scenario
+from shared.events import Finished, FlowOpened, Flying, SessionOpened
 from shared.model import Array
 from shared.record import DOWNLINK, UPLINK
 from shared.summary import Summary, summarise
@@ -181,8 +182,26 @@ def test_a_network_that_loses_everything_is_no_flight() -> None:
     """The client gives up, and says why."""
     lost = QUIET | {"uplink": {"delay": "none", "loss": 1.0}}
     flight = fly(scenario("paper", settle=0.0, network=lost))
-    assert flight.failure == "no answer from netem 1:0 in 16 s"
+    assert str(flight.failure) == "vehicle 1: no answer from netem 1:0 in 16 s"
     assert len(flight.client) == 0
+
+
+def test_a_flight_keeps_what_everybody_said() -> None:
+    """In the order of time, each with its host; names and numbers are the flight's own."""
+    lossless = {
+        "uplink": {"delay": "none", "loss": 0.0},
+        "downlink": {"delay": "none", "loss": 0.0},
+    }
+    flown = scenario("paper", duration=2.0, settle=0.0, seed=7, network=lossless)
+    events = fly(flown, vehicles=2).events
+    assert [event.time_ns for event in events] == sorted(event.time_ns for event in events)
+    said = {host: [event for _, name, event in events if name == host] for _, host, _ in events}
+    assert said == {
+        "netem 7": [FlowOpened(flow=n, host=f"client 7.{n + 1}", port=0) for n in (0, 1)],
+        "client 7.1": [Flying(vehicle=1), Finished(vehicle=1, steps=40, missed=0)],
+        "client 7.2": [Flying(vehicle=2), Finished(vehicle=2, steps=40, missed=0)],
+        "server": [SessionOpened(vehicle=n, host="netem 7", port=n) for n in (1, 2)],
+    }
 
 
 def test_wind_and_gusts_push_but_do_not_break() -> None:

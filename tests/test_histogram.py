@@ -38,6 +38,7 @@ def test_a_quantile_beyond_the_last_bin_is_not_understated() -> None:
     assert histogram.quantile_ms(0.99) == 50.0
 
 
-def test_an_empty_histogram_says_so() -> None:
-    """In words, for the report."""
-    assert str(filled()) == "empty"
+def test_bins_without_any_are_left_out() -> None:
+    """Named by their lower edges; an empty histogram has none."""
+    assert filled(0, 1, 20).by_bin() == {"0 ms": 2, "2e-05 ms": 1}
+    assert filled().by_bin() == {}

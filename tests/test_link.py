@@ -197,7 +197,7 @@ def test_the_delay_histogram_is_of_delays_as_drawn() -> None:
     link, ms = make_link(), MILLISECOND_NS
     take(link, make_lane(400 * ms, 440 * ms, 440 * ms, 500 * ms, lost=[3]), "abcd")
     give(link, now_ns=900 * ms)
-    assert str(link.counts.delay) == "400 ms: 1, 440 ms: 2"
+    assert link.counts.delay.by_bin() == {"400 ms": 1, "440 ms": 2}
 
 
 def recorded(direction: int, lane: Lane, names: str) -> Rows:

@@ -20,14 +20,16 @@ from shared import config
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
+from shared.events import Event, FlowOpened
 from shared.record import PACKET_COLUMNS, Recorder, client_columns, parse, server_columns
 from shell import timer, udp
 from shell.driver import Shell, new_event_loop
-from shell.udp import AddressError
+from shell.udp import AddressError, open_socket
 from sim.flight import Flight
 from sim.flight import fly as fly_virtually
 
 LOOPBACK: Address = ("127.0.0.1", 0)
+LOOPBACK_6: Address = ("::1", 0)
 LATE_NS = SECOND_NS // 4
 """How late anything may come on a busy machine before a test gives up on it."""
 
@@ -54,7 +56,8 @@ class Echo(Endpoint):
         """Answer."""
         assert now_ns > 0
         self.heard.append(datagram.payload)
-        self._news.append("heard")
+        host, port = datagram.peer
+        self._events.append(FlowOpened(flow=len(self.heard), host=host, port=port))
         self._out.append(Datagram(datagram.payload, datagram.peer, len(self.heard) % self.sockets))
 
     def wake(self, *, now_ns: int) -> None:
@@ -64,10 +67,6 @@ class Echo(Endpoint):
     def next_wake_ns(self) -> int | None:
         """The next of the list."""
         return self.wakes_ns[0] if self.wakes_ns else None
-
-    def report(self) -> str:
-        """Nothing to say."""
-        return ""
 
 
 @asynccontextmanager
@@ -82,26 +81,39 @@ async def driven(*shells: Shell) -> AsyncIterator[None]:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def test_datagrams_come_and_go_through_several_sockets() -> None:
-    """Every second answer leaves by a socket that was opened for it."""
+@pytest.mark.parametrize(
+    ("loopback", "family"),
+    [
+        (LOOPBACK, socket.AF_INET),
+        pytest.param(LOOPBACK_6, socket.AF_INET6, marks=pytest.mark.ipv6),
+    ],
+    ids=["IPv4", "IPv6"],
+)
+async def test_datagrams_come_and_go_through_several_sockets(
+    loopback: Address, family: socket.AddressFamily
+) -> None:
+    """Every second answer leaves by a socket that was opened for it; every event is handed on."""
     echo = Echo(last=4, sockets=2)
-    news: list[str] = []
-    driver = Shell(echo, LOOPBACK)
-    loop = asyncio.get_running_loop()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+    events: list[Event] = []
+    with socket.socket(family, socket.SOCK_DGRAM) as peer:
         peer.setblocking(False)
-        peer.bind(LOOPBACK)
-        task = asyncio.create_task(driver.run(news.append))
+        peer.bind(loopback)
+        own = peer.getsockname()[:2]
+        driver = Shell(echo, loopback, [own])
+        loop = asyncio.get_running_loop()
+        task = asyncio.create_task(driver.run(events.append))
         answers = []
         for number in range(4):
             await loop.sock_sendto(peer, b"%d" % number, driver.address)
             answers.append(await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 5))
         await asyncio.wait_for(task, 5)
     assert [payload for payload, _ in answers] == [b"0", b"1", b"2", b"3"]
-    ports = [port for _, (_, port) in answers]
+    ports = [sender[1] for _, sender in answers]
+    assert driver.address[0] == loopback[0]
     assert ports[1] == ports[3] == driver.address[1]
     assert ports[0] == ports[2] != driver.address[1]
-    assert news == ["heard"] * 4
+    assert driver.is_local
+    assert events == [FlowOpened(flow=n, host=own[0], port=own[1]) for n in range(1, 5)]
 
 
 @pytest.mark.parametrize("kernel", [True, False], ids=["timerfd", "the loop's timer"])
@@ -204,6 +216,83 @@ async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.Monk
     assert driver._names.number(("moving", 1)) == addresses["then"]
     assert driver._names.name(addresses["then"]) == ("moving", 1)
     assert driver._names.name(addresses["first"]) == addresses["first"]
+
+
+@pytest.mark.ipv6
+async def test_a_peer_is_seen_as_it_was_written_whatever_the_kernel_calls_it() -> None:
+    """An IPv6 address in long form: its answers come from the endpoint's own peer."""
+    seen: list[Address] = []
+
+    class Asker(Echo):
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            seen.append(datagram.peer)
+            super().receive(datagram, now_ns=now_ns)
+
+    answerer, asker = Shell(Echo(), LOOPBACK_6), Asker(last=1)
+    peer = ("0:0:0:0:0:0:0:1", answerer.address[1])
+    asker._out.append(Datagram(b"who?", peer))
+    driver = Shell(asker, None, [peer])
+    assert driver.address[0] == "::1"
+    async with driven(answerer):
+        await asyncio.wait_for(driver.run(), 5)
+    assert seen == [peer]
+
+
+def test_the_scope_of_a_link_local_address_is_part_of_its_host() -> None:
+    """The kernel keeps it apart, as a number, beside a flow that nobody needs."""
+    name = socket.if_indextoname(1)
+    assert udp.from_kernel(("fe80::1", 5, 7, 1)) == (f"fe80::1%{name}", 5)
+    assert udp.to_kernel((f"fe80::1%{name}", 5)) == ("fe80::1", 5, 0, 1)
+    for address in (("127.0.0.1", 5), ("::1", 5)):
+        assert udp.to_kernel(address) == address
+    assert udp.from_kernel(("::1", 5, 7, 0)) == ("::1", 5)
+    with pytest.raises(OSError, match=r"interface|device"):
+        udp.to_kernel(("fe80::1%no-such-interface", 5))
+
+
+@pytest.mark.parametrize(
+    ("peers", "host"),
+    [
+        ([("127.0.0.1", 1)], "127.0.0.1"),
+        ([("127.0.0.1", 1), ("192.0.2.1", 1)], "0.0.0.0"),
+        ([("::1", 1)], "::1"),
+        ([("::1", 1), ("2001:db8::1", 1)], "::"),
+        ([("fe80::1%eth0", 1)], "::"),
+        ([], "127.0.0.1"),
+    ],
+)
+def test_a_socket_is_bound_as_near_as_its_peers_allow(peers: list[Address], host: str) -> None:
+    """On loopback where all of them are, and in their family."""
+    assert udp.within_reach_of(peers) == (host, 0)
+
+
+@pytest.mark.parametrize(
+    ("families", "host"),
+    [
+        ((socket.AF_INET6, socket.AF_INET), "192.0.2.1"),
+        ((socket.AF_INET6,), "2001:db8::1"),
+    ],
+)
+def test_a_name_means_its_ipv4_address_if_it_has_one(
+    families: tuple[socket.AddressFamily, ...], host: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A name of both families must mean one socket, and the defaults are IPv4."""
+    kernel = {
+        socket.AF_INET: ("192.0.2.1", 5),
+        socket.AF_INET6: ("2001:db8::1", 5, 0, 0),
+    }
+    found = [(family, socket.SOCK_DGRAM, 17, "", kernel[family]) for family in families]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    assert udp.look_up(("both", 5)) == (host, 5)
+
+
+@pytest.mark.ipv6
+def test_an_ipv6_socket_hears_ipv6_alone() -> None:
+    """So that one port may be bound in both families."""
+    with open_socket(("::", 0)) as six:
+        port = six.getsockname()[1]
+        with open_socket(("0.0.0.0", port)) as four:
+            assert four.getsockname()[1] == port
 
 
 def test_addresses_of_no_use_are_named() -> None:

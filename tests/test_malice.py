@@ -11,7 +11,7 @@ from client.vehicle import Client
 from server.endpoint import VEHICLES_MAX, Server
 from shared import config
 from shared.chance import stream
-from shared.endpoint import NEWS_MAX, SECOND_NS, Datagram, Endpoint
+from shared.endpoint import EVENTS_MAX, SECOND_NS, Datagram, Endpoint
 from shared.protocol import FEEDBACK, Heartbeat, Hello, Horizon, Observation, Welcome, encode
 
 SCENARIO = config.load("paper")
@@ -95,7 +95,7 @@ def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
             answers += len(server.outbox())
     assert answers == 6000
     assert len(server._welcomed) == VEHICLES_MAX
-    assert len(server.news()) <= NEWS_MAX
+    assert len(server.events()) <= EVENTS_MAX
 
 
 def test_an_answer_is_no_longer_than_its_question() -> None:

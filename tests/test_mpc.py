@@ -65,11 +65,11 @@ def printed_cost(
     Q, P = np.array(weights.state_weight), np.array(weights.terminal_weight)
     H, cost = weights.horizon, np.zeros(len(x))
     for i in range(H):
-        wanted, given_ = target[:, i, 1] if weights.input_reference else 0.0, u[:, i] + wind
-        cost += (x - target[:, i]) ** 2 @ Q + weights.input_weight * (given_ - wanted) ** 2
+        wanted, driven = target[:, i, 1] if weights.input_reference else 0.0, u[:, i] + wind
+        cost += (x - target[:, i]) ** 2 @ Q + weights.input_weight * (driven - wanted) ** 2
         if i <= H - 2:
             cost += weights.change_weight * (u[:, i] - previous[:, i]) ** 2
-        x = TWO_TAUS.step(x, given_)
+        x = TWO_TAUS.step(x, driven)
     return cost + (x - target[:, H]) ** 2 @ P
 
 

@@ -3,17 +3,36 @@
 `OnPaper` is section 4.1 once more, for one vehicle, with a dense solver and no batch.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from server.mpc import condense, shift
-from server.planner import WINDOW, Desired, Plan, Planner, Successive
+from benchmarks.problems import gradients, listening, solving
+from server.controller import BLOCK
+from server.exact import ExactSolver
+from server.mpc import FIRST, LATER, Problem, make_mpc, pose
+from server.planner import (
+    EMPTY,
+    FIGURES,
+    GENERATOR,
+    PAGE,
+    PAGES,
+    TRACKER,
+    Figures,
+    Planner,
+    Reference,
+    _place,
+)
+from server.scheme import Foresight, foresight
 from server.solver import OsqpSolver
 from shared.config import Scenario, check
-from shared.model import Array, Flags, discretise
+from shared.model import Array, Flags, Indices
 from shared.stopwatch import Stopwatch
 
 H = 15
@@ -32,35 +51,100 @@ SCENARIO = check(
     "test",
 )
 """Two unlike axes, one of them too slow for its circle, and an S-term that shows."""
-MODEL = discretise(SCENARIO.tau_s, SCENARIO.control.dt)
+TERMS = SCENARIO.terms()
+MODEL = TERMS.model
 START = np.array([[1.2, 0.3], [-0.4, 0.8]])
 """Beside the circle, and moving."""
-
-
 CALM = np.zeros((1, 2))
+
+
+def problem(which: int) -> Problem:
+    """The QPs of the scenario."""
+    return pose(MODEL, make_mpc(TERMS, SCENARIO.control), which)
 
 
 def make(capacity: int = 1, scenario: Scenario = SCENARIO) -> Planner:
     """A planner that has not planned yet."""
-    return Planner(scenario, MODEL, capacity, Stopwatch())
+    return Planner(scenario, scenario.terms(), capacity, capacity, Stopwatch())
 
 
-def run(planner: Planner, step: int, estimate: Array, *, row: int = 0) -> Plan:
+class Plan(NamedTuple):
+    """A copy of what a planner has to say of n vehicles, and of what it keeps of them."""
+
+    inputs: Array
+    """U(k) of generator and tracker [m/s]; shape (2, n, axes, H)."""
+    states: Array
+    """X(k) of the generator, behind where it starts [m, m/s]; shape (n, axes, H + 1, 2)."""
+    step: Indices
+    """Step that they start at, or -1; shape (n,)."""
+    planned: Array
+    """x_p(k|k-1) [m, m/s]; shape (n, axes, 2)."""
+    figures: Figures
+    """What the plans are worth; shape (n,)."""
+    horizons: Array
+    """What may be sent [m/s]; shape (n, axes, 2 H)."""
+
+    @property
+    def tracked(self) -> Array:
+        """U(k) of the tracker [m/s]; shape (n, axes, H)."""
+        return self.inputs[TRACKER]
+
+    @property
+    def led(self) -> Array:
+        """U(k) of the generator [m/s]; shape (n, axes, H)."""
+        return self.inputs[GENERATOR]
+
+
+def plan(planner: Planner, rows: Indices, step: Indices, found: Foresight) -> Plan:
+    """The plans of vehicles."""
+    planner.plan(rows, step, found)
+    inputs, states, steps = planner._memory
+    n = len(rows)
+    return Plan(
+        inputs[:, rows].copy(),
+        states[rows].copy(),
+        steps[rows].copy(),
+        planner.planned[:n].copy(),
+        planner.figures[:n].copy(),
+        found.horizons[:n].copy(),
+    )
+
+
+def seen(estimates: Array) -> Foresight:
+    """Foresight of vehicles that are known to be there; shape (n, axes, 2)."""
+    found = foresight(len(estimates), 2, H)
+    found.start[:] = estimates
+    return found
+
+
+def run(planner: Planner, step: int, estimate: Array) -> Plan:
     """The plan of one vehicle at one step."""
-    rows, steps = np.array([row]), np.array([step])
-    planned, fresh = planner.planned(rows, steps, estimate[None])
-    return planner.plan(rows, steps, estimate[None], planned, fresh, CALM)
-
-
-def start_of(planner: Planner, step: int, estimate: Array = START) -> tuple[Array, bool]:
-    """Where the generator would plan from, x_p(k|k-1), and whether it would start anew."""
-    planned, fresh = planner.planned(np.array([0]), np.array([step]), estimate[None])
-    return planned[0], bool(fresh[0])
+    return plan(planner, np.array([0]), np.array([step]), seen(estimate[None]))
 
 
 def elsewhere(step: int) -> Array:
     """Some estimate, another one at every step."""
     return START + np.random.default_rng(step).normal(scale=0.2, size=(2, 2))
+
+
+def same(one: Plan, other: Plan) -> None:
+    """Assert that two plans have the same bits."""
+    for mine, yours in zip(one, other, strict=True):
+        for name in FIGURES.names if mine.dtype == FIGURES else (...,):
+            np.testing.assert_array_equal(mine[name], yours[name])
+
+
+def shift(inputs: Array, gap: int) -> Array:
+    """Horizons as seen some steps later (11); shape (..., H)."""
+    return inputs[..., np.minimum(np.arange(H) + gap, H - 1)]
+
+
+def fly(x: Array, u: Array) -> Array:
+    """x, and the states that H inputs lead through; shape (axes, H + 1, 2)."""
+    states = [x]
+    for stage in range(H):
+        states.append(MODEL.step(states[-1], u[:, stage]))
+    return np.stack(states, axis=1)
 
 
 class OnPaper:
@@ -69,37 +153,27 @@ class OnPaper:
     def __init__(self) -> None:
         self.step: int | None = None
         self.led, self.tracked = np.zeros((2, 2, H))
-        self.trajectory = np.zeros((2, H, 2))
+        self.trajectory = np.zeros((2, H + 1, 2))
 
-    def plan(self, step: int, estimate: Array) -> Array:
+    def plan(self, step: int, estimate: Array, wind: Array) -> Array:
         """U(k) of the tracker; `led` and `trajectory` are the generator's."""
         gap = H + 1 if self.step is None else step - self.step
-        change_weight = 0.0 if gap > H else SCENARIO.control.change_weight
-        start = estimate if gap > H else self.trajectory[:, gap - 1]
+        which = FIRST if gap > H else LATER
+        start = estimate if gap > H else self.trajectory[:, gap]
         times = SCENARIO.control.dt * (step + np.arange(H + 1))
         desired = SCENARIO.make_reference()(times).transpose(1, 0, 2)
-        self.led = self._solve(start, desired, self.led, gap, change_weight)
-        self.trajectory = self._fly(start, self.led)
-        lead = np.concatenate([start[:, None], self.trajectory], axis=1)
-        self.tracked = self._solve(estimate, lead, self.tracked, gap, change_weight)
+        self.led = self._solve(which, start, desired, shift(self.led, gap), CALM)
+        self.trajectory = fly(start, self.led)
+        before = shift(self.tracked, gap)
+        self.tracked = self._solve(which, estimate, self.trajectory, before, wind[None])
         self.step = step
         return self.tracked
 
-    def _fly(self, x: Array, u: Array) -> Array:
-        states = []
-        for stage in range(H):
-            x = MODEL.step(x, u[:, stage])
-            states.append(x)
-        return np.stack(states, axis=1)
-
-    def _solve(
-        self, x: Array, target: Array, before: Array, gap: int, change_weight: float
-    ) -> Array:
-        mpc = condense(MODEL, SCENARIO.control, change_weight=change_weight)
-        previous = shift(before[None], np.array([gap]))
-        gradient = mpc.gradient(x[None], target[None], previous, CALM)[0]
+    def _solve(self, which: int, x: Array, target: Array, previous: Array, wind: Array) -> Array:
+        posed = problem(which)
+        gradient = gradients(posed, x[None], target[None], previous[None], wind)[0]
         answers = []
-        for hessian, g, bound in zip(mpc.hessian, gradient, SCENARIO.u_max, strict=True):
+        for hessian, g, bound in zip(posed.hessian, gradient, posed.mpc.bounds, strict=True):
             L = np.linalg.cholesky(hessian)
             box = (-bound, bound)
             answers.append(lsq_linear(L.T, -np.linalg.solve(L, g), box, "bvls", tol=1e-14).x)
@@ -108,21 +182,23 @@ class OnPaper:
 
 def test_planner_solves_the_papers_two_problems() -> None:
     """Step after step, over gaps, and anew after a long one; inputs are float32."""
-    planner, paper = make(), OnPaper()
+    planner, paper, wind = make(), OnPaper(), np.array([0.1, -0.2])
     for step in (0, 1, 2, 5, 6, 6 + H, 7 + 2 * H, 8 + 2 * H):
-        plan = run(planner, step, elsewhere(step))
-        expected = paper.plan(step, elsewhere(step))
-        assert plan.solved.tolist() == [True]
-        np.testing.assert_allclose(plan.inputs[0], expected, rtol=0, atol=2e-6)
-        np.testing.assert_allclose(planner._generator.inputs[0], paper.led, rtol=0, atol=2e-6)
-        np.testing.assert_allclose(planner._generator.states[0, :, 1:], paper.trajectory, atol=2e-6)
+        found = seen(elsewhere(step)[None])
+        found.disturbance[:] = wind
+        made = plan(planner, np.array([0]), np.array([step]), found)
+        expected = paper.plan(step, elsewhere(step), wind)
+        assert made.figures["solved"].tolist() == [True]
+        np.testing.assert_allclose(made.tracked[0], expected, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(made.led[0], paper.led, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(made.states[0], paper.trajectory, atol=2e-6)
 
 
 def test_first_plan_starts_from_the_estimate() -> None:
     """There is no plan before: x_p = x̂."""
-    planned, fresh = start_of(make(), 7)
-    assert fresh
-    np.testing.assert_array_equal(planned, START)
+    made = run(make(), 7, START)
+    assert made.figures["fresh"].tolist() == [True]
+    np.testing.assert_array_equal(made.planned[0], START)
 
 
 def test_first_plan_has_no_change_term() -> None:
@@ -130,30 +206,25 @@ def test_first_plan_has_no_change_term() -> None:
     desired = SCENARIO.make_reference()(SCENARIO.control.dt * np.arange(H + 1))
     target, still = desired.transpose(1, 0, 2)[None], np.zeros((1, 2, H))
 
-    def best(change_weight: float) -> Array:
-        mpc = condense(MODEL, SCENARIO.control, change_weight=change_weight)
-        gradient = mpc.gradient(START[None], target, still, CALM)
-        return OsqpSolver(mpc.hessian, SCENARIO.u_max).solve(gradient, still)[0]
+    def best(which: int) -> Array:
+        gradient = gradients(problem(which), START[None], target, still, CALM)
+        return OsqpSolver(problem(which)).solve(gradient, still)[0]
 
-    planner = make()
-    run(planner, 0, START)
-    led = planner._generator.inputs
-    np.testing.assert_allclose(led, best(0.0), rtol=0, atol=1e-6)
-    assert np.abs(led - best(SCENARIO.control.change_weight)).max() > 0.05
+    led = run(make(), 0, START).led
+    np.testing.assert_allclose(led, best(FIRST), rtol=0, atol=1e-6)
+    assert np.abs(led - best(LATER)).max() > 0.05
 
 
 @pytest.mark.parametrize("gap", [1, 3, H])
 def test_generator_goes_on_from_its_own_prediction(gap: int) -> None:
     """Prediction x_p(k|k-1) ∈ X_p(k-1): where the last inputs lead in the steps passed."""
     planner = make()
-    run(planner, 10, START)
-    x = START
-    for stage in range(gap):
-        x = MODEL.step(x, planner._generator.inputs[0, :, stage])
-    planned, fresh = start_of(planner, 10 + gap, elsewhere(gap))
-    assert not fresh
-    np.testing.assert_allclose(planned, x, rtol=0, atol=1e-13)
-    np.testing.assert_array_equal(planned, planner._generator.states[0, :, gap])
+    before = run(planner, 10, START)
+    made = run(planner, 10 + gap, elsewhere(gap))
+    assert made.figures["fresh"].tolist() == [False]
+    expected = fly(START, before.led[0])[:, gap]
+    np.testing.assert_allclose(made.planned[0], expected, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(made.planned[0], before.states[0, :, gap])
 
 
 def test_generator_never_looks_at_the_vehicle_again() -> None:
@@ -163,8 +234,8 @@ def test_generator_never_looks_at_the_vehicle_again() -> None:
     run(other, 0, START)
     for step in (1, 2, 4):
         mine, yours = run(one, step, elsewhere(step)), run(other, step, -elsewhere(step))
-        np.testing.assert_array_equal(one._generator.states, other._generator.states)
-        assert np.abs(mine.inputs - yours.inputs).max() > 0.5
+        np.testing.assert_array_equal(mine.states, yours.states)
+        assert np.abs(mine.tracked - yours.tracked).max() > 0.5
 
 
 def test_tracker_follows_all_of_the_trajectory() -> None:
@@ -177,22 +248,10 @@ def test_tracker_follows_all_of_the_trajectory() -> None:
         "terminal_weight": [73.0, 555.0],
     }
     raw = {"model": {"tau_s": [0.81, 0.3], "u_max": [3.0]}, "control": free}
-    planner = make(scenario=check(raw, "test"))
-    run(planner, 0, START)
-    trajectory = planner._generator.states[0]
+    made = run(make(scenario=check(raw, "test")), 0, START)
+    trajectory = made.states[0]
     assert np.abs(trajectory[:, -1] - trajectory[:, 0]).max() > 0.3
-    np.testing.assert_allclose(planner._tracker.states[0], trajectory, rtol=0, atol=1e-5)
-
-
-def test_asking_where_the_plan_is_changes_nothing() -> None:
-    """The trigger asks at every step, whether a plan follows or not."""
-    asked, silent = make(), make()
-    for planner in (asked, silent):
-        run(planner, 0, START)
-    for step in (1, 2, 3, 40):
-        start_of(asked, step)
-    one, other = run(asked, 2, elsewhere(2)), run(silent, 2, elsewhere(2))
-    np.testing.assert_array_equal(one.inputs, other.inputs)
+    np.testing.assert_allclose(fly(START, made.tracked[0]), trajectory, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("anew", ["gap", "forget"])
@@ -204,94 +263,184 @@ def test_vehicle_starts_anew_after_a_long_gap_or_when_forgotten(anew: str) -> No
     if anew == "forget":
         used.forget(0)
         step = 3
-    assert start_of(used, step)[1]
-    one, other = run(used, step, START), run(make(), step, START)
-    np.testing.assert_array_equal(one.inputs, other.inputs)
+    made = run(used, step, START)
+    assert made.figures["fresh"].tolist() == [True]
+    same(made, run(make(), step, START))
 
 
 def test_plan_is_exactly_what_can_be_sent() -> None:
     """Inputs are float32 numbers, and X_p is predicted with those and no others."""
-    planner = make()
-    plan = run(planner, 0, START)
-    np.testing.assert_array_equal(plan.inputs, plan.inputs.astype(np.float32))
-    mpc = condense(MODEL, SCENARIO.control, change_weight=0.0)
-    expected = np.empty_like(planner._generator.states)
-    mpc.predict(START[None], planner._generator.inputs, CALM, expected, np.array([0]))
-    np.testing.assert_array_equal(planner._generator.states, expected)
+    made = run(make(), 0, START)
+    np.testing.assert_array_equal(made.inputs, made.inputs.astype(np.float32))
+    np.testing.assert_array_equal(made.states[0], fly(START, made.led[0]))
+    np.testing.assert_array_equal(made.horizons[:, :, :H], made.tracked)
 
 
-def test_batch_is_planned_as_its_singles() -> None:
+@pytest.mark.parametrize("solver", ["exact", "osqp"])
+def test_batch_is_planned_as_its_singles(solver: str) -> None:
     """Three vehicles at steps of their own, with gaps of their own, one of them new each time."""
-    together, singles = make(5), [make() for _ in range(3)]
+    control = msgspec.structs.replace(SCENARIO.control, solver=solver)
+    scenario = msgspec.structs.replace(SCENARIO, control=control)
+    together, singles = make(5, scenario), [make(scenario=scenario) for _ in range(3)]
     rows = np.array([4, 0, 2])
     for steps in ([0, 100, 7], [1, 103, 7 + H], [2, 104, 9 + 3 * H]):
         estimates = np.stack([elsewhere(step) for step in steps])
-        planned, fresh = together.planned(rows, np.array(steps), estimates)
-        plan = together.plan(
-            rows, np.array(steps), estimates, planned, fresh, np.zeros((len(rows), 2))
-        )
+        made = plan(together, rows, np.array(steps), seen(estimates))
         for i, single in enumerate(singles):
-            alone = run(single, steps[i], estimates[i])
-            np.testing.assert_array_equal(plan.inputs[i], alone.inputs[0])
-            assert plan.solved[i] == alone.solved[0]
+            alone, one = run(single, steps[i], estimates[i]), slice(i, i + 1)
+            same(Plan(made.inputs[:, one], *(field[one] for field in made[1:])), alone)
 
 
-class Unable:
-    """A solver that never finds an answer."""
+def crowd(rng: np.random.Generator, ahead: Indices) -> Foresight:
+    """Foresight of vehicles beside the circle, told this and that, and blown about."""
+    n = len(ahead)
+    found = foresight(n, 2, H)
+    found.ahead[:] = ahead
+    found.start[:] = START + rng.normal(scale=2.0, size=found.start.shape)
+    for field in (found.committed, found.held):
+        field[:] = rng.uniform(-1.0, 1.0, size=field.shape)
+    found.disturbance[:] = rng.normal(scale=0.2, size=(n, 2))
+    return found
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, H), st.integers(0, H))
+def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
+    """V of (16), the cost of flying on above that of the plan, and how far that leads from it."""
+    rng, rows, planner = np.random.default_rng(seed), np.array([2]), make(3)
+    before = plan(planner, rows, np.array([40 - d]), crowd(rng, np.array([d])))
+    found = crowd(rng, np.array([d]))
+    made = plan(planner, rows, np.array([40 - d + gap]), found)
+    (figures,), off = made.figures, found.start[0] - before.states[0, :, gap]
+    P = np.array(SCENARIO.control.terminal_weight)
+    assert (figures["step"], figures["fresh"], figures["solved"]) == (40 - d + gap, False, True)
+    assert figures["error"] == pytest.approx((off**2 @ P).sum())
+    change = found.held[0] - made.tracked[0]
+    cost = np.einsum("ak,akl,al->", change, problem(LATER).hessian, change)
+    assert figures["cost_gap"] == pytest.approx(cost)
+    flown = fly(found.start[0], found.held[0] + found.disturbance[0][:, None])
+    away = flown[:, : H + 1 - gap, 0] - before.states[0, :, gap:, 0]
+    assert figures["deviation_m"] == pytest.approx(np.linalg.norm(away, axis=0).max())
+    committed = found.committed[:, :, :d].astype(np.float32)
+    np.testing.assert_array_equal(made.horizons[:, :, :d], committed)
+    np.testing.assert_array_equal(made.horizons[:, :, d : d + H], made.tracked)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_figures_that_compare_with_nothing_are_zero(first: bool) -> None:
+    """V and deviation at a first step; with "predictive", what compares with what was sent."""
+    control = msgspec.structs.replace(SCENARIO.control, scheme="predictive")
+    scenario = SCENARIO if first else msgspec.structs.replace(SCENARIO, control=control)
+    planner, rng, rows = make(scenario=scenario), np.random.default_rng(1), np.array([0])
+    if not first:
+        run(planner, 0, START)
+    (figures,) = plan(planner, rows, np.array([1]), crowd(rng, np.array([0]))).figures
+    assert (figures["error"] == 0.0, figures["cost_gap"] == 0.0) == (first, not first)
+    assert figures["deviation_m"] == 0.0
+
+
+ROUGH = {
+    "model": {"tau_s": [0.4, 0.6], "u_max": [1.8, 1.0]},
+    "control": {"dt": 0.1, "horizon": H, "input_weight": 1e-3, "state_weight": [10.0, 1.0]},
+    "reference": {"shape": "square", "radius_m": 1.5, "period_s": 4.0},
+}
+"""Long steps, hardly a cost of the input, and corners."""
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        pytest.param(SCENARIO, id="smooth"),
+        pytest.param(check(ROUGH, "test"), id="rough"),
+        pytest.param(
+            check({**ROUGH, "control": {**ROUGH["control"], "scheme": "predictive"}}, "test"),
+            id="predictive",
+        ),
+    ],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
+    scenario: Scenario, seed: int
+) -> None:
+    """Over fresh vehicles, gaps of all lengths, disturbances, and estimates that are no numbers."""
+    rng, capacity = np.random.default_rng(seed), 40
+    compiled = make(capacity, scenario)
+    with listening() as listeners:
+        around = make(capacity, scenario)
+    starts, unsolved, fresh = rng.integers(100, 2000, capacity), 0, 0
+    for _ in range(25):
+        rows = rng.permutation(capacity)[: rng.integers(1, capacity + 1)]
+        starts[rows] += rng.choice([0, 1, 2, 7, H, H + 1, 40], len(rows))
+        for row in rng.permutation(capacity)[:2]:
+            compiled.forget(row)
+            around.forget(row)
+        ahead = rng.integers(0, H + 1, len(rows))
+        found = crowd(rng, ahead)
+        found.start[rng.random(len(rows)) < 0.05] = np.nan
+        other = Foresight(*(field.copy() for field in found))
+        one = plan(compiled, rows, starts[rows] - ahead, found)
+        same(one, plan(around, rows, starts[rows] - ahead, other))
+        unsolved += np.count_nonzero(~one.figures["solved"])
+        fresh += np.count_nonzero(one.figures["fresh"])
+    same(*(Plan(*planner._memory, *(np.zeros(0),) * 3) for planner in (compiled, around)))
+    assert min(unsolved, fresh) > 0
+    assert all(len(listener.heard()[0][0]) > 0 for listener in listeners)
+
+
+class Faulty:
+    """The exact solver, but for who of generator and tracker shall find none; they ask by turns."""
+
+    def __init__(self, posed: Problem, fails: set[int]) -> None:
+        self._exact = ExactSolver(posed)
+        self._fails = fails
+        self._asks = TRACKER
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
         """See `server.solver.Solver`."""
-        return guess.copy(), np.zeros(len(gradient), dtype=np.bool_)
+        self._asks = TRACKER if self._asks == GENERATOR else GENERATOR
+        if self._asks in self._fails:
+            return guess.copy(), np.zeros(len(gradient), dtype=np.bool_)
+        return self._exact.solve(gradient, guess)
 
 
-def disable(problem: Successive) -> None:
-    """Let every solve of a problem fail from here on, first solves included."""
-    problem._solver = problem._first_solver = Unable()
+def make_faulty(fails: set[int]) -> Planner:
+    """A planner of which one problem or both have no answer, while they are in `fails`."""
+    with solving(lambda posed: Faulty(posed, fails)):
+        return make()
 
 
 def test_unsolved_vehicle_goes_on_with_its_shifted_horizon() -> None:
     """Both problems: what was planned at step 4 is flown on at 6, and X_p along with it."""
-    planner = make()
-    run(planner, 4, START)
-    led, tracked = planner._generator.inputs.copy(), planner._tracker.inputs.copy()
-    trajectory = planner._generator.states[0].copy()
-    disable(planner._generator)
-    disable(planner._tracker)
-    plan = run(planner, 6, elsewhere(6))
-    assert plan.solved.tolist() == [False]
-    np.testing.assert_array_equal(plan.inputs, shift(tracked, np.array([2])))
-    np.testing.assert_array_equal(planner._generator.inputs, shift(led, np.array([2])))
-    np.testing.assert_allclose(
-        planner._generator.states[0, :, :-2], trajectory[:, 2:], rtol=0, atol=1e-13
-    )
+    fails: set[int] = set()
+    planner = make_faulty(fails)
+    before = run(planner, 4, START)
+    fails |= {GENERATOR, TRACKER}
+    made = run(planner, 6, elsewhere(6))
+    assert made.figures["solved"].tolist() == [False]
+    np.testing.assert_array_equal(made.inputs, shift(before.inputs, 2))
+    np.testing.assert_allclose(made.states[0, :, :-2], before.states[0, :, 2:], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", ["_generator", "_tracker"])
-def test_plan_is_good_only_if_both_problems_were_solved(name: str) -> None:
+@pytest.mark.parametrize("who", [GENERATOR, TRACKER])
+def test_plan_is_good_only_if_both_problems_were_solved(who: int) -> None:
     """A trajectory that is no optimum is not worth tracking."""
-    planner = make()
-    disable(getattr(planner, name))
-    assert run(planner, 0, START).solved.tolist() == [False]
+    assert run(make_faulty({who}), 0, START).figures["solved"].tolist() == [False]
 
 
 def test_vehicle_without_any_plan_hovers() -> None:
     """Where even the first problem has no answer."""
-    planner = make()
-    disable(planner._generator)
-    disable(planner._tracker)
-    assert not run(planner, 0, START).inputs.any()
+    assert not run(make_faulty({GENERATOR, TRACKER}), 0, START).tracked.any()
 
 
-def test_first_plan_is_tried_again_until_it_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_plan_is_tried_again_until_it_is_solved() -> None:
     """Nothing was sent, so the next step is the first: an event (E18), without an S-term (E8)."""
-    planner = make()
-    with monkeypatch.context() as patch:
-        for name in ("_solver", "_first_solver"):
-            patch.setattr(planner._generator, name, Unable())
-        run(planner, 0, START)
-    assert start_of(planner, 1)[1]
-    one, other = run(planner, 1, START), run(make(), 1, START)
-    np.testing.assert_array_equal(one.inputs, other.inputs)
+    fails = {GENERATOR}
+    planner = make_faulty(fails)
+    run(planner, 0, START)
+    fails.clear()
+    made = run(planner, 1, START)
+    assert made.figures["fresh"].tolist() == [True]
+    same(made, run(make(), 1, START))
 
 
 def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> None:
@@ -302,42 +451,95 @@ def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> 
         estimates = np.stack([elsewhere(step), elsewhere(step + 10)])
         alone = run(neighbour, step, estimates[1])
         estimates[0, 0, 0] = np.nan if step == 1 else estimates[0, 0, 0]
-        planned, fresh = planner.planned(rows, np.full(2, step), estimates)
-        plans.append(
-            planner.plan(rows, np.full(2, step), estimates, planned, fresh, np.zeros((2, 2)))
-        )
-        np.testing.assert_array_equal(plans[-1].inputs[1], alone.inputs[0])
-    assert [plan.solved.tolist() for plan in plans] == [[True, True], [False, True], [True, True]]
-    shifted = shift(plans[0].inputs, np.array([1, 1]))
-    np.testing.assert_array_equal(plans[1].inputs[0], shifted[0])
+        plans.append(plan(planner, rows, np.full(2, step), seen(estimates)))
+        np.testing.assert_array_equal(plans[-1].tracked[1], alone.tracked[0])
+    solved = [made.figures["solved"].tolist() for made in plans]
+    assert solved == [[True, True], [False, True], [True, True]]
+    np.testing.assert_array_equal(plans[1].tracked[0], shift(plans[0].tracked[0], 1))
+
+
+def looked_up(reference: Reference, steps: Indices, ahead: Indices) -> Array:
+    """The desired states at k + d … k + d + H of each vehicle; shape (n, H + 1, axes, 2)."""
+    found = foresight(len(steps), 2, H)
+    found.ahead[:] = ahead
+    pages, held = reference.open(np.arange(len(steps)), steps, found)
+    states = []
+    for start in (steps + ahead).tolist():
+        at, first = _place(held, start // PAGE), start % PAGE
+        states.append(pages[at, :, first : first + H + 1].transpose(1, 0, 2))
+    return np.array(states)
+
+
+def desired_at(start: int) -> Array:
+    """What `looked_up` should find; shape (H + 1, axes, 2)."""
+    return SCENARIO.make_reference()((start + np.arange(H + 1)) * SCENARIO.control.dt)
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    st.lists(st.lists(st.integers(0, 3 * WINDOW), min_size=1, max_size=4), min_size=1, max_size=5)
-)
+@given(st.lists(st.lists(st.integers(0, 9 * PAGE), min_size=1, max_size=4), min_size=1, max_size=5))
 def test_the_reference_looked_up_is_the_reference(calls: list[list[int]]) -> None:
-    """To the last bit: forwards and backwards, near each other and hours apart."""
-    reference = SCENARIO.make_reference()
-    desired = Desired(reference, SCENARIO.control.dt, H)
+    """To the last bit: forwards and backwards, near each other and far apart."""
+    reference = Reference(SCENARIO, TERMS)
     for steps in calls:
-        expected = [reference((step + np.arange(H + 1)) * SCENARIO.control.dt) for step in steps]
-        found = desired(np.array(steps)).transpose(0, 2, 1, 3)
+        found = looked_up(reference, np.array(steps), np.zeros(len(steps), dtype=np.int64))
+        np.testing.assert_array_equal(found, [desired_at(step) for step in steps])
+
+
+def hours_apart(rng: np.random.Generator) -> Indices:
+    """Steps of a full block of vehicles, all over a day: of more pages than there are places."""
+    return rng.integers(0, 86_400 / SCENARIO.control.dt, BLOCK)
+
+
+def test_the_reference_is_right_for_vehicles_that_are_hours_apart() -> None:
+    """Also where pages have to make room for others, and where they want the same place."""
+    assert BLOCK < PAGES  # one block finds room, and a place is left EMPTY
+    reference, rng, pages = Reference(SCENARIO, TERMS), np.random.default_rng(1), set()
+    for _ in range(8):
+        steps, ahead = hours_apart(rng), rng.integers(0, H + 1, BLOCK)
+        steps[0] = PAGES * PAGE + steps[1]  # the place of another
+        found = looked_up(reference, steps, ahead)
+        expected = [desired_at(start) for start in (steps + ahead).tolist()]
         np.testing.assert_array_equal(found, expected)
+        pages |= set(((steps + ahead) // PAGE).tolist())
+        _, held = reference.open(np.arange(0), steps[:0], foresight(1, 2, H))
+        assert EMPTY in held
+    assert len(pages) > 2 * PAGES
 
 
-def test_the_reference_is_computed_once_for_a_window_of_steps() -> None:
-    """Steps within the window take the reference that was computed before."""
-    asked = []
+def test_vehicles_hours_apart_are_planned_for_as_if_alone() -> None:
+    """To the last bit, over steps in which pages come and go."""
+    together, singles = make(BLOCK), {row: make() for row in (0, 50, BLOCK - 1)}
+    rng, rows = np.random.default_rng(2), np.arange(BLOCK)
+    for _ in range(4):
+        steps = hours_apart(rng)
+        for step in (steps, steps + 1):
+            found = crowd(rng, np.zeros(BLOCK, dtype=np.int64))
+            made = plan(together, rows, step, found)
+            for row, single in singles.items():
+                one = Foresight(*(field[row : row + 1].copy() for field in found))
+                alone = plan(single, np.array([0]), step[row : row + 1], one)
+                np.testing.assert_array_equal(made.inputs[:, row], alone.inputs[:, 0])
+                np.testing.assert_array_equal(made.states[row], alone.states[0])
 
-    def reference(times: Array) -> Array:
-        asked.append(times)
-        return SCENARIO.make_reference()(times)
 
-    desired = Desired(reference, SCENARIO.control.dt, H)
-    for step in range(WINDOW):
-        desired(np.array([step]))
+def test_the_reference_is_computed_once_for_a_page_of_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Steps within the page take the reference that was computed before."""
+    asked, sample = [], SCENARIO.make_reference()
+
+    def make_reference(_: Scenario) -> Callable[[Array], Array]:
+        def reference(times: Array) -> Array:
+            asked.append(times)
+            return sample(times)
+
+        return reference
+
+    monkeypatch.setattr(Scenario, "make_reference", make_reference)
+    reference, now = Reference(SCENARIO, TERMS), np.array([0])
+    for step in range(PAGE):
+        looked_up(reference, np.array([step]), now)
     assert len(asked) == 1
-    desired(np.array([WINDOW]))
-    desired(np.array([0, WINDOW]))
-    assert [times.shape for times in asked] == [(WINDOW + H,), (WINDOW + H,), (2, H + 1)]
+    looked_up(reference, np.array([PAGE]), now)
+    looked_up(reference, np.array([0, PAGE]), np.array([0, 0]))
+    assert [times.shape for times in asked] == [(PAGE + H + 1,), (PAGE + H + 1,)]

@@ -9,12 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from shared import protocol
+from shared import config, protocol
 from shared.protocol import (
     FEEDBACK,
     INPUTS_MAX,
     NO_HORIZON,
     PAYLOAD_BYTES_MAX,
+    Difference,
     Heartbeat,
     Hello,
     Horizon,
@@ -253,3 +254,26 @@ def test_the_table_of_messages_is_complete() -> None:
     assert [len(checks) for _, checks in protocol._TYPES] == [
         len(message._fields) for message, _ in protocol._TYPES
     ]
+
+
+@given(terms(), terms())
+def test_terms_differ_in_keys_exactly_where_they_are_not_equal(one: Terms, other: Terms) -> None:
+    """Whichever end asks, with the values changed over."""
+    assert bool(one.differences(other)) == (one != other)
+    assert one.differences(other) == tuple(
+        Difference(difference.key, here=difference.there, there=difference.here)
+        for difference in other.differences(one)
+    )
+
+
+def test_a_difference_names_the_scenarios_key_and_both_values() -> None:
+    """As the user would write them."""
+    other = TERMS._replace(dt_ns=20_000_000, tau_s=(0.81, 0.75))
+    assert TERMS.differences(other) == (
+        Difference("control.dt", here="0.05", there="0.02"),
+        Difference("model.tau_s", here="0.81 0.7", there="0.81 0.75"),
+    )
+    table = config.to_table(config.load("paper"))
+    for key in Terms(1, 1, 1, (1.0,), (1.0,)).differences(TERMS):
+        section, name = key.key.split(".")
+        assert name in table[section]

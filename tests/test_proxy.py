@@ -13,6 +13,7 @@ from netem.link import Link
 from netem.proxy import FLOWS_MAX, IDLE_NS, Proxy
 from shared.config import DirectionConfig, NetworkConfig, Scenario
 from shared.endpoint import MILLISECOND_NS, Datagram
+from shared.events import FlowOpened
 
 SERVER = ("192.0.2.9", 47001)
 ALICE, BOB, CAROL = (("192.0.2.1", 5000), ("192.0.2.1", 5001), ("192.0.2.2", 5000))
@@ -50,11 +51,17 @@ def test_every_client_address_is_a_flow_with_a_socket_of_its_own() -> None:
     proxy = make_proxy()
     sockets = [pass_on(proxy, b"?", client) for client in (ALICE, BOB, CAROL, ALICE, CAROL)]
     assert sockets == [1, 2, 3, 1, 3]
-    assert proxy.news() == [
+    events = proxy.events()
+    assert events == tuple(
+        FlowOpened(flow=flow, host=host, port=port)
+        for flow, (host, port) in enumerate((ALICE, BOB, CAROL))
+    )
+    assert [str(event) for event in events] == [
         "flow 0 for 192.0.2.1:5000",
         "flow 1 for 192.0.2.1:5001",
         "flow 2 for 192.0.2.2:5000",
     ]
+    assert proxy.events() == ()
 
 
 def test_the_servers_answers_find_their_client() -> None:
@@ -194,7 +201,7 @@ def test_what_is_sent_is_handed_out_once() -> None:
     assert [len(proxy.outbox()), len(proxy.outbox())] == [1, 0]
 
 
-def test_the_report_names_every_statistic() -> None:
+def test_the_figures_name_every_statistic() -> None:
     """Flows, refusals, and by direction: forwarded, lost, reordered, queue, delay and its error."""
     proxy, ms = make_proxy(uplink=DirectionConfig(loss=1.0), downlink=IN_20_MS), MILLISECOND_NS
     hear(proxy, b"?", ALICE, at=0)
@@ -202,15 +209,32 @@ def test_the_report_names_every_statistic() -> None:
     hear(proxy, b"!", SERVER, 1, at=3 * ms)
     hear(proxy, b"!", BOB, 1, at=3 * ms)
     proxy.wake(now_ns=21 * ms)
-    assert proxy.report().splitlines() == [
-        "1 flows, 1 packets refused",
-        "uplink: 1 packets, 0 forwarded, 1 lost, 0 reordered, 0 overflowed, queue 0 (at most 0)",
-        "  delay: empty",
-        "  added-delay error: p50 0.00 ms, p99 0.00 ms, largest 0.00 ms",
-        "downlink: 2 packets, 1 forwarded, 0 lost, 0 reordered, 0 overflowed, queue 1 (at most 2)",
-        "  delay: 20 ms: 1",
-        "  added-delay error: p50 1.00 ms, p99 1.00 ms, largest 1.00 ms",
-    ]
+    nothing = dict.fromkeys(("forwarded", "lost", "reordered", "overflowed"), 0)
+    errors = ("error_ms_p50", "error_ms_p99", "error_ms_max")
+    assert proxy.figures() == {
+        "flows": 1,
+        "refused": 1,
+        "uplink": {
+            **nothing,
+            "packets": 1,
+            "bytes": 1,
+            "lost": 1,
+            "queue": 0,
+            "queue_max": 0,
+            "delays": {},
+            **dict.fromkeys(errors, 0.0),
+        },
+        "downlink": {
+            **nothing,
+            "packets": 2,
+            "bytes": 2,
+            "forwarded": 1,
+            "queue": 1,
+            "queue_max": 2,
+            "delays": {"20 ms": 1},
+            **dict.fromkeys(errors, 1.0),
+        },
+    }
 
 
 ARRIVALS = st.lists(

@@ -68,7 +68,7 @@ def test_an_input_is_held_without_feedback_where_the_horizon_has_none(
 
 
 def test_braking_takes_away_its_part_of_the_speed_at_every_step_until_rest() -> None:
-    """Of 0.5 m/s over all axes 0.125 m/s a step: three quarters, a half, a quarter, nothing."""
+    """Speed of 0.5 m/s over all axes, less 0.125 m/s a step; the direction stays."""
     for told, u in ((0.3, 0.3), (-0.4, -0.4)):
         braked = [flown(stage, 10, told, 9.0, 0.5, 0.125, 1.8) for stage in range(10, 16)]
         assert braked == [0.75 * u, 0.5 * u, 0.25 * u, 0.0, 0.0, 0.0]

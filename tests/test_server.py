@@ -11,8 +11,10 @@ from server.endpoint import Server
 from shared import config
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
+from shared.events import SessionEnded, SessionRefused
 from shared.protocol import (
     NO_HORIZON,
+    Difference,
     Heartbeat,
     Hello,
     Horizon,
@@ -124,7 +126,8 @@ def test_other_terms_open_no_session() -> None:
     ((welcome, _),) = vehicles.say(Hello(1, 5, other))
     assert isinstance(welcome, Welcome)
     assert welcome.terms == vehicles.terms
-    assert vehicles.server.news() == ["vehicle 1 flies another scenario: horizon 40 against 20"]
+    differences = (Difference("control.horizon", here="40", there="20"),)
+    assert vehicles.server.events() == (SessionRefused(vehicle=1, differences=differences),)
     vehicles.observe(welcome, 0)
     assert vehicles.server.counts["dropped: unknown session"] == 1
 
@@ -268,7 +271,7 @@ def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
     vehicles.now_ns += controller.SESSION_NS + vehicles.dt_ns
     vehicles.server.wake(now_ns=vehicles.now_ns)
     assert vehicles.server.next_wake_ns() is None
-    assert vehicles.server.news()[-1] == "vehicle 1 is gone"
+    assert vehicles.server.events()[-1] == SessionEnded(vehicle=1)
 
 
 def test_no_more_vehicles_than_there_is_room_for() -> None:
@@ -357,21 +360,21 @@ def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
     assert vehicles.server.counts["unsolved"] == 1
 
 
-def test_report_of_many_vehicles_stays_readable() -> None:
+def test_figures_of_many_vehicles_stay_readable() -> None:
     """Sixteen of them, and how many more."""
     vehicles = Vehicles(scenario())
     for number in range(20):
         vehicles.observe(vehicles.open(vehicle=number), 0)
-    lines = vehicles.server.report().splitlines()
-    assert (len(lines), lines[-1]) == (18, "and 4 more")
+    each = vehicles.server.figures()["each"]
+    assert (len(each), each["and more"]) == (17, 4)
 
 
-def test_report_tells_what_was_counted() -> None:
+def test_figures_tell_what_was_counted() -> None:
     """For the operator, with how well each vehicle's clock is known."""
     vehicles = Vehicles(scenario())
     vehicles.observe(vehicles.open(), 0)
     vehicles.tick()
-    assert vehicles.server.report().splitlines() == [
-        "1 in session, 0 ticks missed, 1 events, 1 steps, 0 unsolved",
-        "vehicle 1: step 0, clock within 0.0 ms",
-    ]
+    figures = vehicles.server.figures()
+    assert (figures["vehicles"], figures["missed"]) == (1, 0)
+    assert figures["counts"] == {"events": 1, "steps": 1, "unsolved": 0}
+    assert figures["each"] == {"vehicle 1": {"step": 0, "clock_bound_ms": 0.0}}

@@ -164,7 +164,6 @@ def test_a_difference_is_told_as_the_scenario_writes_it() -> None:
         Difference("model.tau_s", "[0.84, 0.84]", "[0.5, 0.6]"),
         Difference("reference.loop", "false", "true"),
     )
-    assert str(Difference("control.dt", "0.05", "0.02")) == "control.dt: 0.05 here, 0.02 there"
 
 
 def test_the_longest_terms_fit_one_datagram() -> None:

@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
+from shared.events import Event, Flying
 from sim.world import Clock, World
 
 offsets = st.integers(-(10**15), 10**15)
@@ -36,10 +37,6 @@ class Probe(Endpoint):
     def next_wake_ns(self) -> int | None:
         """The next of the list."""
         return self.wakes_ns[0] if self.wakes_ns else None
-
-    def report(self) -> str:
-        """Nothing to say."""
-        return ""
 
 
 def never() -> bool:
@@ -162,6 +159,39 @@ def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
     world.add("host", probe, on_finished=lambda: told_ns.append(world.now_ns))
     world.run(never, limit_ns=SECOND_NS)
     assert told_ns == [60]
+
+
+def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoint() -> None:
+    """In the world's time, whatever the host's own clock shows."""
+
+    class Talker(Probe):
+        def wake(self, *, now_ns: int) -> None:
+            """Say something."""
+            super().wake(now_ns=now_ns)
+            self._events.append(Flying(vehicle=len(self.log)))
+
+        @property
+        def finished(self) -> bool:
+            """After the last wake."""
+            return not self.wakes_ns
+
+    told: list[tuple[int, str, Event] | str] = []
+    world = World(on_event=lambda *event: told.append(event))
+    for name, wakes_ns, offset_ns in (("one", [50, 80], 0), ("two", [1060], 1000)):
+        world.add(
+            name,
+            Talker(wakes_ns),
+            clock=Clock(offset_ns),
+            on_finished=lambda name=name: told.append(f"{name} has finished"),
+        )
+    world.run(never, limit_ns=SECOND_NS)
+    assert told == [
+        (50, "one", Flying(vehicle=1)),
+        (60, "two", Flying(vehicle=1)),
+        "two has finished",
+        (80, "one", Flying(vehicle=2)),
+        "one has finished",
+    ]
 
 
 @pytest.mark.parametrize("limit_ns", [49, 50])

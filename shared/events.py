@@ -1,0 +1,174 @@
+"""Events: what an endpoint, or the process around it, has to say, as typed values.
+
+An endpoint hands its events out (`Endpoint.events`); a driver gives them to whoever listens: a
+log, a flight in virtual time, a command that has started the process. `str(event)` is the
+operator's sentence. For a program an event is an object of JSON whose key `type` names the class.
+"""
+
+from typing import Any
+
+import msgspec
+
+from shared.terms import Difference
+
+
+def address_text(host: str, port: int) -> str:
+    """HOST:PORT as a user writes it, with an IPv6 host in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process has bound its socket and is about to be driven."""
+
+    host: str
+    port: int
+    waiting_for: str
+    """Whose datagrams it waits for."""
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        return f"listening on {address}, waiting for {self.waiting_for}"
+
+
+class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process talks to, or can be reached by, other machines than its own."""
+
+    def __str__(self) -> str:
+        return "plaintext and unauthenticated: only for a network that you trust"
+
+
+class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process has been asked for its figures, or ends."""
+
+    figures: dict[str, Any]
+    """Numbers by name; a dictionary in it is a group of them."""
+
+    def __str__(self) -> str:
+        return "counted so far:"
+
+
+class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """netem has heard a new client."""
+
+    flow: int
+    """Number of the flow, from 0."""
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"flow {self.flow} for {address_text(self.host, self.port)}"
+
+
+class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """Base of the events of one vehicle."""
+
+    vehicle: int
+    """Number of the vehicle."""
+
+
+class SessionOpened(VehicleEvent, frozen=True, kw_only=True):
+    """The server has received the first observation of a vehicle's session."""
+
+    host: str
+    """Host that the vehicle's HELLO came from."""
+    port: int
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} flies, from {address_text(self.host, self.port)}"
+
+
+class SessionEnded(VehicleEvent, frozen=True, kw_only=True):
+    """The server has forgotten a vehicle that was silent for long."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} is gone"
+
+
+class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
+    """Server and vehicle fly different scenarios; each end says so from its own side."""
+
+    differences: tuple[Difference, ...]
+    """Keys of the scenario that differ."""
+
+    def __str__(self) -> str:
+        keys = "; ".join(
+            f"{difference.key} is {difference.here} here and {difference.there} at the other end"
+            for difference in self.differences
+        )
+        return f"vehicle {self.vehicle} is refused, it flies another scenario: {keys}"
+
+
+class NoAnswer(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has given up, never having heard the server."""
+
+    host: str
+    """Host that it said HELLO to."""
+    port: int
+    waited_s: float
+    """Time since its first HELLO [s]."""
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        return f"vehicle {self.vehicle}: no answer from {address} in {self.waited_s:.0f} s"
+
+
+class Flying(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle's first session has opened, and with it the flight has begun."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: session open, flying"
+
+
+class ServerSilent(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle in flight has not heard the server for `link.timeout_s`."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: the server is silent"
+
+
+class ServerHeard(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle hears the server again after a silence."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: the server is heard again"
+
+
+class ServerRestarted(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has got a session with another life of the server."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: the server has restarted"
+
+
+class Finished(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has begun the last step of its flight."""
+
+    steps: int
+    """Steps of the flight."""
+    missed: int
+    """Steps that it slept through."""
+
+    def __str__(self) -> str:
+        return (
+            f"vehicle {self.vehicle}: flown to the end, {self.missed} of {self.steps} steps missed"
+        )
+
+
+Failure = SessionRefused | NoAnswer
+"""Events after which a vehicle cannot fly."""
+
+Event = (
+    Listening
+    | Plaintext
+    | Counted
+    | FlowOpened
+    | SessionOpened
+    | SessionEnded
+    | SessionRefused
+    | NoAnswer
+    | Flying
+    | ServerSilent
+    | ServerHeard
+    | ServerRestarted
+    | Finished
+)

@@ -1,0 +1,23 @@
+"""What tests need of the machine."""
+
+import socket
+from functools import cache
+
+import pytest
+
+
+@cache
+def has_ipv6() -> bool:
+    """Whether this machine has an IPv6 loopback."""
+    try:
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sock:
+            sock.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what needs IPv6 where there is none."""
+    if item.get_closest_marker("ipv6") and not has_ipv6():
+        pytest.skip("this machine has no IPv6")

@@ -1,0 +1,75 @@
+"""Processes as children: what is known of one is what it says, as events; and its last words."""
+
+import os
+import signal
+
+import pytest
+
+from shared.events import (
+    Counted,
+    Event,
+    Finished,
+    FlowOpened,
+    Flying,
+    Listening,
+    Plaintext,
+    ServerHeard,
+    ServerRestarted,
+    ServerSilent,
+)
+from shell.command import CommandError
+from skytether.fly import _tell
+from skytether.processes import started
+
+
+async def test_a_child_is_known_by_its_events() -> None:
+    """It listens where its first event says, and counts at its end, which is no last word."""
+    heard: list[Event] = []
+    argv = ("demo", "--bind", "0.0.0.0:0", "--server", "127.0.0.1:9")
+    async with started("netem", *argv, on_event=heard.append) as netem:
+        host, port = netem.address
+        assert (host, port > 0) == ("0.0.0.0", True)
+    assert [type(event) for event in heard] == [Listening, Plaintext, Counted]
+    assert netem.process.returncode == 0
+    assert netem.last_words().startswith("netem: plaintext and unauthenticated")
+
+
+@pytest.mark.ipv6
+async def test_a_child_may_listen_on_ipv6() -> None:
+    """Its address is a host and a port, as of any other."""
+    argv = ("demo", "--bind", "[::1]:0", "--server", "[::1]:9")
+    async with started("netem", *argv) as netem:
+        assert netem.address[0] == "::1"
+
+
+async def test_a_child_that_cannot_start_says_why() -> None:
+    """In the one line that it would have for a user."""
+    with pytest.raises(CommandError, match=r"netem: papr: no such scenario; did you mean paper\?"):
+        async with started("netem", "papr"):
+            pass
+
+
+async def test_a_child_that_is_killed_leaves_its_last_event() -> None:
+    """Nothing else is known of it."""
+    async with started("netem", "demo", "--bind", "127.0.0.1:0") as netem:
+        os.kill(netem.process.pid, signal.SIGKILL)
+        assert await netem.process.wait() == -signal.SIGKILL
+    assert netem.last_words().startswith("netem: listening on 127.0.0.1:")
+
+
+def test_a_flight_shows_what_happens_to_its_server_and_nothing_else(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """On stderr, where the progress bar is."""
+    shown = [ServerSilent(vehicle=1), ServerHeard(vehicle=1), ServerRestarted(vehicle=1)]
+    quiet = [
+        Flying(vehicle=1),
+        FlowOpened(flow=0, host="::1", port=1),
+        Counted(figures={}),
+        Finished(vehicle=1, steps=1, missed=0),
+    ]
+    for event in (*shown, *quiet):
+        _tell(event)
+    said = capfd.readouterr()
+    assert said.err.splitlines() == [str(event) for event in shown]
+    assert said.out == ""
