@@ -71,6 +71,11 @@ class PlannedFleet:
             np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)
         ]
 
+    @property
+    def x(self) -> Array:
+        """State of each vehicle [m, m/s]; shape (n, axes, 2)."""
+        return self._vehicles.x
+
     def plan(self) -> None:
         """Plan for all vehicles."""
         for rows in self._blocks:

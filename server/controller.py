@@ -91,7 +91,7 @@ class Controller:
     @property
     def counts(self) -> Counter[str]:
         """Events that were counted, by name."""
-        return self._counts + self._scheme.counts
+        return Counter({**self._counts, **self._scheme.counts})
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""

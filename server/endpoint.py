@@ -70,7 +70,8 @@ class Server(Endpoint):
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, self._terms.dt_ns)
         self.controller = Controller(scenario, self._terms, room, self._clock, self.stopwatch)
-        self._sessions = Sessions(room, boot_id)
+        self.sessions = Sessions(room, boot_id)
+        """Who flies."""
         self._due_ns: int | None = None
         self._expire_ns = 0
         """When to look for vehicles that are gone."""
@@ -102,7 +103,7 @@ class Server(Endpoint):
     def _hello(self, hello: Hello, address: Address, now_ns: int) -> None:
         number = 0
         if hello.terms == self._terms:
-            number = self._sessions.welcome(hello, address).number
+            number = self.sessions.welcome(hello, address).number
         else:
             differences = self._terms.differences(hello.terms)
             self._events.append(SessionRefused(vehicle=hello.vehicle, differences=differences))
@@ -110,7 +111,7 @@ class Server(Endpoint):
         self._out.append(Datagram(encode(welcome), address))
 
     def _observe(self, observation: Observation, address: Address, now_ns: int) -> None:
-        session = self._sessions.find(observation) or self._begin(observation, now_ns)
+        session = self.sessions.find(observation) or self._begin(observation, now_ns)
         row = session.row
         session.heard_ns = now_ns
         self._clock.observe(
@@ -130,7 +131,7 @@ class Server(Endpoint):
 
     def _begin(self, observation: Observation, now_ns: int) -> Session:
         """The session of a first observation, now live."""
-        session = self._sessions.begin(observation, now_ns)
+        session = self.sessions.begin(observation, now_ns)
         self._clock.forget(session.row)
         self.controller.forget(session.row)
         host, port = session.address
@@ -155,9 +156,9 @@ class Server(Endpoint):
         if now_ns >= self._expire_ns:
             # On the grid of its clock: a vehicle is forgotten at the same time in any company.
             self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
-            for session in self._sessions.expire(now_ns):
+            for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
-        if len(self._sessions):
+        if len(self.sessions):
             self._tick(tick_ns, now_ns)
         else:
             self._due_ns = None
@@ -165,7 +166,7 @@ class Server(Endpoint):
     def _tick(self, tick_ns: int, now_ns: int) -> None:
         self.stopwatch.start()
         before_ns = self.stopwatch.spent_ns.total()
-        rows = self._sessions.rows
+        rows = self.sessions.rows
         step = self._clock.steps(rows, tick_ns)
         able = self.controller.able(rows, step)
         if not able.all():
@@ -176,7 +177,7 @@ class Server(Endpoint):
             self._send_horizons(decisions, now_ns)
             self.stopwatch.lap("encode")
             self._record(decisions)
-        for session in self._sessions:
+        for session in self.sessions:
             if now_ns - session.sent_ns >= self._heartbeat_ns:
                 self._send(session, Heartbeat(session.vehicle, session.number, now_ns), now_ns)
         self.stopwatch.lap("encode")
@@ -188,7 +189,7 @@ class Server(Endpoint):
         rows, steps = decisions.rows[sent].tolist(), decisions.step[sent].tolist()
         ahead = found.ahead[sent].tolist()
         for i, row, step, d in zip(sent.tolist(), rows, steps, ahead, strict=True):
-            session = self._sessions.at(row)
+            session = self.sessions.at(row)
             inputs = found.horizons[i, :, : d + H]
             feedback = found.feedback[i] if feeds_back else found.feedback[i, :, :0]
             horizon = Horizon(
@@ -209,7 +210,7 @@ class Server(Endpoint):
         n = len(rows)
         self._recorder.append(
             n,
-            vehicle=self._sessions.vehicle[rows],
+            vehicle=self.sessions.vehicle[rows],
             step=decisions.step,
             estimate=found.estimate[:n],
             ahead=found.ahead[:n],
@@ -221,7 +222,7 @@ class Server(Endpoint):
             event=decisions.event,
             solved=figures["solved"],
             solve_ns=decisions.solve_ns,
-            stale=[self._sessions.at(row).stale for row in rows.tolist()],
+            stale=[self.sessions.at(row).stale for row in rows.tolist()],
             missed=self.missed,
         )
         self.stopwatch.lap("record")
@@ -233,20 +234,20 @@ class Server(Endpoint):
     @property
     def counts(self) -> Counter[str]:
         """Events that were counted, by name."""
-        return self._dropped + self.controller.counts
+        return Counter({**self._dropped, **self.controller.counts})
 
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
         each: dict[str, Any] = {}
-        for session in self._sessions.first(VEHICLES_TOLD_MAX):
+        for session in self.sessions.first(VEHICLES_TOLD_MAX):
             each[f"vehicle {session.vehicle}"] = {
                 "step": int(self.controller.last_step[session.row]),
                 "clock_bound_ms": self._clock.bound_ns(session.row) / MILLISECOND_NS,
             }
-        if len(self._sessions) > VEHICLES_TOLD_MAX:
-            each["and more"] = len(self._sessions) - VEHICLES_TOLD_MAX
+        if len(self.sessions) > VEHICLES_TOLD_MAX:
+            each["and more"] = len(self.sessions) - VEHICLES_TOLD_MAX
         return {
-            "vehicles": len(self._sessions),
+            "vehicles": len(self.sessions),
             "missed": self.missed,
             "tick_ms_p50": self.ticks.quantile_ms(0.5),
             "tick_ms_p99": self.ticks.quantile_ms(0.99),

@@ -385,6 +385,9 @@ def _foresee(
         if settings.decay < 1.0:
             _observe_disturbance(settings, memory, row, d, course, track)
         seen, observed = memory.seen[row], memory.observed[row]
+        assert (
+            k - observed <= settings.reach
+        )  # the controller's promise; the track has no more room
         # Those that had d steps and are not in force have been overtaken, or are lost.
         first = _first_after(memory, row, max(seen.in_force, observed - d))
         for number in range(_first_after(memory, row, seen.in_force), first):

@@ -57,7 +57,7 @@ class Sessions:
         self._opened = first
         self._live: dict[int, Session] = {}
         """Sessions by vehicle."""
-        self._welcomed: dict[int, Session] = {}
+        self.welcomed: dict[int, Session] = {}
         """New lives of vehicles, until their first observation, by vehicle."""
         self._by_row: dict[int, Session] = {}
         self._free_rows = list(range(room))
@@ -87,18 +87,18 @@ class Sessions:
         Raises:
             ProtocolError: there is no room for another vehicle.
         """
-        for known in (self._live, self._welcomed):
+        for known in (self._live, self.welcomed):
             session = known.get(hello.vehicle)
             if session is not None and session.boot_id == hello.boot_id:
                 return session
-        taken = self._live.keys() | self._welcomed.keys()
+        taken = self._live.keys() | self.welcomed.keys()
         if hello.vehicle not in taken and len(taken) >= self._room:
-            if not self._welcomed:
+            if not self.welcomed:
                 raise ProtocolError("no room for another vehicle")
-            del self._welcomed[next(iter(self._welcomed))]  # the oldest that never came
+            del self.welcomed[next(iter(self.welcomed))]  # the oldest that never came
         self._opened += 1
         session = Session(hello.vehicle, self._opened % 2**32, hello.boot_id, address)
-        self._welcomed[hello.vehicle] = session
+        self.welcomed[hello.vehicle] = session
         return session
 
     def find(self, observation: Observation) -> Session | None:
@@ -112,10 +112,10 @@ class Sessions:
         Raises:
             ProtocolError: there is none.
         """
-        session = self._welcomed.get(observation.vehicle)
+        session = self.welcomed.get(observation.vehicle)
         if session is None or session.number != observation.session:
             raise ProtocolError("unknown session")
-        del self._welcomed[session.vehicle]
+        del self.welcomed[session.vehicle]
         before = self._live.get(session.vehicle)
         session.row = heappop(self._free_rows) if before is None else before.row
         session.sent_ns = now_ns

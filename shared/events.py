@@ -9,12 +9,21 @@ from typing import Any
 
 import msgspec
 
-from shared.terms import Difference
-
 
 def address_text(host: str, port: int) -> str:
     """HOST:PORT as a user writes it, with an IPv6 host in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """A term on which two ends disagree."""
+
+    key: str
+    """Key of the scenario."""
+    here: str
+    """Value at the end that tells it."""
+    there: str
+    """Value at the other end."""
 
 
 class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):

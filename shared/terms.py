@@ -9,21 +9,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-import msgspec
-
 from shared.endpoint import SECOND_NS
+from shared.events import Difference
 from shared.model import Model, discretise
-
-
-class Difference(msgspec.Struct, frozen=True):
-    """A term on which two ends disagree."""
-
-    key: str
-    """Key of the scenario."""
-    here: str
-    """Value at the end that tells it."""
-    there: str
-    """Value at the other end."""
 
 
 class Terms(NamedTuple):

@@ -15,10 +15,12 @@ import pytest
 
 from benchmarks import accuracy, netem, solvers, tick, versions, wire
 from benchmarks.__main__ import DOCUMENT, ROOT, SECTIONS, write
+from benchmarks.airspace import PlannedFleet
 from benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
 from benchmarks.harness import HOT, PACED, Lateness, Table, interleave, machine, refresh
-from benchmarks.problems import Recorded, record
+from benchmarks.problems import Recorded, listening, record
 from benchmarks.reference import Reference
+from server.controller import BLOCK
 from server.exact import ExactSolver
 
 TINY = MappingProxyType(
@@ -89,6 +91,25 @@ def test_the_flights_are_what_they_are_called(
     """Never at a bound, and often."""
     assert results["solvers"]["smooth"]["active"] == 0.0
     assert saturated.active() > 0.2
+
+
+def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
+    """So what it asks are the problems of the fleet that is measured, block by block."""
+    scenario, count = tick.mixes()["half"], BLOCK + 2
+    fleet = PlannedFleet(scenario, count)
+    with listening() as listeners:
+        heard = PlannedFleet(scenario, count)
+    first, later = listeners
+    for _ in range(3):
+        for each in (fleet, heard):
+            each.plan()
+            each.fly()
+        np.testing.assert_array_equal(heard.x, fleet.x)
+    shape = (2, count, 2, scenario.control.horizon)
+    assert [each.shape for each in first.heard()] == [shape] * 2
+    assert [each.shape for each in later.heard(2)] == [shape] * 2
+    gradient, guess = later.heard()
+    assert gradient.shape == guess.shape == (2, 2 * count, *shape[2:])
 
 
 @pytest.mark.parametrize("name", sorted(contestants(TUNINGS[0]).keys() - {NOTHING}))

@@ -13,6 +13,7 @@ from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram
 from shared.events import (
+    Difference,
     Finished,
     Flying,
     NoAnswer,
@@ -23,7 +24,6 @@ from shared.events import (
 )
 from shared.protocol import (
     NO_HORIZON,
-    Difference,
     Heartbeat,
     Hello,
     Horizon,

@@ -8,6 +8,7 @@ import pytest
 
 from shared.events import (
     Counted,
+    Difference,
     Event,
     Finished,
     FlowOpened,
@@ -23,7 +24,6 @@ from shared.events import (
     SessionRefused,
     address_text,
 )
-from shared.terms import Difference
 from shell.log import Line, LogFormat, rendered, say
 
 SENTENCES = [

@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from server import controller
-from server.endpoint import Server
+from server.endpoint import VEHICLES_MAX, Server
+from server.sessions import SESSION_NS
 from shared import config
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
-from shared.events import SessionEnded, SessionRefused
+from shared.events import Difference, SessionEnded, SessionRefused
 from shared.protocol import (
     NO_HORIZON,
-    Difference,
     Heartbeat,
     Hello,
     Horizon,
@@ -268,7 +267,7 @@ def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
     """The vehicle's row is free again, and the server comes to rest."""
     vehicles = Vehicles(scenario())
     vehicles.observe(vehicles.open(), 0)
-    vehicles.now_ns += controller.SESSION_NS + vehicles.dt_ns
+    vehicles.now_ns += SESSION_NS + vehicles.dt_ns
     vehicles.server.wake(now_ns=vehicles.now_ns)
     assert vehicles.server.next_wake_ns() is None
     assert vehicles.server.events()[-1] == SessionEnded(vehicle=1)
@@ -277,8 +276,7 @@ def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
 def test_no_more_vehicles_than_there_is_room_for() -> None:
     """The one too many gets no answer; one that is known always does."""
     vehicles = Vehicles(scenario())
-    assert vehicles.server._room == controller.VEHICLES_MAX
-    for number in range(controller.VEHICLES_MAX):
+    for number in range(VEHICLES_MAX):
         vehicles.observe(vehicles.open(vehicle=number), 0)
     assert vehicles.say(Hello(1000, 1, vehicles.terms)) == []
     assert vehicles.server.counts["dropped: no room for another vehicle"] == 1
@@ -288,7 +286,7 @@ def test_no_more_vehicles_than_there_is_room_for() -> None:
 def test_vehicles_that_never_came_give_their_place_to_new_ones() -> None:
     """A welcome is a promise that expires: HELLOs alone cannot fill the server."""
     vehicles = Vehicles(scenario())
-    for number in range(controller.VEHICLES_MAX):
+    for number in range(VEHICLES_MAX):
         vehicles.open(vehicle=number)
     vehicles.observe(vehicles.open(vehicle=1000), 0)
     assert [type(message) for message, _ in vehicles.tick()] == [Horizon]
@@ -333,13 +331,13 @@ def test_a_row_that_was_left_is_used_again_as_if_it_were_new() -> None:
             if welcomes:
                 vehicles.tick()
         vehicles.now_ns = 50 * SECOND_NS + 20 * MILLISECOND_NS
-        assert set(vehicles.server._sessions) == set(others) - {1}
+        assert {each.vehicle for each in vehicles.server.sessions} == set(others) - {1}
         welcome, sent = vehicles.open(vehicle=4, sender=("v", 4)), []
         for step in range(10):
             vehicles.observe(welcome, step, ((1.0, 0.1), (0.1 * step, 0.2)), ("v", 4))
             sent += [message for message, peer in vehicles.tick() if peer == ("v", 4)]
         if others:
-            assert vehicles.server._sessions[4].row == 0
+            assert vehicles.server.sessions.at(0).vehicle == 4
         return [message.inputs.tobytes() for message in sent if isinstance(message, Horizon)]
 
     alone = fourth(())

@@ -15,8 +15,9 @@ from shared import config
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Datagram
+from shared.events import Difference
 from shared.protocol import PAYLOAD_BYTES_MAX, Hello, encode
-from shared.terms import FREE, KEYS, Difference
+from shared.terms import FREE, KEYS
 
 HERE = config.check(
     {
