@@ -30,7 +30,7 @@ def derive(name: str, **sections: Any) -> Scenario:
 def gradients(
     problem: Problem, x: Array, target: Array, previous: Array, disturbance: Array
 ) -> Array:
-    """g of the QPs of n vehicles; shape (n, axes, H).
+    """Gradient g of the QPs of n vehicles; shape (n, axes, H).
 
     Args:
         problem: what poses them.

@@ -31,7 +31,7 @@ class Compensator:
         self._feedback: list[list[float]] = []
         """The horizon's feedback of each axis, see `shared.protocol.Horizon`; empty without."""
         self._led: list[tuple[float, float]] = []
-        """x̄ of each axis at stage `_led_stage` [m, m/s]."""
+        """State x̄ that the horizon leads to, of each axis at stage `_led_stage` [m, m/s]."""
         self._led_stage = 0
         self.in_force = NO_HORIZON
         """Step that the horizon was made for, k_h, or NO_HORIZON: then the vehicle hovers."""
@@ -66,7 +66,7 @@ class Compensator:
         self._led_stage = 0
 
     def choose(self, step: int, state: Array) -> Array:
-        """u* for `step` [m/s]; shape (axes,).
+        """Input u* for `step` [m/s]; shape (axes,).
 
         Args:
             step: k, never smaller than before.

@@ -57,7 +57,7 @@ class FirstOrderPlant:
         self._tau = tau
         self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(tau)))
         self._push = self._steady_mps.tolist()
-        """w + τ a, gusts included [m/s]."""
+        """Push w + τ a on each axis, gusts included [m/s]."""
         start = scenario.vehicle.start_m or scenario.make_reference()(np.zeros(()))[:, 0]
         self._x = [(float(position), 0.0) for position in start]
 

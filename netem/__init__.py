@@ -1,1 +1,1 @@
-"""netem: the bad network between clients and a server, a UDP proxy that never reads its packets."""
+"""Network emulator: the bad network between the two, a UDP proxy that never reads its packets."""

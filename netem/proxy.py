@@ -1,4 +1,4 @@
-"""netem: a UDP proxy that stands for the network and never decodes what it carries.
+"""UDP proxy that stands for the network and never decodes what it carries.
 
 Clients send to netem's bound socket. Each client address is a flow with a socket of its own towards
 the server, so that the server's answers find their way back. Uplink is server to client, downlink

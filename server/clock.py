@@ -42,7 +42,7 @@ class ClockMap:
     def __init__(self, capacity: int, dt_ns: int) -> None:
         self._dt_ns = dt_ns
         self.minimum = np.full((capacity, 2, BUCKETS), UNSEEN, dtype=np.int64)
-        """min F and min G of each half second [ns], a ring; shape (capacity, 2, BUCKETS)."""
+        """Smallest F and G of each half second [ns], a ring; shape (capacity, 2, BUCKETS)."""
         self._samples = np.zeros((capacity, BUCKETS), dtype=np.int64)
         self._newest = np.zeros(capacity, dtype=np.int64)
         """Half second of the newest sample; shape (capacity,)."""
@@ -70,7 +70,7 @@ class ClockMap:
         )
 
     def steps(self, rows: Indices, now_ns: int) -> Indices:
-        """k of each vehicle at a time of the server's clock; shape (n,)."""
+        """Step k of each vehicle at a time of the server's clock; shape (n,)."""
         steps = np.empty(len(rows), dtype=np.int64)
         _steps(
             self.minimum,

@@ -39,19 +39,19 @@ class Decisions:
     rows: Indices
     """The vehicles; shape (n,)."""
     step: Indices
-    """k of each; shape (n,)."""
+    """Step k of each; shape (n,)."""
     found: Foresight
     """What was foreseen, and the horizons; the n vehicles come first."""
     figures: Figures
     """What the plans are worth; shape (n,)."""
     planned: Array
-    """x_p(k+d|k-1) [m, m/s]; shape (n, axes, 2)."""
+    """Planned state x_p(k+d|k-1) [m, m/s]; shape (n, axes, 2)."""
     verdict: Verdict
     """What the trigger says."""
     event: Flags
     """Which are sent their horizon; shape (n,)."""
     sent: Indices
-    """The same, by index."""
+    """Indices of those that are sent theirs."""
     solve_ns: int
     """How long planning took for all of them, or -1 where nobody measures it."""
 

@@ -29,10 +29,10 @@ to 1.3 % came later than d."""
 
 
 class DelayBound(NamedTuple):
-    """d of up to `capacity` vehicles, and the samples that it comes from."""
+    """Delay bounds d of up to `capacity` vehicles, and the samples that it comes from."""
 
     steps: I1
-    """d of each vehicle, or 0 while nothing is known; shape (capacity,)."""
+    """Delay bound d of each vehicle, or 0 while nothing is known; shape (capacity,)."""
     samples: I2
     """Newest samples of each [steps], a ring; shape (capacity, SAMPLES)."""
     seen: I1

@@ -38,7 +38,7 @@ class Estimator:
         """Step of the newest observation, or -1; shape (capacity,)."""
         self._state = np.zeros((capacity, axes, 2))
         self._inputs = np.zeros((capacity, axes, reach))
-        """û, a ring over the steps: zero, hovering, where nothing was computed [m/s]."""
+        """Input history û, a ring over the steps; 0, hovering, where nothing was computed [m/s]."""
         self._last_step = np.full(capacity, -1, dtype=np.int64)
         """Step whose û was computed last, or -1; shape (capacity,)."""
 
@@ -78,7 +78,7 @@ class Estimator:
         found: Foresight,
         event: Flags,  # noqa: ARG002 - whether sent or not (E12)
     ) -> None:
-        """û(k) ← u(k|k), eq. (12).
+        """Take û(k) ← u(k|k), eq. (12).
 
         Steps before at which nothing was computed flew on with the input of before them.
         """

@@ -56,7 +56,7 @@ class MPC(NamedTuple):
     model: Axes
     """Eq. (4); shape (axes,)."""
     bounds: F1
-    """u_max [m/s]; shape (axes,)."""
+    """Bound u_max of the input [m/s]; shape (axes,)."""
     weights: Weights
     """Q, P, R and S."""
 

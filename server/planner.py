@@ -79,9 +79,9 @@ class Draft(NamedTuple):
     """The plans of a block of vehicles in the making."""
 
     planned: F3
-    """x_p(k|k-1), where the generator starts [m, m/s]; shape (block, axes, 2)."""
+    """Planned state x_p(k|k-1), where the generator starts [m, m/s]; shape (block, axes, 2)."""
     gradient: F3
-    """g of the problem to be solved; shape (block, axes, H)."""
+    """Gradient g of the problem to be solved; shape (block, axes, H)."""
     guess: F3
     """Horizon of the step before, shifted [m/s]; shape (block, axes, H)."""
     inputs: F4
@@ -199,7 +199,7 @@ class Planner:
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         """What the last plans are worth; those of a block come first."""
         self.planned = self._draft.planned
-        """x_p(k+d|k-1) of the last plans [m, m/s]; shape (block, axes, 2)."""
+        """Planned states x_p(k+d|k-1) of the last plans [m, m/s]; shape (block, axes, 2)."""
         self.inputs = self._memory.inputs[TRACKER]
         """U of the last plan of each vehicle [m/s]; shape (capacity, axes, H)."""
         self.solve_ns = -1

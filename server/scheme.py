@@ -20,17 +20,17 @@ class Foresight(NamedTuple):
     """
 
     estimate: F3
-    """x̂(k) [m, m/s]; shape (block, axes, 2)."""
+    """Estimate x̂(k) [m, m/s]; shape (block, axes, 2)."""
     ahead: I1
-    """d: planning starts at k + d; shape (block,)."""
+    """Delay bound d: planning starts at k + d; shape (block,)."""
     start: F3
-    """x̂(k+d) [m, m/s]; shape (block, axes, 2)."""
+    """Estimate x̂(k+d), where planning starts [m, m/s]; shape (block, axes, 2)."""
     committed: F3
     """Inputs of k … k+d-1, the first d of the last axis [m/s]; shape (block, axes, H)."""
     held: F3
     """Inputs from k+d on, if nothing more were sent [m/s]; shape (block, axes, H)."""
     disturbance: F2
-    """ŵ, an input that nobody gave [m/s]; shape (block, axes)."""
+    """Disturbance ŵ, an input that nobody gave [m/s]; shape (block, axes)."""
     horizons: S3
     """What may be sent, from k on: d committed inputs, then H planned ones [m/s]; shape
     (block, axes, 2 H)."""

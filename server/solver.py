@@ -16,7 +16,7 @@ from shared.model import Array, Flags
 
 ITERATIONS_MAX = 4000
 TOLERANCE = 1e-9
-"""Of both residuals: inputs are then right to about 1e-8 m/s, for 30 iterations instead of 20."""
+"""Tolerance of both residuals: inputs are right to about 1e-8 m/s, in 30 iterations, not 20."""
 RHO_PER_CURVATURE = 2.5
 """OSQP's step size over the mean curvature of the Hessian: fewest iterations in the worst case."""
 

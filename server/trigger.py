@@ -28,9 +28,9 @@ class Situation(NamedTuple):
     figures: Figures
     """What their plans are worth, see `server.planner.FIGURES`; shape (n,)."""
     estimate: Array
-    """x̂ where planning starts [m, m/s]; shape (n, axes, 2)."""
+    """Estimate x̂ where planning starts [m, m/s]; shape (n, axes, 2)."""
     planned: Array
-    """x_p there [m, m/s]; shape (n, axes, 2)."""
+    """Planned state x_p there [m, m/s]; shape (n, axes, 2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class Budget:
         self._gain = packets_per_s * control.dt
         self._burst = burst
         self._tokens = np.full(capacity, burst, dtype=np.float64)
-        """b right after step `_step`; shape (capacity,)."""
+        """Tokens b right after step `_step`; shape (capacity,)."""
         self._step = np.zeros(capacity, dtype=np.int64)
 
     def forget(self, row: int) -> None:
@@ -153,7 +153,7 @@ class Budget:
         self._step[rows] = figures["step"]
 
     def _filled(self, rows: Indices, figures: Figures) -> Array:
-        """b at these steps; shape (n,)."""
+        """Tokens b at these steps; shape (n,)."""
         gained = self._gain * (figures["step"] - self._step[rows])
         return np.minimum(self._tokens[rows] + gained, self._burst)
 

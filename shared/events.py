@@ -57,7 +57,7 @@ class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """netem has heard a new client."""
+    """New client, heard by netem."""
 
     flow: int
     """Number of the flow, from 0."""

@@ -86,13 +86,13 @@ class Observation(NamedTuple):
     stamp_ns: int
     """When the state was sampled [client clock]."""
     in_force: int
-    """Step that the horizon in force was made for, or NO_HORIZON,"""
+    """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
-    """and the first step that was flown with it."""
+    """First step that was flown with that horizon."""
     server_ns: int
-    """Newest `server_ns` seen, echoed,"""
+    """Newest `server_ns` seen, echoed [server clock]."""
     received_ns: int
-    """and when it came [client clock]."""
+    """When that stamp came [client clock]."""
     state: NDArray[np.float64]
     """Position [m] and velocity [m/s]; shape (axes, 2)."""
 
@@ -103,7 +103,7 @@ class Horizon(NamedTuple):
     vehicle: int
     session: int
     step: int
-    """k: the step of the first input, on the vehicle's grid."""
+    """Step k of the first input, on the vehicle's grid."""
     server_ns: int
     observed_ns: int
     """Stamp of the observation it was computed from, echoed [client clock]."""
@@ -192,7 +192,7 @@ def _feedback(value: object, ours: Terms) -> NDArray[np.float32]:
 
 
 def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
-    """Of each axis at least and at most so many numbers."""
+    """Array of `axes` rows, with at least and at most so many numbers each."""
     if type(value) is not bytes:
         raise ProtocolError("shape")
     count, rest = divmod(len(value), axes * dtype.itemsize)

@@ -308,7 +308,7 @@ def test_every_contender_gets_the_same_search(tuned: Path) -> None:
 def test_searches_that_are_done_are_not_done_again(
     tuned: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same command reads their journals, and writes the same."""
+    """A repeated command reads their journals, and writes the same."""
     kept = {path: path.read_bytes() for path in tuned.rglob("*") if path.is_file()}
     monkeypatch.setattr(pool.Crew, "share", None)
     assert main([*TUNE, "--out", str(tuned)]) == 0

@@ -1,4 +1,4 @@
-"""shared.kernel: machine code on disk is used as long as all that it was made of is the same."""
+"""Machine code of kernels on disk is used as long as all that it was made of is the same."""
 
 import subprocess
 import sys

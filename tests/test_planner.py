@@ -81,7 +81,7 @@ class Plan(NamedTuple):
     step: Indices
     """Step that they start at, or -1; shape (n,)."""
     planned: Array
-    """x_p(k|k-1) [m, m/s]; shape (n, axes, 2)."""
+    """Planned state x_p(k|k-1) [m, m/s]; shape (n, axes, 2)."""
     figures: Figures
     """What the plans are worth; shape (n,)."""
     horizons: Array
@@ -143,7 +143,7 @@ def shift(inputs: Array, gap: int) -> Array:
 
 
 def fly(x: Array, u: Array) -> Array:
-    """x, and the states that H inputs lead through; shape (axes, H + 1, 2)."""
+    """State x, and the states that H inputs lead through; shape (axes, H + 1, 2)."""
     states = [x]
     for stage in range(H):
         states.append(MODEL.step(states[-1], u[:, stage]))
