@@ -89,8 +89,10 @@ class Proxy(Endpoint):
         self._forward(now_ns)
 
     def _forward(self, now_ns: int) -> None:
-        self._out += self.uplink.give(now_ns=now_ns)
-        self._out += self.downlink.give(now_ns=now_ns)
+        for link in (self.uplink, self.downlink):
+            due_ns = link.next_due_ns()
+            if due_ns is not None and due_ns <= now_ns:
+                self._out += link.give(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
         """Time at which the next packet is due."""

@@ -73,6 +73,8 @@ class Endpoint(ABC):
 
     def outbox(self) -> list[Datagram]:
         """Datagrams to be sent; each is handed out once."""
+        if not self._out:
+            return []
         out, self._out = self._out, []
         return out
 

@@ -24,6 +24,8 @@ class Stopwatch:
 
     def lap(self, name: str) -> int:
         """End the lap, count it by this name, and begin the next; returns how long it took [ns]."""
+        if not self.runs:
+            return 0
         now_ns = self._clock_ns()
         took_ns = now_ns - self._since_ns
         self.spent_ns[name] += took_ns

@@ -30,11 +30,14 @@ class Clock:
 
     def local(self, time_ns: int) -> int:
         """Time that it shows at a time of the world."""
-        return self.offset_ns + time_ns + time_ns * self.drift_ppb // BILLION
+        shown_ns = self.offset_ns + time_ns
+        return shown_ns + time_ns * self.drift_ppb // BILLION if self.drift_ppb else shown_ns
 
     def world(self, local_ns: int) -> int:
         """First time of the world at which it shows at least this time."""
         passed_ns = local_ns - self.offset_ns
+        if not self.drift_ppb:
+            return passed_ns
         return passed_ns - passed_ns * self.drift_ppb // (BILLION + self.drift_ppb)
 
 
