@@ -22,10 +22,7 @@ RUN /build/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /bui
     && /build/bin/pip --python /opt/skytether/bin/python install --quiet \
         --no-deps --no-index /build/wheel/*.whl
 # What importing the server compiles; a machine of another kind compiles it anew when it starts.
-# A layer keeps whole seconds of a file's time, and Numba's cache wants to find the time it knew.
-RUN find /opt/skytether/lib -path '*/site-packages/server/*.py' \
-        -exec sh -c 'touch --date="@$(stat --format=%Y "$0")" "$0"' {} \; \
-    && NUMBA_CACHE_DIR=/opt/skytether/kernels /opt/skytether/bin/python -P -c "import server.controller"
+RUN NUMBA_CACHE_DIR=/opt/skytether/kernels /opt/skytether/bin/python -P -c "import server.endpoint"
 
 
 FROM ${BASE_IMAGE}

@@ -238,7 +238,7 @@ DRAWN = ("rmse_xy", "event_ratio")
 
 
 def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
-    """Values of λ and ε, and over both mean RMSE xy [m] and event ratio; shapes (λ,), (ε,), twice (λ, ε)."""
+    """Values of λ and ε; over both, mean RMSE xy [m] and event ratio; shapes (λ,), (ε,), (λ, ε)."""
     decay, epsilon = (np.unique([values[axis] for values in flown]) for axis in (0, 1))
     shape = (len(decay), len(epsilon))
     rmse, ratio = (

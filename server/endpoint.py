@@ -10,6 +10,7 @@ from typing import Any
 
 from server.clock import ClockMap
 from server.controller import BLOCK, Controller, Decisions
+from server.scheme import in_a_row
 from server.sessions import Session, Sessions
 from shared.config import Scenario
 from shared.endpoint import (
@@ -24,14 +25,15 @@ from shared.endpoint import (
 from shared.events import SessionEnded, SessionOpened, SessionRefused
 from shared.histogram import Histogram
 from shared.protocol import (
+    FEEDBACK,
     Heartbeat,
     Hello,
-    Horizon,
     Observation,
     ProtocolError,
     Welcome,
     decode,
     encode,
+    encode_horizon,
 )
 from shared.record import Recorder
 from shared.stopwatch import Stopwatch
@@ -179,29 +181,36 @@ class Server(Endpoint):
             self._record(decisions)
         for session in self.sessions:
             if now_ns - session.sent_ns >= self._heartbeat_ns:
-                self._send(session, Heartbeat(session.vehicle, session.number, now_ns), now_ns)
+                session.sent_ns = now_ns
+                heartbeat = Heartbeat(session.vehicle, session.number, now_ns)
+                self._out.append(Datagram(encode(heartbeat), session.address))
         self.stopwatch.lap("encode")
         self.ticks.add(self.stopwatch.spent_ns.total() - before_ns)
 
     def _send_horizons(self, decisions: Decisions, now_ns: int) -> None:
-        found, H, feeds_back = decisions.found, self._terms.horizon, self._terms.feeds_back
-        sent = decisions.sent
-        rows, steps = decisions.rows[sent].tolist(), decisions.step[sent].tolist()
-        ahead = found.ahead[sent].tolist()
-        for i, row, step, d in zip(sent.tolist(), rows, steps, ahead, strict=True):
-            session = self.sessions.at(row)
-            inputs = found.horizons[i, :, : d + H]
-            feedback = found.feedback[i] if feeds_back else found.feedback[i, :, :0]
-            horizon = Horizon(
+        sent, found = decisions.sent, decisions.found
+        if not len(sent):
+            return
+        # Bytes of one input on all axes, and of what goes with a horizon.
+        width = 4 * self._terms.axes
+        feedback, told = found.feedback.data.cast("B"), 0
+        if self._terms.feeds_back:
+            told = width * FEEDBACK
+        inputs, begin = in_a_row(found, sent), 0
+        columns = (sent, decisions.rows[sent], decisions.step[sent], found.ahead[sent])
+        for i, row, step, d in zip(*(column.tolist() for column in columns), strict=True):
+            session, end = self.sessions.at(row), begin + width * (d + self._terms.horizon)
+            payload = encode_horizon(
                 session.vehicle,
                 session.number,
                 step,
                 now_ns,
                 session.observed_ns,
-                inputs,
-                feedback,
+                inputs[begin:end],
+                feedback[i * told : (i + 1) * told],
             )
-            self._send(session, horizon, now_ns)
+            session.sent_ns, begin = now_ns, end
+            self._out.append(Datagram(payload, session.address))
 
     def _record(self, decisions: Decisions) -> None:
         if self._recorder is None:
@@ -226,10 +235,6 @@ class Server(Endpoint):
             missed=self.missed,
         )
         self.stopwatch.lap("record")
-
-    def _send(self, session: Session, message: Horizon | Heartbeat, now_ns: int) -> None:
-        session.sent_ns = now_ns
-        self._out.append(Datagram(encode(message), session.address))
 
     @property
     def counts(self) -> Counter[str]:

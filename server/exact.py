@@ -233,6 +233,8 @@ class ExactSolver:
         rounds = np.empty(gradient.shape[:2], dtype=np.int64)
         mpc, which = self._problem.mpc, self._problem.which
         _solve(mpc, which, self.work, gradient, guess, inputs, rounds)
+        if rounds.min() > 0:
+            return inputs, np.ones(len(gradient), dtype=np.bool_)
         solved: Flags = (rounds != NOT_FINITE).all(axis=1)
         for vehicle, axis in np.argwhere((rounds == CYCLED) & solved[:, None]):
             self.fallbacks += 1

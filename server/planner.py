@@ -251,17 +251,17 @@ def _rounded(u: F1) -> None:
         u[i] = np.float64(np.float32(u[i]))
 
 
-@part
+@inline
 def _appraise(memory: Memory, row: int, start: int, figures: Figures, i: int, k: int) -> int:
     """Steps since a vehicle was planned for last; notes whether its plan is to begin anew."""
     last = memory.step[row]
     gap = start - last
     figures[i].step, figures[i].solved = k, True
-    figures[i].fresh = last < 0 or gap > memory.inputs.shape[3]
+    figures[i].fresh = last < 0 or not 0 <= gap <= memory.inputs.shape[3]
     return gap
 
 
-@part
+@inline
 def _pose_generator(
     given: Given,
     memory: Memory,
@@ -292,7 +292,7 @@ def _pose_generator(
     gradient(given.mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
 
 
-@part
+@inline
 def _pose_tracker(
     given: Given,
     memory: Memory,
@@ -316,7 +316,7 @@ def _pose_tracker(
     gradient(given.mpc, axis, which, w, states, previous, gap, fresh, draft.drift, g)
 
 
-@part
+@inline
 def _conclude(
     given: Given,
     memory: Memory,

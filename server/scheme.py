@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from shared.kernel import F2, F3, I1, S3
+from shared.kernel import F2, F3, I1, S1, S3, kernel
 from shared.model import Flags, Indices
 from shared.protocol import FEEDBACK, Observation
 
@@ -51,6 +51,29 @@ def foresight(block: int, axes: int, H: int) -> Foresight:
         horizons=np.zeros((block, axes, 2 * H), dtype=np.float32),
         feedback=np.zeros((block, axes, FEEDBACK), dtype=np.float32),
     )
+
+
+def in_a_row(found: Foresight, sent: Indices) -> memoryview:
+    """Bytes of the horizons of some vehicles of a block, one after the other, as they are sent.
+
+    Args:
+        sent: which vehicles, by index; their horizons have d + H inputs on each axis; shape (n,).
+    """
+    _, axes, most = found.horizons.shape
+    packed = np.empty(len(sent) * axes * most, dtype=np.float32)
+    _pack(found.horizons, found.ahead, sent, packed)
+    return packed.data.cast("B")
+
+
+@kernel
+def _pack(horizons: S3, ahead: I1, sent: I1, packed: S1) -> None:
+    """Fill in `in_a_row` as numbers; shape of `packed`: as many as there can be."""
+    at, H = 0, horizons.shape[2] // 2
+    for i in sent:
+        for axis in range(horizons.shape[1]):
+            for stage in range(ahead[i] + H):
+                packed[at] = horizons[i, axis, stage]
+                at += 1
 
 
 class Scheme(Protocol):

@@ -230,6 +230,22 @@ def encode(message: Message) -> bytes:
     return payload
 
 
+def encode_horizon(
+    vehicle: int,
+    session: int,
+    step: int,
+    server_ns: int,
+    observed_ns: int,
+    inputs: memoryview,
+    feedback: memoryview,
+) -> bytes:
+    """Datagram of a `Horizon` whose arrays are bytes already, for a server that sends many."""
+    fields = (vehicle, session, step, server_ns, observed_ns, inputs, feedback)
+    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *fields))
+    assert len(payload) <= PAYLOAD_BYTES_MAX
+    return payload
+
+
 def decode(payload: bytes, terms: Terms) -> Message:
     """The message in a datagram, every field checked against our own terms.
 

@@ -28,7 +28,7 @@ from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
 from skytether import processes
 
-STAGES = ("receive", "decode", "observe", "estimate", "trigger", "plan", "solve", "encode", "send")
+STAGES = ("receive", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
 """Stages of the server's work, in their order; `record`, the price of watching, is left out."""
 
 

@@ -397,7 +397,7 @@ def test_a_client_that_is_refused_names_each_key_and_both_values(
 
 def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> None:
     """Lines of JSON alone, each with process and CLOCK_MONOTONIC, in the order of time."""
-    server = start("server", "demo", "--bind", "127.0.0.1:0")
+    server = start("server", "demo", "--bind", "127.0.0.1:0", *QUICK)
     argv = ["--server", server.address(), "--duration", "0.5", "--log", "json", *QUICK]
     began_ns = time.monotonic_ns()
     run = skytether_("client", "demo", *argv)

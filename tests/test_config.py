@@ -514,7 +514,10 @@ def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> Non
 
 def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
     """With one number an axis, and the step in nanoseconds."""
-    assert Scenario().terms() == (50_000_000, 40, 2, (0.84, 0.84), (1.6, 1.6))
+    terms = Scenario().terms()
+    assert terms[:5] == (50_000_000, 40, 2, (0.84, 0.84), (1.6, 1.6))
+    assert terms[5:9] == ("committed", "brake", 2.0, 0.1)
+    assert terms[9:] == ("circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
 
 
 @pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])

@@ -1,6 +1,7 @@
 """Terms of a flight: for every key of a scenario, two ends differ and are told, or may differ."""
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -172,3 +173,12 @@ def test_the_longest_terms_fit_one_datagram() -> None:
     terms = HERE.terms()._replace(tau_s=(math.pi,) * 3, u_max=(math.pi,) * 3, points="x" * 32)
     terms = terms._replace(scheme="x" * 32, exhausted="x" * 32, shape="x" * 32, table="x" * 32)
     assert len(encode(Hello(2**16 - 1, 2**64 - 1, terms))) <= PAYLOAD_BYTES_MAX
+
+
+def test_the_documented_tables_name_every_key() -> None:
+    """The terms in the order on the wire, and all others with whose they are."""
+    text = (Path(__file__).parent.parent / "docs" / "protocol.md").read_text()
+    terms, free = text.split("## Terms")[1].split("## Rules")[0].split("All other keys")
+    assert re.findall(r"^\| `([a-z_.0-9]+)` \|", terms, re.MULTILINE) == list(KEYS.values())
+    rows = re.findall(r"^\| (`.*`) \| (.*) \|$", free, re.MULTILINE)
+    assert {key: whose for keys, whose in rows for key in re.findall("`(.*?)`", keys)} == FREE
