@@ -25,7 +25,7 @@ demo: setup  ## fly the demonstration
 reproduce: setup  ## the paper's table and figures, and more, in results/report.html (15 minutes)
 	$(BIN)/skytether reproduce --out results
 
-test: setup  ## everything but Docker, in under three minutes on two cores
+test: setup  ## everything but Docker, in five minutes on two cores
 	$(BIN)/pytest -q -m "not docker" -n 2 --dist loadfile
 
 check: setup  ## style, types, and who imports whom
