@@ -202,11 +202,11 @@ def gradient(
         g: what is filled in; shape (H,).
     """
     model, weights = axis_at(mpc.model, axis), mpc.weights
-    S, R, T = weights.changes, weights.input, weights.target
+    S, R, T = weights.changes[which], weights.input, weights.target
     l0, l1 = 0.0, 0.0
     for i in range(len(g) - 1, -1, -1):
         l0, l1 = l0 + drift[i, 0], model.a01 * l0 + model.a11 * l1 + drift[i, 1]
-        toward = S[which, i] * shifted(previous, gap, fresh, i) + T * target[i, 1]
+        toward = S[i] * shifted(previous, gap, fresh, i) + T * target[i, 1]
         toward -= R * w
         g[i] = model.b0 * l0 + model.b1 * l1 - toward
 

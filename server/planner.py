@@ -48,14 +48,18 @@ GENERATOR, TRACKER = 0, 1
 """First index of what both MPCs have."""
 
 FIGURES = record(
+    ("row", "i8"),
     ("step", "i8"),
+    ("start", "i8"),
+    ("gap", "i8"),
     ("error", "f8"),
     ("cost_gap", "f8"),
     ("deviation_m", "f8"),
     ("fresh", "?"),
     ("solved", "?"),
 )
-"""What is known of a vehicle once its plan is made: k; V(k) of eq. (16); the cost of flying on with
+"""What is known of a vehicle once its plan is made: its row; k; k + d, where planning starts; the
+steps since planning started before; V(k) of eq. (16); the cost of flying on with
 what was sent, above that of the plan; the largest distance between that and the generator's last
 plan [m]; whether it is at its first step or after a gap that no plan reached over; and whether the
 plan is new and right, so that it may be sent."""
@@ -94,17 +98,6 @@ class Draft(NamedTuple):
     """Scratch: squares of distances [m²]; shape (H + 1,)."""
 
 
-class Given(NamedTuple):
-    """What a plan starts from, besides what was foreseen."""
-
-    mpc: MPC
-    """The problem."""
-    terminal_weight: F1
-    """P, on position and velocity; shape (2,)."""
-    compares: bool
-    """Whether what was sent before is known, so that the plan can be compared with it."""
-
-
 class Desired(NamedTuple):
     """The desired trajectory, looked up in pages rather than computed each time."""
 
@@ -113,6 +106,27 @@ class Desired(NamedTuple):
     (PAGES, axes, PAGE + H + 1, 2)."""
     held: I1
     """Which page of the trajectory each is, or EMPTY; shape (PAGES,)."""
+
+
+class Batch(NamedTuple):
+    """A block of vehicles, and all that their plans are made of."""
+
+    mpc: MPC
+    """The problem."""
+    terminal_weight: F1
+    """P, on position and velocity; shape (2,)."""
+    compares: bool
+    """Whether what was sent before is known, so that a plan can be compared with it."""
+    memory: Memory
+    """What is remembered of all vehicles."""
+    draft: Draft
+    """The plans in the making."""
+    desired: Desired
+    """The desired trajectory."""
+    found: Foresight
+    """What is foreseen of the vehicles."""
+    figures: Figures
+    """What their plans are worth."""
 
 
 class Reference:
@@ -127,10 +141,10 @@ class Reference:
             held=np.full(PAGES, EMPTY, dtype=np.int64),
         )
 
-    def open(self, rows: Indices, steps: Indices, found: Foresight) -> Desired:
+    def open(self, steps: Indices, ahead: Indices) -> Desired:
         """The desired trajectory, with all pages that vehicles need at their steps k + d."""
         pages, held = self._desired
-        while (page := _missing(self._desired, rows, steps, found)) != EMPTY:
+        while (page := _missing(self._desired, steps, ahead)) != EMPTY:
             if np.count_nonzero(held == EMPTY) == 1:
                 held[:] = EMPTY
             at = plain(_place)(held, page)
@@ -149,10 +163,10 @@ def _place(held: I1, page: int) -> int:
 
 
 @kernel
-def _missing(desired: Desired, rows: I1, steps: I1, found: Foresight) -> int:
+def _missing(desired: Desired, steps: I1, ahead: I1) -> int:
     """A page that vehicles need and that is not held, or EMPTY."""
-    for i in range(len(rows)):
-        page = (steps[i] + found.ahead[i]) // PAGE
+    for i in range(len(steps)):
+        page = (steps[i] + ahead[i]) // PAGE
         if desired.held[_place(desired.held, page)] != page:
             return page
     return EMPTY
@@ -177,7 +191,9 @@ class Planner:
         control, axes, H = scenario.control, terms.axes, terms.horizon
         self._reference = Reference(scenario, terms)
         mpc = make_mpc(terms, control)
-        self._given = Given(mpc, np.array(control.terminal_weight), terms.commits)
+        self._mpc = mpc
+        self._terminal_weight = np.array(control.terminal_weight)
+        self._compares = terms.commits
         self._solvers = [
             make_solver(control, pose(terms.model, mpc, which)) for which in (FIRST, LATER)
         ]
@@ -217,19 +233,27 @@ class Planner:
             step: k of each; shape (n,).
             found: what is foreseen of them.
         """
-        desired = self._reference.open(rows, step, found)
-        batch = (self._given, self._memory, self._draft, rows, step, found)
+        batch = Batch(
+            mpc=self._mpc,
+            terminal_weight=self._terminal_weight,
+            compares=self._compares,
+            memory=self._memory,
+            draft=self._draft,
+            desired=self._reference.open(step, found.ahead),
+            found=found,
+            figures=self.figures,
+        )
         left = np.arange(len(rows))
         solver = self._solvers[LATER]
         if type(solver) is ExactSolver:
-            undone = _plan(*batch, desired, solver.work, self.figures)
+            undone = _plan(batch, rows, step, solver.work)
             left = np.flatnonzero(~self.figures["solved"][: len(rows)]) if undone else left[:0]
         if len(left):
-            _pose_generators(*batch, desired, left, self.figures)
+            _pose_generators(batch, rows, step, left)
             self._solve(GENERATOR, left)
-            _pose_trackers(*batch, left, self.figures)
+            _pose_trackers(batch, left)
             self._solve(TRACKER, left)
-            _conclude_all(*batch, left, self.figures)
+            _conclude_all(batch, left)
         took_ns = self._stopwatch.lap("plan")
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
@@ -252,244 +276,180 @@ def _rounded(u: F1) -> None:
 
 
 @inline
-def _appraise(memory: Memory, row: int, start: int, figures: Figures, i: int, k: int) -> int:
-    """Steps since a vehicle was planned for last; notes whether its plan is to begin anew."""
-    last = memory.step[row]
-    gap = start - last
-    figures[i].step, figures[i].solved = k, True
-    figures[i].fresh = last < 0 or not 0 <= gap <= memory.inputs.shape[3]
-    return gap
+def _begin(batch: Batch, i: int, row: int, k: int) -> None:
+    """Note what the plan of vehicle `i` of the block starts from, and whether it begins anew."""
+    figures, last, start = batch.figures[i], batch.memory.step[row], k + batch.found.ahead[i]
+    figures.row, figures.step, figures.start, figures.gap = row, k, start, start - last
+    figures.solved = True
+    figures.fresh = last < 0 or not 0 <= start - last <= batch.memory.inputs.shape[3]
 
 
 @inline
-def _pose_generator(
-    given: Given,
-    memory: Memory,
-    draft: Draft,
-    found: Foresight,
-    desired: Desired,
-    i: int,
-    at: int,
-    row: int,
-    axis: int,
-    start: int,
-    gap: int,
-    fresh: bool,
-) -> None:
+def _pose_generator(batch: Batch, i: int, at: int, axis: int) -> None:
     """Pose the generator's problem (14) on one axis of vehicle `i` of the block, at draft `at`."""
+    memory, draft, found, figures = batch.memory, batch.draft, batch.found, batch.figures[i]
+    row, gap, fresh = figures.row, figures.gap, figures.fresh
     H = memory.inputs.shape[3]
     if fresh:
         x = (found.start[i, axis, 0], found.start[i, axis, 1])
     else:
         x = (memory.states[row, axis, gap, 0], memory.states[row, axis, gap, 1])
     draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
-    place, first = _place(desired.held, start // PAGE), start % PAGE
-    target = desired.pages[place, axis, first : first + H + 1]
+    place, first = _place(batch.desired.held, figures.start // PAGE), figures.start % PAGE
+    target = batch.desired.pages[place, axis, first : first + H + 1]
     previous, g = memory.inputs[GENERATOR, row, axis], draft.gradient[at, axis]
     # The generator plans for no vehicle in particular, and so for no disturbance.
-    lead(given.mpc, axis, x, 0.0, target, draft.drift)
+    lead(batch.mpc, axis, x, 0.0, target, draft.drift)
     which = FIRST if fresh else LATER
-    gradient(given.mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
+    gradient(batch.mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
 
 
 @inline
-def _pose_tracker(
-    given: Given,
-    memory: Memory,
-    draft: Draft,
-    found: Foresight,
-    i: int,
-    at: int,
-    row: int,
-    axis: int,
-    gap: int,
-    fresh: bool,
-) -> None:
+def _pose_tracker(batch: Batch, i: int, at: int, axis: int) -> None:
     """Pose the tracker's problem (15) on one axis, behind the generator's answer in the draft."""
+    draft, found, figures = batch.draft, batch.found, batch.figures[i]
     u, states = draft.inputs[GENERATOR, at, axis], draft.states[at, axis]
     _rounded(u)
     x = (found.start[i, axis, 0], found.start[i, axis, 1])
     planned = (draft.planned[i, axis, 0], draft.planned[i, axis, 1])
-    previous, g = memory.inputs[TRACKER, row, axis], draft.gradient[at, axis]
-    follow(given.mpc, axis, x, found.disturbance[i, axis], planned, u, states, draft.drift)
-    which, w = FIRST if fresh else LATER, found.disturbance[i, axis]
-    gradient(given.mpc, axis, which, w, states, previous, gap, fresh, draft.drift, g)
+    previous, g = batch.memory.inputs[TRACKER, figures.row, axis], draft.gradient[at, axis]
+    which, w, gap = FIRST if figures.fresh else LATER, found.disturbance[i, axis], figures.gap
+    follow(batch.mpc, axis, x, w, planned, u, states, draft.drift)
+    gradient(batch.mpc, axis, which, w, states, previous, gap, figures.fresh, draft.drift, g)
+
+
+@part
+def _deviate(batch: Batch, i: int, axis: int, distance: F1) -> None:
+    """Add the squares of how far `held` leads away from the generator's last plan on one axis.
+
+    Args:
+        distance: what is added to, stage by stage, as far as that plan goes [m²]; shape (H + 1,).
+    """
+    found, figures, held = batch.found, batch.figures[i], batch.found.held[i, axis]
+    model, w, H = axis_at(batch.mpc.model, axis), found.disturbance[i, axis], len(held)
+    p, v = found.start[i, axis, 0], found.start[i, axis, 1]
+    for stage in range(H + 1 - figures.gap):
+        away = p - batch.memory.states[figures.row, axis, stage + figures.gap, 0]
+        distance[stage] += away * away
+        if stage < H:
+            p, v = advance(model, p, v, held[stage] + w)
 
 
 @inline
-def _conclude(
-    given: Given,
-    memory: Memory,
-    draft: Draft,
-    found: Foresight,
-    i: int,
-    at: int,
-    row: int,
-    start: int,
-    gap: int,
-    figures: Figures,
-) -> None:
+def _conclude(batch: Batch, i: int, at: int) -> None:
     """Appraise the plan of vehicle `i`, whose answers are in the draft, and remember it."""
-    axes, H, P = len(given.mpc.model), memory.inputs.shape[3], given.terminal_weight
-    error, cost, d = 0.0, 0.0, found.ahead[i]
-    change, compared = draft.gradient[at, 0], H - gap if not figures[i].fresh else -1
+    memory, draft, found, figures = batch.memory, batch.draft, batch.found, batch.figures[i]
+    axes, H, P = len(batch.mpc.model), memory.inputs.shape[3], batch.terminal_weight
+    row, d, error, cost = figures.row, found.ahead[i], 0.0, 0.0
+    change, distance, furthest = draft.gradient[at, 0], draft.distance, 0.0
+    if batch.compares:
+        distance[:] = 0.0
     for axis in range(axes):
         u = draft.inputs[TRACKER, at, axis]
         _rounded(u)
         off_p = found.start[i, axis, 0] - draft.planned[i, axis, 0]
         off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
         error += off_p * off_p * P[0] + off_v * off_v * P[1]
-        if given.compares:
+        if batch.compares:
             for stage in range(H):
                 change[stage] = found.held[i, axis, stage] - u[stage]
-            cost = add_cost(given.mpc, axis, change, cost)
-            x = (found.start[i, axis, 0], found.start[i, axis, 1])
-            states = memory.states[row, axis]
-            model, w, (p, v) = axis_at(given.mpc.model, axis), found.disturbance[i, axis], x
-            for stage in range(compared + 1):
-                away = p - states[stage + gap, 0]
-                before = draft.distance[stage] if axis > 0 else 0.0
-                draft.distance[stage] = before + away * away
-                if stage < H:
-                    p, v = advance(model, p, v, found.held[i, axis, stage] + w)
+            cost = add_cost(batch.mpc, axis, change, cost)
+            if not figures.fresh:
+                _deviate(batch, i, axis, distance)
         for stage in range(d):
             found.horizons[i, axis, stage] = found.committed[i, axis, stage]
         for stage in range(H):
             found.horizons[i, axis, d + stage] = u[stage]
-    furthest = 0.0
-    for stage in range(compared + 1):
-        furthest = max(furthest, draft.distance[stage])
-    figures[i].error, figures[i].cost_gap = error, cost
-    figures[i].deviation_m = np.sqrt(furthest)
+    if batch.compares:
+        furthest = np.sqrt(distance.max())
+    figures.error, figures.cost_gap, figures.deviation_m = error, cost, furthest
     for axis in range(axes):
         memory.inputs[GENERATOR, row, axis] = draft.inputs[GENERATOR, at, axis]
         memory.inputs[TRACKER, row, axis] = draft.inputs[TRACKER, at, axis]
         memory.states[row, axis] = draft.states[at, axis]
     # A first plan that failed is no plan to go on from.
-    memory.step[row] = start if figures[i].solved or not figures[i].fresh else -1
+    memory.step[row] = figures.start if figures.solved or not figures.fresh else -1
+
+
+@inline
+def _solve_exactly(batch: Batch, which: int, i: int, axis: int, work: Workspace) -> bool:
+    """Solve a problem posed at draft 0 of vehicle `i`; whether that came to an end."""
+    figures, g = batch.figures[i], batch.draft.gradient[0, axis]
+    previous, u = batch.memory.inputs[which, figures.row, axis], batch.draft.inputs[which, 0, axis]
+    weights, gap, fresh = FIRST if figures.fresh else LATER, figures.gap, figures.fresh
+    return active_set(batch.mpc, axis, weights, work, g, previous, gap, fresh, u) > 0
 
 
 @kernel
-def _plan(
-    given: Given,
-    memory: Memory,
-    draft: Draft,
-    rows: I1,
-    steps: I1,
-    found: Foresight,
-    desired: Desired,
-    work: Workspace,
-    figures: Figures,
-) -> int:
+def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
     """Plan for vehicles with the exact solver, see `Planner.plan`; how many have to be left.
 
     Those have no `solved` in their figures, and are as they were.
     """
-    mpc, undone = given.mpc, 0
+    undone, mpc, memory, draft = 0, batch.mpc, batch.memory, batch.draft
     for i in range(len(rows)):
-        row, start = rows[i], steps[i] + found.ahead[i]
-        gap = _appraise(memory, row, start, figures, i, steps[i])
-        fresh = figures[i].fresh
+        _begin(batch, i, rows[i], steps[i])
+        row, gap, fresh = rows[i], batch.figures[i].gap, batch.figures[i].fresh
         which = FIRST if fresh else LATER
-        for axis in range(len(mpc.model)):
-            g = draft.gradient[0, axis]
-            _pose_generator(
-                given, memory, draft, found, desired, i, 0, row, axis, start, gap, fresh
-            )
-            before, u = memory.inputs[GENERATOR, row, axis], draft.inputs[GENERATOR, 0, axis]
-            if active_set(mpc, axis, which, work, g, before, gap, fresh, u) <= 0:
-                figures[i].solved = False
+        for axis in range(len(batch.mpc.model)):
+            _pose_generator(batch, i, 0, axis)
+            g, u = draft.gradient[0, axis], draft.inputs[GENERATOR, 0, axis]
+            if (
+                active_set(
+                    mpc, axis, which, work, g, memory.inputs[GENERATOR, row, axis], gap, fresh, u
+                )
+                <= 0
+            ):
+                batch.figures[i].solved = False
                 break
-            _pose_tracker(given, memory, draft, found, i, 0, row, axis, gap, fresh)
-            before, u = memory.inputs[TRACKER, row, axis], draft.inputs[TRACKER, 0, axis]
-            if active_set(mpc, axis, which, work, g, before, gap, fresh, u) <= 0:
-                figures[i].solved = False
+            _pose_tracker(batch, i, 0, axis)
+            u = draft.inputs[TRACKER, 0, axis]
+            if (
+                active_set(
+                    mpc, axis, which, work, g, memory.inputs[TRACKER, row, axis], gap, fresh, u
+                )
+                <= 0
+            ):
+                batch.figures[i].solved = False
                 break
-        if figures[i].solved:
-            _conclude(given, memory, draft, found, i, 0, row, start, gap, figures)
+        if batch.figures[i].solved:
+            _conclude(batch, i, 0)
         else:
             undone += 1
     return undone
 
 
 @part
-def _guess(
-    memory: Memory, draft: Draft, which: int, i: int, row: int, gap: int, fresh: bool
-) -> None:
+def _guess(batch: Batch, which: int, i: int) -> None:
     """Fill in the guess of a solver that is no part of the pass: the horizon before, shifted."""
-    for axis in range(draft.guess.shape[1]):
-        for stage in range(draft.guess.shape[2]):
-            previous = memory.inputs[which, row, axis]
-            draft.guess[i, axis, stage] = shifted(previous, gap, fresh, stage)
+    figures, guess = batch.figures[i], batch.draft.guess
+    for axis in range(guess.shape[1]):
+        previous = batch.memory.inputs[which, figures.row, axis]
+        for stage in range(guess.shape[2]):
+            guess[i, axis, stage] = shifted(previous, figures.gap, figures.fresh, stage)
 
 
 @kernel
-def _pose_generators(
-    given: Given,
-    memory: Memory,
-    draft: Draft,
-    rows: I1,
-    steps: I1,
-    found: Foresight,
-    desired: Desired,
-    left: I1,
-    figures: Figures,
-) -> None:
+def _pose_generators(batch: Batch, rows: I1, steps: I1, left: I1) -> None:
     """Pose the generator's problems of those `left` in a block, by index."""
     for i in left:
-        start = steps[i] + found.ahead[i]
-        gap = _appraise(memory, rows[i], start, figures, i, steps[i])
-        _guess(memory, draft, GENERATOR, i, rows[i], gap, figures[i].fresh)
-        for axis in range(len(given.mpc.model)):
-            _pose_generator(
-                given,
-                memory,
-                draft,
-                found,
-                desired,
-                i,
-                i,
-                rows[i],
-                axis,
-                start,
-                gap,
-                figures[i].fresh,
-            )
+        _begin(batch, i, rows[i], steps[i])
+        _guess(batch, GENERATOR, i)
+        for axis in range(len(batch.mpc.model)):
+            _pose_generator(batch, i, i, axis)
 
 
 @kernel
-def _pose_trackers(
-    given: Given,
-    memory: Memory,
-    draft: Draft,
-    rows: I1,
-    steps: I1,
-    found: Foresight,
-    left: I1,
-    figures: Figures,
-) -> None:
+def _pose_trackers(batch: Batch, left: I1) -> None:
     """Pose the tracker's problems of those `left` in a block, by index."""
     for i in left:
-        gap = steps[i] + found.ahead[i] - memory.step[rows[i]]
-        _guess(memory, draft, TRACKER, i, rows[i], gap, figures[i].fresh)
-        for axis in range(len(given.mpc.model)):
-            fresh = figures[i].fresh
-            _pose_tracker(given, memory, draft, found, i, i, rows[i], axis, gap, fresh)
+        _guess(batch, TRACKER, i)
+        for axis in range(len(batch.mpc.model)):
+            _pose_tracker(batch, i, i, axis)
 
 
 @kernel
-def _conclude_all(
-    given: Given,
-    memory: Memory,
-    draft: Draft,
-    rows: I1,
-    steps: I1,
-    found: Foresight,
-    left: I1,
-    figures: Figures,
-) -> None:
+def _conclude_all(batch: Batch, left: I1) -> None:
     """Conclude the plans of those `left` in a block, by index."""
     for i in left:
-        start = steps[i] + found.ahead[i]
-        gap = start - memory.step[rows[i]]
-        _conclude(given, memory, draft, found, i, i, rows[i], start, gap, figures)
+        _conclude(batch, i, i)

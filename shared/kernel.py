@@ -101,6 +101,10 @@ class Reaching:
         """What must be as it was for machine code on disk to be used."""
         return self.stamp
 
+    def get_disambiguator(self) -> str:
+        """Part of the file's name: a file that another stamp belongs to is not even opened."""
+        return self.stamp[:16]
+
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
         """The locator of a kernel, or None where this place cannot be written to."""
@@ -128,8 +132,9 @@ LOCATORS = [f"{each.__module__}.{each.__qualname__}" for each in (Given, Beside,
 
 
 def stamp(function: Callable[..., Any]) -> str:
-    """A digest of a function, and of all compiled functions and constants that it reaches."""
-    found: dict[str, str] = {}
+    """A digest of a kernel, and of all types, compiled functions and constants that it reaches."""
+    hints = get_type_hints(function, include_extras=True)
+    found = {"types": repr([_type_name(hint) for hint in hints.values()])}
     waiting = [function]
     while waiting:
         each = waiting.pop()
@@ -144,3 +149,12 @@ def stamp(function: Callable[..., Any]) -> str:
             elif isinstance(value, int | float | str | tuple | np.dtype):
                 found[f"{place}: {name}"] = repr(value)
     return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()
+
+
+def _type_name(hint: Any) -> str:
+    """A type in words that differ where the type does, wherever it is defined."""
+    if not hasattr(hint, "_fields"):
+        return repr(hint)
+    fields = get_type_hints(hint, include_extras=True)
+    names = (f"{name}: {_type_name(field)}" for name, field in fields.items())
+    return f"{hint.__module__}.{hint.__qualname__}({', '.join(names)})"

@@ -5,9 +5,13 @@ import sys
 from pathlib import Path
 
 HELPER = """
-from shared.kernel import inline
+from typing import NamedTuple
+from shared.kernel import F1, inline
 
 FACTOR = 2
+
+class Given(NamedTuple):
+    values: F1
 
 @inline
 def scaled(x):
@@ -15,16 +19,17 @@ def scaled(x):
 """
 CALLER = """
 import numpy as np
-from helper import scaled
-from shared.kernel import F1, kernel
+from helper import Given, scaled
+from shared.kernel import kernel
 
 @kernel
-def double(values: F1) -> None:
+def double(given: Given) -> None:
+    values = given.values
     for i in range(len(values)):
         values[i] = scaled(values[i])
 
 values = np.ones(1)
-double(values)
+double(Given(values))
 print(values[0], sum(double.stats.cache_hits.values()))
 """
 
@@ -54,6 +59,18 @@ def test_a_kernel_is_compiled_anew_when_what_it_calls_has_changed(tmp_path: Path
     helper.write_text(HELPER.replace("x * FACTOR", "x * FACTOR + 1"))
     assert run(tmp_path) == "3.0 0"
     assert run(tmp_path) == "3.0 1"
+
+
+def test_machine_code_for_a_type_that_is_gone_is_no_reason_to_fail(tmp_path: Path) -> None:
+    """The type has moved to another module, as it may between two versions."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    caller = tmp_path / "caller.py"
+    caller.write_text(CALLER)
+    assert run(tmp_path) == "2.0 0"
+    (tmp_path / "elsewhere.py").write_text(HELPER)
+    (tmp_path / "helper.py").write_text(HELPER.replace("Given", "Told"))
+    caller.write_text(CALLER.replace("from helper import Given, ", "from elsewhere import Given, "))
+    assert run(tmp_path) == "2.0 0"
 
 
 def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path) -> None:
