@@ -24,8 +24,9 @@ class Compensator:
         self._brake = terms.brake
         self._bounds = terms.u_max
         self._model = terms.model.axes()
-        self._inputs: list[list[float]] = []
-        """The horizon's inputs of each axis, within the bound [m/s]."""
+        self._nothing = [0.0] * terms.axes
+        self._inputs = np.zeros((terms.axes, 1), dtype=np.float32)
+        """The horizon's inputs [m/s]; shape (axes, d + H)."""
         self._speed = 0.0
         """Magnitude of its last input [m/s]."""
         self._feedback: list[list[float]] = []
@@ -56,11 +57,8 @@ class Compensator:
             return
         self.in_force, self._new = horizon.step, True
         self.observed_ns = horizon.observed_ns
-        self._inputs = [
-            [bounded(u, bound) for u in inputs]
-            for inputs, bound in zip(horizon.inputs.tolist(), self._bounds, strict=True)
-        ]
-        self._speed = math.sqrt(sum(inputs[-1] * inputs[-1] for inputs in self._inputs))
+        self._inputs = horizon.inputs
+        self._speed = math.sqrt(sum(u * u for u in self._told(-1)))
         self._feedback = horizon.feedback.tolist() if horizon.feedback.size else []
         self._led = [(p, v) for p, v, *_ in self._feedback]
         self._led_stage = 0
@@ -76,23 +74,28 @@ class Compensator:
             self.since, self._new = step, False
         if self.in_force == NO_HORIZON:
             return np.zeros(len(self._bounds))
-        stage, length = stage_at(step, self.in_force, self._indexed), len(self._inputs[0])
-        back = self._led_back(stage, state) if self._feedback else [0.0] * len(self._bounds)
-        at = entry(stage, length)
+        stage, length = stage_at(step, self.in_force, self._indexed), self._inputs.shape[1]
+        told = self._told(entry(stage, length))
+        back = self._led_back(stage, state) if self._feedback else self._nothing
         return np.array(
             [
-                flown(stage, length, inputs[at], back[axis], self._speed, self._brake, bound)
-                for axis, (inputs, bound) in enumerate(zip(self._inputs, self._bounds, strict=True))
+                flown(stage, length, u, led, self._speed, self._brake, bound)
+                for u, led, bound in zip(told, back, self._bounds, strict=True)
             ]
         )
 
+    def _told(self, stage: int) -> list[float]:
+        """The horizon's input at a stage, of each axis, within the bound [m/s]."""
+        inputs = self._inputs[:, stage].tolist()
+        return [bounded(u, bound) for u, bound in zip(inputs, self._bounds, strict=True)]
+
     def _led_back(self, stage: int, state: Array) -> list[float]:
         """Feedback at a stage, of each axis [m/s]; x̄ is rolled on to there, or to its end."""
-        for reached in range(self._led_stage, min(stage, len(self._inputs[0]) - 1)):
+        for reached in range(self._led_stage, min(stage, self._inputs.shape[1] - 1)):
             self._led = [
-                advance(axis, *led, inputs[reached] + told[2])
-                for axis, led, inputs, told in zip(
-                    self._model, self._led, self._inputs, self._feedback, strict=True
+                advance(axis, *led, u + told[2])
+                for axis, led, u, told in zip(
+                    self._model, self._led, self._told(reached), self._feedback, strict=True
                 )
             ]
             self._led_stage = reached + 1
