@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.optimize import lsq_linear
 import server.planner
 from benchmarks.problems import gradients, listening, solving
 from server.controller import BLOCK
-from server.exact import ExactSolver
+from server.exact import ExactSolver, Workspace
 from server.mpc import FIRST, LATER, Problem, make_mpc, pose
 from server.planner import (
     EMPTY,
@@ -25,9 +25,8 @@ from server.planner import (
     PAGE,
     PAGES,
     TRACKER,
+    Batch,
     Figures,
-    Given,
-    Memory,
     Planner,
     Reference,
     _place,
@@ -103,12 +102,15 @@ def plan(planner: Planner, rows: Indices, step: Indices, found: Foresight) -> Pl
     planner.plan(rows, step, found)
     inputs, states, steps = planner._memory
     n = len(rows)
+    figures = planner.figures[:n].copy()
+    figures["row"] = 0  # where a vehicle lies is nothing that its plan should know
+    figures["gap"][figures["fresh"]] = 0
     return Plan(
         inputs[:, rows].copy(),
         states[rows].copy(),
         steps[rows].copy(),
         planner.planned[:n].copy(),
-        planner.figures[:n].copy(),
+        figures,
         found.horizons[:n].copy(),
     )
 
@@ -353,14 +355,13 @@ ROUGH = {
 compiled_pass = server.planner._plan
 
 
-def leaving(known: Given, memory: Memory, *rest: Any) -> int:
+def leaving(batch: Batch, rows: Indices, steps: Indices, work: Workspace) -> int:
     """The compiled pass, but every third vehicle is left as if its active set had wandered."""
-    rows, figures = rest[1], rest[-1]
-    left = rows[::3]
+    left, memory = rows[::3], batch.memory
     before = memory.inputs[:, left], memory.states[left], memory.step[left]
-    compiled_pass(known, memory, *rest)
+    compiled_pass(batch, rows, steps, work)
     memory.inputs[:, left], memory.states[left], memory.step[left] = before
-    figures["solved"][: len(rows) : 3] = False
+    batch.figures["solved"][: len(rows) : 3] = False
     return len(left)
 
 
@@ -483,9 +484,7 @@ def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> 
 
 def looked_up(reference: Reference, steps: Indices, ahead: Indices) -> Array:
     """The desired states at k + d … k + d + H of each vehicle; shape (n, H + 1, axes, 2)."""
-    found = foresight(len(steps), 2, H)
-    found.ahead[:] = ahead
-    pages, held = reference.open(np.arange(len(steps)), steps, found)
+    pages, held = reference.open(steps, ahead)
     states = []
     for start in (steps + ahead).tolist():
         at, first = _place(held, start // PAGE), start % PAGE
@@ -524,7 +523,7 @@ def test_the_reference_is_right_for_vehicles_that_are_hours_apart() -> None:
         expected = [desired_at(start) for start in (steps + ahead).tolist()]
         np.testing.assert_array_equal(found, expected)
         pages |= set(((steps + ahead) // PAGE).tolist())
-        _, held = reference.open(np.arange(0), steps[:0], foresight(1, 2, H))
+        _, held = reference.open(steps[:0], ahead[:0])
         assert EMPTY in held
     assert len(pages) > 2 * PAGES
 

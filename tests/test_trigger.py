@@ -39,7 +39,10 @@ def figures_of(
     deviation_m: float = 0.0,
 ) -> Figures:
     """What is known of n vehicles alike."""
-    return np.array([(step, error, cost_gap, deviation_m, fresh, True)] * n, dtype=FIGURES)
+    figures = np.zeros(n, dtype=FIGURES)
+    figures["step"], figures["error"], figures["fresh"] = step, error, fresh
+    figures["cost_gap"], figures["deviation_m"] = cost_gap, deviation_m
+    return figures
 
 
 def facing(rows: Indices, figures: Figures) -> Situation:
