@@ -114,51 +114,43 @@ KEYS: Mapping[str, str] = MappingProxyType(
 )
 """Key of the scenario that each term comes from."""
 
+_OWNERS = {
+    "a word for people": "title",
+    "the vehicle's: how long it flies": "duration",
+    "the vehicle's: what its summary leaves out": "settle",
+    "of chance, at each end its own": "seed",
+    "the server's: where it plans from": "control.delay_bound",
+    "the server's: how it estimates": "control.observer_s",
+    "the server's: when it sends": """
+        control.trigger control.period control.epsilon control.decay_rate control.cost_gap
+        control.deviation_m
+    """,
+    "the server's: how it plans": """
+        control.solver control.state_weight control.terminal_weight control.input_weight
+        control.change_weight control.input_reference
+    """,
+    "the vehicle's: what it truly is": """
+        vehicle.tau_s vehicle.gain vehicle.dead_time_s
+    """,
+    "the vehicle's: where it starts": "vehicle.start_m",
+    "the vehicle's: the air it flies in": """
+        vehicle.wind vehicle.steady_wind_mps vehicle.gust_mps2 vehicle.gust_every_s
+        vehicle.gust_s
+    """,
+    "netem's": """
+        network.uplink.delay network.uplink.minimum_s network.uplink.slot_s
+        network.uplink.slots_mean network.uplink.loss network.downlink.delay
+        network.downlink.minimum_s network.downlink.slot_s network.downlink.slots_mean
+        network.downlink.loss
+    """,
+    "the vehicle's: when it says HELLO again": "link.timeout_s",
+    "the vehicle's: when it gives up": "link.connect_s",
+    "of virtual time": """
+        simulation.compute_s simulation.clock_offset_s simulation.clock_drift_ppm
+    """,
+}
 FREE: Mapping[str, str] = MappingProxyType(
-    {
-        "title": "a word for people",
-        "duration": "the vehicle's: how long it flies",
-        "settle": "the vehicle's: what its summary leaves out",
-        "seed": "of chance, at each end its own",
-        "control.delay_bound": "the server's: where it plans from",
-        "control.observer_s": "the server's: how it estimates",
-        "control.trigger": "the server's: when it sends",
-        "control.period": "the server's: when it sends",
-        "control.epsilon": "the server's: when it sends",
-        "control.decay_rate": "the server's: when it sends",
-        "control.cost_gap": "the server's: when it sends",
-        "control.deviation_m": "the server's: when it sends",
-        "control.solver": "the server's: how it plans",
-        "control.state_weight": "the server's: how it plans",
-        "control.terminal_weight": "the server's: how it plans",
-        "control.input_weight": "the server's: how it plans",
-        "control.change_weight": "the server's: how it plans",
-        "control.input_reference": "the server's: how it plans",
-        "vehicle.tau_s": "the vehicle's: what it truly is",
-        "vehicle.gain": "the vehicle's: what it truly is",
-        "vehicle.dead_time_s": "the vehicle's: what it truly is",
-        "vehicle.start_m": "the vehicle's: where it starts",
-        "vehicle.wind": "the vehicle's: the air it flies in",
-        "vehicle.steady_wind_mps": "the vehicle's: the air it flies in",
-        "vehicle.gust_mps2": "the vehicle's: the air it flies in",
-        "vehicle.gust_every_s": "the vehicle's: the air it flies in",
-        "vehicle.gust_s": "the vehicle's: the air it flies in",
-        "network.uplink.delay": "netem's",
-        "network.uplink.minimum_s": "netem's",
-        "network.uplink.slot_s": "netem's",
-        "network.uplink.slots_mean": "netem's",
-        "network.uplink.loss": "netem's",
-        "network.downlink.delay": "netem's",
-        "network.downlink.minimum_s": "netem's",
-        "network.downlink.slot_s": "netem's",
-        "network.downlink.slots_mean": "netem's",
-        "network.downlink.loss": "netem's",
-        "link.timeout_s": "the vehicle's: when it says HELLO again",
-        "link.connect_s": "the vehicle's: when it gives up",
-        "simulation.compute_s": "of virtual time",
-        "simulation.clock_offset_s": "of virtual time",
-        "simulation.clock_drift_ppm": "of virtual time",
-    }
+    {key: whose for whose, keys in _OWNERS.items() for key in keys.split()}
 )
 """Keys of the scenario that may differ, and whose they are."""
 
