@@ -44,8 +44,8 @@ PAGES = 256
 """Places for pages: more than a block of vehicles can need at once."""
 EMPTY = -1
 """In place of the page that a place holds."""
-GENERATOR, TRACKER = 0, 1
-"""First index of what both MPCs have."""
+GENERATOR, TRACKER, CONCLUDE = 0, 1, 2
+"""First index of what both MPCs have; the last is the move behind both."""
 
 FIGURES = record(
     ("row", "i8"),
@@ -249,11 +249,10 @@ class Planner:
             undone = _plan(batch, rows, step, solver.work)
             left = np.flatnonzero(~self.figures["solved"][: len(rows)]) if undone else left[:0]
         if len(left):
-            _pose_generators(batch, rows, step, left)
-            self._solve(GENERATOR, left)
-            _pose_trackers(batch, left)
-            self._solve(TRACKER, left)
-            _conclude_all(batch, left)
+            for which in (GENERATOR, TRACKER):
+                _move(batch, rows, step, left, which)
+                self._solve(which, left)
+            _move(batch, rows, step, left, CONCLUDE)
         took_ns = self._stopwatch.lap("plan")
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
@@ -430,26 +429,17 @@ def _guess(batch: Batch, which: int, i: int) -> None:
 
 
 @kernel
-def _pose_generators(batch: Batch, rows: I1, steps: I1, left: I1) -> None:
-    """Pose the generator's problems of those `left` in a block, by index."""
+def _move(batch: Batch, rows: I1, steps: I1, left: I1, move: int) -> None:
+    """Make one move for those `left` in a block, by index: pose for an MPC, or CONCLUDE."""
     for i in left:
-        _begin(batch, i, rows[i], steps[i])
-        _guess(batch, GENERATOR, i)
+        if move == CONCLUDE:
+            _conclude(batch, i, i)
+            continue
+        if move == GENERATOR:
+            _begin(batch, i, rows[i], steps[i])
+        _guess(batch, move, i)
         for axis in range(len(batch.mpc.model)):
-            _pose_generator(batch, i, i, axis)
-
-
-@kernel
-def _pose_trackers(batch: Batch, left: I1) -> None:
-    """Pose the tracker's problems of those `left` in a block, by index."""
-    for i in left:
-        _guess(batch, TRACKER, i)
-        for axis in range(len(batch.mpc.model)):
-            _pose_tracker(batch, i, i, axis)
-
-
-@kernel
-def _conclude_all(batch: Batch, left: I1) -> None:
-    """Conclude the plans of those `left` in a block, by index."""
-    for i in left:
-        _conclude(batch, i, i)
+            if move == GENERATOR:
+                _pose_generator(batch, i, i, axis)
+            else:
+                _pose_tracker(batch, i, i, axis)
