@@ -10,7 +10,7 @@ than a horizon takes. Another solver, or one that has to help out, takes the sam
 it: pose the generator's problem, solve; pose the tracker's, solve; conclude.
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -275,73 +275,100 @@ def _rounded(u: F1) -> None:
 
 
 @inline
-def _begin(batch: Batch, i: int, row: int, k: int) -> None:
-    """Note what the plan of vehicle `i` of the block starts from, and whether it begins anew."""
-    figures, last, start = batch.figures[i], batch.memory.step[row], k + batch.found.ahead[i]
-    figures.row, figures.step, figures.start, figures.gap = row, k, start, start - last
-    figures.solved = True
-    figures.fresh = last < 0 or not 0 <= start - last <= batch.memory.inputs.shape[3]
+def _begin(memory: Memory, ahead: int, plan: Any, row: int, k: int) -> None:
+    """Note what a plan starts from, in its record of FIGURES, and whether it begins anew."""
+    last, start = memory.step[row], k + ahead
+    plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
+    plan.solved = True
+    plan.fresh = last < 0 or not 0 <= start - last <= memory.inputs.shape[3]
 
 
 @inline
-def _pose_generator(batch: Batch, i: int, at: int, axis: int) -> None:
+def _pose_generator(
+    mpc: MPC,
+    memory: Memory,
+    draft: Draft,
+    desired: Desired,
+    found: Foresight,
+    plan: Any,
+    i: int,
+    at: int,
+    axis: int,
+) -> None:
     """Pose the generator's problem (14) on one axis of vehicle `i` of the block, at draft `at`."""
-    memory, draft, found, figures = batch.memory, batch.draft, batch.found, batch.figures[i]
-    row, gap, fresh = figures.row, figures.gap, figures.fresh
-    H = memory.inputs.shape[3]
+    row, gap, fresh, H = plan.row, plan.gap, plan.fresh, memory.inputs.shape[3]
     if fresh:
         x = (found.start[i, axis, 0], found.start[i, axis, 1])
     else:
         x = (memory.states[row, axis, gap, 0], memory.states[row, axis, gap, 1])
     draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
-    place, first = _place(batch.desired.held, figures.start // PAGE), figures.start % PAGE
-    target = batch.desired.pages[place, axis, first : first + H + 1]
+    place, first = _place(desired.held, plan.start // PAGE), plan.start % PAGE
+    target = desired.pages[place, axis, first : first + H + 1]
     previous, g = memory.inputs[GENERATOR, row, axis], draft.gradient[at, axis]
     # The generator plans for no vehicle in particular, and so for no disturbance.
-    lead(batch.mpc, axis, x, 0.0, target, draft.drift)
+    lead(mpc, axis, x, 0.0, target, draft.drift)
     which = FIRST if fresh else LATER
-    gradient(batch.mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
+    gradient(mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
 
 
 @inline
-def _pose_tracker(batch: Batch, i: int, at: int, axis: int) -> None:
+def _pose_tracker(
+    mpc: MPC,
+    memory: Memory,
+    draft: Draft,
+    found: Foresight,
+    plan: Any,
+    i: int,
+    at: int,
+    axis: int,
+) -> None:
     """Pose the tracker's problem (15) on one axis, behind the generator's answer in the draft."""
-    draft, found, figures = batch.draft, batch.found, batch.figures[i]
     u, states = draft.inputs[GENERATOR, at, axis], draft.states[at, axis]
     _rounded(u)
     x = (found.start[i, axis, 0], found.start[i, axis, 1])
     planned = (draft.planned[i, axis, 0], draft.planned[i, axis, 1])
-    previous, g = batch.memory.inputs[TRACKER, figures.row, axis], draft.gradient[at, axis]
-    which, w, gap = FIRST if figures.fresh else LATER, found.disturbance[i, axis], figures.gap
-    follow(batch.mpc, axis, x, w, planned, u, states, draft.drift)
-    gradient(batch.mpc, axis, which, w, states, previous, gap, figures.fresh, draft.drift, g)
+    previous, g = memory.inputs[TRACKER, plan.row, axis], draft.gradient[at, axis]
+    which, w, gap = FIRST if plan.fresh else LATER, found.disturbance[i, axis], plan.gap
+    follow(mpc, axis, x, w, planned, u, states, draft.drift)
+    gradient(mpc, axis, which, w, states, previous, gap, plan.fresh, draft.drift, g)
 
 
-@part
-def _deviate(batch: Batch, i: int, axis: int, distance: F1) -> None:
+@inline
+def _deviate(
+    mpc: MPC, memory: Memory, found: Foresight, plan: Any, i: int, axis: int, distance: F1
+) -> None:
     """Add the squares of how far `held` leads away from the generator's last plan on one axis.
 
     Args:
         distance: what is added to, stage by stage, as far as that plan goes [m²]; shape (H + 1,).
     """
-    found, figures, held = batch.found, batch.figures[i], batch.found.held[i, axis]
-    model, w, H = axis_at(batch.mpc.model, axis), found.disturbance[i, axis], len(held)
+    held = found.held[i, axis]
+    model, w, H = axis_at(mpc.model, axis), found.disturbance[i, axis], len(held)
     p, v = found.start[i, axis, 0], found.start[i, axis, 1]
-    for stage in range(H + 1 - figures.gap):
-        away = p - batch.memory.states[figures.row, axis, stage + figures.gap, 0]
+    for stage in range(H + 1 - plan.gap):
+        away = p - memory.states[plan.row, axis, stage + plan.gap, 0]
         distance[stage] += away * away
         if stage < H:
             p, v = advance(model, p, v, held[stage] + w)
 
 
 @inline
-def _conclude(batch: Batch, i: int, at: int) -> None:
+def _conclude(
+    mpc: MPC,
+    terminal_weight: F1,
+    compares: bool,
+    memory: Memory,
+    draft: Draft,
+    found: Foresight,
+    plan: Any,
+    i: int,
+    at: int,
+) -> None:
     """Appraise the plan of vehicle `i`, whose answers are in the draft, and remember it."""
-    memory, draft, found, figures = batch.memory, batch.draft, batch.found, batch.figures[i]
-    axes, H, P = len(batch.mpc.model), memory.inputs.shape[3], batch.terminal_weight
-    row, d, error, cost = figures.row, found.ahead[i], 0.0, 0.0
+    axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
+    row, d, error, cost = plan.row, found.ahead[i], 0.0, 0.0
     change, distance, furthest = draft.gradient[at, 0], draft.distance, 0.0
-    if batch.compares:
+    if compares:
         distance[:] = 0.0
     for axis in range(axes):
         u = draft.inputs[TRACKER, at, axis]
@@ -349,34 +376,36 @@ def _conclude(batch: Batch, i: int, at: int) -> None:
         off_p = found.start[i, axis, 0] - draft.planned[i, axis, 0]
         off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
         error += off_p * off_p * P[0] + off_v * off_v * P[1]
-        if batch.compares:
+        if compares:
             for stage in range(H):
                 change[stage] = found.held[i, axis, stage] - u[stage]
-            cost = add_cost(batch.mpc, axis, change, cost)
-            if not figures.fresh:
-                _deviate(batch, i, axis, distance)
+            cost = add_cost(mpc, axis, change, cost)
+            if not plan.fresh:
+                _deviate(mpc, memory, found, plan, i, axis, distance)
         for stage in range(d):
             found.horizons[i, axis, stage] = found.committed[i, axis, stage]
         for stage in range(H):
             found.horizons[i, axis, d + stage] = u[stage]
-    if batch.compares:
+    if compares:
         furthest = np.sqrt(distance.max())
-    figures.error, figures.cost_gap, figures.deviation_m = error, cost, furthest
+    plan.error, plan.cost_gap, plan.deviation_m = error, cost, furthest
     for axis in range(axes):
         memory.inputs[GENERATOR, row, axis] = draft.inputs[GENERATOR, at, axis]
         memory.inputs[TRACKER, row, axis] = draft.inputs[TRACKER, at, axis]
         memory.states[row, axis] = draft.states[at, axis]
     # A first plan that failed is no plan to go on from.
-    memory.step[row] = figures.start if figures.solved or not figures.fresh else -1
+    memory.step[row] = plan.start if plan.solved or not plan.fresh else -1
 
 
 @inline
-def _solve_exactly(batch: Batch, which: int, i: int, axis: int, work: Workspace) -> bool:
-    """Solve a problem posed at draft 0 of vehicle `i`; whether that came to an end."""
-    figures, g = batch.figures[i], batch.draft.gradient[0, axis]
-    previous, u = batch.memory.inputs[which, figures.row, axis], batch.draft.inputs[which, 0, axis]
-    weights, gap, fresh = FIRST if figures.fresh else LATER, figures.gap, figures.fresh
-    return active_set(batch.mpc, axis, weights, work, g, previous, gap, fresh, u) > 0
+def _solve_exactly(
+    mpc: MPC, memory: Memory, draft: Draft, plan: Any, which: int, axis: int, work: Workspace
+) -> bool:
+    """Solve a problem posed at draft 0; whether that came to an end."""
+    previous, u = memory.inputs[which, plan.row, axis], draft.inputs[which, 0, axis]
+    weights, gap, fresh = FIRST if plan.fresh else LATER, plan.gap, plan.fresh
+    g = draft.gradient[0, axis]
+    return active_set(mpc, axis, weights, work, g, previous, gap, fresh, u) > 0
 
 
 @kernel
@@ -385,61 +414,50 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
 
     Those have no `solved` in their figures, and are as they were.
     """
-    undone, mpc, memory, draft = 0, batch.mpc, batch.memory, batch.draft
+    mpc, terminal_weight, compares, memory, draft, desired, found, figures = batch
+    undone = 0
     for i in range(len(rows)):
-        _begin(batch, i, rows[i], steps[i])
-        row, gap, fresh = rows[i], batch.figures[i].gap, batch.figures[i].fresh
-        which = FIRST if fresh else LATER
-        for axis in range(len(batch.mpc.model)):
-            _pose_generator(batch, i, 0, axis)
-            g, u = draft.gradient[0, axis], draft.inputs[GENERATOR, 0, axis]
-            if (
-                active_set(
-                    mpc, axis, which, work, g, memory.inputs[GENERATOR, row, axis], gap, fresh, u
-                )
-                <= 0
-            ):
-                batch.figures[i].solved = False
+        plan = figures[i]
+        _begin(memory, found.ahead[i], plan, rows[i], steps[i])
+        for axis in range(len(mpc.model)):
+            _pose_generator(mpc, memory, draft, desired, found, plan, i, 0, axis)
+            if not _solve_exactly(mpc, memory, draft, plan, GENERATOR, axis, work):
+                plan.solved = False
                 break
-            _pose_tracker(batch, i, 0, axis)
-            u = draft.inputs[TRACKER, 0, axis]
-            if (
-                active_set(
-                    mpc, axis, which, work, g, memory.inputs[TRACKER, row, axis], gap, fresh, u
-                )
-                <= 0
-            ):
-                batch.figures[i].solved = False
+            _pose_tracker(mpc, memory, draft, found, plan, i, 0, axis)
+            if not _solve_exactly(mpc, memory, draft, plan, TRACKER, axis, work):
+                plan.solved = False
                 break
-        if batch.figures[i].solved:
-            _conclude(batch, i, 0)
+        if plan.solved:
+            _conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, 0)
         else:
             undone += 1
     return undone
 
 
 @part
-def _guess(batch: Batch, which: int, i: int) -> None:
+def _guess(memory: Memory, plan: Any, which: int, guess: F2) -> None:
     """Fill in the guess of a solver that is no part of the pass: the horizon before, shifted."""
-    figures, guess = batch.figures[i], batch.draft.guess
-    for axis in range(guess.shape[1]):
-        previous = batch.memory.inputs[which, figures.row, axis]
-        for stage in range(guess.shape[2]):
-            guess[i, axis, stage] = shifted(previous, figures.gap, figures.fresh, stage)
+    for axis in range(len(guess)):
+        previous = memory.inputs[which, plan.row, axis]
+        for stage in range(guess.shape[1]):
+            guess[axis, stage] = shifted(previous, plan.gap, plan.fresh, stage)
 
 
 @kernel
 def _move(batch: Batch, rows: I1, steps: I1, left: I1, move: int) -> None:
     """Make one move for those `left` in a block, by index: pose for an MPC, or CONCLUDE."""
+    mpc, terminal_weight, compares, memory, draft, desired, found, figures = batch
     for i in left:
+        plan = figures[i]
         if move == CONCLUDE:
-            _conclude(batch, i, i)
+            _conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, i)
             continue
         if move == GENERATOR:
-            _begin(batch, i, rows[i], steps[i])
-        _guess(batch, move, i)
-        for axis in range(len(batch.mpc.model)):
+            _begin(memory, found.ahead[i], plan, rows[i], steps[i])
+        _guess(memory, plan, move, draft.guess[i])
+        for axis in range(len(mpc.model)):
             if move == GENERATOR:
-                _pose_generator(batch, i, i, axis)
+                _pose_generator(mpc, memory, draft, desired, found, plan, i, i, axis)
             else:
-                _pose_tracker(batch, i, i, axis)
+                _pose_tracker(mpc, memory, draft, found, plan, i, i, axis)
