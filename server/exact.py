@@ -58,13 +58,7 @@ class Workspace(NamedTuple):
 
 @part
 def _backward(
-    after: tuple[float, float, float],
-    stages: F2,
-    side: F1,
-    last: int,
-    mpc: MPC,
-    axis: int,
-    rho: F1,
+    after: tuple[float, float, float], stages: F2, side: F1, last: int, mpc: MPC, axis: int, rho: F1
 ) -> None:
     """Fill in the rows of `stages` from `last` to 0, for an active set.
 

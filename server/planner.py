@@ -181,12 +181,7 @@ class Planner:
     """Trajectory generator and tracker of up to `capacity` vehicles, `block` of them at a time."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        terms: Terms,
-        capacity: int,
-        block: int,
-        stopwatch: Stopwatch,
+        self, scenario: Scenario, terms: Terms, capacity: int, block: int, stopwatch: Stopwatch
     ) -> None:
         control, axes, H = scenario.control, terms.axes, terms.horizon
         self._reference = Reference(scenario, terms)
@@ -313,14 +308,7 @@ def _pose_generator(
 
 @inline
 def _pose_tracker(
-    mpc: MPC,
-    memory: Memory,
-    draft: Draft,
-    found: Foresight,
-    plan: Any,
-    i: int,
-    at: int,
-    axis: int,
+    mpc: MPC, memory: Memory, draft: Draft, found: Foresight, plan: Any, i: int, at: int, axis: int
 ) -> None:
     """Pose the tracker's problem (15) on one axis, behind the generator's answer in the draft."""
     u, states = draft.inputs[GENERATOR, at, axis], draft.states[at, axis]

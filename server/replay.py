@@ -179,13 +179,7 @@ class Replay:
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
         """See `Scheme`: planning starts at k + d."""
         lost = _foresee(
-            self._settings,
-            self._memory,
-            self.delay_bound,
-            self._clock.minimum,
-            rows,
-            step,
-            found,
+            self._settings, self._memory, self.delay_bound, self._clock.minimum, rows, step, found
         )
         if lost:
             self.counts["horizons lost"] += lost

@@ -52,10 +52,7 @@ def figure_eight(radius_m: float, period_s: float, axes: int, altitude_m: float 
     w = 2.0 * np.pi / period_s
     return _planar(
         lambda t: (radius_m * np.sin(w * t), radius_m * w * np.cos(w * t)),
-        lambda t: (
-            0.5 * radius_m * np.sin(2.0 * w * t),
-            radius_m * w * np.cos(2.0 * w * t),
-        ),
+        lambda t: (0.5 * radius_m * np.sin(2.0 * w * t), radius_m * w * np.cos(2.0 * w * t)),
         axes,
         altitude_m,
     )

@@ -187,12 +187,7 @@ def drive(
             "send_errors": shell.send_errors,
         }
 
-    run(
-        [shell],
-        on_start=start,
-        on_event=tell,
-        on_usr1=lambda: tell(Counted(figures=figures())),
-    )
+    run([shell], on_start=start, on_event=tell, on_usr1=lambda: tell(Counted(figures=figures())))
     last = figures()
     tell(Counted(figures=last))
     if json:

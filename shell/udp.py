@@ -79,10 +79,7 @@ def _prepare(sock: socket.socket, *, shared: bool) -> None:
         sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
     if shared:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-    for plain, forced in (
-        (socket.SO_RCVBUF, _SO_RCVBUFFORCE),
-        (socket.SO_SNDBUF, _SO_SNDBUFFORCE),
-    ):
+    for plain, forced in ((socket.SO_RCVBUF, _SO_RCVBUFFORCE), (socket.SO_SNDBUF, _SO_SNDBUFFORCE)):
         sock.setsockopt(socket.SOL_SOCKET, plain, BUFFER_BYTES)
         with contextlib.suppress(OSError):  # over the system's limit, for those who may
             sock.setsockopt(socket.SOL_SOCKET, forced, BUFFER_BYTES)
