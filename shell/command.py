@@ -63,33 +63,35 @@ class Options(Protocol):
         """The scenario."""
 
 
+T = TypeVar("T")
 O = TypeVar("O", bound=Options)  # noqa: E741 - the options of one command
+
+
+def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
+    """Options of a command line, laid over others; `help_` says what the command does.
+
+    Raises:
+        SystemExit: tyro has shown the help, or what is wrong with a flag.
+    """
+    about = cleandoc(help_ or "")
+    return tyro.cli(type(default), args=argv, default=default, prog=prog, description=about)
 
 
 def parse(defaults: O, argv: Sequence[str], prog: str, help_: str | None) -> O:
     """Parse a command line; returns its options, laid over the scenario it names.
 
     Raises:
-        CommandError: the scenario cannot be flown.
+        ConfigError: the scenario cannot be flown.
         SystemExit: tyro has shown the help, or what is wrong with a flag.
     """
     name = argv[0] if argv and not argv[0].startswith("-") else defaults.scenario
-    try:
-        while True:
-            default = replace(defaults, scenario=name, config=config.load(name))  # type: ignore[type-var]
-            options = tyro.cli(
-                type(defaults),
-                args=argv,
-                default=default,
-                prog=prog,
-                description=cleandoc(help_ or ""),
-            )
-            if options.scenario == name:
-                break
-            name = options.scenario
-        checked = config.check(config.to_table(options.config), f"{name} and the command line")
-    except ConfigError as error:
-        raise CommandError(str(error), CONFIGURATION) from None
+    while True:
+        default = replace(defaults, scenario=name, config=config.load(name))  # type: ignore[type-var]
+        options = read(default, argv, prog, help_)
+        if options.scenario == name:
+            break
+        name = options.scenario
+    checked = config.check(config.to_table(options.config), f"{name} and the command line")
     return replace(options, config=checked)  # type: ignore[type-var]
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from inspect import cleandoc
 from pathlib import Path
 from typing import Annotated
 
@@ -53,12 +52,7 @@ def compare(argv: Sequence[str]) -> None:
     PDF as well. Everything flown is kept: after Ctrl-C, or a crash, the same command goes on; once
     all is flown, it only draws anew.
     """
-    options = tyro.cli(
-        Options,
-        args=argv,
-        prog="skytether compare",
-        description=cleandoc(compare.__doc__ or ""),
-    )
+    options = command.read(Options(), argv, "skytether compare", compare.__doc__)
     command.check_count("--runs", options.runs, 100_000)
     command.check_count("--generations", options.generations, 10**6)
     options.pool.check()

@@ -5,7 +5,6 @@ import json
 import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from inspect import cleandoc
 from pathlib import Path
 from typing import Annotated
 
@@ -50,12 +49,7 @@ def reproduce(argv: Sequence[str]) -> None:
     Flights over real UDP stand beside those in virtual time. Everything flown is kept: after
     Ctrl-C, or a crash, the same command goes on; once all is flown, it only draws anew.
     """
-    options = tyro.cli(
-        Options,
-        args=argv,
-        prog="skytether reproduce",
-        description=cleandoc(reproduce.__doc__ or ""),
-    )
+    options = command.read(Options(), argv, "skytether reproduce", reproduce.__doc__)
     command.check_count("--runs", options.runs, 100_000)
     options.pool.check()
     scale = studies.full(options.runs)
