@@ -26,6 +26,7 @@ from shared.protocol import (
     Welcome,
     decode,
     encode,
+    encode_horizon,
 )
 from shared.terms import Terms
 
@@ -149,6 +150,17 @@ def test_documented_sizes_are_the_real_ones() -> None:
     observation = Observation(1, session, 500, stamp_ns, 480, 490, stamp_ns, stamp_ns, state)
     assert len(encode(observation)) == 79
     assert len(encode(Heartbeat(1, session, stamp_ns))) == 18
+
+
+def test_a_horizon_made_of_bytes_is_the_message() -> None:
+    """What a server sends in numbers is what its arrays would make, with feedback and without."""
+    inputs = np.arange(84, dtype=np.float32).reshape(2, 42) / 84
+    for count in (0, FEEDBACK):
+        feedback = np.ones((2, count), np.float32)
+        horizon = Horizon(1, 2**31, 500, 10**15, 10**14, inputs, feedback)
+        *fields, _, _ = horizon
+        bytes_of = (array.ravel().data.cast("B") for array in (inputs, feedback))
+        assert encode_horizon(*fields, *bytes_of) == encode(horizon)
 
 
 def body(message: Message) -> list[object]:
