@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import pytest
 
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
+from lab.keys import flat, lay
 from server.endpoint import Server
 from shared import config
 from shared.chance import stream
@@ -50,26 +50,14 @@ OTHER: dict[str, Any] = {
 """Another value of the keys that are no numbers, or that not every number may be."""
 
 
-def leaves(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key of a scenario with dots, and its value."""
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-ALL = dict(leaves(config.to_table(HERE)))
+ALL = dict(flat(config.to_table(HERE)))
+"""Every key of a scenario with dots, and its value."""
 
 
 def with_(key: str, value: Any) -> Scenario:
     """The scenario with one key changed."""
     table = config.to_table(HERE)
-    inner = table
-    *path, last = key.split(".")
-    for part in path:
-        inner = inner[part]
-    inner[last] = value
+    lay({key: value}, table)
     if key == "model.axes":
         table["reference"]["points_m"] = ()
     return config.check(table, "there")
