@@ -3,8 +3,8 @@
     observations → x̂(k), x̂(k+d) (`replay` or `estimator`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`planner`) → event? (`trigger`) → what is sent, remembered.
 
-With the schemes "predictive" and "none" d is 0. Every vehicle is planned for at every step: the
-plan costs less than to find out whether it could be spared.
+With the schemes "predictive" and "none" d is 0. Every vehicle is planned for at every step, for
+planning is a small part of what a step costs.
 """
 
 from collections import Counter
