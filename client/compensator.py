@@ -41,6 +41,9 @@ class Compensator:
         self._new = False
         self.observed_ns = -1
         """Stamp of the observation that the horizon was computed from [client clock]."""
+        self.covered = False
+        """Whether the horizon has an input for the step chosen for last; without one the vehicle
+        hovers, brakes, or holds the last."""
         self.stale = 0
         """Number of horizons that came after a newer one."""
 
@@ -75,6 +78,7 @@ class Compensator:
         if self.in_force == NO_HORIZON:
             return np.zeros(len(self._bounds))
         stage, length = stage_at(step, self.in_force, self._indexed), self._inputs.shape[1]
+        self.covered = stage < length
         told = self._told(entry(stage, length))
         back = self._led_back(stage, state) if self._feedback else self._nothing
         return np.array(

@@ -213,6 +213,7 @@ class Client(Endpoint):
             present,
             *state.ravel().tolist(),
             *self._input.tolist(),
+            self._compensator.covered,
             self._compensator.in_force,
             -1 if observed_ns < 0 else stamp_ns - observed_ns,
             self._compensator.stale,

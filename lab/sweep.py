@@ -255,6 +255,8 @@ FIGURES = (
     "rmse_y",
     "rmse_z",
     "rmse_xy",
+    "error_max",
+    "covered",
     "event_ratio",
     "uplink_packets",
     "uplink_bytes",

@@ -25,6 +25,7 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("step", "<i8"),
             ("state", "<f8", (axes, 2)),  # true position [m] and velocity [m/s]
             ("input", "<f8", (axes,)),  # desired velocity that is flown from here on [m/s]
+            ("covered", "?"),  # whether that is an input of a horizon, neither hovering nor braking
             ("in_force", "<i8"),  # step that its horizon was made for, -1 for none
             ("age_ns", "<i8"),  # since the observation behind that horizon, -1 for none
             ("stale", "<i8"),  # horizons older than the one held, so far

@@ -24,6 +24,11 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     rmse_z: float | None
     """Root mean square of the altitude's error [m]; None in the plane."""
     rmse_xy: float | None
+    error_max: float | None
+    """Largest distance from the desired trajectory, from `settle` on [m]."""
+    covered: float | None
+    """Share of the steps for which the vehicle had an input planned; in the others it hovered,
+    braked, or held the last."""
     event_ratio: float | None
     """Share of the server's steps that sent a horizon."""
     uplink_packets: int | None
@@ -69,6 +74,7 @@ def summarise(
     settled = error[client["step"] * scenario.control.dt >= scenario.settle]
     squares = (settled**2).mean(axis=0) if len(settled) else np.array([np.nan])
     rmse = [float(value) for value in np.sqrt(squares)] if np.isfinite(squares).all() else []
+    distances = np.linalg.norm(settled, axis=1)
     age_ms = client["age_ns"][client["age_ns"] >= 0] / 1e6
     stale, missed = _last(client, "stale"), _last(client, "missed")
     event_ratio, solve_ms = None, np.empty(0)
@@ -86,6 +92,8 @@ def summarise(
         rmse_y=rmse[1] if rmse else None,
         rmse_z=rmse[2] if len(rmse) == 3 else None,
         rmse_xy=math.hypot(*rmse[:2]) if rmse else None,
+        error_max=float(distances.max()) if len(distances) else None,
+        covered=float(client["covered"].mean()) if len(client) else None,
         event_ratio=event_ratio,
         uplink_packets=_count(netem, UPLINK),
         uplink_bytes=_bytes(netem, UPLINK),

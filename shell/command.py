@@ -296,6 +296,8 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ("steps", f"{s.steps} in {s.duration_s:g} s"),
         ("RMSE x, y, xy [m]", _values(".4f", s.rmse_x, s.rmse_y, s.rmse_xy)),
         ("RMSE z [m]", _values(".4f", s.rmse_z)),
+        ("largest error [m]", _values(".4f", s.error_max)),
+        ("steps with a planned input", _values(".3f", s.covered)),
         ("event ratio", _values(".3f", s.event_ratio)),
         ("uplink packets, bytes", _values("d", s.uplink_packets, s.uplink_bytes)),
         ("downlink packets, bytes", _values("d", s.downlink_packets, s.downlink_bytes)),
