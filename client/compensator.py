@@ -11,7 +11,7 @@ import numpy as np
 
 from shared.model import Array, advance
 from shared.protocol import NO_HORIZON, Horizon, ProtocolError
-from shared.rule import bounded, entry, flown, led_back, stage_at
+from shared.rule import bounded, entry, flown, lasting, late_max, led_back
 from shared.terms import Terms
 
 
@@ -20,13 +20,16 @@ class Compensator:
 
     def __init__(self, terms: Terms) -> None:
         self._H = terms.horizon
+        self._age_max = terms.age_max
         self._indexed = terms.indexed
+        self._commits = terms.commits
+        self._late_max = late_max(terms.horizon)
         self._brake = terms.brake
         self._bounds = terms.u_max
         self._model = terms.model.axes()
         self._nothing = [0.0] * terms.axes
         self._inputs = np.zeros((terms.axes, 1), dtype=np.float32)
-        """The horizon's inputs [m/s]; shape (axes, d + H)."""
+        """The horizon's inputs that may be flown [m/s]; shape (axes, at most d + H)."""
         self._speed = 0.0
         """Magnitude of its last input [m/s]."""
         self._feedback: list[list[float]] = []
@@ -47,20 +50,37 @@ class Compensator:
         self.stale = 0
         """Number of horizons that came after a newer one."""
 
-    def offer(self, horizon: Horizon, step: int) -> None:
-        """Take a horizon that arrived during `step`, unless a newer one is held.
+    def offer(self, horizon: Horizon, step: int, observed: int) -> None:
+        """Take a horizon that arrived before the input of a step is chosen, unless a newer is held.
+
+        Args:
+            horizon: what arrived.
+            step: k, the step whose input is chosen next.
+            observed: step of the observation that the horizon was planned from.
 
         Raises:
-            ProtocolError: it is made for a time so far ahead that nothing later could replace it.
+            ProtocolError: it is made for a time so far ahead that nothing later could replace it,
+                from an observation that was not made yet, or too long ago for any of its inputs,
+                or so long after its committed steps that other inputs were flown meanwhile.
         """
         if horizon.step > step + self._H:
             raise ProtocolError("from the future")
         if horizon.step <= self.in_force:
             self.stale += 1
             return
+        given = horizon.inputs.shape[1] if self._indexed else self._age_max + self._H
+        length = lasting(given, horizon.step, observed, self._age_max)
+        if not 0 <= observed < step:
+            raise ProtocolError("observation")
+        if length < 1:
+            raise ProtocolError("too old")
+        if self._commits and step - horizon.step > given - self._H + self._late_max:
+            raise ProtocolError("too late")
         self.in_force, self._new = horizon.step, True
         self.observed_ns = horizon.observed_ns
-        self._inputs = horizon.inputs
+        self._inputs = horizon.inputs[:, :length]
+        if not self._indexed:
+            self._inputs = np.broadcast_to(horizon.inputs[:, :1], (len(self._bounds), length))
         self._speed = math.sqrt(sum(u * u for u in self._told(-1)))
         self._feedback = horizon.feedback.tolist() if horizon.feedback.size else []
         self._led = [(p, v) for p, v, *_ in self._feedback]
@@ -77,7 +97,7 @@ class Compensator:
             self.since, self._new = step, False
         if self.in_force == NO_HORIZON:
             return np.zeros(len(self._bounds))
-        stage, length = stage_at(step, self.in_force, self._indexed), self._inputs.shape[1]
+        stage, length = step - self.in_force, self._inputs.shape[1]
         self.covered = stage < length
         told = self._told(entry(stage, length))
         back = self._led_back(stage, state) if self._feedback else self._nothing

@@ -18,6 +18,9 @@ from shared.events import (
     Finished,
     Flying,
     NoAnswer,
+    NotFlown,
+    PlanEnded,
+    PlanResumed,
     ServerHeard,
     ServerRestarted,
     ServerSilent,
@@ -27,6 +30,7 @@ from shared.protocol import (
     Heartbeat,
     Hello,
     Horizon,
+    Idle,
     Observation,
     ProtocolError,
     Welcome,
@@ -88,6 +92,12 @@ class Client(Endpoint):
         """Step at whose start the plant's state is."""
         self._input = self._compensator.choose(0, plant.state())
         """Desired velocity flown now [m/s]; shape (axes,)."""
+        self._covered = 0
+        """Number of steps for which there was an input planned."""
+        self._covered_last = 0
+        """Step after the last of these."""
+        self._idle = Idle.PLANS
+        """Why the server makes no plan, as it said last."""
         self.failure: Failure | None = None
         """Event after which there can be no flight."""
         self.missed = 0
@@ -110,10 +120,12 @@ class Client(Endpoint):
                     self._welcome(welcome, now_ns)
                 case Horizon() as horizon:
                     self._heard(horizon, now_ns)
-                    self._compensator.offer(horizon, self._step)
+                    self._idle = Idle.PLANS
+                    self._compensator.offer(horizon, self._step, self._step_at(horizon.observed_ns))
                     self.counts["horizons"] += 1
                 case Heartbeat() as heartbeat:
                     self._heard(heartbeat, now_ns)
+                    self._idle = Idle(heartbeat.idle)
                 case _:
                     raise ProtocolError("not for a client")
         except ProtocolError as error:
@@ -142,6 +154,12 @@ class Client(Endpoint):
             self._events.append(ServerHeard(vehicle=self.vehicle))
         self._hello_due_ns = None
         self._echo = (message.server_ns, now_ns)
+
+    def _step_at(self, stamp_ns: int) -> int:
+        """Step of one of the vehicle's own stamps, or -1 where it is none."""
+        assert self._epoch_ns is not None
+        step, off_ns = divmod(stamp_ns - self._epoch_ns, self._dt_ns)
+        return -1 if off_ns else step
 
     def _fail(self, failure: Failure) -> None:
         self.failure = failure
@@ -185,11 +203,10 @@ class Client(Endpoint):
         for _ in range(self._flown, present):
             self._plant.advance(self._input)
         self._flown, self._step = present, present + 1
-        if self.finished:
-            finished = Finished(vehicle=self.vehicle, steps=self._steps, missed=self.missed)
-            self._events.append(finished)
         state, stamp_ns = self._plant.state(), epoch_ns + present * self._dt_ns
+        had_plan = self._compensator.covered
         self._input = self._compensator.choose(present, state)
+        self._tell_of_plan(had_plan, self._compensator.covered)
         server_ns, received_ns = self._echo
         assert self._session is not None
         self._send(
@@ -219,6 +236,26 @@ class Client(Endpoint):
             self._compensator.stale,
             self.missed,
         )
+
+    def _tell_of_plan(self, had: bool, has: bool) -> None:
+        """Say when a plan ends and when another begins, and how the flight ended."""
+        self._covered += has
+        self._covered_last = self._step if has else self._covered_last
+        why = "the server is silent" if self._hello_due_ns is not None else str(self._idle)
+        if self.finished:
+            if (
+                self._step - self._covered_last
+            ) * self._dt_ns <= self._timeout_ns and self._covered:
+                finished = Finished(vehicle=self.vehicle, steps=self._steps, missed=self.missed)
+                self._events.append(finished)
+            else:
+                covered, steps = self._covered, self._steps
+                self._fail(NotFlown(vehicle=self.vehicle, covered=covered, steps=steps, why=why))
+        elif had and not has:
+            brakes = self._terms.exhausted == "brake"
+            self._events.append(PlanEnded(vehicle=self.vehicle, brakes=brakes, why=why))
+        elif has and not had and self._covered > 1:
+            self._events.append(PlanResumed(vehicle=self.vehicle))
 
     def _send(self, message: Hello | Observation) -> None:
         self._out.append(Datagram(encode(message), self._server))

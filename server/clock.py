@@ -9,6 +9,8 @@ vehicle's clock minus server's. Half of any asymmetry of the two smallest delays
 offset is right to within the bound and no better. Step k begins at epoch + k Δt of the vehicle.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
@@ -28,8 +30,32 @@ STEP_SAMPLES = 5
 STEP_NS = 40 * MILLISECOND_NS
 """Smallest step of a clock: up in one direction, and down by about as much in the other [ns]."""
 
+ECHOES = 4
+"""Newest echoes of a vehicle, which tell how long packets take to it just now."""
+
 UNSEEN = 2**61
 """In place of a minimum where nothing was seen."""
+
+
+class Seen(NamedTuple):
+    """What was seen of the clocks and delays of up to `capacity` vehicles."""
+
+    minimum: I3
+    """Smallest F and G of each half second [ns], a ring; shape (capacity, 2, BUCKETS)."""
+    samples: I2
+    """Number of both in each half second; shape (capacity, BUCKETS)."""
+    newest: I1
+    """Half second of the newest sample; shape (capacity,)."""
+    echoes: I2
+    """Newest G, each of another packet of ours [ns], a ring; shape (capacity, ECHOES)."""
+    echo: I1
+    """Stamp of ours that the newest of them is of [ns]; shape (capacity,)."""
+    heard: I1
+    """Number of them so far; shape (capacity,)."""
+    adopted: I1
+    """Offset that is reckoned with [ns], or UNSEEN; shape (capacity,)."""
+    epoch: I1
+    """Begin of step 0 [ns; vehicle's clock]; shape (capacity,)."""
 
 
 class ClockMap:
@@ -41,80 +67,85 @@ class ClockMap:
 
     def __init__(self, capacity: int, dt_ns: int) -> None:
         self._dt_ns = dt_ns
-        self.minimum = np.full((capacity, 2, BUCKETS), UNSEEN, dtype=np.int64)
-        """Smallest F and G of each half second [ns], a ring; shape (capacity, 2, BUCKETS)."""
-        self._samples = np.zeros((capacity, BUCKETS), dtype=np.int64)
-        self._newest = np.zeros(capacity, dtype=np.int64)
-        """Half second of the newest sample; shape (capacity,)."""
-        self._adopted = np.full(capacity, UNSEEN, dtype=np.int64)
-        """Offset that is reckoned with [ns]; shape (capacity,)."""
-        self.epoch_ns = np.zeros(capacity, dtype=np.int64)
+        numbers = np.zeros((5, capacity), dtype=np.int64)
+        self.seen = Seen(
+            minimum=np.empty((capacity, 2, BUCKETS), dtype=np.int64),
+            samples=np.empty((capacity, BUCKETS), dtype=np.int64),
+            newest=numbers[0],
+            echoes=np.empty((capacity, ECHOES), dtype=np.int64),
+            echo=numbers[1],
+            heard=numbers[2],
+            adopted=numbers[3],
+            epoch=numbers[4],
+        )
+        self.epoch_ns = self.seen.epoch
         """Begin of step 0 [vehicle's clock]; shape (capacity,)."""
+        for row in range(capacity):
+            self.forget(row)
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle, or with a new life of it."""
-        self.minimum[row] = UNSEEN
-        self._samples[row] = 0
-        self._adopted[row] = UNSEEN
+        self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
+        self.seen.echoes[row], self.seen.heard[row] = -UNSEEN, 0
+        self.seen.adopted[row] = UNSEEN
 
-    def observe(self, row: int, forward_ns: int, backward_ns: int, *, now_ns: int) -> None:
-        """Take one F and one G of a vehicle, received at `now_ns`."""
-        _observe(
-            self.minimum,
-            self._samples,
-            self._newest,
-            row,
-            forward_ns,
-            backward_ns,
-            now_ns // BUCKET_NS,
-        )
+    def observe(
+        self, row: int, forward_ns: int, backward_ns: int, *, echo_ns: int, now_ns: int
+    ) -> None:
+        """Take one F and one G of a vehicle, received at `now_ns`.
+
+        Args:
+            echo_ns: our own stamp that G is of.
+        """
+        _observe(self.seen, row, forward_ns, backward_ns, echo_ns, now_ns // BUCKET_NS)
 
     def steps(self, rows: Indices, now_ns: int) -> Indices:
         """Step k of each vehicle at a time of the server's clock; shape (n,)."""
         steps = np.empty(len(rows), dtype=np.int64)
-        _steps(
-            self.minimum,
-            self._samples,
-            self._newest,
-            self._adopted,
-            self.epoch_ns,
-            rows,
-            now_ns,
-            self._dt_ns,
-            steps,
-        )
+        _steps(self.seen, rows, now_ns, self._dt_ns, steps)
         return steps
 
     def offset_ns(self, rows: Indices) -> Indices:
         """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
         self.steps(rows, 0)
-        return self._adopted[rows]
+        return self.seen.adopted[rows]
 
     def bound_ns(self, row: int) -> int:
         """How far the offset of a vehicle may be off [ns]."""
-        return int(plain(half_trip_ns)(self.minimum, row))
+        return int(plain(half_trip_ns)(self.seen, row))
 
 
 @part
-def half_trip_ns(minimum: I3, row: int) -> int:
+def half_trip_ns(seen: Seen, row: int) -> int:
     """Half of the smallest round trip of a vehicle [ns]."""
-    return (minimum[row, 0].min() + minimum[row, 1].min()) // 2
+    return (seen.minimum[row, 0].min() + seen.minimum[row, 1].min()) // 2
+
+
+@part
+def shortest_ns(seen: Seen, row: int) -> int:
+    """Shortest of the delays of the newest ECHOES packets to a vehicle, as the map knows it [ns].
+
+    It is negative while there are fewer.
+    """
+    return seen.echoes[row].min() - seen.adopted[row]
 
 
 @kernel
-def _observe(
-    minimum: I3, samples: I2, newest: I1, row: int, forward: int, backward: int, bucket: int
-) -> None:
-    """Take F and G [ns] of a vehicle into the half second `bucket`; changes the arrays in place."""
-    for passed in range(max(newest[row] + 1, bucket - BUCKETS + 1), bucket + 1):
+def _observe(seen: Seen, row: int, forward: int, backward: int, echo: int, bucket: int) -> None:
+    """Take F and G [ns] of a vehicle into the half second `bucket`."""
+    if echo != seen.echo[row]:
+        seen.echo[row] = echo
+        seen.echoes[row, seen.heard[row] % ECHOES] = backward
+        seen.heard[row] += 1
+    for passed in range(max(seen.newest[row] + 1, bucket - BUCKETS + 1), bucket + 1):
         slot = passed % BUCKETS
-        minimum[row, 0, slot], minimum[row, 1, slot] = UNSEEN, UNSEEN
-        samples[row, slot] = 0
-    newest[row] = max(newest[row], bucket)
+        seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
+        seen.samples[row, slot] = 0
+    seen.newest[row] = max(seen.newest[row], bucket)
     slot = bucket % BUCKETS
-    minimum[row, 0, slot] = min(minimum[row, 0, slot], forward)
-    minimum[row, 1, slot] = min(minimum[row, 1, slot], backward)
-    samples[row, slot] += 1
+    seen.minimum[row, 0, slot] = min(seen.minimum[row, 0, slot], forward)
+    seen.minimum[row, 1, slot] = min(seen.minimum[row, 1, slot], backward)
+    seen.samples[row, slot] += 1
 
 
 @part
@@ -131,44 +162,35 @@ def _change(minimum: I1, newest: int) -> int:
 
 
 @part
-def _drop_stepped(minimum: I3, samples: I2, newest: I1, row: int) -> None:
+def _drop_stepped(seen: Seen, row: int) -> None:
     """Keep only what came since, where one of a vehicle's two clocks has stepped."""
-    recent, old = 0, 0
+    recent, old, newest = 0, 0, seen.newest[row]
     for age in range(BUCKETS):
-        count = samples[row, (newest[row] - age) % BUCKETS]
+        count = seen.samples[row, (newest - age) % BUCKETS]
         if age < RECENT:
             recent += count
         elif age >= OLD:
             old += count
     if min(recent, old) < STEP_SAMPLES:
         return
-    forward = _change(minimum[row, 0], newest[row])
-    backward = _change(minimum[row, 1], newest[row])
+    forward = _change(seen.minimum[row, 0], newest)
+    backward = _change(seen.minimum[row, 1], newest)
     large = min(abs(forward), abs(backward)) > STEP_NS
     if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
         for age in range(RECENT, BUCKETS):
-            slot = (newest[row] - age) % BUCKETS
-            minimum[row, 0, slot], minimum[row, 1, slot] = UNSEEN, UNSEEN
-            samples[row, slot] = 0
+            slot = (newest - age) % BUCKETS
+            seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
+            seen.samples[row, slot] = 0
 
 
 @kernel
-def _steps(
-    minimum: I3,
-    samples: I2,
-    newest: I1,
-    adopted: I1,
-    epoch: I1,
-    rows: I1,
-    now: int,
-    dt: int,
-    steps: I1,
-) -> None:
+def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
     """Fill in k of each vehicle, see `ClockMap.steps`; forgets what came before a clock stepped."""
     for i in range(len(rows)):
         row = rows[i]
-        _drop_stepped(minimum, samples, newest, row)
-        estimate = (minimum[row, 1].min() - minimum[row, 0].min()) // 2
-        if adopted[row] == UNSEEN or abs(estimate - adopted[row]) > dt // 2:
-            adopted[row] = estimate
-        steps[i] = (now + adopted[row] - epoch[row]) // dt
+        _drop_stepped(seen, row)
+        estimate = (seen.minimum[row, 1].min() - seen.minimum[row, 0].min()) // 2
+        adopted = seen.adopted[row]
+        if adopted == UNSEEN or abs(estimate - adopted) > dt // 2:
+            adopted = seen.adopted[row] = estimate
+        steps[i] = (now + adopted - seen.epoch[row]) // dt

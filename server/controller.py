@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from server.clock import ClockMap
+from server.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from server.estimator import Estimator
 from server.planner import Figures, Planner
 from server.replay import Replay
@@ -21,12 +21,12 @@ from server.trigger import Situation, Verdict, make_trigger
 from shared.config import Scenario
 from shared.kernel import B1, I1, kernel
 from shared.model import Array, Flags, Indices
-from shared.protocol import Observation
+from shared.protocol import Idle, Observation, committed_max
 from shared.stopwatch import Stopwatch
 from shared.terms import Terms
 
-REACH_S = 2.0
-"""Observations older than this are no base for an estimate [s]."""
+PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
+"""As kernels take them."""
 BLOCK = 128
 """Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
@@ -71,21 +71,29 @@ class Controller:
     ) -> None:
         control = scenario.control
         block = min(room, BLOCK)
-        self._reach = max(1, round(REACH_S / terms.dt_s))
+        self._age_max = terms.age_max
+        self._clock = clock
+        most = max(committed_max(terms), 1)
+        self._uplink_max_ns = (most if terms.commits else terms.horizon) * terms.dt_ns
+        """Longest delay to a vehicle that a horizon has room for [ns]."""
+        if not terms.indexed:
+            self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
         self._scheme: Scheme = (
-            Replay(terms, control, room, self._reach, clock)
+            Replay(terms, control, room, clock)
             if terms.commits
-            else Estimator(terms.model, room, self._reach, compensate=terms.indexed)
+            else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
         )
         self.planner = Planner(scenario, terms, room, block, stopwatch)
         """Plans of every vehicle."""
         self._trigger = make_trigger(control, room)
-        self._found = foresight(block, terms.axes, terms.horizon)
+        self._found = foresight(block, terms.axes, terms.horizon, most)
         self._stopwatch = stopwatch
         self.last_step = np.full(room, -1, dtype=np.int64)
         """Step of each vehicle that was decided last, or -1; shape (room,)."""
         self.observed_step = self._scheme.observed_step
         """Step of the newest observation of each vehicle, or -1; shape (room,)."""
+        self.idle = np.zeros(room, dtype=np.int64)
+        """Why there was no plan for each vehicle, or none sent, one of `Idle`; shape (room,)."""
         self._counts: Counter[str] = Counter()
 
     @property
@@ -96,6 +104,7 @@ class Controller:
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""
         self.last_step[row] = -1
+        self.idle[row] = Idle.PLANS
         self._scheme.forget(row)
         self.planner.forget(row)
         self._trigger.forget(row)
@@ -105,9 +114,19 @@ class Controller:
         return self._scheme.observe(row, observation)
 
     def able(self, rows: Indices, step: Indices) -> Flags:
-        """Which vehicles can be decided on: their step is new, and their observation recent."""
+        """Which vehicles can be decided on: their step is new, and `idle` names no reason."""
         able = np.empty(len(rows), dtype=np.bool_)
-        _able(rows, step, self.last_step, self.observed_step, self._reach, able)
+        _able(
+            rows,
+            step,
+            self.last_step,
+            self.observed_step,
+            self._age_max,
+            self._clock.seen,
+            self._uplink_max_ns,
+            self.idle,
+            able,
+        )
         return able
 
     def decide(self, rows: Indices, step: Indices) -> Decisions:
@@ -124,24 +143,71 @@ class Controller:
         self.planner.plan(rows, step, found)  # (14), (15)
         figures, planned = self.planner.figures[:n], self.planner.planned[:n]
         verdict = self._trigger.test(Situation(rows, figures, found.start[:n], planned))  # (16)
-        solved = figures["solved"]
-        event = verdict.event & solved
+        event = verdict.event.copy()
+        unsolved = _withhold(
+            rows, step, found.ahead, self.observed_step, self._age_max, figures, self.idle, event
+        )
         sent = event.nonzero()[0]
         self._scheme.remember(rows, step, found, event)  # (12)
         if len(sent):
             self._trigger.sent(rows[sent], figures[sent])
         self._counts["steps"] += n
         self._counts["events"] += len(sent)
-        self._counts["unsolved"] += n - int(np.count_nonzero(solved))
+        self._counts["unsolved"] += unsolved
         stopwatch.lap("trigger")
         solve_ns = self.planner.solve_ns
         return Decisions(rows, step, found, figures, planned, verdict, event, sent, solve_ns)
 
 
 @kernel
-def _able(rows: I1, steps: I1, last_step: I1, observed_step: I1, reach: int, able: B1) -> None:
-    """Fill in `Controller.able`."""
+def _able(
+    rows: I1,
+    steps: I1,
+    last_step: I1,
+    observed_step: I1,
+    age_max: int,
+    seen: Seen,
+    uplink_max: int,
+    idle: I1,
+    able: B1,
+) -> None:
+    """Fill in `Controller.able`, and `Controller.idle` for vehicles whose step is new."""
     for i in range(len(rows)):
         row, step = rows[i], steps[i]
-        observed = observed_step[row]
-        able[i] = step > last_step[row] and observed >= 0 and step - observed <= reach
+        able[i] = False
+        if step <= last_step[row] or observed_step[row] < 0:
+            continue
+        idle[row] = PLANS
+        if step - observed_step[row] > age_max:
+            idle[row] = OBSERVATION
+        elif shortest_ns(seen, row) > uplink_max:
+            idle[row] = DELAY
+        able[i] = idle[row] == PLANS
+
+
+@kernel
+def _withhold(
+    rows: I1,
+    steps: I1,
+    ahead: I1,
+    observed_step: I1,
+    age_max: int,
+    figures: Figures,
+    idle: I1,
+    event: B1,
+) -> int:
+    """Take back events whose plan is none, with the reason in `idle`; the number of the unsolved.
+
+    A plan that would begin when its observation has become too old is not flown.
+    """
+    unsolved = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        if not figures[i].solved:
+            unsolved += 1
+            idle[row] = UNSOLVED
+            event[i] = False
+        elif steps[i] + ahead[i] - observed_step[row] > age_max:
+            idle[row] = OBSERVATION
+            event[i] = False
+    return unsolved

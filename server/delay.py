@@ -51,7 +51,7 @@ def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) ->
         most: the largest d, what a horizon has room for.
         fixed_s: a bound that is known [s]; None to estimate it.
     """
-    least = 1
+    least, most = 1, max(most, 1)
     if fixed_s is not None:
         fixed = -(-seconds_to_ns(fixed_s) // seconds_to_ns(dt_s))
         least = most = min(max(fixed, 1), most)
@@ -69,6 +69,12 @@ def forget(bound: DelayBound, row: int) -> None:
 def begin(bound: DelayBound, row: int, guess: int) -> None:
     """Set a first d [steps] of a vehicle without a sample."""
     bound.steps[row] = min(max(guess, bound.least), bound.most)
+
+
+@part
+def at_least(bound: DelayBound, row: int, delay: int) -> None:
+    """Raise d of a vehicle to what every packet takes just now [steps], acknowledged or not."""
+    bound.steps[row] = max(bound.steps[row], min(delay, bound.most))
 
 
 @part

@@ -8,8 +8,11 @@ passed is skipped and counted, never caught up with.
 from collections import Counter
 from typing import Any
 
+import numpy as np
+
 from server.clock import ClockMap
 from server.controller import BLOCK, Controller, Decisions
+from server.plausibility import Plausibility, Verdict
 from server.scheme import in_a_row
 from server.sessions import Session, Sessions
 from shared.config import Scenario
@@ -22,12 +25,19 @@ from shared.endpoint import (
     Endpoint,
     seconds_to_ns,
 )
-from shared.events import SessionEnded, SessionOpened, SessionRefused
+from shared.events import (
+    PlanningResumed,
+    PlanningStopped,
+    SessionEnded,
+    SessionOpened,
+    SessionRefused,
+)
 from shared.histogram import Histogram
 from shared.protocol import (
     FEEDBACK,
     Heartbeat,
     Hello,
+    Idle,
     Observation,
     ProtocolError,
     Welcome,
@@ -71,9 +81,12 @@ class Server(Endpoint):
         self._recorder = recorder
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, self._terms.dt_ns)
+        self._plausibility = Plausibility(self._terms, room)
         self.controller = Controller(scenario, self._terms, room, self._clock, self.stopwatch)
         self.sessions = Sessions(room, boot_id)
         """Who flies."""
+        self._idle = np.zeros(room, dtype=np.int64)
+        """Why no plan is made for each vehicle, as it was told last; shape (room,)."""
         self._due_ns: int | None = None
         self._expire_ns = 0
         """When to look for vehicles that are gone."""
@@ -114,28 +127,36 @@ class Server(Endpoint):
 
     def _observe(self, observation: Observation, address: Address, now_ns: int) -> None:
         session = self.sessions.find(observation) or self._begin(observation, now_ns)
-        row = session.row
+        row, stamp_ns, echo_ns = session.row, observation.stamp_ns, observation.server_ns
+        epoch_ns = stamp_ns - observation.step * self._terms.dt_ns
+        forward_ns, backward_ns = now_ns - stamp_ns, observation.received_ns - echo_ns
+        verdict = self._plausibility.judge(row, observation, epoch_ns, forward_ns, backward_ns)
+        if verdict > Verdict.BELIEVED:
+            raise ProtocolError(f"implausible: {verdict.name.lower()}")
+        if verdict == Verdict.ANEW:
+            self._anew(row)
         session.heard_ns = now_ns
-        self._clock.observe(
-            row,
-            now_ns - observation.stamp_ns,
-            observation.received_ns - observation.server_ns,
-            now_ns=now_ns,
-        )
+        self._clock.observe(row, forward_ns, backward_ns, echo_ns=echo_ns, now_ns=now_ns)
         if not self.controller.observe(row, observation):
             session.stale += 1
             return
         session.address = address
-        session.observed_ns = observation.stamp_ns
-        self._clock.epoch_ns[row] = observation.stamp_ns - observation.step * self._terms.dt_ns
+        session.observed_ns = stamp_ns
+        self._clock.epoch_ns[row] = epoch_ns
         if self._due_ns is None:
             self._due_ns = -(-now_ns // self._terms.dt_ns) * self._terms.dt_ns  # the next, or now
+
+    def _anew(self, row: int) -> None:
+        """Forget all that is known of a vehicle but its session."""
+        self._clock.forget(row)
+        self.controller.forget(row)
+        self._idle[row] = Idle.PLANS
 
     def _begin(self, observation: Observation, now_ns: int) -> Session:
         """The session of a first observation, now live."""
         session = self.sessions.begin(observation, now_ns)
-        self._clock.forget(session.row)
-        self.controller.forget(session.row)
+        self._plausibility.forget(session.row)
+        self._anew(session.row)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))
         return session
@@ -179,13 +200,26 @@ class Server(Endpoint):
             self._send_horizons(decisions, now_ns)
             self.stopwatch.lap("encode")
             self._record(decisions)
+        self._tell_idle()
         for session in self.sessions:
             if now_ns - session.sent_ns >= self._heartbeat_ns:
                 session.sent_ns = now_ns
-                heartbeat = Heartbeat(session.vehicle, session.number, now_ns)
+                idle = int(self._idle[session.row])
+                heartbeat = Heartbeat(session.vehicle, session.number, now_ns, idle)
                 self._out.append(Datagram(encode(heartbeat), session.address))
         self.stopwatch.lap("encode")
         self.ticks.add(self.stopwatch.spent_ns.total() - before_ns)
+
+    def _tell_idle(self) -> None:
+        """Say where planning has stopped, and where it goes on."""
+        idle = self.controller.idle
+        for row in np.flatnonzero(idle != self._idle).tolist():
+            self._idle[row] = idle[row]
+            vehicle, why = self.sessions.at(row).vehicle, Idle(idle[row])
+            if why == Idle.PLANS:
+                self._events.append(PlanningResumed(vehicle=vehicle))
+            else:
+                self._events.append(PlanningStopped(vehicle=vehicle, why=str(why)))
 
     def _send_horizons(self, decisions: Decisions, now_ns: int) -> None:
         sent, found = decisions.sent, decisions.found

@@ -16,7 +16,7 @@ Axes = Annotated[NDArray[np.void], records(AXIS, 1)]
 """A model as kernels take it; shape (axes,)."""
 
 advance = inline(model.advance)
-stage_at, entry, bounded = inline(rule.stage_at), inline(rule.entry), inline(rule.bounded)
+entry, bounded, lasting = inline(rule.entry), inline(rule.bounded), inline(rule.lasting)
 led_back, flown = inline(rule.led_back), inline(rule.flown)
 
 

@@ -31,15 +31,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server import delay
-from server.clock import ClockMap, half_trip_ns
-from server.delay import DelayBound, acknowledge, begin, delay_bound
-from server.model import AXIS_FIELDS, advance, bounded, entry, flown, led_back, stage_at
+from server.clock import ClockMap, Seen, half_trip_ns, shortest_ns
+from server.delay import DelayBound, acknowledge, at_least, begin, delay_bound
+from server.model import AXIS_FIELDS, advance, bounded, entry, flown, lasting, led_back
 from server.mpc import stationary_gain
 from server.scheme import Foresight
 from shared.config import ControlConfig
-from shared.kernel import B1, F1, F2, I1, I3, S4, kernel, part, record, records
+from shared.kernel import B1, F1, F2, I1, S4, kernel, part, record, records
 from shared.model import Flags, Indices
-from shared.protocol import INPUTS_MAX, NO_HORIZON, Observation
+from shared.protocol import NO_HORIZON, Observation, committed_max
 from shared.terms import Terms
 
 MARGIN = 2
@@ -65,9 +65,9 @@ horizons sent so far."""
 STATE = record(("p", "f8"), ("v", "f8"), ("base_p", "f8"), ("base_v", "f8"), ("w", "f8"))
 """On one axis of a vehicle: position [m] and velocity [m/s] of its newest observation and of the
 one before, and the disturbance [m/s]."""
-SENT = record(("step", "i8"), ("length", "i8"), ("speed", "f8"))
-"""A horizon that was sent: the step it was made for, how many inputs it has, and the magnitude of
-the last [m/s]."""
+SENT = record(("step", "i8"), ("due", "i8"), ("length", "i8"), ("speed", "f8"))
+"""A horizon that was sent: the step it was made for; that at which it is in force, or lost; how
+many inputs it has; and the magnitude of the last [m/s]."""
 ORIGIN = record(("p", "f4"), ("v", "f4"), ("w", "f4"))
 """Where a horizon leads on from on one axis: position [m], velocity [m/s], disturbance [m/s]."""
 
@@ -79,7 +79,7 @@ class Settings(NamedTuple):
     """Model, bound and gain; shape (axes,)."""
     H: int
     """Steps planned ahead."""
-    reach: int
+    age_max: int
     """Largest age of an observation that counts [steps]."""
     dt_ns: int
     """Length of a step [ns]."""
@@ -103,7 +103,7 @@ class Memory(NamedTuple):
     sent: Annotated[NDArray[np.void], records(SENT, 2)]
     """Horizons that were sent, a ring; shape (capacity, room)."""
     inputs: S4
-    """Their inputs [m/s]; shape (capacity, room, axes, 2 H)."""
+    """Their inputs [m/s]; shape (capacity, room, axes, most + H), with the largest d."""
     origins: Annotated[NDArray[np.void], records(ORIGIN, 3)]
     """Where they lead on from; shape (capacity, room, axes)."""
 
@@ -114,14 +114,13 @@ class Replay:
     Args:
         terms: the rule of flight.
         control: `observer_s`, `delay_bound`, and the weights that make the gain of feedback aboard.
-        reach: largest age of an observation [steps].
         clock: knows half of the smallest round trip, which is a first guess at the delay bound.
     """
 
     def __init__(
-        self, terms: Terms, control: ControlConfig, capacity: int, reach: int, clock: ClockMap
+        self, terms: Terms, control: ControlConfig, capacity: int, clock: ClockMap
     ) -> None:
-        axes, H = terms.axes, terms.horizon
+        axes, H, most = terms.axes, terms.horizon, max(committed_max(terms), 1)
         self.counts: Counter[str] = Counter()
         rule = np.zeros(axes, dtype=RULE)
         for name, numbers in terms.model._asdict().items():
@@ -132,26 +131,24 @@ class Replay:
         self._settings = Settings(
             rule=rule,
             H=H,
-            reach=reach,
+            age_max=terms.age_max,
             dt_ns=terms.dt_ns,
             brake=terms.brake,
             decay=float(np.exp(-terms.dt_s / control.observer_s)) if control.observer_s else 1.0,
             feeds_back=terms.feeds_back,
         )
-        room = reach + H
+        room = terms.age_max + H
         self._memory = Memory(
             observed=np.zeros(capacity, dtype=np.int64),
             seen=np.zeros(capacity, dtype=SEEN),
             state=np.zeros((capacity, axes), dtype=STATE),
             sent=np.zeros((capacity, room), dtype=SENT),
-            inputs=np.zeros((capacity, room, axes, 2 * H), dtype=np.float32),
+            inputs=np.zeros((capacity, room, axes, most + H), dtype=np.float32),
             origins=np.zeros((capacity, room, axes), dtype=ORIGIN),
         )
         given = control.delay_bound
         fixed_s = None if given == "auto" else given
-        self.delay_bound = delay_bound(
-            capacity, terms.dt_s, min(H, INPUTS_MAX // axes - H), fixed_s
-        )
+        self.delay_bound = delay_bound(capacity, terms.dt_s, most, fixed_s)
         self._clock = clock
         self.observed_step: Indices = self._memory.observed
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
@@ -179,7 +176,7 @@ class Replay:
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
         """See `Scheme`: planning starts at k + d."""
         lost = _foresee(
-            self._settings, self._memory, self.delay_bound, self._clock.minimum, rows, step, found
+            self._settings, self._memory, self.delay_bound, self._clock.seen, rows, step, found
         )
         if lost:
             self.counts["horizons lost"] += lost
@@ -233,18 +230,32 @@ def _first_after(memory: Memory, row: int, step: int) -> int:
 
 
 @part
+def _first_under_way(memory: Memory, row: int, in_force: int, observed: int) -> int:
+    """Number of the first horizon that was made after the one in force, and is not due yet."""
+    room = memory.sent.shape[1]
+    count = memory.seen[row].sent
+    number = count
+    while number > max(count - room, 0):
+        sent = memory.sent[row, (number - 1) % room]
+        if sent.step <= in_force or sent.due <= observed:
+            break
+        number -= 1
+    return number
+
+
+@part
 def _chart(
-    course: Course, memory: Memory, row: int, begin: int, d: int, flown: int, following: range
+    course: Course, memory: Memory, row: int, begin: int, flown: int, following: range
 ) -> int:
     """Number of legs of the course from `begin`: `flown`, then each of those following it.
 
     Args:
-        following: numbers of horizons, each in force d steps after it was made.
+        following: numbers of horizons, each in force when it is due.
     """
     room, legs = memory.sent.shape[1], 1
     course.begins[0], course.numbers[0] = begin, flown
     for number in following:
-        due = memory.sent[row, number % room].step + d
+        due = memory.sent[row, number % room].due
         if due <= begin:
             course.numbers[0] = number
             continue
@@ -276,7 +287,8 @@ def _roll(
             continue
         if number < 0:
             for step in range(first, last):
-                u = 0.0 if number == HOVERS else v  # as good a guess as any: it flies on
+                # As good a guess as any: it flies on.
+                u = 0.0 if number == HOVERS else min(max(v, -rule.bound), rule.bound)
                 track.commands[step - begin] = u
                 track.states[step - begin, 0], track.states[step - begin, 1] = p, v
                 p, v = advance(rule, p, v, u + w)
@@ -292,7 +304,7 @@ def _roll(
                 u = bounded(float(inputs[stage]), rule.bound)
                 led_p, led_v = advance(rule, led_p, led_v, u + led_w)
         for step in range(first, last):
-            stage, back = stage_at(step, made_for, True), 0.0
+            stage, back = step - made_for, 0.0
             told = bounded(float(inputs[entry(stage, length)]), rule.bound)
             if settings.feeds_back:
                 back = led_back(rule.gain_p, rule.gain_v, led_p - p, led_v - v)
@@ -308,7 +320,7 @@ def _roll(
 
 @part
 def _observe_disturbance(
-    settings: Settings, memory: Memory, row: int, d: int, course: Course, track: Track
+    settings: Settings, memory: Memory, row: int, course: Course, track: Track
 ) -> None:
     """Disturbance observer: from the observation before to the newest, where there is a new one."""
     seen = memory.seen[row]
@@ -316,9 +328,9 @@ def _observe_disturbance(
     if end == begin:
         return
     before, after = _number(memory, row, seen.base_in_force), _number(memory, row, seen.in_force)
-    if min(before, after) > UNKNOWN and begin >= 0 and end - begin <= settings.reach:
-        first = _first_after(memory, row, max(seen.base_in_force, begin - d))
-        legs = _chart(course, memory, row, begin, d, before, range(first, after))
+    if min(before, after) > UNKNOWN and begin >= 0 and end - begin <= settings.age_max:
+        first = _first_under_way(memory, row, seen.base_in_force, begin)
+        legs = _chart(course, memory, row, begin, before, range(first, after))
         # What came into force, and when, is known.
         while legs > 1 and course.begins[legs - 1] >= seen.since:
             legs -= 1
@@ -344,11 +356,12 @@ def _observe_disturbance(
 
 
 @part
-def _listen(settings: Settings, memory: Memory, bound: DelayBound, minimum: I3, row: int) -> None:
+def _listen(settings: Settings, memory: Memory, bound: DelayBound, clock: Seen, row: int) -> None:
     """Take what the newest observation says of the delay of horizons."""
     seen, room = memory.seen[row], memory.sent.shape[1]
     if bound.steps[row] == 0:
-        begin(bound, row, -(-half_trip_ns(minimum, row) // settings.dt_ns) + MARGIN)
+        begin(bound, row, -(-half_trip_ns(clock, row) // settings.dt_ns) + MARGIN)
+    at_least(bound, row, -(-shortest_ns(clock, row) // settings.dt_ns))
     if seen.in_force == seen.acknowledged or seen.sent == 0:
         return
     oldest = max(seen.sent - room, 0)
@@ -362,7 +375,7 @@ def _foresee(
     settings: Settings,
     memory: Memory,
     bound: DelayBound,
-    minimum: I3,
+    clock: Seen,
     rows: I1,
     steps: I1,
     found: Foresight,
@@ -370,25 +383,25 @@ def _foresee(
     """Fill in what is foreseen of vehicles at their steps k; the number of horizons newly lost."""
     axes, H, room = len(settings.rule), settings.H, memory.sent.shape[1]
     course = Course(np.empty(room + 2, dtype=np.int64), np.empty(room + 2, dtype=np.int64))
-    longest = settings.reach + 2 * H + 1
+    longest = settings.age_max + bound.most + H + 1
     track, lost = Track(np.empty(longest), np.empty((longest, 2))), 0
     for i in range(len(rows)):
         row, k = rows[i], steps[i]
-        _listen(settings, memory, bound, minimum, row)
+        _listen(settings, memory, bound, clock, row)
         d = bound.steps[row]
         if settings.decay < 1.0:
-            _observe_disturbance(settings, memory, row, d, course, track)
+            _observe_disturbance(settings, memory, row, course, track)
         seen, observed = memory.seen[row], memory.observed[row]
         assert (
-            k - observed <= settings.reach
+            k - observed <= settings.age_max
         )  # the controller's promise; the track has no more room
-        # Those that had d steps and are not in force have been overtaken, or are lost.
-        first = _first_after(memory, row, max(seen.in_force, observed - d))
+        # Those that were due and are not in force have been overtaken, or are lost.
+        first = _first_under_way(memory, row, seen.in_force, observed)
         for number in range(_first_after(memory, row, seen.in_force), first):
-            lost += memory.sent[row, number % room].step > seen.judged
-        memory.seen[row].judged = max(seen.judged, observed - d)
+            lost += memory.sent[row, number % room].due > seen.judged
+        memory.seen[row].judged = observed
         flying = _number(memory, row, seen.in_force)
-        legs = _chart(course, memory, row, observed, d, flying, range(first, seen.sent))
+        legs = _chart(course, memory, row, observed, flying, range(first, seen.sent))
         found.ahead[i] = d
         for axis in range(axes):
             state, rule = memory.state[row, axis], settings.rule[axis]
@@ -423,7 +436,8 @@ def _remember(
         row = rows[i]
         slot = memory.seen[row].sent % room
         memory.seen[row].sent += 1
-        length, squares = found.ahead[i] + settings.H, 0.0
+        given, squares = found.ahead[i] + settings.H, 0.0
+        length = lasting(given, steps[i], memory.observed[row], settings.age_max)
         for axis in range(len(settings.rule)):
             for stage in range(length):
                 memory.inputs[row, slot, axis, stage] = found.horizons[i, axis, stage]
@@ -433,4 +447,5 @@ def _remember(
             origin.p, origin.v = found.feedback[i, axis, 0], found.feedback[i, axis, 1]
             origin.w = found.feedback[i, axis, 2]
         sent = memory.sent[row, slot]
-        sent.step, sent.length, sent.speed = steps[i], length, np.sqrt(squares)
+        sent.step, sent.due = steps[i], steps[i] + found.ahead[i]
+        sent.length, sent.speed = length, np.sqrt(squares)

@@ -26,29 +26,30 @@ class Foresight(NamedTuple):
     start: F3
     """Estimate x̂(k+d), where planning starts [m, m/s]; shape (block, axes, 2)."""
     committed: F3
-    """Inputs of k … k+d-1, the first d of the last axis [m/s]; shape (block, axes, H)."""
+    """Inputs of k … k+d-1, the first d of the last axis [m/s]; shape (block, axes, most), with
+    the largest d there may be."""
     held: F3
     """Inputs from k+d on, if nothing more were sent [m/s]; shape (block, axes, H)."""
     disturbance: F2
     """Disturbance ŵ, an input that nobody gave [m/s]; shape (block, axes)."""
     horizons: S3
     """What may be sent, from k on: d committed inputs, then H planned ones [m/s]; shape
-    (block, axes, 2 H)."""
+    (block, axes, most + H)."""
     feedback: S3
     """What goes with a horizon, see `shared.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
 
 
-def foresight(block: int, axes: int, H: int) -> Foresight:
-    """Room for a block of vehicles."""
-    states, inputs = (block, axes, 2), (block, axes, H)
+def foresight(block: int, axes: int, H: int, most: int) -> Foresight:
+    """Room for a block of vehicles, whose delay bounds are at most `most`."""
+    states = (block, axes, 2)
     return Foresight(
         estimate=np.zeros(states),
         ahead=np.zeros(block, dtype=np.int64),
         start=np.zeros(states),
-        committed=np.zeros(inputs),
-        held=np.zeros(inputs),
+        committed=np.zeros((block, axes, most)),
+        held=np.zeros((block, axes, H)),
         disturbance=np.zeros((block, axes)),
-        horizons=np.zeros((block, axes, 2 * H), dtype=np.float32),
+        horizons=np.zeros((block, axes, most + H), dtype=np.float32),
         feedback=np.zeros((block, axes, FEEDBACK), dtype=np.float32),
     )
 
@@ -61,14 +62,14 @@ def in_a_row(found: Foresight, sent: Indices) -> memoryview:
     """
     _, axes, most = found.horizons.shape
     packed = np.empty(len(sent) * axes * most, dtype=np.float32)
-    _pack(found.horizons, found.ahead, sent, packed)
+    _pack(found.horizons, found.ahead, sent, found.held.shape[2], packed)
     return packed.data.cast("B")
 
 
 @kernel
-def _pack(horizons: S3, ahead: I1, sent: I1, packed: S1) -> None:
+def _pack(horizons: S3, ahead: I1, sent: I1, H: int, packed: S1) -> None:
     """Fill in `in_a_row` as numbers; shape of `packed`: as many as there can be."""
-    at, H = 0, horizons.shape[2] // 2
+    at = 0
     for i in sent:
         for axis in range(horizons.shape[1]):
             for stage in range(ahead[i] + H):

@@ -115,9 +115,12 @@ class Periodic:
 
 
 def silence(control: ControlConfig, capacity: int, seconds: float) -> Periodic:
-    """No silence is longer than so many seconds, or a step where that is longer."""
+    """No silence is longer than so many seconds or half a horizon, or a step where that is longer.
+
+    A horizon of which half is left is replaced in time even if the first that follows is lost.
+    """
     steps = int(seconds / control.dt + 1e-9)  # as much as floating point may take from 0.35 / 0.05
-    return Periodic(control, capacity, steps)
+    return Periodic(control, capacity, min(steps, control.horizon // 2))
 
 
 class Budget:

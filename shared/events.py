@@ -149,6 +149,57 @@ class ServerRestarted(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: the server has restarted"
 
 
+class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
+    """The server makes no plan for a vehicle that it hears, or sends none."""
+
+    why: str
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} is sent no plan: {self.why}"
+
+
+class PlanningResumed(VehicleEvent, frozen=True, kw_only=True):
+    """The server plans for a vehicle again."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} is planned for again"
+
+
+class PlanEnded(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle in flight has come to the end of its newest horizon."""
+
+    brakes: bool
+    """Whether it brakes and hovers, or else holds the last input."""
+    why: str
+    """Reason for there being no newer one, as far as the vehicle knows."""
+
+    def __str__(self) -> str:
+        does = "brakes and hovers" if self.brakes else "holds its last input"
+        return f"vehicle {self.vehicle} {does}, its plan has ended: {self.why}"
+
+
+class PlanResumed(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle whose plan had ended flies another."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} flies a plan again"
+
+
+class NotFlown(VehicleEvent, frozen=True, kw_only=True):
+    """The time of a flight is over, and the vehicle has had no plan for long, or never had one."""
+
+    covered: int
+    """Number of steps for which it had an input planned."""
+    steps: int
+    """Number of all steps."""
+    why: str
+    """Reason for there being none, as far as the vehicle knows."""
+
+    def __str__(self) -> str:
+        flown = f"ended without a plan, after {self.covered} of {self.steps} steps with one"
+        return f"vehicle {self.vehicle} {flown if self.covered else 'was never flown'}: {self.why}"
+
+
 class Finished(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle has begun the last step of its flight."""
 
@@ -163,8 +214,8 @@ class Finished(VehicleEvent, frozen=True, kw_only=True):
         )
 
 
-Failure = SessionRefused | NoAnswer
-"""Events after which a vehicle cannot fly."""
+Failure = SessionRefused | NoAnswer | NotFlown
+"""Events after which a vehicle cannot fly, or has not."""
 
 Event = (
     Listening
@@ -179,5 +230,10 @@ Event = (
     | ServerSilent
     | ServerHeard
     | ServerRestarted
+    | PlanningStopped
+    | PlanningResumed
+    | PlanEnded
+    | PlanResumed
+    | NotFlown
     | Finished
 )

@@ -9,7 +9,7 @@
 | 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
 |      |             |         | received_ns, state                                         |
 | 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback    |
-| 5    | HEARTBEAT   | server  | session, server_ns                                         |
+| 5    | HEARTBEAT   | server  | session, server_ns, idle                                   |
 
 `docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
 Those that control uses are the client's; `server_ns` is the server's own, which the client only
@@ -19,6 +19,7 @@ mistake, to be dropped and counted by its reason, never answered.
 
 import math
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import msgpack
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from shared.terms import Terms
 
-VERSION = 2
+VERSION = 3
 PAYLOAD_BYTES_MAX = 1200
 """So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
 
@@ -108,11 +109,35 @@ class Horizon(NamedTuple):
     observed_ns: int
     """Stamp of the observation it was computed from, echoed [client clock]."""
     inputs: NDArray[np.float32]
-    """Desired velocity [m/s]; shape (axes, d + H), with d, 0 … H, committed ones first."""
+    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """The position [m] and velocity [m/s] at `step` that they lead on from, the disturbance that
     was reckoned with [m/s], and the gains on what the position [1/s] and the velocity are away from
     that; shape (axes, FEEDBACK), or (axes, 0) where the inputs are to be flown as they are."""
+
+
+class Idle(IntEnum):
+    """Why the server makes no plan for a vehicle."""
+
+    PLANS = 0
+    """It makes them, and has sent what is worth sending."""
+    OBSERVATION = 1
+    """The newest observation is older than `link.age_max_s`, or would be before a plan began."""
+    DELAY = 2
+    """The delay to the vehicle is longer than a horizon has room for."""
+    UNSOLVED = 3
+    """The solver has found no plan."""
+
+    def __str__(self) -> str:
+        return IDLE_TEXTS[self]
+
+
+IDLE_TEXTS = {
+    Idle.PLANS: "no newer horizon has come",
+    Idle.OBSERVATION: "what is known of it at the server is older than link.age_max_s",
+    Idle.DELAY: "the delay to it is longer than a horizon has room for",
+    Idle.UNSOLVED: "the solver has found none",
+}
 
 
 class Heartbeat(NamedTuple):
@@ -121,6 +146,8 @@ class Heartbeat(NamedTuple):
     vehicle: int
     session: int
     server_ns: int
+    idle: int
+    """Why no plan is made for the vehicle, one of `Idle`."""
 
 
 Message = Hello | Welcome | Observation | Horizon | Heartbeat
@@ -172,7 +199,8 @@ def _state(value: object, ours: Terms) -> NDArray[np.float64]:
 
 
 def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
-    inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, 2 * ours.horizon))
+    most = ours.horizon + committed_max(ours)
+    inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, most))
     largest = np.abs(inputs).max(axis=1).tolist()  # NaN where there is one
     if not all(map(math.isfinite, largest)):
         raise ProtocolError("not finite")
@@ -189,6 +217,11 @@ def _feedback(value: object, ours: Terms) -> NDArray[np.float32]:
     if not all(map(math.isfinite, feedback.ravel().tolist())):
         raise ProtocolError("not finite")
     return feedback
+
+
+def committed_max(terms: Terms) -> int:
+    """Most committed steps that a horizon has room for beside those that are planned."""
+    return min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max)
 
 
 def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
@@ -215,7 +248,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Welcome, (_U16, _U32, _U64, _U64, _STAMP, _terms)),
     (Observation, (_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP, _state)),
     (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback)),
-    (Heartbeat, (_U16, _U32, _STAMP)),
+    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)))),
 )
 """Message of each type number (from 1) and the check of each of its fields."""
 

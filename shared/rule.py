@@ -2,12 +2,14 @@
 
     u*(k) = u(min(k, k_h + n - 1) | k_h)                    k_h: the step the horizon was made for
                                                             n: the inputs it has
+                                                            k - k_h: the stage it is at
 With feedback aboard the vehicle is led back to where the horizon leads, x̄:
 
     u*(k) = u(k | k_h) + K (x̄(k) - x(k)),     x̄(i+1) = A x̄(i) + B (u(i | k_h) + ŵ)
 
-After its last input a horizon is held for ever, or braked along. Without compensation its first
-input is flown, whatever the step.
+No input is flown for longer than `link.age_max_s` after the observation that it was planned from:
+a horizon that reaches further ends there. After its last input it is held for ever, or braked
+along. Without compensation all of its inputs until then are its first.
 
 This is the one source of that rule. The client flies by it, number by number; the server's replay
 compiles the very same functions into its kernels, and so knows what was flown. Each works on one
@@ -15,15 +17,25 @@ spatial axis; `speed` alone belongs to all of them.
 """
 
 
-def stage_at(step: int, made_for: int, indexed: bool) -> int:
-    """Stage of a horizon that belongs to a step: 0 for its first input, negative before that.
+def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
+    """Number of a horizon's inputs that are flown; none where it is less than 1.
 
     Args:
-        step: k, on the vehicle's grid.
-        made_for: k_h.
-        indexed: whether delays are compensated; otherwise every step is the first.
+        length: number of inputs that it has.
+        made_for: k_h, the step of the first.
+        observed: step of the observation that they were planned from.
+        age_max: largest age of that observation [steps].
     """
-    return step - made_for if indexed else 0
+    return min(length, observed + age_max - made_for + 1)
+
+
+def late_max(horizon: int) -> int:
+    """Number of steps after its committed ones at which a horizon may still come into force.
+
+    By then the vehicle has flown other inputs than its plan begins with; a few are made good with
+    the next plan, many would make the server's estimate and its plans swing.
+    """
+    return max(2, horizon // 4)
 
 
 def entry(stage: int, length: int) -> int:

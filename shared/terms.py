@@ -35,6 +35,8 @@ class Terms(NamedTuple):
     """How fast braking takes the desired velocity to zero [m/s²]."""
     heartbeat_s: float
     """Longest silence of the server [s]."""
+    age_max_s: float
+    """Largest age of the observation behind an input [s]."""
     shape: str
     """Shape of the desired trajectory."""
     radius_m: float
@@ -78,6 +80,11 @@ class Terms(NamedTuple):
         return self.scheme == "feedback"
 
     @property
+    def age_max(self) -> int:
+        """Largest age of the observation behind an input [steps]."""
+        return int(self.age_max_s * SECOND_NS) // self.dt_ns
+
+    @property
     def brake(self) -> float:
         """Speed that braking takes away in a step [m/s]; 0 where the last input is held."""
         return self.brake_mps2 * self.dt_s if self.exhausted == "brake" else 0.0
@@ -102,6 +109,7 @@ KEYS: Mapping[str, str] = MappingProxyType(
         "exhausted": "vehicle.exhausted",
         "brake_mps2": "vehicle.brake_mps2",
         "heartbeat_s": "link.heartbeat_s",
+        "age_max_s": "link.age_max_s",
         "shape": "reference.shape",
         "radius_m": "reference.radius_m",
         "period_s": "reference.period_s",

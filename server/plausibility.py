@@ -1,0 +1,166 @@
+"""Which observations are believed: one may be well formed, in a session, and still be impossible.
+
+Each is held against the one of its vehicle that was believed last:
+
+    epoch     its stamp is the beginning of its step, on the vehicle's one grid
+    clock     with the delay of the other direction it makes no round trip of less than nothing
+    horizon   the horizon in force, and since when, go on with time and not beyond it
+    jump      position and velocity have changed by no more than a vehicle can fly
+
+One that fails is dropped and counted. It may be the others that are wrong: REPEATS in a row that
+agree with each other are believed, and the vehicle is begun with anew.
+"""
+
+from enum import IntEnum
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.endpoint import MILLISECOND_NS
+from shared.kernel import F4, kernel, part, record, records
+from shared.protocol import Observation
+from shared.terms import Terms
+
+REPEATS = 3
+"""Observations in a row, each possible after the one before, that are believed in the end."""
+SLACK_NS = 50 * MILLISECOND_NS
+"""What clocks that drift may take from a round trip [ns]."""
+ACCELERATION_MPS2 = 50.0
+"""Acceleration that no vehicle exceeds [m/s²]."""
+JUMP_M, JUMP_MPS = 1.0, 2.0
+"""What noise may add to a change of position [m] and of velocity [m/s]."""
+
+SAID = record(
+    ("epoch", "i8"),
+    ("step", "i8"),
+    ("in_force", "i8"),
+    ("since", "i8"),
+    ("forward", "i8"),
+    ("backward", "i8"),
+    ("count", "i8"),
+)
+"""An observation: begin of step 0 [ns; vehicle's clock]; its step, or -1 where there is none; the
+horizon in force, and its first step; F and G of `server.clock` [ns]; and how many before it agree
+with it."""
+
+
+class Verdict(IntEnum):
+    """What becomes of an observation."""
+
+    ANEW = -1
+    """Believed, unlike all that was believed before."""
+    BELIEVED = 0
+    EPOCH = 1
+    CLOCK = 2
+    HORIZON = 3
+    JUMP = 4
+
+
+LAST, DOUBTED, NEW = 0, 1, 2
+"""Places of a vehicle's observations: believed last, doubted last, and to be judged."""
+
+
+class Said(NamedTuple):
+    """What vehicles have said."""
+
+    numbers: Annotated[NDArray[np.void], records(SAID, 2)]
+    """Observations at their three places; shape (3, capacity)."""
+    states: F4
+    """Their positions [m] and velocities [m/s]; shape (3, capacity, axes, 2)."""
+
+
+class Plausibility:
+    """Judge of the observations of up to `capacity` vehicles."""
+
+    def __init__(self, terms: Terms, capacity: int) -> None:
+        self._said = Said(
+            numbers=np.zeros((3, capacity), dtype=SAID),
+            states=np.zeros((3, capacity, terms.axes, 2)),
+        )
+        self._dt_s, self._H = terms.dt_s, terms.horizon
+        for row in range(capacity):
+            self.forget(row)
+
+    def forget(self, row: int) -> None:
+        """Begin anew with a vehicle, or with a new life of it."""
+        self._said.numbers["step"][:, row] = -1
+
+    def judge(self, row: int, observation: Observation, epoch: int, F: int, G: int) -> Verdict:
+        """What becomes of an observation of a vehicle.
+
+        Args:
+            row: the vehicle.
+            observation: what it says.
+            epoch: begin of step 0, by its stamp and its step [ns; vehicle's clock].
+            F, G: of the observation and its echo, see `server.clock` [ns].
+        """
+        _, _, step, _, in_force, since, _, _, state = observation
+        self._said.numbers[NEW, row] = (epoch, step, in_force, since, F, G, 0)
+        self._said.states[NEW, row] = state
+        return VERDICTS[_judge(self._said, row, self._H, self._dt_s)]
+
+
+VERDICTS = {int(verdict): verdict for verdict in Verdict}
+ANEW, BELIEVED, EPOCH, CLOCK, HORIZON, JUMP = map(int, Verdict)
+"""As kernels take them."""
+
+
+@part
+def _against(said: Said, row: int, which: int, H: int, dt: float) -> int:
+    """What speaks against the new observation after another; BELIEVED where nothing does."""
+    before, new = said.numbers[which, row], said.numbers[NEW, row]
+    verdict = BELIEVED
+    if new.in_force > new.since + H or new.since > new.step:
+        verdict = HORIZON
+    elif before.step >= 0:
+        trip = min(new.forward + before.backward, new.backward + before.forward)
+        if new.epoch != before.epoch:
+            verdict = EPOCH
+        elif min(trip, new.forward + new.backward) < -SLACK_NS:
+            verdict = CLOCK
+        elif new.step > before.step:  # an older one tells of the clocks alone
+            if new.in_force < before.in_force or new.since < before.since:
+                verdict = HORIZON
+            elif _jumps(said, row, which, (new.step - before.step) * dt):
+                verdict = JUMP
+    return verdict
+
+
+@part
+def _jumps(said: Said, row: int, which: int, time: float) -> bool:
+    """Whether no vehicle can come from the state of another observation to the new one's in time.
+
+    Args:
+        time: between the two [s].
+    """
+    jumps = False
+    for axis in range(said.states.shape[2]):
+        p, v = said.states[which, row, axis, 0], said.states[which, row, axis, 1]
+        after_p, after_v = said.states[NEW, row, axis, 0], said.states[NEW, row, axis, 1]
+        off = after_p - p - 0.5 * (v + after_v) * time
+        jumps |= abs(after_v - v) > JUMP_MPS + ACCELERATION_MPS2 * time
+        jumps |= abs(off) > JUMP_M + 0.5 * ACCELERATION_MPS2 * time * time
+    return jumps
+
+
+@kernel
+def _judge(said: Said, row: int, H: int, dt: float) -> int:
+    """The verdict on the new observation of a vehicle, which takes its place among the others."""
+    numbers, place = said.numbers, LAST
+    verdict = _against(said, row, LAST, H, dt)
+    if verdict != BELIEVED:
+        place = DOUBTED
+        agrees = numbers[DOUBTED, row].step >= 0 and (
+            _against(said, row, DOUBTED, H, dt) == BELIEVED
+        )
+        numbers[NEW, row].count = numbers[DOUBTED, row].count + 1 if agrees else 1
+        if numbers[NEW, row].count == REPEATS:
+            place, verdict = LAST, ANEW
+    if verdict == BELIEVED and numbers[NEW, row].step <= numbers[LAST, row].step:
+        return BELIEVED
+    if place == LAST:
+        numbers[DOUBTED, row].step = -1
+    numbers[place, row] = numbers[NEW, row]
+    said.states[place, row] = said.states[NEW, row]
+    return verdict
