@@ -15,7 +15,15 @@ from server.scheme import foresight
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
 from shared.model import Array, Indices, discretise
-from shared.protocol import NO_HORIZON, Hello, Observation, Welcome, decode, encode
+from shared.protocol import (
+    NO_HORIZON,
+    Hello,
+    Observation,
+    Welcome,
+    committed_max,
+    decode,
+    encode,
+)
 from shared.stopwatch import Stopwatch
 
 NOISE = np.array([0.001, 0.01])
@@ -65,7 +73,7 @@ class PlannedFleet:
     def __init__(self, scenario: Scenario, count: int) -> None:
         terms = scenario.terms()
         self._planner = Planner(scenario, terms, count, BLOCK, Stopwatch())
-        self._found = foresight(BLOCK, terms.axes, terms.horizon)
+        self._found = foresight(BLOCK, terms.axes, terms.horizon, committed_max(terms))
         self._vehicles = Vehicles(scenario, count)
         self._blocks = [
             np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)
