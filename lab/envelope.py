@@ -48,8 +48,8 @@ NEAR_M = 1.0
 """Distance from the reference within which a vehicle flies it [m]."""
 SIGMAS = 6.0
 """Number of standard deviations of white wind that are no fault of the vehicle."""
-COMMAND_TOLERANCE_MPS = 1e-6
-"""Rounding of a command [m/s]."""
+ROUNDING = 1e-6
+"""Rounding of a distance [m] or of a speed [m/s]."""
 
 Outcome = Literal[
     "flown", "interrupted", "hovering", "unanswered", "refused", "astray", "flyaway", "crashed"
@@ -207,9 +207,11 @@ def settling_s(scenario: Scenario) -> float:
 
 
 def disc(scenario: Scenario) -> tuple[Array, float]:
-    """Centre [m; shape (axes,)] and radius [m] of a disc, or ball, around the whole reference."""
+    """Centre [m; shape (axes,)] and radius [m] of a disc, or ball, around reference and start."""
     times_s = np.arange(scenario.steps) * scenario.control.dt
     points = scenario.make_reference()(times_s)[..., 0]
+    if scenario.vehicle.start_m:
+        points = np.vstack([points, scenario.vehicle.start_m])
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
@@ -256,7 +258,9 @@ def _faults(
     speed, command = np.linalg.norm(velocity, axis=1), np.linalg.norm(client["input"], axis=1)
     begun = _begun(covered)
     since_s = time_s - time_s[begun]
-    pushed_m, pushed_mps = _wind(scenario, since_s)
+    age_s = client["age_ns"] / SECOND_NS
+    # Nobody answers the wind before it has been seen.
+    pushed_m, pushed_mps = _wind(scenario, np.where(covered, np.maximum(0.0, age_s), since_s))
     # A command flown before is still on its way for as long as the dead time.
     on_its_way = np.where(vehicle.dead_time_s > 0.0, top_mps, command[begun])
     stopping_s = on_its_way / brake + dt + vehicle.dead_time_s
@@ -272,37 +276,37 @@ def _faults(
     curve_mps = speed[begun] * left(since_s)
     curve_mps += vehicle.gain * on_its_way * left(since_s - stopping_s)
     # Time under plans that the vehicle was last seen at by whoever made the plan it flies.
-    seen_s = np.where(client["age_ns"] >= 0, since_s - client["age_ns"] / SECOND_NS, -1.0)
+    seen_s = np.where(age_s >= 0.0, since_s - age_s, -1.0)
     rules: tuple[tuple[str, Flags, Array, Any], ...] = (
         (
-            "it is commanded {:.2f} m/s without a plan, where braking leaves {:.2f} m/s",
+            "it is commanded {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",
             ~covered,
             command,
-            np.maximum(0.0, command[begun] - brake * since_s) + COMMAND_TOLERANCE_MPS,
+            np.maximum(0.0, command[begun] - brake * since_s),
         ),
         (
-            "it went {:.2f} m without a plan, where braking takes {:.2f} m",
+            "it went {:.3g} m without a plan, where braking takes {:.3g} m",
             ~covered,
             travelled_m,
-            stop_m(speed[begun], on_its_way) + pushed_m + COMMAND_TOLERANCE_MPS,
+            stop_m(speed[begun], on_its_way) + pushed_m,
         ),
         (
-            "it has {:.2f} m/s without a plan, where braking leaves {:.2f} m/s",
+            "it has {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",
             ~covered,
             speed,
-            curve_mps + pushed_mps + COMMAND_TOLERANCE_MPS,
+            curve_mps + pushed_mps,
         ),
         (
-            "it is {:.2f} m outside the reference's disc, where stopping may take {:.2f} m",
+            "it is {:.3g} m outside the reference's disc, where stopping may take {:.3g} m",
             np.ones_like(covered),
             outside_m,
-            NEAR_M + stop_m(top_mps * max(1.0, vehicle.gain), top_mps) + pushed_m * ~covered,
+            NEAR_M + stop_m(top_mps * max(1.0, vehicle.gain), top_mps) + pushed_m,
         ),
         (
-            "it is {:.2f} m from the reference, which {:.2f} m would hold if it stood still",
+            "it is {:.3g} m from the reference, which {:.3g} m would hold if it stood still",
             covered & (seen_s >= settling_s(scenario)),
             error_m,
-            np.broadcast_to(NEAR_M + radius_m, error_m.shape),
+            NEAR_M + radius_m + pushed_m,
         ),
     )
     lost = ~np.isfinite(client["state"]).all(axis=(1, 2))
@@ -310,7 +314,7 @@ def _faults(
         step = int(lost.argmax())
         yield step, f"at {time_s[step]:.2f} s its state is no number"
     for says, rows, given, most in rules:
-        broken = rows & (given > most)
+        broken = rows & (given > most + ROUNDING)
         if broken.any():
             step = int(broken.argmax())
             yield step, f"at {time_s[step]:.2f} s {says.format(given[step], most[step])}"
@@ -323,9 +327,13 @@ def _begun(covered: Flags) -> Any:
     return np.maximum.accumulate(np.where(changed, rows, 0))
 
 
-def _wind(scenario: Scenario, since_s: Array) -> tuple[Array, float]:
-    """How far [m], and at what speed [m/s], wind may carry a vehicle that is not flown."""
+def _wind(scenario: Scenario, blind_s: Array) -> tuple[Array, float]:
+    """How far [m], and at what speed [m/s], wind may carry a vehicle that nobody leads back.
+
+    Args:
+        blind_s: for how long nobody does [s]; shape (steps,).
+    """
     vehicle, tau_s = scenario.vehicle, float(scenario.true_tau_s.max())
     blown_mps = float(np.linalg.norm(vehicle.steady_wind_mps)) + tau_s * vehicle.gust_mps2
     white = SIGMAS * vehicle.wind * tau_s
-    return blown_mps * since_s + white * np.sqrt(since_s), blown_mps + white / math.sqrt(tau_s)
+    return blown_mps * blind_s + white * np.sqrt(blind_s), blown_mps + white / math.sqrt(tau_s)

@@ -208,9 +208,9 @@ UNPLANNED = until(400)
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        (along(held, UNPLANNED), "at 20.05 s it is commanded 0.30 m/s without a plan, where"),
+        (along(held, UNPLANNED), "at 20.05 s it is commanded 0.3 m/s without a plan, where"),
         (along(slack, UNPLANNED), "at 20.05 s it is commanded 1.55 m/s without a plan, where"),
-        (along(restarted, UNPLANNED), "at 21.00 s it is commanded 1.60 m/s without a plan, where"),
+        (along(restarted, UNPLANNED), "at 21.00 s it is commanded 1.6 m/s without a plan, where"),
     ],
     ids=["held", "too slow", "begun anew"],
 )
@@ -224,8 +224,8 @@ def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, s
 @pytest.mark.parametrize(
     ("moves_mps", "has_mps", "said"),
     [
-        (0.5, 0.0, "m without a plan, where braking takes 0.31 m"),
-        (0.0, 0.5, "at 20.05 s it has 0.50 m/s without a plan, where braking leaves 0.47 m/s"),
+        (0.5, 0.0, "m without a plan, where braking takes 0.311 m"),
+        (0.0, 0.5, "at 20.05 s it has 0.5 m/s without a plan, where braking leaves 0.471 m/s"),
     ],
 )
 def test_a_vehicle_that_moves_though_its_command_is_none_is_a_flyaway(
@@ -262,7 +262,7 @@ def test_a_growing_swing_under_plans_is_a_flyaway() -> None:
     state = np.array([swinging(step) for step in range(STEPS)])
     verdict = judge(SCENARIO, record(state, PATH[..., 1], YES))
     assert verdict.outcome == "flyaway"
-    assert "m from the reference, which 3.00 m would hold if it stood still" in verdict.line
+    assert "m from the reference, which 3 m would hold if it stood still" in verdict.line
     # The same seen never, because no observation came through, is bad luck and no loop.
     blind = judge(SCENARIO, record(state, PATH[..., 1], YES, age_s=60.0))
     assert blind.outcome == "astray"
