@@ -17,6 +17,7 @@ reorders and loses their packets.
   fly [SCENARIO]        one flight, with everything it needs; the command to start with
   fleet [SCENARIO]      many vehicles on one server, and what each costs it
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
+  envelope [SCENARIO]   the networks and settings that a scenario bears, by random flights
   reproduce             the paper's table and figures, and more, as a report
   compare               schemes and triggers on the same seeds, each at its best weights
   calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
@@ -42,6 +43,7 @@ COMMANDS = {
     "fly": "skytether.fly:fly",
     "fleet": "skytether.fleet:fleet",
     "sweep": "skytether.sweep:sweep",
+    "envelope": "skytether.envelope:envelope",
     "reproduce": "skytether.reproduce:reproduce",
     "compare": "skytether.compare:compare",
     "calibrate": "skytether.calibrate:calibrate",

@@ -40,13 +40,17 @@ def skytether(line: str) -> list[str]:
     [
         line
         for line in dict.fromkeys(COMMANDS)
-        if line.startswith(("skytether fl", "skytether sc", "skytether sw", "skytether ca"))
+        if line.startswith(
+            ("skytether fl", "skytether sc", "skytether sw", "skytether ca", "skytether en")
+        )
     ],
 )
 def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
     """As written; over UDP a tenth as long and as many, and sweeps with few and short flights."""
     if "sweep" in line:
         line += " --settle 0 --duration 1 --runs 2"
+    if "envelope" in line:
+        line += " --settle 0 --duration 1 --points 3"
     if "calibrate" in line:
         line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
     if "--duration 20" in line:
@@ -91,7 +95,7 @@ def test_documented_targets_exist(line: str) -> None:
 def test_every_documented_command_is_tested() -> None:
     """Here, or by make docker-test."""
     known = ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
-    known += ("skytether scenarios", "skytether calibrate ")
+    known += ("skytether scenarios", "skytether calibrate ", "skytether envelope ")
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py
     known += ("docker compose up",)

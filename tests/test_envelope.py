@@ -1,0 +1,428 @@
+"""The envelope of a scenario: which points are drawn, how they are judged, and what is said."""
+
+import csv
+import re
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from client.plant import FirstOrderPlant
+from lab.envelope import Envelope, Point, Verdict, disc, draw, judge, settling_s, worst_first
+from lab.journal import Journal
+from lab.keys import lay
+from shared import config
+from shared.chance import stream
+from shared.config import Scenario
+from shared.model import Array, Flags
+from shared.record import Rows, client_columns
+from shell import command
+from sim import flight
+from skytether import fly
+from skytether.__main__ import main
+
+DEMO = Envelope("demo", config.load("demo"))
+
+
+def changed(**keys: Any) -> Scenario:
+    """The demo with some keys changed."""
+    table = config.to_table(config.load("demo"))
+    lay({key.replace("__", "."): value for key, value in keys.items()}, table)
+    return config.check(table, "test")
+
+
+# -- the points ----------------------------------------------------------------------------------
+
+
+def test_points_lie_within_their_bounds_and_fill_them() -> None:
+    """Delays to 3 s, losses to 0.99 and half of the points to 0.5, Δt and H by logarithms."""
+    points = [draw(1, number) for number in range(2000)]
+    column = {key: np.array([point[key] for point in points]) for key in points[0]}
+    for direction in ("uplink", "downlink"):
+        delays = column[f"network.{direction}.minimum_s"]
+        assert 0.0 <= delays.min() < 0.01
+        assert 2.99 < delays.max() <= 3.0
+        assert {*column[f"network.{direction}.delay"]} == {"constant", "poisson"}
+    up, down = (column[f"network.{direction}.loss"] for direction in ("uplink", "downlink"))
+    assert 0.97 < max(up.max(), down.max()) <= 0.99
+    assert np.mean(np.maximum(up, down) <= 0.5) == pytest.approx(
+        0.5 + 0.5 * 0.5**2 * 1.02, abs=0.04
+    )
+    assert 0.005 <= column["control.dt"].min() < 0.0052
+    assert 0.48 < column["control.dt"].max() <= 0.5
+    assert np.median(column["control.dt"]) == pytest.approx(0.05, rel=0.15)
+    assert (column["control.horizon"].min(), column["control.horizon"].max()) == (1, 120)
+    assert {*column["control.scheme"]} == {"committed", "feedback"}
+    assert len({*column["seed"]}) == 2000
+    delays = [column[f"network.{direction}.minimum_s"] for direction in ("uplink", "downlink")]
+    assert abs(np.corrcoef(delays)[0, 1]) < 0.1
+
+
+def test_a_point_is_the_same_whatever_else_is_flown() -> None:
+    """It follows from seed and number; another seed has other points."""
+    assert draw(1, 5) == draw(1, 5)
+    assert draw(1, 5) != draw(2, 5)
+    scenario = DEMO.scenario_of(1)
+    assert config.to_table(scenario)["control"]["horizon"] == draw(1, 1)["control.horizon"]
+    assert scenario.network.uplink.minimum_s == draw(1, 1)["network.uplink.minimum_s"]
+    assert scenario.reference == DEMO.scenario.reference
+
+
+def test_the_command_line_of_a_point_flies_that_point() -> None:
+    """All its keys, and those that the user has changed; what is the scenario's own is left out."""
+    plan = Envelope("demo", changed(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2]))
+    line = plan.command(1).split()
+    assert line[:4] == ["skytether", "fly", "demo", "--virtual"]
+    options = command.parse(fly.Options(), line[2:], "skytether fly", "")
+    assert options.config == plan.scenario_of(1)
+    assert "--reference.radius-m" not in line
+
+
+# -- the verdict, on flights by hand -------------------------------------------------------------
+
+SCENARIO = changed(
+    duration=40.0, control__dt=0.05, vehicle__wind=0.0, network__uplink__loss=0.0, seed=1
+)
+DT, STEPS = 0.05, SCENARIO.steps
+TIME_S = np.arange(STEPS) * DT
+PATH = SCENARIO.make_reference()(TIME_S)
+BRAKE = SCENARIO.vehicle.brake_mps2
+YES, NO = np.ones(STEPS, np.bool_), np.zeros(STEPS, np.bool_)
+
+
+def record(state: Array, inputs: Array, covered: Flags, age_s: float = 1.0) -> Rows:
+    """The record of a client that saw these states, flew these inputs, and had plans or none."""
+    rows = np.zeros(len(state), client_columns(2))
+    rows["step"], rows["state"], rows["input"] = np.arange(len(state)), state, inputs
+    rows["covered"], rows["age_ns"] = covered, np.where(covered, round(age_s * 1e9), -1)
+    return rows
+
+
+def along(command: Callable[[int, Array], Any], covered: Flags = YES) -> Rows:
+    """The record of a vehicle that flies a command of step and state, without wind."""
+    plant = FirstOrderPlant(SCENARIO, stream(1, "test"))
+    states, inputs = [], []
+    for step in range(STEPS):
+        states.append(plant.state())
+        inputs.append(np.asarray(command(step, states[-1]), dtype=np.float64))
+        plant.advance(inputs[-1])
+    return record(np.array(states), np.array(inputs), covered)
+
+
+def chase(step: int, state: Array) -> Array:
+    """A command that brings the vehicle to the reference, within its bounds."""
+    wanted = PATH[step, :, 1] + 2.0 * (PATH[step, :, 0] - state[:, 0])
+    return np.clip(wanted, -1.6, 1.6)
+
+
+def ramp(speed_mps: float, since_s: float, brake: float = BRAKE) -> Array:
+    """A command along x that brakes."""
+    return np.array([max(0.0, speed_mps - brake * since_s), 0.0])
+
+
+def until(*ends: int) -> Flags:
+    """Whether there is a plan: first yes, then by turns from these steps on."""
+    return np.array([sum(step >= end for end in ends) % 2 == 0 for step in range(STEPS)])
+
+
+def test_a_flight_near_the_reference_is_flown() -> None:
+    """Its largest error is that after settling, when it started a metre and a half away."""
+    rows = record(PATH, PATH[..., 1], YES)
+    assert judge(SCENARIO, rows) == Verdict("flown", 0.0, 1.0, pytest.approx(0.0))
+    late = rows.copy()
+    late["state"][settling_s(SCENARIO) - 1.0 > TIME_S, 0, 0] += 1.5
+    assert judge(SCENARIO, late).outcome == "flown"
+    assert judge(SCENARIO, late).error_max == 0.0
+
+
+def test_what_never_got_a_plan_and_stood_still_is_hovering() -> None:
+    """Nothing is settled, and nothing is wrong."""
+    verdict = judge(SCENARIO, along(lambda *_: [0.0, 0.0], NO))
+    assert verdict == Verdict("hovering", None, 0.0, 0.0)
+
+
+def test_a_flight_that_brakes_along_the_curve_is_hovering() -> None:
+    """Planned for 20 s, then from 1.6 m/s to rest."""
+    covered = until(400)
+
+    def command(step: int, state: Array) -> Array:
+        return chase(step, state) if step < 400 else ramp(1.6, (step - 399) * DT)
+
+    verdict = judge(SCENARIO, along(command, covered))
+    assert (verdict.outcome, verdict.covered, verdict.line) == ("hovering", 0.5, "")
+    assert verdict.error_max is not None
+    assert verdict.error_max > 1.0
+
+
+def test_a_flight_with_plans_again_at_its_end_is_interrupted() -> None:
+    """Braked from 10 s to 25 s, it comes back."""
+
+    def command(step: int, state: Array) -> Array:
+        return ramp(1.0, (step - 199) * DT) if 200 <= step < 500 else chase(step, state)
+
+    assert judge(SCENARIO, along(command, until(200, 500))).outcome == "interrupted"
+
+
+def test_a_flight_whose_plans_came_too_late_to_settle_is_interrupted() -> None:
+    """Five seconds before the end, with nothing to be judged by."""
+    rows = along(lambda step, state: chase(step, state) if step >= 700 else [0.0, 0.0], ~until(700))
+    verdict = judge(SCENARIO, rows)
+    assert (verdict.outcome, verdict.error_max, verdict.covered) == ("interrupted", None, 0.125)
+
+
+def test_a_flight_beside_the_reference_is_astray() -> None:
+    """Always planned, always a metre and a half off."""
+    rows = record(PATH, PATH[..., 1], YES)
+    rows["state"][:, 1, 0] += 1.5
+    verdict = judge(SCENARIO, rows)
+    assert (verdict.outcome, verdict.error_max) == ("astray", pytest.approx(1.5))
+
+
+def test_a_flight_without_a_step_is_unanswered() -> None:
+    """No session, no record."""
+    assert judge(SCENARIO, np.zeros(0, client_columns(2))) == Verdict("unanswered")
+
+
+def held(step: int, state: Array) -> Array:
+    """A command that is held from 20 s on, though there is no plan."""
+    return chase(step, state) if step < 400 else np.array([0.3, 0.0])
+
+
+def slack(step: int, state: Array) -> Array:
+    """A command that falls at half the rate."""
+    return chase(step, state) if step < 400 else ramp(1.6, (step - 400) * DT, 0.5 * BRAKE)
+
+
+def restarted(step: int, state: Array) -> Array:
+    """A command that brakes, and begins anew each second, with a plan that has run out."""
+    return chase(step, state) if step < 400 else ramp(1.6, step * DT % 1.0)
+
+
+UNPLANNED = until(400)
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (along(held, UNPLANNED), "at 20.05 s it is commanded 0.3 m/s without a plan, where"),
+        (along(slack, UNPLANNED), "at 20.05 s it is commanded 1.55 m/s without a plan, where"),
+        (along(restarted, UNPLANNED), "at 21.00 s it is commanded 1.6 m/s without a plan, where"),
+    ],
+    ids=["held", "too slow", "begun anew"],
+)
+def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, said: str) -> None:
+    """However near it still is."""
+    verdict = judge(SCENARIO, rows)
+    assert verdict.outcome == "flyaway"
+    assert verdict.line.startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("moves_mps", "has_mps", "said"),
+    [
+        (0.5, 0.0, "m without a plan, where braking takes 0.311 m"),
+        (0.0, 0.5, "at 20.05 s it has 0.5 m/s without a plan, where braking leaves 0.471 m/s"),
+    ],
+)
+def test_a_vehicle_that_moves_though_its_command_is_none_is_a_flyaway(
+    moves_mps: float, has_mps: float, said: str
+) -> None:
+    """By where it is, or by the speed that it has."""
+    state = PATH.copy()
+    state[400:, :, 0] = PATH[400, :, 0] + moves_mps * (TIME_S[400:, None] - 20.0) * [1.0, 0.0]
+    state[400:, :, 1] = [has_mps, 0.0]
+    state[400, :, 1] = [0.5 if has_mps else 0.37, 0.0]
+    verdict = judge(SCENARIO, record(state, PATH[..., 1] * UNPLANNED[:, None], UNPLANNED))
+    assert verdict.outcome == "flyaway"
+    assert said in verdict.line
+
+
+def test_a_vehicle_that_plans_lead_away_is_a_flyaway() -> None:
+    """Out of the disc, 1 m and the way to stop from full speed; it has a radius of two metres."""
+    centre, radius_m = disc(SCENARIO)
+    assert centre == pytest.approx([0.0, 0.0], abs=1e-3)
+    assert radius_m == pytest.approx(2.0, abs=1e-3)
+    verdict = judge(SCENARIO, along(lambda *_: [1.0, 0.0]))
+    assert verdict.outcome == "flyaway"
+    assert "m outside the reference's disc, where stopping may take 4.29 m" in verdict.line
+
+
+def swinging(step: int) -> Array:
+    """A state that swings about the reference, wider and wider."""
+    swing = np.array([0.1 * TIME_S[step] * np.sin(TIME_S[step]), 0.0])
+    return PATH[step] + np.stack([swing, 0.0 * swing], -1)
+
+
+def test_a_growing_swing_under_plans_is_a_flyaway() -> None:
+    """Further from the reference than if it stood still in the middle, and plans have seen it."""
+    state = np.array([swinging(step) for step in range(STEPS)])
+    verdict = judge(SCENARIO, record(state, PATH[..., 1], YES))
+    assert verdict.outcome == "flyaway"
+    assert "m from the reference, which 3 m would hold if it stood still" in verdict.line
+    # The same seen never, because no observation came through, is bad luck and no loop.
+    blind = judge(SCENARIO, record(state, PATH[..., 1], YES, age_s=60.0))
+    assert blind.outcome == "astray"
+
+
+def test_a_state_that_is_no_number_is_a_flyaway() -> None:
+    """A comparison with it would be false."""
+    rows = record(PATH, PATH[..., 1], YES)
+    rows["state"][-1, 0, 0] = np.nan
+    assert judge(SCENARIO, rows).line == "at 39.95 s its state is no number"
+
+
+def test_wind_may_carry_a_vehicle_that_brakes() -> None:
+    """As far as it blows, and no further."""
+    windy = changed(duration=40.0, vehicle__steady_wind_mps=[0.1, 0.0], vehicle__wind=0.0)
+    state = np.zeros((STEPS, 2, 2))
+    state[:, 0, 0], state[:, 0, 1] = 0.1 * TIME_S, 0.1
+    rows = record(state, np.zeros((STEPS, 2)), NO)
+    rows["state"][0, 0, 1] = 0.0
+    assert judge(windy, rows).outcome == "hovering"
+    assert judge(SCENARIO, rows).outcome == "flyaway"
+    rows["state"][:, 0, 0] *= 1.2
+    assert judge(windy, rows).outcome == "flyaway"
+
+
+# -- real flights --------------------------------------------------------------------------------
+
+
+def test_a_vehicle_that_does_not_brake_is_caught_and_one_that_does_is_not() -> None:
+    """Nine of ten horizons lost: they run out, and their last input is held, or braked."""
+
+    def outcome(exhausted: str) -> str:
+        keys = {"vehicle__exhausted": exhausted, "network__uplink__loss": 0.9}
+        scenario = changed(**keys, duration=40.0)
+        return judge(scenario, flight.fly(scenario).client).outcome
+
+    assert (outcome("hold"), outcome("brake")) == ("flyaway", "interrupted")
+
+
+UNGUARDED: dict[str, Any] = {}
+"""Keys that switch off what stops a vehicle whose plans are older than they can bear."""
+
+
+def test_a_round_trip_longer_than_plans_can_bear_is_caught_where_nothing_guards_it() -> None:
+    """Every horizon comes when it has run out, and begins the braking anew: tens of metres."""
+    table = config.to_table(config.load("demo"))
+    for direction, delay_s in (("uplink", 0.05), ("downlink", 1.5)):
+        network = f"network.{direction}"
+        lay({f"{network}.delay": "constant", f"{network}.minimum_s": delay_s}, table)
+    lay({"duration": 40.0, "control.dt": 0.02, "control.horizon": 20} | UNGUARDED, table)
+    scenario = msgspec.convert(table, Scenario)  # unchecked: a check may refuse it
+    verdict = judge(scenario, flight.fly(scenario).client)
+    assert verdict.outcome == "flyaway"
+    assert "without a plan, where braking leaves" in verdict.line
+    assert verdict.outside_m is not None
+    assert verdict.outside_m > 10.0
+
+
+def test_no_point_of_the_demo_flies_away() -> None:
+    """Sixty random points, each flown, hovering within the braking curve, or refused."""
+    points = [DEMO.fly(number) for number in range(60)]
+    assert [DEMO.command(point.number) for point in worst_first(points) if point.line] == []
+    outcomes = [point.outcome for point in points]
+    assert {"flown", "hovering", "refused"} <= {*outcomes}
+
+
+def test_a_refused_point_has_the_line_that_a_user_would_read() -> None:
+    """The scenario, the key, what was given and what was expected."""
+    point = DEMO.fly(0)
+    assert point.outcome == "refused"
+    assert point.line.startswith("demo: control.horizon: got 1, expected horizon · dt (now 0.005")
+
+
+def test_a_point_that_raises_has_crashed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the line of what was raised; the others are flown on."""
+
+    def fail(_: Scenario) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr(flight, "fly", fail)
+    assert DEMO.fly(1) == Point(1, "crashed", line="ZeroDivisionError: division by zero")
+
+
+def test_the_worst_come_first() -> None:
+    """Crashes, then who flew furthest, then who was furthest from the reference."""
+    points = [
+        Point(0, "astray", 1.2),
+        Point(1, "flyaway", None, 0.0, 3.0),
+        Point(2, "flown", 0.1),
+        Point(3, "flyaway", None, 0.0, 50.0),
+        Point(4, "crashed"),
+        Point(5, "astray", 2.2),
+    ]
+    assert [point.number for point in worst_first(points)] == [4, 3, 1, 5, 0]
+
+
+# -- the command ---------------------------------------------------------------------------------
+
+SHORT = ["envelope", "demo", "--duration", "4", "--settle", "0", "--workers", "1"]
+
+
+def test_more_points_go_on_where_fewer_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The table of all points is the same as in one go, and the picture is drawn."""
+    once, twice = tmp_path / "once", tmp_path / "twice"
+    main([*SHORT, "--points", "12", "--out", str(once)])
+    main([*SHORT, "--points", "5", "--out", str(twice)])
+    kept = (twice / "journal.jsonl").read_bytes()
+    assert len((twice / "points.csv").read_text().splitlines()) == 6
+    capsys.readouterr()
+    main([*SHORT, "--points", "12", "--out", str(twice)])
+    assert (twice / "journal.jsonl").read_bytes().startswith(kept)
+    assert (twice / "points.csv").read_bytes() == (once / "points.csv").read_bytes()
+    assert (twice / "envelope.png").read_bytes().startswith(b"\x89PNG")
+    rows = list(csv.DictReader((once / "points.csv").read_text().splitlines()))
+    assert [int(row["number"]) for row in rows] == list(range(12))
+    assert [float(row["control.dt"]) for row in rows] == [
+        draw(1, number)["control.dt"] for number in range(12)
+    ]
+    refused = sum(row["outcome"] == "refused" for row in rows)
+    assert re.search(rf"refused +│ +{refused} │", capsys.readouterr().out)
+
+
+def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which flies that point again; what went astray is told, too, and is no failure."""
+    plan = Envelope("demo", changed(duration=4.0, settle=0.0))
+    lost = Point(0, "flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
+    with closing(Journal(tmp_path, plan.settings(), Point)) as journal:
+        journal.append(Point(1, "astray", 1.25, 1.0, 0.0))
+        journal.append(lost)
+    assert main([*SHORT, "--points", "2", "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    assert f"flyaway: {lost.line}\n    {plan.command(0)}\nastray: 1.25 m from the" in said.out
+    assert said.err == "envelope: 1 of 2 points flew away or crashed\n"
+
+
+def test_another_seed_does_not_go_on_in_the_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its points are others."""
+    Journal(tmp_path, DEMO.settings(), Point).close()
+    assert main(["envelope", "demo", "--seed", "2", "--points", "1", "--out", str(tmp_path)]) == 2
+    said = f"envelope: {tmp_path}: seed: got 2, expected 1, to go on there; or another --out\n"
+    assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (["--points", "0"], "--points: got 0, expected 1 to 1000000"),
+        (["--workers", "0"], "--workers: got 0, expected 1 to 1024"),
+    ],
+)
+def test_an_impossible_envelope_is_refused(
+    argv: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line, before anything is written."""
+    assert main(["envelope", "demo", "--out", str(tmp_path / "out"), *argv]) == 2
+    assert capsys.readouterr().err == f"envelope: {line}\n"
+    assert not (tmp_path / "out").exists()
