@@ -25,7 +25,7 @@ from shared import policy
 from shared import reference as shapes
 from shared.endpoint import seconds_to_ns
 from shared.hint import hint
-from shared.protocol import INPUTS_MAX
+from shared.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 from shared.terms import Terms
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -173,6 +173,8 @@ class NetworkConfig(Section, frozen=True):
     """Direction from server to vehicle."""
     downlink: DirectionConfig = DirectionConfig()
     """Direction from vehicle to server."""
+    mtu: Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)] = 1472
+    """Longest UDP payload that passes [B]: 1472 fill an Ethernet frame."""
 
 
 class LinkConfig(Section, frozen=True):

@@ -141,7 +141,7 @@ _OWNERS = {
         network.uplink.delay network.uplink.minimum_s network.uplink.slot_s
         network.uplink.slots_mean network.uplink.loss network.downlink.delay
         network.downlink.minimum_s network.downlink.slot_s network.downlink.slots_mean
-        network.downlink.loss
+        network.downlink.loss network.mtu
     """,
     "the vehicle's: when it says HELLO again": "link.timeout_s",
     "the vehicle's: when it gives up": "link.connect_s",
