@@ -3,7 +3,8 @@
 A journal is a folder. `settings.toml` holds all that the results follow from, `journal.jsonl` a
 line for each entry: its checksum (CRC-32) and the entry itself. A line is on the disk before the
 next is begun. Half a line at the end, left by a writer that was killed, is overwritten; a line that
-was changed is refused.
+was changed is refused. Files that the results follow from stand in the settings by their digests,
+and are flown from copies of that content alone.
 """
 
 import fcntl
@@ -11,12 +12,15 @@ import hashlib
 import os
 import tomllib
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any, Generic, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from lab.keys import flat
 from shared.config import ConfigError, Scenario
@@ -42,6 +46,8 @@ class Journal(Generic[E]):
     def __init__(self, folder: Path, settings: Mapping[str, Any], kind: type[E]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
+        self.files: Mapping[str, str] = settings.get("files", {})
+        """Digest of every file that the entries follow from, by its path."""
         self.entries: list[E] = []
         """Everything done so far, in the order in which it was done."""
         self._file = os.fdopen(os.open(folder / ENTRIES, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
@@ -124,7 +130,34 @@ def write(path: Path, content: bytes) -> None:
 def digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
     """Digest of every file that some scenarios refer to, by its path: a part of their settings."""
     files = {each.reference.file for each in scenarios if each.reference.shape == "csv"}
-    return {
-        file: hashlib.blake2b(Path(file).read_bytes(), digest_size=8).hexdigest()
-        for file in sorted(files)
-    }
+    return {file: _digest(Path(file).read_bytes()) for file in sorted(files)}
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=8).hexdigest()
+
+
+@contextmanager
+def pinned(scenario: Scenario, files: Mapping[str, str]) -> Iterator[Scenario]:
+    """A scenario that refers to a copy of its file, which nobody edits while it is flown.
+
+    Args:
+        files: digest that each file must have, by its path; others are left as they are.
+
+    Raises:
+        ConfigError: the file has changed since the work began, or is another one on this machine.
+    """
+    reference = scenario.reference
+    if reference.shape != "csv" or reference.file not in files:
+        yield scenario
+        return
+    content, expected = Path(reference.file).read_bytes(), files[reference.file]
+    if _digest(content) != expected:
+        raise ConfigError(
+            f"{reference.file}: got the content {_digest(content)}, expected {expected}, "
+            "with which the work began; or another --out"
+        )
+    with NamedTemporaryFile(prefix="skytether-", suffix=".csv") as copy:
+        copy.write(content)
+        copy.flush()
+        yield replace(scenario, reference=replace(reference, file=copy.name))

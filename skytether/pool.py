@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -16,6 +16,7 @@ from concurrent.futures import (
 )
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
@@ -114,6 +115,7 @@ class Crew:
 
         Raises:
             CommandError: interrupted, or a worker has died.
+            ConfigError: the trajectory's file has changed since the sweep began.
         """
         todo = plan.todo(lab.sweep.results(journal.entries))
         before = len(plan.cells) * plan.runs - sum(len(task.seeds) for task in todo)
@@ -127,7 +129,7 @@ class Crew:
             self.spent.runs += len(done.runs)
             self.advance(len(done.runs), text)
 
-        self.share(work, todo, keep)
+        self.share(partial(work, files=journal.files), todo, keep)
 
     def flown(self, plan: Sweep, folder: Path, text: str) -> Results:
         """All results of a sweep, after what was missing has been flown; see `fly`.
@@ -233,10 +235,10 @@ def _deaf() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def work(task: Task) -> tuple[Done, float]:
+def work(task: Task, files: Mapping[str, str]) -> tuple[Done, float]:
     """What came of a task, and the CPU time that it took [s]; called in a worker."""
     began_s = time.thread_time()
-    return lab.sweep.fly(task), time.thread_time() - began_s
+    return lab.sweep.fly(task, files), time.thread_time() - began_s
 
 
 def _executor(flags: Flags) -> AbstractContextManager[Executor]:

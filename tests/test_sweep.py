@@ -19,10 +19,10 @@ import pytest
 from msgspec.structs import replace
 
 from lab import figures
-from lab.journal import Journal, sealed
+from lab.journal import Journal, digests, pinned, sealed
 from lab.sweep import CHUNK, Axis, Done, Sweep, estimate, fly, parse_axis
 from shared import config
-from shared.config import ConfigError
+from shared.config import ConfigError, Scenario
 from shared.summary import summarise
 from sim import flight
 
@@ -145,7 +145,7 @@ def test_a_sweep_is_every_combination_in_chunks_of_seeds() -> None:
 def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
     """In the order of their seeds."""
     (task,) = Sweep("paper", PAPER, [parse_axis("control.trigger=periodic")], 3).tasks()
-    done = fly(task)
+    done = fly(task, {})
     assert (done.cell, done.chunk) == (0, 0)
     for seed, run in zip((1, 2, 3), done.runs, strict=True):
         flown = replace(task.scenario, seed=seed)
@@ -164,7 +164,7 @@ def test_a_run_that_never_flew_has_no_error_and_spoils_no_mean() -> None:
     )
     sweep = Sweep("paper", scenario, [], 6)
     (task,) = sweep.tasks()
-    done = {(0, 0): fly(task)}
+    done = {(0, 0): fly(task, {})}
     rows = list(csv.DictReader(sweep.runs_csv(done).splitlines()))
     failed = [row for row in rows if row["steps"] == "0"]
     assert 0 < len(failed) < 6
@@ -333,20 +333,90 @@ def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
     assert capsys.readouterr().err == said
 
 
+def along(path: Path) -> Scenario:
+    """The paper's, along a trajectory that is written to a file."""
+    path.write_text(LINE)
+    table = config.to_table(PAPER) | {"reference": {"shape": "csv", "file": str(path)}}
+    return config.check(table, "mine")
+
+
+LINE, OTHER_LINE = "t,x,y\n0,0,0\n5,1,1\n", "t,x,y\n0,0,0\n5,1,2\n"
+
+
 def test_a_trajectory_edited_between_two_sweeps_is_refused(tmp_path: Path) -> None:
     """One cell would hold flights along both, and its mean would be of neither."""
     paths = [tmp_path / name for name in ("one.csv", "two.csv")]
-    for path in paths:
-        path.write_text("t,x,y\n0,0,0\n5,1,1\n")
-    table = config.to_table(PAPER) | {"reference": {"shape": "csv", "file": str(paths[0])}}
+    scenario, _ = map(along, paths)
     grid = parse_axis(f"reference.file={paths[0]},{paths[1]}")
-    plan = Sweep("mine", config.check(table, "mine"), [grid], 3)
+    plan = Sweep("mine", scenario, [grid], 3)
     journal_of(plan, tmp_path / "out").close()
     journal_of(plan, tmp_path / "out").close()
-    paths[1].write_text("t,x,y\n0,0,0\n5,1,2\n")
+    paths[1].write_text(OTHER_LINE)
     with pytest.raises(ConfigError) as refused:
         journal_of(plan, tmp_path / "out")
     assert str(refused.value).startswith(f"{tmp_path}/out: files.{paths[1]}: got '")
+
+
+def test_a_task_whose_trajectory_was_edited_since_the_sweep_began_is_not_flown(
+    tmp_path: Path,
+) -> None:
+    """Nor is it kept; once the file is what it was, the sweep goes on."""
+    path = tmp_path / "path.csv"
+    plan = Sweep("mine", along(path), [], CHUNK + 1)
+    first, second = plan.tasks()
+    with closing(journal_of(plan, tmp_path / "out")) as journal:
+        journal.append(fly(first, journal.files))
+        path.write_text(OTHER_LINE)
+        with pytest.raises(ConfigError, match=r"path\.csv: got the content .*, with which"):
+            fly(second, journal.files)
+        path.write_text(LINE)
+        journal.append(fly(second, journal.files))
+        assert len(journal.entries) == 2
+
+
+def test_a_flight_under_way_does_not_see_edits_of_its_trajectory(tmp_path: Path) -> None:
+    """Each task flies along a copy of its own, however often somebody saves the file meanwhile."""
+    path = tmp_path / "path.csv"
+    scenario = along(path)
+    with pinned(scenario, digests([scenario])) as flown:
+        path.write_text(OTHER_LINE)
+        at_the_end = flown.make_reference()(np.array([5.0]))[0, :, 0]
+        terms = flown.terms()
+    assert at_the_end.tolist() == [1.0, 1.0]
+    path.write_text(LINE)
+    assert terms == scenario.terms()
+    assert not Path(flown.reference.file).exists()
+
+
+def test_a_trajectory_edited_while_a_sweep_runs_ends_the_command_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before any table is written; the same command goes on with the file as it was."""
+    from skytether.__main__ import main
+    from skytether.pool import Crew
+
+    path, out = tmp_path / "path.csv", tmp_path / "out"
+    along(path)
+    (tmp_path / "mine.toml").write_text(
+        'extends = "paper"\nreference = { shape = "csv", file = "path.csv" }\n'
+    )
+    argv = ["sweep", str(tmp_path / "mine.toml"), "--duration", "2", "--settle", "0"]
+    argv += ["--runs", "2", "--workers", "1", "--out", str(out)]
+    fly_sweep = Crew.fly
+
+    def edited(*arguments: Any) -> None:
+        """Fly, after somebody has saved another trajectory."""
+        path.write_text(OTHER_LINE)
+        fly_sweep(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Crew, "fly", edited)
+        assert main(argv) == 2
+    said = capsys.readouterr().err
+    assert re.fullmatch(rf"sweep: {path}: got the content \w+, expected \w+, with .*\n", said)
+    assert (lines(out), (out / "runs.csv").exists()) == (0, False)
+    path.write_text(LINE)
+    assert main(argv) == 0
 
 
 # -- the command ---------------------------------------------------------------------------------
