@@ -183,7 +183,8 @@ class LinkConfig(Section, frozen=True):
     heartbeat_s: Positive = 0.1
     """Longest time that the server lets pass without a packet [s]."""
     timeout_s: Positive = 1.0
-    """Time of silence after which the vehicle says HELLO again [s]."""
+    """Time of silence after which the vehicle says HELLO again, and its number is free for another
+    life [s]."""
     connect_s: Positive = 15.0
     """Time that the vehicle waits for its first session before it gives up [s]."""
 

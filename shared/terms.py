@@ -143,7 +143,7 @@ _OWNERS = {
         network.downlink.minimum_s network.downlink.slot_s network.downlink.slots_mean
         network.downlink.loss network.mtu
     """,
-    "the vehicle's: when it says HELLO again": "link.timeout_s",
+    "each end's own: when it takes the other for silent": "link.timeout_s",
     "the vehicle's: when it gives up": "link.connect_s",
     "of virtual time": """
         simulation.compute_s simulation.clock_offset_s simulation.clock_drift_ppm
