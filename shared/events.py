@@ -118,7 +118,7 @@ class ServerFull(VehicleEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
-        full = f"the server is full ({self.room} vehicles); see --vehicles"
+        full = f"the server is full (room for {self.room}); see --vehicles"
         return f"vehicle {self.vehicle} from {address} is refused: {full}"
 
 

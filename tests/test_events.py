@@ -54,7 +54,7 @@ SENTENCES = [
     ),
     (
         ServerFull(vehicle=3, host="192.0.2.1", port=5, room=64),
-        ("vehicle 3 from 192.0.2.1:5 is refused: the server is full (64 vehicles); see --vehicles"),
+        ("vehicle 3 from 192.0.2.1:5 is refused: the server is full (room for 64); see --vehicles"),
     ),
     (
         NumberTaken(vehicle=3, host="192.0.2.1", port=5, holder="[::1]:6"),
