@@ -278,6 +278,20 @@ def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_hear
     assert (horizon.session, peer) == (first.session, HERE)
 
 
+def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> None:
+    """It was welcomed while the old one had its row, and gets one of its own."""
+    vehicles = Vehicles(scenario(), room=1)
+    vehicles.observe(vehicles.open(boot_id=5), 0)
+    vehicles.now_ns += SESSION_NS - SECOND_NS
+    new = vehicles.open(boot_id=6)
+    vehicles.now_ns += 2 * SECOND_NS
+    vehicles.tick()
+    assert len(vehicles.server.sessions) == 0
+    assert vehicles.ask(vehicle=2).refusal == FULL
+    vehicles.observe(new, 0)
+    assert [session.boot_id for session in vehicles.server.sessions] == [6]
+
+
 def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None:
     """Two lives of the server share no session."""
     welcome = Vehicles(scenario(), boot_id=1).open()
