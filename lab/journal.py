@@ -3,8 +3,7 @@
 A journal is a folder. `settings.toml` holds all that the results follow from, `journal.jsonl` a
 line for each entry: its checksum (CRC-32) and the entry itself. A line is on the disk before the
 next is begun. Half a line at the end, left by a writer that was killed, is overwritten; a line that
-was changed is refused. Files that the results follow from stand in the settings by their digests,
-and are flown from copies of that content alone.
+was changed is refused. Files that the results follow from stand in the settings by their digests.
 """
 
 import fcntl
@@ -12,15 +11,12 @@ import hashlib
 import os
 import tomllib
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any, Generic, TypeVar
 
 import msgspec
-from msgspec.structs import replace
 
 from lab.keys import flat
 from shared.config import ConfigError, Scenario
@@ -130,34 +126,9 @@ def write(path: Path, content: bytes) -> None:
 def digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
     """Digest of every file that some scenarios refer to, by its path: a part of their settings."""
     files = {each.reference.file for each in scenarios if each.reference.shape == "csv"}
-    return {file: _digest(Path(file).read_bytes()) for file in sorted(files)}
+    return {file: digest(Path(file).read_bytes()) for file in sorted(files)}
 
 
-def _digest(content: bytes) -> str:
+def digest(content: bytes) -> str:
+    """Short text that differs where the content of a file does."""
     return hashlib.blake2b(content, digest_size=8).hexdigest()
-
-
-@contextmanager
-def pinned(scenario: Scenario, files: Mapping[str, str]) -> Iterator[Scenario]:
-    """A scenario that refers to a copy of its file, which nobody edits while it is flown.
-
-    Args:
-        files: digest that each file must have, by its path; others are left as they are.
-
-    Raises:
-        ConfigError: the file has changed since the work began, or is another one on this machine.
-    """
-    reference = scenario.reference
-    if reference.shape != "csv" or reference.file not in files:
-        yield scenario
-        return
-    content, expected = Path(reference.file).read_bytes(), files[reference.file]
-    if _digest(content) != expected:
-        raise ConfigError(
-            f"{reference.file}: got the content {_digest(content)}, expected {expected}, "
-            "with which the work began; or another --out"
-        )
-    with NamedTemporaryFile(prefix="skytether-", suffix=".csv") as copy:
-        copy.write(content)
-        copy.flush()
-        yield replace(scenario, reference=replace(reference, file=copy.name))

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import msgspec
 import numpy as np
 
-from lab.journal import Journal, digests, pinned
+from lab.journal import Journal, digests
 from shared import config
 from shared.config import ConfigError, Scenario
 
@@ -228,14 +228,13 @@ class Search:
         """After each generation, all points so far, those that the journal has with them.
 
         Raises:
-            ConfigError: the journal has points that this search does not propose, or the
-                trajectory's file has changed since the search began.
+            ConfigError: the journal has points that this search does not propose.
         """
         seed = self.start.seed
         optimiser = Optimiser(
             self.start, self.free, population=self.population, sigma=self.sigma, seed=seed
         )
-        fly = partial(self._fly, files=journal.files)
+        fly = partial(self.objective.fly, seeds=range(seed, seed + self.runs))
         points: list[Point] = []
         for number in range(generations):
             proposed = optimiser.ask()
@@ -252,12 +251,6 @@ class Search:
             points += generation
             optimiser.tell([point.score for point in generation])
             yield points
-
-    def _fly(self, scenario: Scenario, files: Mapping[str, str]) -> Values:
-        """Figures of a point; called in a worker."""
-        seeds = range(self.start.seed, self.start.seed + self.runs)
-        with pinned(scenario, files) as flown:
-            return self.objective.fly(flown, seeds)
 
     def _point(self, keys: dict[str, float], values: Values) -> Point:
         figures = {column: dict(found) for column, found in values.items()}

@@ -20,7 +20,7 @@ import numpy as np
 from msgspec.structs import astuple, replace
 from scipy import stats
 
-from lab.journal import digests, pinned
+from lab.journal import digests
 from lab.keys import lay
 from shared import config
 from shared.config import ConfigError, Scenario
@@ -145,17 +145,9 @@ def results(entries: Iterable[Done]) -> Results:
     return {(done.cell, done.chunk): done for done in entries}
 
 
-def fly(task: Task, files: Mapping[str, str]) -> Done:
-    """Fly all runs of a task in virtual time.
-
-    Args:
-        files: see `lab.journal.pinned`.
-
-    Raises:
-        ConfigError: the trajectory's file has changed since the sweep began.
-    """
-    with pinned(task.scenario, files) as scenario:
-        return Done(task.cell, task.chunk, summaries(task.name, scenario, task.seeds))
+def fly(task: Task) -> Done:
+    """Fly all runs of a task in virtual time."""
+    return Done(task.cell, task.chunk, summaries(task.name, task.scenario, task.seeds))
 
 
 def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> tuple[Summary, ...]:

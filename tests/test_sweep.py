@@ -19,12 +19,13 @@ import pytest
 from msgspec.structs import replace
 
 from lab import figures
-from lab.journal import Journal, digests, pinned, sealed
+from lab.journal import Journal, digests, sealed
 from lab.sweep import CHUNK, Axis, Done, Sweep, estimate, fly, parse_axis
 from shared import config
 from shared.config import ConfigError, Scenario
 from shared.summary import summarise
 from sim import flight
+from skytether.pool import Crew, pinned, work
 
 PATIENCE_S = 30.0
 
@@ -145,7 +146,7 @@ def test_a_sweep_is_every_combination_in_chunks_of_seeds() -> None:
 def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
     """In the order of their seeds."""
     (task,) = Sweep("paper", PAPER, [parse_axis("control.trigger=periodic")], 3).tasks()
-    done = fly(task, {})
+    done = fly(task)
     assert (done.cell, done.chunk) == (0, 0)
     for seed, run in zip((1, 2, 3), done.runs, strict=True):
         flown = replace(task.scenario, seed=seed)
@@ -164,7 +165,7 @@ def test_a_run_that_never_flew_has_no_error_and_spoils_no_mean() -> None:
     )
     sweep = Sweep("paper", scenario, [], 6)
     (task,) = sweep.tasks()
-    done = {(0, 0): fly(task, {})}
+    done = {(0, 0): fly(task)}
     rows = list(csv.DictReader(sweep.runs_csv(done).splitlines()))
     failed = [row for row in rows if row["steps"] == "0"]
     assert 0 < len(failed) < 6
@@ -365,12 +366,12 @@ def test_a_task_whose_trajectory_was_edited_since_the_sweep_began_is_not_flown(
     plan = Sweep("mine", along(path), [], CHUNK + 1)
     first, second = plan.tasks()
     with closing(journal_of(plan, tmp_path / "out")) as journal:
-        journal.append(fly(first, journal.files))
+        journal.append(work(first, journal.files)[0])
         path.write_text(OTHER_LINE)
         with pytest.raises(ConfigError, match=r"path\.csv: got the content .*, with which"):
-            fly(second, journal.files)
+            work(second, journal.files)
         path.write_text(LINE)
-        journal.append(fly(second, journal.files))
+        journal.append(work(second, journal.files)[0])
         assert len(journal.entries) == 2
 
 
@@ -393,7 +394,6 @@ def test_a_trajectory_edited_while_a_sweep_runs_ends_the_command_in_one_line(
 ) -> None:
     """Before any table is written; the same command goes on with the file as it was."""
     from skytether.__main__ import main
-    from skytether.pool import Crew
 
     path, out = tmp_path / "path.csv", tmp_path / "out"
     along(path)
