@@ -10,9 +10,9 @@ from benchmarks.harness import HOT, Lateness, Table, figures_us, interleave, us
 from benchmarks.problems import derive
 from shared.protocol import (
     Heartbeat,
-    Idle,
     Hello,
     Horizon,
+    Idle,
     Message,
     Observation,
     Welcome,
@@ -43,7 +43,7 @@ def messages(terms: Terms) -> list[Message]:
     session, step = 2**31, 5000
     return [
         Hello(1, 2**60, terms),
-        Welcome(1, session, 2**60, 2**60, now_ns, terms),
+        Welcome(1, session, 2**60, 2**60, now_ns, 0, terms),
         Observation(1, session, step, now_ns, step - 20, step - 10, now_ns, now_ns, state),
         Horizon(1, session, step, now_ns, now_ns, inputs),
         Heartbeat(1, session, now_ns, Idle.PLANS),

@@ -16,7 +16,7 @@ from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from shared.chance import stream
 from shared.config import Scenario
-from shared.events import SessionRefused
+from shared.events import NoAnswer
 from shared.record import Recorder, client_columns, parse
 from shared.summary import summarise
 from shell import command
@@ -51,7 +51,7 @@ def fly(argv: Sequence[str]) -> None:
     """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM.
 
     SIGUSR1 prints what was counted so far. The exit code is 1 where no server answers, and 2 where
-    the server flies another scenario.
+    the server flies another scenario, is full, or has another client under this number.
     """
     options = command.parse(Options(), argv, "skytether client", fly.__doc__)
     scenario, server = options.config, command.address("--server", options.server)
@@ -91,8 +91,8 @@ def fly(argv: Sequence[str]) -> None:
         sink.seek(0)
         rows = parse(sink.read())
     if failure := endpoint.failure:
-        refused = isinstance(failure, SessionRefused)
-        raise CommandError(str(failure), command.CONFIGURATION if refused else command.RUN)
+        unheard = isinstance(failure, NoAnswer)
+        raise CommandError(str(failure), command.RUN if unheard else command.CONFIGURATION)
     if alone and len(rows):
         summary = summarise(scenario, options.scenario, rows)
         if options.log == "text":

@@ -7,7 +7,7 @@ meanwhile.
 """
 
 from collections import Counter
-from typing import Any
+from typing import Any, Literal
 
 from client.compensator import Compensator
 from client.plant import Plant
@@ -18,6 +18,7 @@ from shared.events import (
     Finished,
     Flying,
     NoAnswer,
+    NoSession,
     NotFlown,
     PlanEnded,
     PlanResumed,
@@ -27,6 +28,10 @@ from shared.events import (
     SessionRefused,
 )
 from shared.protocol import (
+    ACCEPTED,
+    FULL,
+    REFUSALS,
+    TAKEN,
     Heartbeat,
     Hello,
     Horizon,
@@ -98,6 +103,8 @@ class Client(Endpoint):
         """Step after the last of these."""
         self._idle = Idle.PLANS
         """Why the server makes no plan, as it said last."""
+        self._refusal: NoSession | None = None
+        """Why the server opens no session, as far as it has said so since the last one."""
         self.failure: Failure | None = None
         """Event after which there can be no flight."""
         self.missed = 0
@@ -139,6 +146,10 @@ class Client(Endpoint):
                 differences = self._terms.differences(welcome.terms)
                 self._fail(SessionRefused(vehicle=self.vehicle, differences=differences))
             raise ProtocolError("other terms")
+        if welcome.refusal != ACCEPTED:
+            self._note_refusal(welcome.refusal)
+            raise ProtocolError(REFUSALS[welcome.refusal])
+        self._refusal = None
         if self._server_boot_id not in (None, welcome.server_boot_id):
             self._events.append(ServerRestarted(vehicle=self.vehicle))
         self._session, self._server_boot_id = welcome.session, welcome.server_boot_id
@@ -146,6 +157,17 @@ class Client(Endpoint):
         if self._epoch_ns is None:
             self._epoch_ns = now_ns
             self._events.append(Flying(vehicle=self.vehicle))
+
+    def _note_refusal(self, refusal: int) -> None:
+        """Note why there is no session, and say it once; a refusal that comes late is none."""
+        if self._hello_due_ns is None or refusal not in (FULL, TAKEN):
+            return
+        host, port = self._server
+        reason: Literal["full", "taken"] = "full" if refusal == FULL else "taken"
+        said = NoSession(vehicle=self.vehicle, host=host, port=port, reason=reason)
+        if said != self._refusal:
+            self._refusal = said
+            self._events.append(said)
 
     def _heard(self, message: Welcome | Horizon | Heartbeat, now_ns: int) -> None:
         if (message.vehicle, message.session) != (self.vehicle, self._session):
@@ -160,6 +182,14 @@ class Client(Endpoint):
         assert self._epoch_ns is not None
         step, off_ns = divmod(stamp_ns - self._epoch_ns, self._dt_ns)
         return -1 if off_ns else step
+
+    def _give_up(self, waited_s: float) -> None:
+        """Fail for want of a first session; a refusal has been said before."""
+        if self._refusal is not None:
+            self.failure = self._refusal
+            return
+        host, port = self._server
+        self._fail(NoAnswer(vehicle=self.vehicle, host=host, port=port, waited_s=waited_s))
 
     def _fail(self, failure: Failure) -> None:
         self.failure = failure
@@ -181,9 +211,7 @@ class Client(Endpoint):
             self._began_ns = now_ns
         if self._epoch_ns is None:
             if now_ns - self._began_ns > self._connect_ns:
-                host, port = self._server
-                waited_s = (now_ns - self._began_ns) / SECOND_NS
-                self._fail(NoAnswer(vehicle=self.vehicle, host=host, port=port, waited_s=waited_s))
+                self._give_up((now_ns - self._began_ns) / SECOND_NS)
                 return
         elif now_ns < self._epoch_ns + self._step * self._dt_ns:
             return

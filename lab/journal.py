@@ -3,7 +3,7 @@
 A journal is a folder. `settings.toml` holds all that the results follow from, `journal.jsonl` a
 line for each entry: its checksum (CRC-32) and the entry itself. A line is on the disk before the
 next is begun. Half a line at the end, left by a writer that was killed, is overwritten; a line that
-was changed is refused.
+was changed is refused. Files that the results follow from stand in the settings by their digests.
 """
 
 import fcntl
@@ -42,6 +42,8 @@ class Journal(Generic[E]):
     def __init__(self, folder: Path, settings: Mapping[str, Any], kind: type[E]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
+        self.files: Mapping[str, str] = settings.get("files", {})
+        """Digest of every file that the entries follow from, by its path."""
         self.entries: list[E] = []
         """Everything done so far, in the order in which it was done."""
         self._file = os.fdopen(os.open(folder / ENTRIES, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
@@ -124,7 +126,9 @@ def write(path: Path, content: bytes) -> None:
 def digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
     """Digest of every file that some scenarios refer to, by its path: a part of their settings."""
     files = {each.reference.file for each in scenarios if each.reference.shape == "csv"}
-    return {
-        file: hashlib.blake2b(Path(file).read_bytes(), digest_size=8).hexdigest()
-        for file in sorted(files)
-    }
+    return {file: digest(Path(file).read_bytes()) for file in sorted(files)}
+
+
+def digest(content: bytes) -> str:
+    """Short text that differs where the content of a file does."""
+    return hashlib.blake2b(content, digest_size=8).hexdigest()

@@ -12,6 +12,9 @@ from shared.record import Recorder
 
 QUEUE_MAX = 65536
 """Most packets under way in one direction; more are dropped, and counted apart from losses."""
+QUEUE_BYTES_MAX = 64 * 1024 * 1024
+"""Most UDP payload under way in one direction, whatever `network.mtu` lets pass [B]: with both
+directions full, and what Python takes for each packet, netem stays below 256 MiB."""
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
 """Width of the bins in which delays are counted [ns]: the lattice of the paper's delay."""
@@ -47,8 +50,10 @@ class Counts:
     """Packets whose fate was to be lost."""
     reordered: int = 0
     """Packets overtaken by a later one of their flow."""
+    oversized: int = 0
+    """Packets dropped because they were longer than `network.mtu`."""
     overflowed: int = 0
-    """Packets dropped because QUEUE_MAX were under way."""
+    """Packets dropped because QUEUE_MAX or QUEUE_BYTES_MAX were under way."""
     depth_max: int = 0
     """Most packets that were under way at once."""
     delay: Histogram = field(default_factory=lambda: Histogram(DELAY_BIN_NS))
@@ -62,14 +67,18 @@ class Link:
 
     Args:
         direction: UPLINK or DOWNLINK, for the record.
+        mtu: longest UDP payload that passes [B].
         recorder: takes one row a packet, where there is one.
     """
 
-    def __init__(self, direction: int, recorder: Recorder | None) -> None:
+    def __init__(self, direction: int, mtu: int, recorder: Recorder | None) -> None:
         self._direction = direction
+        self._mtu = mtu
         self._recorder = recorder
         self._heap: list[tuple[int, int, Datagram, Lane, int, int]] = []
         """Heap of due time [ns], order of entry, packet, lane, number in the lane, delay [ns]."""
+        self._bytes = 0
+        """UDP payload under way [B]."""
         self._entered = 0
         self.counts = Counts()
 
@@ -81,15 +90,18 @@ class Link:
         counts.packets += 1
         counts.bytes += size
         depth = len(self._heap)
-        if lost:
+        if size > self._mtu:
+            counts.oversized += 1
+        elif lost:
             counts.lost += 1
             if self._recorder is not None:
                 self._recorder.append_row(
                     self._direction, lane.flow, number, size, now_ns, delay_ns, True, False
                 )
-        elif depth >= QUEUE_MAX:
+        elif depth >= QUEUE_MAX or self._bytes + size > QUEUE_BYTES_MAX:
             counts.overflowed += 1
         else:
+            self._bytes += size
             self._entered += 1
             due_ns = now_ns + delay_ns
             heappush(self._heap, (due_ns, self._entered, datagram, lane, number, delay_ns))
@@ -101,6 +113,7 @@ class Link:
         heap, counts, out = self._heap, self.counts, []
         while heap and heap[0][0] <= now_ns:
             due_ns, _, datagram, lane, number, delay_ns = heappop(heap)
+            self._bytes -= len(datagram.payload)
             overtaken = number < lane.newest_out
             if overtaken:
                 counts.reordered += 1
@@ -125,6 +138,10 @@ class Link:
         """Number of packets under way."""
         return len(self._heap)
 
+    def depth_bytes(self) -> int:
+        """UDP payload under way [B]."""
+        return self._bytes
+
     def figures(self) -> dict[str, Any]:
         """Statistics by name, as in `Endpoint.figures`."""
         counts = self.counts
@@ -134,6 +151,7 @@ class Link:
             "forwarded": counts.forwarded,
             "lost": counts.lost,
             "reordered": counts.reordered,
+            "oversized": counts.oversized,
             "overflowed": counts.overflowed,
             "queue": self.depth(),
             "queue_max": counts.depth_max,

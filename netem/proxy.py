@@ -5,6 +5,7 @@ the server, so that the server's answers find their way back. Uplink is server t
 is client to server, as in the paper.
 """
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,9 +58,11 @@ class Proxy(Endpoint):
         self._flows_max = flows
         self._scenario = scenario
         self._server = server
-        self.uplink = Link(UPLINK, recorder)
-        self.downlink = Link(DOWNLINK, recorder)
-        self._by_client: dict[Address, Flow] = {}
+        mtu = scenario.network.mtu
+        self.uplink = Link(UPLINK, mtu, recorder)
+        self.downlink = Link(DOWNLINK, mtu, recorder)
+        self._by_client: OrderedDict[Address, Flow] = OrderedDict()
+        """Flows by client, the one that has been idle longest first."""
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
         self.refused = 0
@@ -82,6 +85,7 @@ class Proxy(Endpoint):
                 return
             self.uplink.take(Datagram(payload, flow.client), flow.uplink, now_ns=now_ns)
         flow.used_ns = now_ns
+        self._by_client.move_to_end(flow.client)
         self._forward(now_ns)
 
     def wake(self, *, now_ns: int) -> None:
@@ -104,7 +108,7 @@ class Proxy(Endpoint):
     def _open(self, client: Address, now_ns: int) -> Flow | None:
         socket = len(self._by_socket) + 1
         if socket > self._flows_max:
-            idle = min(self._by_socket.values(), key=lambda flow: flow.used_ns)
+            idle = next(iter(self._by_client.values()))
             if now_ns - idle.used_ns < IDLE_NS:
                 return None
             del self._by_client[idle.client]

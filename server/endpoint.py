@@ -5,7 +5,7 @@ At a tick, for all vehicles in session: which step is it aboard (`clock`), what 
 passed is skipped and counted, never caught up with.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from typing import Any
 
 import numpy as np
@@ -26,15 +26,24 @@ from shared.endpoint import (
     seconds_to_ns,
 )
 from shared.events import (
+    Event,
+    NumberTaken,
     PlanningResumed,
     PlanningStopped,
+    ServerFull,
     SessionEnded,
     SessionOpened,
     SessionRefused,
+    address_text,
 )
 from shared.histogram import Histogram
 from shared.protocol import (
+    ACCEPTED,
     FEEDBACK,
+    FULL,
+    OTHER_TERMS,
+    REFUSALS,
+    TAKEN,
     Heartbeat,
     Hello,
     Idle,
@@ -50,6 +59,8 @@ from shared.stopwatch import Stopwatch
 
 VEHICLES_MAX = 64
 """Vehicles at once, unless room is made for more."""
+REFUSALS_TOLD_MAX = 64
+"""Newest refusals that are remembered, so as not to tell the operator of each HELLO anew."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
@@ -83,7 +94,7 @@ class Server(Endpoint):
         self._clock = ClockMap(room, self._terms.dt_ns)
         self._plausibility = Plausibility(self._terms, room)
         self.controller = Controller(scenario, self._terms, room, self._clock, self.stopwatch)
-        self.sessions = Sessions(room, boot_id)
+        self.sessions = Sessions(room, boot_id, seconds_to_ns(scenario.link.timeout_s))
         """Who flies."""
         self._idle = np.zeros(room, dtype=np.int64)
         """Why no plan is made for each vehicle, as it was told last; shape (room,)."""
@@ -95,7 +106,9 @@ class Server(Endpoint):
         self.ticks = Histogram(TICK_BIN_NS)
         """How long each tick took, as far as the stopwatch runs."""
         self._dropped: Counter[str] = Counter()
-        """Number of datagrams dropped, by reason."""
+        """Number of datagrams dropped, and of vehicles refused, by reason."""
+        self._told: deque[tuple[int, int, int]] = deque(maxlen=REFUSALS_TOLD_MAX)
+        """Vehicle, boot id and refusal of the newest refusals that the operator was told."""
 
     # -- datagrams ---------------------------------------------------------------------------
 
@@ -116,14 +129,35 @@ class Server(Endpoint):
         self.stopwatch.lap("observe")
 
     def _hello(self, hello: Hello, address: Address, now_ns: int) -> None:
-        number = 0
-        if hello.terms == self._terms:
-            number = self.sessions.welcome(hello, address).number
-        else:
-            differences = self._terms.differences(hello.terms)
-            self._events.append(SessionRefused(vehicle=hello.vehicle, differences=differences))
-        welcome = Welcome(hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, self._terms)
+        refusal, number = self._refusal(hello, address, now_ns), 0
+        if refusal == ACCEPTED:
+            number = self.sessions.welcome(hello, address, now_ns).number
+        welcome = Welcome(
+            hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
+        )
         self._out.append(Datagram(encode(welcome), address))
+
+    def _refusal(self, hello: Hello, address: Address, now_ns: int) -> int:
+        """Why a HELLO is refused, if not ACCEPTED; the operator is told once a life and reason."""
+        vehicle, (host, port) = hello.vehicle, address
+        event: Event
+        if hello.terms != self._terms:
+            refusal, differences = OTHER_TERMS, self._terms.differences(hello.terms)
+            event = SessionRefused(vehicle=vehicle, differences=differences)
+        elif (holder := self.sessions.holder(hello, now_ns)) is not None:
+            refusal, holder_at = TAKEN, address_text(*holder.address)
+            event = NumberTaken(vehicle=vehicle, host=host, port=port, holder=holder_at)
+        elif self.sessions.is_full(hello, now_ns):
+            refusal, room = FULL, len(self.sessions.vehicle)
+            event = ServerFull(vehicle=vehicle, host=host, port=port, room=room)
+        else:
+            return ACCEPTED
+        self._dropped[f"refused: {REFUSALS[refusal]}"] += 1
+        told = vehicle, hello.boot_id, refusal
+        if told not in self._told:
+            self._told.append(told)
+            self._events.append(event)
+        return refusal
 
     def _observe(self, observation: Observation, address: Address, now_ns: int) -> None:
         session = self.sessions.find(observation) or self._begin(observation, now_ns)

@@ -1,10 +1,13 @@
 """Who flies: sessions of vehicles, each with a row in every array of the server.
 
 A vehicle is welcomed when it says HELLO, and gets its row with its first observation; until then
-the session of an earlier life of it goes on. Rows that are free are used again, lowest first, so
-that what is in use lies close together.
+the session of an earlier life of it goes on. For each vehicle that was welcomed and has no row yet,
+one is kept free, but not for longer than WELCOME_NS where another vehicle wants it. As long as a
+life of a vehicle is heard, no other life gets its number: that would be another vehicle's. Rows
+that are free are used again, lowest first, so that what is in use lies close together.
 """
 
+from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from heapq import heappop, heappush
@@ -18,6 +21,8 @@ from shared.protocol import Hello, Observation, ProtocolError
 
 SESSION_NS = 30 * SECOND_NS
 """A vehicle unheard for so long is forgotten [ns]."""
+WELCOME_NS = 5 * SECOND_NS
+"""Time after its last HELLO for which a welcomed vehicle keeps its place without coming [ns]."""
 
 
 @dataclass(slots=True)
@@ -50,15 +55,19 @@ class Sessions:
     Args:
         room: vehicles at once.
         first: the number before that of the first session.
+        silence_ns: time after which a vehicle that is not heard may be taken for gone [ns].
     """
 
-    def __init__(self, room: int, first: int) -> None:
-        self._room = room
+    def __init__(self, room: int, first: int, silence_ns: int) -> None:
         self._opened = first
+        self._silence_ns = silence_ns
         self._live: dict[int, Session] = {}
         """Sessions by vehicle."""
-        self.welcomed: dict[int, Session] = {}
-        """New lives of vehicles, until their first observation, by vehicle."""
+        self.coming: OrderedDict[int, Session] = OrderedDict()
+        """Welcomed vehicles without a row, the one that said HELLO longest ago first; never more
+        than there are free rows."""
+        self._again: dict[int, Session] = {}
+        """New lives of vehicles in session, until their first observation, by vehicle."""
         self._by_row: dict[int, Session] = {}
         self._free_rows = list(range(room))
         """Rows that are free, a heap."""
@@ -81,25 +90,55 @@ class Sessions:
         """The session in a row."""
         return self._by_row[row]
 
-    def welcome(self, hello: Hello, address: Address) -> Session:
+    def holder(self, hello: Hello, now_ns: int) -> Session | None:
+        """The session of another life that keeps its vehicle's number from the one that says HELLO.
+
+        It is the live one as long as it is heard, else one that was welcomed and may still come.
+        """
+        live = self._live.get(hello.vehicle)
+        if live is not None and live.boot_id == hello.boot_id:
+            return None
+        if live is not None and self._is_heard(live, now_ns):
+            return live
+        welcomed = self._waiting(hello.vehicle).get(hello.vehicle)
+        if welcomed is None or welcomed.boot_id == hello.boot_id:
+            return None
+        return welcomed if _is_expected(welcomed, now_ns) else None
+
+    def is_full(self, hello: Hello, now_ns: int) -> bool:
+        """Whether there is no room for the vehicle that says HELLO."""
+        known = hello.vehicle in self._live or hello.vehicle in self.coming
+        if known or len(self.coming) < len(self._free_rows):
+            return False
+        oldest = next(iter(self.coming.values()), None)
+        return oldest is None or _is_expected(oldest, now_ns)
+
+    def welcome(self, hello: Hello, address: Address, now_ns: int) -> Session:
         """The session of the life that says HELLO, a new one or the one it has.
 
-        Raises:
-            ProtocolError: there is no room for another vehicle.
+        There must be room for it, if only that of a vehicle that was welcomed and did not come.
         """
-        for known in (self._live, self.welcomed):
-            session = known.get(hello.vehicle)
-            if session is not None and session.boot_id == hello.boot_id:
-                return session
-        taken = self._live.keys() | self.welcomed.keys()
-        if hello.vehicle not in taken and len(taken) >= self._room:
-            if not self.welcomed:
-                raise ProtocolError("no room for another vehicle")
-            del self.welcomed[next(iter(self.welcomed))]  # the oldest that never came
-        self._opened += 1
-        session = Session(hello.vehicle, self._opened % 2**32, hello.boot_id, address)
-        self.welcomed[hello.vehicle] = session
+        live = self._live.get(hello.vehicle)
+        if live is not None and live.boot_id == hello.boot_id:
+            return live
+        waiting = self._waiting(hello.vehicle)
+        session = waiting.pop(hello.vehicle, None)
+        if session is None or session.boot_id != hello.boot_id:
+            self._opened += 1
+            session = Session(hello.vehicle, self._opened % 2**32, hello.boot_id, address)
+        session.heard_ns = now_ns
+        if waiting is self.coming and len(waiting) == len(self._free_rows):
+            self.coming.popitem(last=False)
+        waiting[hello.vehicle] = session
         return session
+
+    def _waiting(self, vehicle: int) -> dict[int, Session]:
+        """Where the welcomed session of a vehicle is kept, if it has one."""
+        return self._again if vehicle in self._live else self.coming
+
+    def _is_heard(self, live: Session, now_ns: int) -> bool:
+        """Whether a vehicle in session has been heard of late."""
+        return now_ns - live.heard_ns <= self._silence_ns
 
     def find(self, observation: Observation) -> Session | None:
         """The live session of an observation, if it has one."""
@@ -110,13 +149,16 @@ class Sessions:
         """The welcomed session of a first observation, now live.
 
         Raises:
-            ProtocolError: there is none.
+            ProtocolError: there is none, or an earlier life of the vehicle is heard again.
         """
-        session = self.welcomed.get(observation.vehicle)
+        before = self._live.get(observation.vehicle)
+        waiting = self._waiting(observation.vehicle)
+        session = waiting.get(observation.vehicle)
         if session is None or session.number != observation.session:
             raise ProtocolError("unknown session")
-        del self.welcomed[session.vehicle]
-        before = self._live.get(session.vehicle)
+        if before is not None and self._is_heard(before, now_ns):
+            raise ProtocolError("taken")
+        del waiting[session.vehicle]
         session.row = heappop(self._free_rows) if before is None else before.row
         session.sent_ns = now_ns
         self._live[session.vehicle] = self._by_row[session.row] = session
@@ -130,9 +172,17 @@ class Sessions:
         for session in gone:
             del self._live[session.vehicle], self._by_row[session.row]
             heappush(self._free_rows, session.row)
+            again = self._again.pop(session.vehicle, None)
+            if again is not None:
+                self.coming[session.vehicle] = again
         if gone:
             self._note_rows()
         return gone
 
     def _note_rows(self) -> None:
         self.rows = np.array(sorted(self._by_row), dtype=np.int64)
+
+
+def _is_expected(welcomed: Session, now_ns: int) -> bool:
+    """Whether the first observation of a welcomed vehicle may still come."""
+    return now_ns - welcomed.heard_ns <= WELCOME_NS

@@ -25,7 +25,7 @@ from shared import policy
 from shared import reference as shapes
 from shared.endpoint import seconds_to_ns
 from shared.hint import hint
-from shared.protocol import INPUTS_MAX
+from shared.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 from shared.terms import Terms
 
 TINY = 1e-9
@@ -180,6 +180,8 @@ class NetworkConfig(Section, frozen=True):
     """Direction from server to vehicle."""
     downlink: DirectionConfig = DirectionConfig()
     """Direction from vehicle to server."""
+    mtu: Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)] = 1472
+    """Longest UDP payload that passes [B]: 1472 fill an Ethernet frame."""
 
 
 class LinkConfig(Section, frozen=True):
@@ -191,7 +193,8 @@ class LinkConfig(Section, frozen=True):
     """Largest age of the observation behind an input [s]; with no younger one the vehicle brakes
     and hovers, or holds its last input where `vehicle.exhausted` says so."""
     timeout_s: Positive = 1.0
-    """Time of silence after which the vehicle says HELLO again [s]."""
+    """Time of silence after which the vehicle says HELLO again, and its number is free for another
+    life [s]."""
     connect_s: Positive = 15.0
     """Time that the vehicle waits for its first session before it gives up [s]."""
 

@@ -5,7 +5,7 @@ log, a flight in virtual time, a command that has started the process. `str(even
 operator's sentence. For a program an event is an object of JSON whose key `type` names the class.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -105,6 +105,53 @@ class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
             for difference in self.differences
         )
         return f"vehicle {self.vehicle} is refused, it flies another scenario: {keys}"
+
+
+class ServerFull(VehicleEvent, frozen=True, kw_only=True):
+    """The server has refused a vehicle for which it has no room."""
+
+    host: str
+    """Host that the vehicle's HELLO came from."""
+    port: int
+    room: int
+    """Number of vehicles that there is room for."""
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        full = f"the server is full (room for {self.room}); see --vehicles"
+        return f"vehicle {self.vehicle} from {address} is refused: {full}"
+
+
+class NumberTaken(VehicleEvent, frozen=True, kw_only=True):
+    """The server has refused a vehicle whose number is that of another one, which it hears."""
+
+    host: str
+    """Host that the refused vehicle's HELLO came from."""
+    port: int
+    holder: str
+    """HOST:PORT that the other vehicle is heard from."""
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        taken = f"another client flies under this number, from {self.holder}; see --id"
+        return f"vehicle {self.vehicle} from {address} is refused: {taken}"
+
+
+class NoSession(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has heard why the server opens no session for it; it goes on asking."""
+
+    host: str
+    """Host that it says HELLO to."""
+    port: int
+    reason: Literal["full", "taken"]
+    """Whether the server has no room, or another client flies under the vehicle's number."""
+
+    def __str__(self) -> str:
+        why = {
+            "full": "the server is full; see its --vehicles",
+            "taken": "another client flies under this number; see --id",
+        }[self.reason]
+        return f"vehicle {self.vehicle} is refused by {address_text(self.host, self.port)}: {why}"
 
 
 class NoAnswer(VehicleEvent, frozen=True, kw_only=True):
@@ -214,7 +261,7 @@ class Finished(VehicleEvent, frozen=True, kw_only=True):
         )
 
 
-Failure = SessionRefused | NoAnswer | NotFlown
+Failure = SessionRefused | NoSession | NoAnswer | NotFlown
 """Events after which a vehicle cannot fly, or has not."""
 
 Event = (
@@ -225,6 +272,9 @@ Event = (
     | SessionOpened
     | SessionEnded
     | SessionRefused
+    | ServerFull
+    | NumberTaken
+    | NoSession
     | NoAnswer
     | Flying
     | ServerSilent

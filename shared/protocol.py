@@ -5,7 +5,8 @@
 | type | message     | sent by | fields after `vehicle`                                     |
 |------|-------------|---------|------------------------------------------------------------|
 | 1    | HELLO       | client  | boot_id, terms                                             |
-| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, terms         |
+| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, refusal,      |
+|      |             |         | terms                                                      |
 | 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
 |      |             |         | received_ns, state                                         |
 | 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback    |
@@ -46,6 +47,12 @@ NO_FEEDBACK = np.empty((0, 0), np.float32)
 INPUT_TOLERANCE = 1.001
 """How far over its bound an input may be (float32 rounds) before the packet is refused."""
 
+ACCEPTED, OTHER_TERMS, FULL, TAKEN = range(4)
+"""Values of `Welcome.refusal`: the vehicle is welcome, it has other terms, the server has no room,
+or another client flies under its number."""
+REFUSALS = ("accepted", "other terms", "full", "taken")
+"""What the values of `Welcome.refusal` are called."""
+
 NO_HORIZON = -1
 """`Observation.in_force` while no horizon has arrived yet."""
 
@@ -67,14 +74,17 @@ class Hello(NamedTuple):
 
 
 class Welcome(NamedTuple):
-    """The server opens it; with other terms than the vehicle's it says which, and opens none."""
+    """The server opens it, or says why it opens none."""
 
     vehicle: int
     session: int
+    """Number of the session, 0 where there is none."""
     boot_id: int
     """The vehicle's own, echoed: an answer to another life of the vehicle is not for this one."""
     server_boot_id: int
     server_ns: int
+    refusal: int
+    """ACCEPTED, OTHER_TERMS, FULL or TAKEN."""
     terms: Terms
 
 
@@ -245,7 +255,7 @@ _STEP_OR_NONE = range(NO_HORIZON, 2**40 + 1)
 
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),
-    (Welcome, (_U16, _U32, _U64, _U64, _STAMP, _terms)),
+    (Welcome, (_U16, _U32, _U64, _U64, _STAMP, range(len(REFUSALS)), _terms)),
     (Observation, (_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP, _state)),
     (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback)),
     (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)))),

@@ -149,9 +149,9 @@ _OWNERS = {
         network.uplink.delay network.uplink.minimum_s network.uplink.slot_s
         network.uplink.slots_mean network.uplink.loss network.downlink.delay
         network.downlink.minimum_s network.downlink.slot_s network.downlink.slots_mean
-        network.downlink.loss
+        network.downlink.loss network.mtu
     """,
-    "the vehicle's: when it says HELLO again": "link.timeout_s",
+    "each end's own: when it takes the other for silent": "link.timeout_s",
     "the vehicle's: when it gives up": "link.connect_s",
     "of virtual time": """
         simulation.compute_s simulation.clock_offset_s simulation.clock_drift_ppm

@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -16,17 +16,21 @@ from concurrent.futures import (
 )
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Annotated, TypeVar
 
 import tyro
+from msgspec.structs import replace
 
 import lab.sweep
-from lab.journal import Journal
-from lab.search import Generation, Point, Search, best
+from lab.journal import Journal, digest
+from lab.search import Generation, Point, Search, Values, best
 from lab.sweep import Done, Results, Sweep, Task
+from shared.config import ConfigError, Scenario
 from shell import command
 from shell.command import Bar, CommandError
 from shell.workers import die_with_parent
@@ -114,6 +118,7 @@ class Crew:
 
         Raises:
             CommandError: interrupted, or a worker has died.
+            ConfigError: the trajectory's file has changed since the sweep began.
         """
         todo = plan.todo(lab.sweep.results(journal.entries))
         before = len(plan.cells) * plan.runs - sum(len(task.seeds) for task in todo)
@@ -127,7 +132,7 @@ class Crew:
             self.spent.runs += len(done.runs)
             self.advance(len(done.runs), text)
 
-        self.share(work, todo, keep)
+        self.share(partial(work, files=journal.files), todo, keep)
 
     def flown(self, plan: Sweep, folder: Path, text: str) -> Results:
         """All results of a sweep, after what was missing has been flown; see `fly`.
@@ -149,10 +154,17 @@ class Crew:
 
         Raises:
             CommandError: interrupted, or a worker has died.
-            ConfigError: the journal is another search's.
+            ConfigError: the journal is another search's, or the trajectory's file has changed since
+                the search began.
         """
+
+        def fly_all(
+            fly: Callable[[Scenario], Values], proposed: Sequence[Scenario]
+        ) -> Sequence[Values]:
+            return self.map(partial(_fly_point, fly, journal.files), proposed)
+
         points: list[Point] = []
-        for points in search.points(journal, generations, self.map):
+        for points in search.points(journal, generations, fly_all):
             self.advance(1, f"{text}best {best(points).score:.4f}")
         return points
 
@@ -233,10 +245,50 @@ def _deaf() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def work(task: Task) -> tuple[Done, float]:
-    """What came of a task, and the CPU time that it took [s]; called in a worker."""
+def work(task: Task, files: Mapping[str, str]) -> tuple[Done, float]:
+    """What came of a task, and the CPU time that it took [s]; called in a worker.
+
+    Args:
+        files: see `pinned`.
+    """
     began_s = time.thread_time()
-    return lab.sweep.fly(task), time.thread_time() - began_s
+    with pinned(task.scenario, files) as scenario:
+        done = lab.sweep.fly(replace(task, scenario=scenario))
+    return done, time.thread_time() - began_s
+
+
+def _fly_point(
+    fly: Callable[[Scenario], Values], files: Mapping[str, str], scenario: Scenario
+) -> Values:
+    """Figures of a point of a search; called in a worker."""
+    with pinned(scenario, files) as flown:
+        return fly(flown)
+
+
+@contextmanager
+def pinned(scenario: Scenario, files: Mapping[str, str]) -> Iterator[Scenario]:
+    """A scenario that refers to a copy of its file, which nobody edits while it is flown.
+
+    Args:
+        files: digest that each file must have, by its path; others are left as they are.
+
+    Raises:
+        ConfigError: the file has changed since the work began, or is another one on this machine.
+    """
+    reference = scenario.reference
+    if reference.shape != "csv" or reference.file not in files:
+        yield scenario
+        return
+    content, expected = Path(reference.file).read_bytes(), files[reference.file]
+    if digest(content) != expected:
+        raise ConfigError(
+            f"{reference.file}: got the content {digest(content)}, expected {expected}, "
+            "with which the work began; or another --out"
+        )
+    with NamedTemporaryFile(prefix="skytether-", suffix=".csv") as copy:
+        copy.write(content)
+        copy.flush()
+        yield replace(scenario, reference=replace(reference, file=copy.name))
 
 
 def _executor(flags: Flags) -> AbstractContextManager[Executor]:

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from server import sessions
 from shared import chance, config
 from shared.config import Scenario
-from shared.endpoint import MILLISECOND_NS
+from shared.endpoint import MILLISECOND_NS, SECOND_NS
 from shared.events import SessionEnded
 from shared.protocol import Heartbeat, encode
 from sim import flight
@@ -152,6 +153,19 @@ def test_a_session_is_forgotten_at_the_same_time_in_any_company() -> None:
     flights = assert_as_alone(flown, range(4))
     ended = [sum(event == SessionEnded(vehicle=1) for *_, event in run.events) for run in flights]
     assert sum(ended) >= 3
+
+
+@pytest.mark.parametrize("name", ["demo", "paper"])
+def test_a_run_whose_sessions_expire_is_the_same_in_any_company(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Vehicles heard once in some seconds, by a server that forgets them after three."""
+    monkeypatch.setattr(sessions, "SESSION_NS", 3 * SECOND_NS)
+    table = config.to_table(config.load(name)) | {"duration": 20.0, "settle": 0.0}
+    table["network"]["downlink"]["loss"] = 0.97
+    table["link"]["connect_s"] = 1000.0
+    flights = assert_as_alone(config.check(table, "test"), range(1, 13))
+    assert sum(event == SessionEnded(vehicle=1) for run in flights for *_, event in run.events) >= 6
 
 
 def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:

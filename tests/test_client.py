@@ -1,7 +1,7 @@
 """The client as an endpoint: session, steps on its own grid, and flying on alone."""
 
 import io
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -17,13 +17,17 @@ from shared.events import (
     Finished,
     Flying,
     NoAnswer,
+    NoSession,
     ServerHeard,
     ServerRestarted,
     ServerSilent,
     SessionRefused,
 )
 from shared.protocol import (
+    ACCEPTED,
+    FULL,
     NO_HORIZON,
+    TAKEN,
     Heartbeat,
     Hello,
     Horizon,
@@ -80,10 +84,16 @@ class Server:
         self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
 
     def welcome(
-        self, *, boot_id: int = 99, server_boot_id: int = 1, terms: Terms | None = None
+        self,
+        *,
+        boot_id: int = 99,
+        server_boot_id: int = 1,
+        refusal: int = ACCEPTED,
+        terms: Terms | None = None,
     ) -> None:
-        """Open a session."""
-        self.say(Welcome(4, self.session, boot_id, server_boot_id, 1234, terms or self.terms))
+        """Open a session, or refuse it."""
+        session, terms = self.session if refusal == ACCEPTED else 0, terms or self.terms
+        self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
 
     def horizon(self, step: int, value: float, *, observed_ns: int = 0) -> None:
         """A horizon of one constant input."""
@@ -139,6 +149,58 @@ def test_another_scenario_at_the_server_ends_the_client_with_the_difference() ->
     assert server.client.failure == failure
     assert server.client.events() == (failure,)
     assert str(failure).endswith(": control.dt is 0.05 here and 0.02 at the other end")
+
+
+@pytest.mark.parametrize(
+    ("refusal", "reason", "said"),
+    [
+        (FULL, "full", "the server is full; see its --vehicles"),
+        (TAKEN, "taken", "another client flies under this number; see --id"),
+    ],
+)
+def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason(
+    refusal: int, reason: Literal["full", "taken"], said: str
+) -> None:
+    """Once, at the first refusal; it gives up after `link.connect_s`, as without an answer."""
+    server, hellos = Server(scenario()), 0
+    while not server.client.finished:
+        hellos += len(server.wake())
+        server.welcome(refusal=refusal)
+    assert hellos == 16
+    failure = NoSession(vehicle=4, host="server", port=0, reason=reason)
+    assert server.client.failure == failure
+    assert server.client.events() == (failure,)
+    assert str(failure) == f"vehicle 4 is refused by server:0: {said}"
+    assert server.client.next_wake_ns() is None
+    assert server.client.counts == {f"dropped: {reason}": 17}
+
+
+def test_a_vehicle_that_was_refused_flies_once_there_is_room() -> None:
+    """The refusals before leave nothing behind."""
+    server = Server(scenario())
+    for refusal in (FULL, TAKEN, ACCEPTED):
+        server.wake()
+        server.welcome(refusal=refusal)
+    (said,) = server.wake()
+    assert isinstance(said, Observation)
+    events = [type(event) for event in server.client.events()]
+    assert events == [NoSession, NoSession, Flying]
+
+
+def test_a_refusal_in_flight_is_told_and_flown_through() -> None:
+    """After its first session a vehicle never gives up; a refusal that comes late is no news."""
+    server = flying(link={"heartbeat_s": 0.1, "timeout_s": 1.0, "connect_s": 2.0})
+    server.welcome(refusal=TAKEN)
+    assert server.client.events() == (Flying(vehicle=4),)
+    for _ in range(100):
+        server.wake()
+        server.welcome(refusal=TAKEN)
+    taken = NoSession(vehicle=4, host="server", port=0, reason="taken")
+    assert server.client.events() == (ServerSilent(vehicle=4), taken)
+    server.welcome()
+    assert server.client.events() == (ServerHeard(vehicle=4),)
+    assert server.client.failure is None
+    assert server.rows()["step"].tolist() == list(range(100))
 
 
 def test_the_epoch_is_the_moment_the_session_opens() -> None:

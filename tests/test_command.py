@@ -395,6 +395,30 @@ def test_a_client_that_is_refused_names_each_key_and_both_values(
     assert server.end() == 0
 
 
+def test_a_client_too_many_and_one_under_a_number_in_flight_are_told_why(
+    start: Callable[..., Process],
+) -> None:
+    """Exit code 2 and one line each, and one at the server; who flies already flies on."""
+    patient = ["--settle", "0", "--link.timeout-s", "10"]  # nobody is silent, on a busy machine
+    server = start("server", "demo", "--bind", "127.0.0.1:0", "--vehicles", "1", *patient)
+    address = server.address()
+    argv = ["client", "demo", "--server", address, *patient]
+    flying = start(*argv)
+    server.wait_for("vehicle 1 flies")
+    reasons = {
+        "1": "another client flies under this number; see --id",
+        "2": "the server is full; see its --vehicles",
+    }
+    for number, reason in reasons.items():
+        run = skytether_(*argv, "--id", number, "--link.connect-s", "1.5")
+        assert run.returncode == 2
+        assert run.stderr == f"client: vehicle {number} is refused by {address}: {reason}\n"
+    server.wait_for(r"vehicle 1 from .* is refused: another client flies .*, from 127.0.0.1:\d+;")
+    server.wait_for(r"vehicle 2 from .* is refused: the server is full \(room for 1\);")
+    assert flying.counted("horizons") > 0
+    assert (flying.end(), server.end()) == (0, 0)
+
+
 def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> None:
     """Lines of JSON alone, each with process and CLOCK_MONOTONIC, in the order of time."""
     server = start("server", "demo", "--bind", "127.0.0.1:0", *QUICK)

@@ -15,7 +15,10 @@ from shared.events import (
     Flying,
     Listening,
     NoAnswer,
+    NoSession,
+    NumberTaken,
     Plaintext,
+    ServerFull,
     ServerHeard,
     ServerRestarted,
     ServerSilent,
@@ -48,6 +51,21 @@ SENTENCES = [
             "vehicle 1 is refused, it flies another scenario: control.dt is 0.05 here and 0.02 at "
             "the other end; model.axes is 2 here and 3 at the other end"
         ),
+    ),
+    (
+        ServerFull(vehicle=3, host="192.0.2.1", port=5, room=64),
+        ("vehicle 3 from 192.0.2.1:5 is refused: the server is full (room for 64); see --vehicles"),
+    ),
+    (
+        NumberTaken(vehicle=3, host="192.0.2.1", port=5, holder="[::1]:6"),
+        (
+            "vehicle 3 from 192.0.2.1:5 is refused: another client flies under this number, "
+            "from [::1]:6; see --id"
+        ),
+    ),
+    (
+        NoSession(vehicle=3, host="::1", port=5, reason="full"),
+        "vehicle 3 is refused by [::1]:5: the server is full; see its --vehicles",
     ),
     (
         NoAnswer(vehicle=1, host="server", port=5, waited_s=15.6),

@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 
 from netem import link as link_module
 from netem.fate import Fate
-from netem.link import Lane, Link
+from netem.link import QUEUE_BYTES_MAX, Lane, Link
 from shared.endpoint import MILLISECOND_NS, Datagram
 from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Recorder, Rows, parse
 
 PEER = ("192.0.2.1", 5000)
 
 
-def make_link() -> Link:
+def make_link(mtu: int = 1472) -> Link:
     """A link that writes nothing down."""
-    return Link(UPLINK, None)
+    return Link(UPLINK, mtu, None)
 
 
 def make_lane(*delays_ns: int, flow: int = 0, lost: Iterable[int] = ()) -> Lane:
@@ -140,6 +140,42 @@ def test_a_packet_that_overflows_uses_up_its_fate(monkeypatch: pytest.MonkeyPatc
     assert link.next_due_ns() == 8
 
 
+def test_what_is_longer_than_the_mtu_is_dropped_and_counted_apart() -> None:
+    """The longest that passes is the MTU itself; the dropped one uses up its fate."""
+    link, lane = make_link(mtu=1200), make_lane(0, 0, 7)
+    for size in (1200, 1201, 1):
+        link.take(Datagram(bytes(size), PEER), lane, now_ns=0)
+    assert [len(datagram.payload) for datagram in link.give(now_ns=6)] == [1200]
+    assert link.next_due_ns() == 7
+    counts = link.counts
+    assert (counts.oversized, counts.lost, counts.overflowed, counts.packets) == (1, 0, 0, 3)
+
+
+def test_what_is_under_way_is_bounded_in_bytes_too() -> None:
+    """The worst flood, packets as long as UDP takes: 64 MiB of them, whoever sent more."""
+    link, size = make_link(mtu=65_507), 65_507
+    lane = make_lane(*range(1, 2001))
+    payload = bytes(size)
+    for _ in range(2000):
+        link.take(Datagram(payload, PEER), lane, now_ns=0)
+    most = QUEUE_BYTES_MAX // size
+    assert (link.depth(), link.counts.overflowed) == (most, 2000 - most)
+    assert link.depth_bytes() == most * size <= QUEUE_BYTES_MAX
+    assert len(link.give(now_ns=most)) == most
+    assert link.depth_bytes() == 0
+
+
+def test_what_leaves_makes_room_for_as_many_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A short packet still passes where a long one would not."""
+    monkeypatch.setattr(link_module, "QUEUE_BYTES_MAX", 100)
+    link, lane = make_link(), make_lane(5, 5, 5, 5)
+    for size in (90, 20, 10):
+        link.take(Datagram(bytes(size), PEER), lane, now_ns=0)
+    assert [len(datagram.payload) for datagram in link.give(now_ns=5)] == [90, 10]
+    link.take(Datagram(bytes(100), PEER), lane, now_ns=5)
+    assert (link.depth(), link.counts.overflowed) == (1, 1)
+
+
 def test_the_greatest_depth_is_remembered() -> None:
     """After the queue has emptied as well."""
     link = make_link()
@@ -203,7 +239,7 @@ def test_the_delay_histogram_is_of_delays_as_drawn() -> None:
 def recorded(direction: int, lane: Lane, names: str) -> Rows:
     """What a link writes down of packets 1 µs apart that all leave in the end."""
     sink = io.BytesIO()
-    link = Link(direction, Recorder(PACKET_COLUMNS, sink))
+    link = Link(direction, 1472, Recorder(PACKET_COLUMNS, sink))
     for index, name in enumerate(names):
         link.take(packet(name), lane, now_ns=1000 * index)
     link.give(now_ns=10**9)

@@ -26,7 +26,7 @@ def hostile(rng: random.Random) -> Iterator[bytes]:
     real = [
         encode(message)
         for message in (
-            Welcome(1, 7, 5, 3, 10, TERMS),
+            Welcome(1, 7, 5, 3, 10, 0, TERMS),
             Observation(1, 7, 5, 10, 4, 4, 8, 9, np.zeros((2, 2))),
             Horizon(1, 7, 5, 10, 9, inputs),
             Horizon(1, 7, 5, 10, 9, inputs, np.ones((2, FEEDBACK), np.float32)),
@@ -85,7 +85,9 @@ def test_ten_thousand_hostile_datagrams_are_counted_and_change_nothing(
 
 
 def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
-    """Many vehicles with many lives each: one answer each, and no more kept than there is room."""
+    """Many vehicles with many lives each: one answer each, no more kept than there is room, and
+    each refusal told.
+    """
     server = Server(SCENARIO, boot_id=1)
     answers = 0
     for boot_id in range(3):
@@ -94,7 +96,7 @@ def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
             server.receive(Datagram(hello, STRANGER), now_ns=SECOND_NS)
             answers += len(server.outbox())
     assert answers == 6000
-    assert len(server.sessions.welcomed) == VEHICLES_MAX
+    assert len(server.sessions.coming) == VEHICLES_MAX
     assert len(server.events()) <= EVENTS_MAX
 
 

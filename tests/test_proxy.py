@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from netem import link as link_module
 from netem.fate import fates
 from netem.link import Link
-from netem.proxy import FLOWS_MAX, IDLE_NS, Proxy
+from netem.proxy import FLOWS_MAX, IDLE_NS, Flow, Proxy
 from shared.config import DirectionConfig, NetworkConfig, Scenario
 from shared.endpoint import MILLISECOND_NS, Datagram
 from shared.events import FlowOpened
@@ -27,9 +27,10 @@ def make_proxy(
     downlink: DirectionConfig | None = None,
     seed: int = 1,
     flows: int = FLOWS_MAX,
+    mtu: int = 1472,
 ) -> Proxy:
     """A proxy with this network, the same both ways unless said."""
-    network = NetworkConfig(uplink=uplink, downlink=downlink or uplink)
+    network = NetworkConfig(uplink=uplink, downlink=downlink or uplink, mtu=mtu)
     return Proxy(Scenario(seed=seed, network=network), server=SERVER, flows=flows)
 
 
@@ -112,6 +113,32 @@ def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client() -> None
     assert (proxy.outbox(), proxy.refused) == ([], 2)
 
 
+def test_flows_give_way_in_the_order_of_their_last_use() -> None:
+    """Whether that was the client's packet or the server's."""
+    proxy = make_proxy(flows=3)
+    for client in (ALICE, BOB, CAROL, ALICE):
+        pass_on(proxy, b"?", client)
+    hear(proxy, b"!", SERVER, 2)
+    proxy.outbox()
+    newcomers = [("192.0.2.3", port) for port in range(3)]
+    assert [pass_on(proxy, b"?", client, at=IDLE_NS) for client in newcomers] == [3, 1, 2]
+
+
+def test_a_refusal_looks_at_one_flow_however_many_there_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A flood from strangers takes as long with 16 384 flows as with one."""
+    proxy = make_proxy(flows=300)
+    for port in range(300):
+        pass_on(proxy, b"?", ("192.0.2.1", port))
+    looked = []
+    monkeypatch.setattr(Flow, "used_ns", property(lambda flow: looked.append(flow.socket) or 0))
+    for port in range(100):
+        hear(proxy, b"?", ("192.0.2.3", port))
+    assert proxy.refused == 100
+    assert looked == [1] * 100
+
+
 def test_the_servers_packets_keep_a_flow_in_use() -> None:
     """A client that only listens is not idle."""
     proxy = make_proxy(flows=1)
@@ -137,10 +164,21 @@ def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() 
 def test_payloads_pass_unread(length: int) -> None:
     """Any bytes, none, and the longest that UDP takes, both ways."""
     payload = random.Random(length).randbytes(length)
-    proxy = make_proxy()
+    proxy = make_proxy(mtu=65_507)
     socket = pass_on(proxy, payload, ALICE)
     hear(proxy, payload, SERVER, socket)
     assert proxy.outbox() == [Datagram(payload, ALICE, 0)]
+
+
+def test_a_datagram_longer_than_the_mtu_passes_neither_way() -> None:
+    """As on a path that does not fragment; the flow lives on."""
+    proxy = make_proxy(mtu=1300)
+    socket = pass_on(proxy, bytes(1300), ALICE)
+    hear(proxy, bytes(1301), ALICE)
+    hear(proxy, bytes(1301), SERVER, socket)
+    assert proxy.outbox() == []
+    assert (proxy.downlink.counts.oversized, proxy.uplink.counts.oversized) == (1, 1)
+    assert pass_on(proxy, b"?", ALICE) == socket
 
 
 def test_without_delay_packets_are_forwarded_as_they_arrive() -> None:
@@ -209,7 +247,7 @@ def test_the_figures_name_every_statistic() -> None:
     hear(proxy, b"!", SERVER, 1, at=3 * ms)
     hear(proxy, b"!", BOB, 1, at=3 * ms)
     proxy.wake(now_ns=21 * ms)
-    nothing = dict.fromkeys(("forwarded", "lost", "reordered", "overflowed"), 0)
+    nothing = dict.fromkeys(("forwarded", "lost", "reordered", "oversized", "overflowed"), 0)
     errors = ("error_ms_p50", "error_ms_p99", "error_ms_max")
     assert proxy.figures() == {
         "flows": 1,
@@ -268,5 +306,5 @@ def test_no_packet_appears_or_vanishes(
 def is_balanced(link: Link) -> bool:
     """Whether what entered is accounted for, and the queue within its bound."""
     counts = link.counts
-    gone = counts.forwarded + counts.lost + counts.overflowed
+    gone = counts.forwarded + counts.lost + counts.oversized + counts.overflowed
     return counts.packets == gone + link.depth() and link.depth() <= 8

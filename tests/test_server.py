@@ -5,20 +5,34 @@ import math
 from typing import Any
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from server.endpoint import VEHICLES_MAX, Server
-from server.sessions import SESSION_NS
+from server.sessions import SESSION_NS, WELCOME_NS, Sessions
 from shared import config
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
-from shared.events import Difference, SessionEnded, SessionRefused
+from shared.events import (
+    Difference,
+    NumberTaken,
+    ServerFull,
+    SessionEnded,
+    SessionOpened,
+    SessionRefused,
+)
 from shared.protocol import (
+    ACCEPTED,
+    FULL,
     NO_HORIZON,
+    OTHER_TERMS,
+    TAKEN,
     Heartbeat,
     Hello,
     Horizon,
     Message,
     Observation,
+    ProtocolError,
     Welcome,
     decode,
     encode,
@@ -26,26 +40,29 @@ from shared.protocol import (
 from shared.record import Recorder, Rows, parse, server_columns
 
 HERE: Address = ("vehicle", 1)
+SILENCE_NS = 1500 * MILLISECOND_NS
+"""Time after which another life of a vehicle may take its number, in all of these tests."""
 DAY_NS = 86_400 * SECOND_NS
 """What the vehicle's clock is ahead of the server's, in all of these tests."""
 
 
 def scenario(**control: Any) -> Scenario:
-    """The paper's, with some keys of `control` changed."""
+    """The paper's, with some keys of `control` changed, and vehicles that are soon found silent."""
     table = config.to_table(config.load("paper-every-step"))
     table["control"] |= control
+    table["link"]["timeout_s"] = SILENCE_NS / SECOND_NS
     return config.check(table, "test")
 
 
 class Vehicles:
     """A server, and vehicles that say to it exactly what a test wants them to."""
 
-    def __init__(self, flown: Scenario, boot_id: int = 77) -> None:
+    def __init__(self, flown: Scenario, boot_id: int = 77, room: int = VEHICLES_MAX) -> None:
         self.terms = flown.terms()
         self.dt_ns = flown.dt_ns
         self.sink = io.BytesIO()
         recorder = Recorder(server_columns(flown.model.axes), self.sink)
-        self.server = Server(flown, boot_id=boot_id, recorder=recorder)
+        self.server = Server(flown, boot_id=boot_id, room=room, recorder=recorder)
         # Ticks lie on multiples of 50 ms: the first comes 30 ms after what is said first.
         self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
 
@@ -58,11 +75,17 @@ class Vehicles:
         """What is in the outbox, decoded."""
         return [(decode(out.payload, self.terms), out.peer) for out in self.server.outbox()]
 
-    def open(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
-        """A session, welcomed but not yet live."""
+    def ask(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
+        """The answer to a HELLO."""
         ((welcome, peer),) = self.say(Hello(vehicle, boot_id, self.terms), sender)
         assert isinstance(welcome, Welcome)
         assert peer == sender
+        return welcome
+
+    def open(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
+        """A session, welcomed but not yet live."""
+        welcome = self.ask(vehicle, boot_id, sender)
+        assert welcome.refusal == ACCEPTED
         return welcome
 
     def observe(
@@ -91,8 +114,8 @@ class Vehicles:
         """Time passes until the next tick; what is sent at it."""
         due_ns = self.server.next_wake_ns()
         assert due_ns is not None
-        self.now_ns = due_ns
-        self.server.wake(now_ns=due_ns)
+        self.now_ns = max(self.now_ns, due_ns)
+        self.server.wake(now_ns=self.now_ns)
         return self.answers()
 
     def rows(self) -> Rows:
@@ -125,6 +148,7 @@ def test_other_terms_open_no_session() -> None:
     ((welcome, _),) = vehicles.say(Hello(1, 5, other))
     assert isinstance(welcome, Welcome)
     assert welcome.terms == vehicles.terms
+    assert (welcome.refusal, welcome.session) == (OTHER_TERMS, 0)
     differences = (Difference("control.horizon", here="40", there="20"),)
     assert vehicles.server.events() == (SessionRefused(vehicle=1, differences=differences),)
     vehicles.observe(welcome, 0)
@@ -190,6 +214,7 @@ def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None
     vehicles = Vehicles(scenario())
     old = vehicles.open(boot_id=5)
     vehicles.observe(old, 50)
+    vehicles.now_ns += SILENCE_NS + 1
     new = vehicles.open(boot_id=6)
     assert new.session != old.session
     ((horizon, _),) = vehicles.tick()
@@ -198,9 +223,73 @@ def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None
     vehicles.observe(new, 0)
     ((horizon, _),) = vehicles.tick()
     assert isinstance(horizon, Horizon)
-    assert (horizon.session, horizon.step) == (new.session, 1)
+    assert (horizon.session, horizon.step) == (new.session, 0)
     vehicles.observe(old, 51)
     assert vehicles.server.counts["dropped: unknown session"] == 1
+
+
+def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing() -> None:
+    """As long as the first is heard; both operators read it, once for each life."""
+    vehicles = Vehicles(scenario())
+    first = vehicles.open(vehicle=3, boot_id=5)
+    for step in range(100):
+        vehicles.observe(first, step)
+        if step % 20 == 0:
+            refused = vehicles.ask(vehicle=3, boot_id=6, sender=("other", 2))
+            assert (refused.refusal, refused.session, refused.boot_id) == (TAKEN, 0, 6)
+        ((horizon, peer),) = vehicles.tick()
+        assert isinstance(horizon, Horizon)
+        assert (horizon.session, peer) == (first.session, HERE)
+    taken = NumberTaken(vehicle=3, host="other", port=2, holder="vehicle:1")
+    opened = SessionOpened(vehicle=3, host="vehicle", port=1)
+    assert vehicles.server.events() == (opened, taken)
+    assert vehicles.server.counts["refused: taken"] == 5
+
+
+def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
+    """The second is refused before the first has come, and gets in if that never does."""
+    vehicles = Vehicles(scenario())
+    first = vehicles.open(boot_id=5)
+    assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == TAKEN
+    vehicles.observe(first, 0)
+    ((horizon, _),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert horizon.session == first.session
+    vehicles = Vehicles(scenario())
+    vehicles.open(boot_id=5)
+    vehicles.now_ns += WELCOME_NS + 1
+    vehicles.observe(vehicles.open(boot_id=6), 0)
+    assert len(vehicles.server.sessions) == 1
+
+
+def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_heard_again() -> None:
+    """The network was away, not the vehicle: who was welcomed meanwhile is told when it asks."""
+    vehicles = Vehicles(scenario())
+    first = vehicles.open(boot_id=5)
+    vehicles.observe(first, 0)
+    vehicles.now_ns += SILENCE_NS + 1
+    second = vehicles.open(boot_id=6, sender=("other", 2))
+    vehicles.observe(first, 61)
+    vehicles.observe(second, 0, sender=("other", 2))
+    assert vehicles.server.counts["dropped: taken"] == 1
+    assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == TAKEN
+    ((horizon, peer),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert (horizon.session, peer) == (first.session, HERE)
+
+
+def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> None:
+    """It was welcomed while the old one had its row, and gets one of its own."""
+    vehicles = Vehicles(scenario(), room=1)
+    vehicles.observe(vehicles.open(boot_id=5), 0)
+    vehicles.now_ns += SESSION_NS - SECOND_NS
+    new = vehicles.open(boot_id=6)
+    vehicles.now_ns += 2 * SECOND_NS
+    vehicles.tick()
+    assert len(vehicles.server.sessions) == 0
+    assert vehicles.ask(vehicle=2).refusal == FULL
+    vehicles.observe(new, 0)
+    assert [session.boot_id for session in vehicles.server.sessions] == [6]
 
 
 def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None:
@@ -273,23 +362,95 @@ def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
     assert vehicles.server.events()[-1] == SessionEnded(vehicle=1)
 
 
-def test_no_more_vehicles_than_there_is_room_for() -> None:
-    """The one too many gets no answer; one that is known always does."""
+def test_a_vehicle_too_many_is_told_that_the_server_is_full() -> None:
+    """So is the operator, once; a vehicle that is known is always welcome."""
     vehicles = Vehicles(scenario())
     for number in range(VEHICLES_MAX):
         vehicles.observe(vehicles.open(vehicle=number), 0)
-    assert vehicles.say(Hello(1000, 1, vehicles.terms)) == []
-    assert vehicles.server.counts["dropped: no room for another vehicle"] == 1
+    vehicles.server.events()
+    for _ in range(3):
+        refused = vehicles.ask(vehicle=1000)
+        assert (refused.refusal, refused.session) == (FULL, 0)
+    full = ServerFull(vehicle=1000, host="vehicle", port=1, room=VEHICLES_MAX)
+    assert vehicles.server.events() == (full,)
+    assert vehicles.server.counts["refused: full"] == 3
     assert vehicles.open(vehicle=7).vehicle == 7
 
 
-def test_vehicles_that_never_came_give_their_place_to_new_ones() -> None:
-    """A welcome is a promise that expires: HELLOs alone cannot fill the server."""
-    vehicles = Vehicles(scenario())
-    for number in range(VEHICLES_MAX):
-        vehicles.open(vehicle=number)
-    vehicles.observe(vehicles.open(vehicle=1000), 0)
-    assert [type(message) for message, _ in vehicles.tick()] == [Horizon]
+def test_a_full_server_keeps_the_second_life_of_a_vehicle_from_a_stranger() -> None:
+    """The vehicle that restarts has its row already: no stranger is welcomed in its place."""
+    vehicles = Vehicles(scenario(), room=2)
+    for number in (1, 2):
+        vehicles.observe(vehicles.open(vehicle=number), 0)
+    vehicles.now_ns += SILENCE_NS + 1
+    second_life = vehicles.open(vehicle=1, boot_id=6)
+    for _ in range(2):
+        assert vehicles.ask(vehicle=1000).refusal == FULL
+        vehicles.now_ns += WELCOME_NS + 1
+    vehicles.observe(second_life, 0)
+    assert [session.boot_id for session in vehicles.server.sessions] == [6, 5]
+
+
+def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
+    """Each that was told so gets its row; one that never came makes room for the next."""
+    vehicles = Vehicles(scenario(), room=3)
+    welcomes = [vehicles.open(vehicle=number) for number in range(3)]
+    assert vehicles.ask(vehicle=1000).refusal == FULL
+    vehicles.now_ns += WELCOME_NS
+    vehicles.open(vehicle=0)  # says HELLO again: of the others, 1 has waited longest
+    assert vehicles.ask(vehicle=1000).refusal == FULL
+    vehicles.now_ns += 1
+    late = vehicles.open(vehicle=1000)
+    for welcome in (welcomes[0], welcomes[2], late):
+        vehicles.observe(welcome, 0)
+    assert len(vehicles.server.sessions) == 3
+    vehicles.observe(welcomes[1], 0)
+    assert vehicles.server.counts["dropped: unknown session"] == 1
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["hello", "observe", "wait"]), st.integers(0, 5), st.integers(0, 2)
+        ),
+        max_size=60,
+    )
+)
+def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
+    moves: list[tuple[str, int, int]],
+) -> None:
+    """Any vehicles, lives and waits: never more than there is room for, and never a crash."""
+    sessions, now_ns = Sessions(3, 1, SILENCE_NS), DAY_NS
+    terms = scenario().terms()
+    numbers: dict[tuple[int, int], int] = {}
+    due: dict[int, tuple[int, int]] = {}
+    """Life that each vehicle must be granted, and until when."""
+    for move, vehicle, boot_id in moves:
+        match move:
+            case "hello":
+                hello = Hello(vehicle, boot_id, terms)
+                if sessions.holder(hello, now_ns) is None and not sessions.is_full(hello, now_ns):
+                    session = sessions.welcome(hello, HERE, now_ns)
+                    numbers[vehicle, boot_id] = session.number
+                    due[vehicle] = (boot_id, now_ns + WELCOME_NS)
+            case "observe" if (vehicle, boot_id) in numbers:
+                said = Observation(
+                    vehicle, numbers[vehicle, boot_id], 0, 0, -1, 0, 0, 0, np.zeros((2, 2))
+                )
+                granted, refused = due.get(vehicle, (-1, 0)), ""
+                try:
+                    (sessions.find(said) or sessions.begin(said, now_ns)).heard_ns = now_ns
+                except ProtocolError as error:
+                    refused = error.reason
+                in_time = granted[0] == boot_id and now_ns <= granted[1]
+                assert refused in ("", "taken") or not in_time
+            case "wait":
+                now_ns += boot_id * (SILENCE_NS // 2 + 1) + vehicle * SECOND_NS
+                if vehicle == 5:
+                    now_ns += SESSION_NS
+                sessions.expire(now_ns)
+        assert len(sessions) + len(sessions.coming) <= 3
+        assert len(sessions.rows) == len(sessions)
 
 
 def test_two_vehicles_fly_as_each_would_alone() -> None:

@@ -19,12 +19,13 @@ import pytest
 from msgspec.structs import replace
 
 from lab import figures
-from lab.journal import Journal, sealed
+from lab.journal import Journal, digests, sealed
 from lab.sweep import CHUNK, Axis, Done, Sweep, estimate, fly, parse_axis
 from shared import config
-from shared.config import ConfigError
+from shared.config import ConfigError, Scenario
 from shared.summary import summarise
 from sim import flight
+from skytether.pool import Crew, pinned, work
 
 PATIENCE_S = 30.0
 
@@ -333,20 +334,89 @@ def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
     assert capsys.readouterr().err == said
 
 
+def along(path: Path) -> Scenario:
+    """The paper's, along a trajectory that is written to a file."""
+    path.write_text(LINE)
+    table = config.to_table(PAPER) | {"reference": {"shape": "csv", "file": str(path)}}
+    return config.check(table, "mine")
+
+
+LINE, OTHER_LINE = "t,x,y\n0,0,0\n5,1,1\n", "t,x,y\n0,0,0\n5,1,2\n"
+
+
 def test_a_trajectory_edited_between_two_sweeps_is_refused(tmp_path: Path) -> None:
     """One cell would hold flights along both, and its mean would be of neither."""
     paths = [tmp_path / name for name in ("one.csv", "two.csv")]
-    for path in paths:
-        path.write_text("t,x,y\n0,0,0\n5,1,1\n")
-    table = config.to_table(PAPER) | {"reference": {"shape": "csv", "file": str(paths[0])}}
+    scenario, _ = map(along, paths)
     grid = parse_axis(f"reference.file={paths[0]},{paths[1]}")
-    plan = Sweep("mine", config.check(table, "mine"), [grid], 3)
+    plan = Sweep("mine", scenario, [grid], 3)
     journal_of(plan, tmp_path / "out").close()
     journal_of(plan, tmp_path / "out").close()
-    paths[1].write_text("t,x,y\n0,0,0\n5,1,2\n")
+    paths[1].write_text(OTHER_LINE)
     with pytest.raises(ConfigError) as refused:
         journal_of(plan, tmp_path / "out")
     assert str(refused.value).startswith(f"{tmp_path}/out: files.{paths[1]}: got '")
+
+
+def test_a_task_whose_trajectory_was_edited_since_the_sweep_began_is_not_flown(
+    tmp_path: Path,
+) -> None:
+    """Nor is it kept; once the file is what it was, the sweep goes on."""
+    path = tmp_path / "path.csv"
+    plan = Sweep("mine", along(path), [], CHUNK + 1)
+    first, second = plan.tasks()
+    with closing(journal_of(plan, tmp_path / "out")) as journal:
+        journal.append(work(first, journal.files)[0])
+        path.write_text(OTHER_LINE)
+        with pytest.raises(ConfigError, match=r"path\.csv: got the content .*, with which"):
+            work(second, journal.files)
+        path.write_text(LINE)
+        journal.append(work(second, journal.files)[0])
+        assert len(journal.entries) == 2
+
+
+def test_a_flight_under_way_does_not_see_edits_of_its_trajectory(tmp_path: Path) -> None:
+    """Each task flies along a copy of its own, however often somebody saves the file meanwhile."""
+    path = tmp_path / "path.csv"
+    scenario = along(path)
+    with pinned(scenario, digests([scenario])) as flown:
+        path.write_text(OTHER_LINE)
+        at_the_end = flown.make_reference()(np.array([5.0]))[0, :, 0]
+        terms = flown.terms()
+    assert at_the_end.tolist() == [1.0, 1.0]
+    path.write_text(LINE)
+    assert terms == scenario.terms()
+    assert not Path(flown.reference.file).exists()
+
+
+def test_a_trajectory_edited_while_a_sweep_runs_ends_the_command_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before any table is written; the same command goes on with the file as it was."""
+    from skytether.__main__ import main
+
+    path, out = tmp_path / "path.csv", tmp_path / "out"
+    along(path)
+    (tmp_path / "mine.toml").write_text(
+        'extends = "paper"\nreference = { shape = "csv", file = "path.csv" }\n'
+    )
+    argv = ["sweep", str(tmp_path / "mine.toml"), "--duration", "2", "--settle", "0"]
+    argv += ["--runs", "2", "--workers", "1", "--out", str(out)]
+    fly_sweep = Crew.fly
+
+    def edited(*arguments: Any) -> None:
+        """Fly, after somebody has saved another trajectory."""
+        path.write_text(OTHER_LINE)
+        fly_sweep(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Crew, "fly", edited)
+        assert main(argv) == 2
+    said = capsys.readouterr().err
+    assert re.fullmatch(rf"sweep: {path}: got the content \w+, expected \w+, with .*\n", said)
+    assert (lines(out), (out / "runs.csv").exists()) == (0, False)
+    path.write_text(LINE)
+    assert main(argv) == 0
 
 
 # -- the command ---------------------------------------------------------------------------------
