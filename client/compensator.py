@@ -74,7 +74,9 @@ class Compensator:
             raise ProtocolError("observation")
         if length < 1:
             raise ProtocolError("too old")
-        if self._commits and step - horizon.step > given - self._H + self._late_max:
+        stage = step - horizon.step
+        late = self._commits and stage > given - self._H + self._late_max
+        if late or (self._brake and stage >= length):  # braking is not begun anew
             raise ProtocolError("too late")
         self.in_force, self._new = horizon.step, True
         self.observed_ns = horizon.observed_ns
