@@ -44,6 +44,9 @@ from shared.terms import Terms
 
 MARGIN = 2
 """Steps on top of half a round trip, until a horizon has been acknowledged."""
+TRIP_NS = 1_500_000_000
+"""Longest trip, from an observation to the plan made from it, that `control.observer_s` is meant
+for [ns]; over a longer one an observer as fast as that makes the plans swing."""
 HOVERS, UNKNOWN = -1, -2
 """In place of the number of a horizon: none yet; one that was sent in an earlier life of ours."""
 
@@ -320,9 +323,13 @@ def _roll(
 
 @part
 def _observe_disturbance(
-    settings: Settings, memory: Memory, row: int, course: Course, track: Track
+    settings: Settings, memory: Memory, row: int, trip: int, course: Course, track: Track
 ) -> None:
-    """Disturbance observer: from the observation before to the newest, where there is a new one."""
+    """Disturbance observer: from the observation before to the newest, where there is a new one.
+
+    Args:
+        trip: steps from that to where planning starts; a long trip makes it slower.
+    """
     seen = memory.seen[row]
     begin, end = seen.base_step, memory.observed[row]
     if end == begin:
@@ -347,7 +354,8 @@ def _observe_disturbance(
             )
             # A change of w changes the velocity after m steps by 1 - a11^m of it.
             off = (state.v - track.states[m, 1]) / (1.0 - rule.a11**m)
-            w = state.w + (1.0 - settings.decay**m) * off
+            slower = max(1.0, trip * settings.dt_ns / TRIP_NS)
+            w = state.w + (1.0 - settings.decay ** (m / slower)) * off
             memory.state[row, axis].w = min(max(w, -rule.bound), rule.bound)
     for axis in range(len(settings.rule)):
         state = memory.state[row, axis]
@@ -390,7 +398,8 @@ def _foresee(
         _listen(settings, memory, bound, clock, row)
         d = bound.steps[row]
         if settings.decay < 1.0:
-            _observe_disturbance(settings, memory, row, course, track)
+            trip = k + d - memory.observed[row]
+            _observe_disturbance(settings, memory, row, trip, course, track)
         seen, observed = memory.seen[row], memory.observed[row]
         assert (
             k - observed <= settings.age_max
