@@ -49,8 +49,8 @@ class Options:
 def fly(argv: Sequence[str]) -> None:
     """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM.
 
-    SIGUSR1 prints what was counted so far. The exit code is 1 where no server answers, and 2 where
-    the server flies another scenario.
+    SIGUSR1 prints what was counted so far. The exit code is 1 where no server answers or the
+    record is incomplete, and 2 where the server flies another scenario.
     """
     options = command.parse(Options(), argv, "skytether client", fly.__doc__)
     scenario, server = options.config, command.address("--server", options.server)

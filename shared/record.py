@@ -2,7 +2,7 @@
 
 Each process keeps its own part: the client what flew, the server what it thought, netem the fate of
 every packet. A part is a line of JSON that names the columns, then the rows as they are in memory.
-So a part that is cut off anywhere is one, and nothing is held in memory.
+So a part may end anywhere, as that of a process that is killed does: half a row is left out.
 """
 
 import json

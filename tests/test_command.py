@@ -489,6 +489,30 @@ def call_as_strangers(port: int, count: int) -> None:
             stranger.recv(65536)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_workers_that_are_told_to_end_twice_end_in_order(number: signal.Signals) -> None:
+    """By a terminal or a supervisor, which tells every process, and by their parent."""
+    argv = ["server", "demo", "--bind", "127.0.0.1:0", "--workers", "2"]
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", *argv],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+    ) as server:
+        try:
+            assert server.stdout is not None
+            said = [server.stdout.readline() for _ in range(2)]
+            os.killpg(server.pid, number)
+            rest, mistakes = server.communicate(timeout=PATIENCE_S)
+        finally:
+            server.kill()
+    assert (server.returncode, mistakes) == (0, "")
+    for worker in ("server.1", "server.2"):
+        assert any(line.startswith(f"{worker}: listening on") for line in said)
+        assert f"{worker}: counted so far:" in rest
+
+
 def test_a_flood_of_strangers_is_counted_in_a_line(start: Callable[..., Process]) -> None:
     """A few of them are told; the others are a number, and none is missing in it."""
     server = start("server", "demo", "--bind", "127.0.0.1:0", "--log", "json")
