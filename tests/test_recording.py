@@ -1,6 +1,7 @@
 """A part of the record on its way to a file: all rows, or as many as fit and a line about it."""
 
 import os
+import time
 from pathlib import Path
 from typing import BinaryIO
 
@@ -29,6 +30,16 @@ def test_rows_are_in_the_file_at_the_end(tmp_path: Path) -> None:
         assert part.rows()["number"].tolist() == list(range(1000))
         assert (part.news(), part.fault()) == (None, None)
     np.testing.assert_array_equal(read(path)["number"], np.arange(1000))
+
+
+def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
+    """Nobody has to end anything for it: a process that is killed keeps them."""
+    path = tmp_path / "netem"
+    with recorded(path, PACKET_COLUMNS) as part:
+        append(part, 10)
+        while path.stat().st_size < part._header_bytes + 10 * PACKET_COLUMNS.itemsize:
+            time.sleep(0.01)
+        assert read(path)["number"].tolist() == list(range(10))
 
 
 def test_a_full_disk_is_said_once_and_ends_the_command_when_all_is_done() -> None:
