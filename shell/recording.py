@@ -32,14 +32,9 @@ class Recording:
     """
 
     def __init__(self, name: str, columns: np.dtype[np.void], file: BinaryIO | OSError) -> None:
-        self._name = name
+        self._name = name.encode(errors="replace").decode()  # a file's name need not be Unicode
         self._file = file
-        self._writer = Writer(
-            file,
-            room=ROOM_BYTES,
-            together=TOGETHER_BYTES,
-            pause_s=PAUSE_S,
-        )
+        self._writer = Writer(file, room=ROOM_BYTES, together=TOGETHER_BYTES, pause_s=PAUSE_S)
         self.recorder = Recorder(columns, self._writer)
         """Takes the rows; it never waits and never fails."""
         self._header_bytes = self._writer.offered

@@ -106,6 +106,14 @@ def test_a_disk_that_is_too_slow_loses_whole_rows(monkeypatch: pytest.MonkeyPatc
         assert part.fault() == f"netem: the disk is too slow: {kept} of 1000 rows are recorded"
 
 
+def test_a_file_of_any_name_can_be_told_of() -> None:
+    """Its name need not be Unicode, but a line of JSON is."""
+    part = Recording("netem\udcff", PACKET_COLUMNS, OSError(28, "No space left on device"))
+    part.end()
+    assert part.news() == RecordIncomplete(file="netem?", reason="No space left on device")
+    part.close()
+
+
 def test_a_command_that_fails_otherwise_says_only_that() -> None:
     """A vehicle that was refused is the reason, whatever is in the record."""
 
