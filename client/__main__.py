@@ -2,7 +2,6 @@
 
 import secrets
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +15,8 @@ from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from shared.chance import stream
 from shared.config import Scenario
-from shared.events import NoAnswer
-from shared.record import Recorder, client_columns, parse
+from shared.events import NoSession, SessionRefused
+from shared.record import client_columns
 from shared.summary import summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -50,8 +49,9 @@ class Options:
 def fly(argv: Sequence[str]) -> None:
     """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM.
 
-    SIGUSR1 prints what was counted so far. The exit code is 1 where no server answers, and 2 where
-    the server flies another scenario, is full, or has another client under this number.
+    SIGUSR1 prints what was counted so far. The exit code is 1 where no server answers, where there
+    was never a plan to fly, or none at the end, and where the record is incomplete; 2 where the
+    server flies another scenario, is full, or has another client under this number.
     """
     options = command.parse(Options(), argv, "skytether client", fly.__doc__)
     scenario, server = options.config, command.address("--server", options.server)
@@ -61,10 +61,12 @@ def fly(argv: Sequence[str]) -> None:
         given = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else numbers[0]
         raise CommandError(f"--id: got {given}, expected 0 to 65535", 2)
     allow_sockets(len(numbers))
+    columns = client_columns(scenario.model.axes)
     with (
-        command.open_record(options.record) if options.record else tempfile.TemporaryFile()
-    ) as sink:
-        recorder = Recorder(client_columns(scenario.model.axes), sink)
+        command.recorded(options.record, columns)
+        if options.record
+        else command.recorded_meanwhile(columns)
+    ) as recording:
         clients = [
             Client(
                 scenario,
@@ -72,7 +74,7 @@ def fly(argv: Sequence[str]) -> None:
                 server=server,
                 vehicle=number,
                 boot_id=secrets.randbits(64),
-                recorder=recorder,
+                recorder=recording.recorder,
             )
             for number in numbers
         ]
@@ -86,19 +88,18 @@ def fly(argv: Sequence[str]) -> None:
             waiting_for=f"the server at {options.server}",
             log=options.log,
             json=None if alone else options.json,
+            recording=recording,
         )
-        sink.flush()
-        sink.seek(0)
-        rows = parse(sink.read())
-    if failure := endpoint.failure:
-        unheard = isinstance(failure, NoAnswer)
-        raise CommandError(str(failure), command.RUN if unheard else command.CONFIGURATION)
-    if alone and len(rows):
-        summary = summarise(scenario, options.scenario, rows)
-        if options.log == "text":
-            command.finish(summary, "client", options.json)
-        elif options.json:
-            command.write(options.json, msgspec.json.encode(summary))
+        if alone and len(rows := recording.rows()):
+            summary = summarise(scenario, options.scenario, rows)
+            title = "client, as far as it is recorded" if recording.fault() else "client"
+            if options.log == "text":
+                command.finish(summary, title, options.json)
+            elif options.json:
+                command.write(options.json, msgspec.json.encode(summary))
+        if failure := endpoint.failure:
+            refused = isinstance(failure, SessionRefused | NoSession)
+            raise CommandError(str(failure), command.CONFIGURATION if refused else command.RUN)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

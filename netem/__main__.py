@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,7 @@ import tyro
 
 from netem.proxy import FLOWS_MAX, Proxy
 from shared.config import Scenario
-from shared.record import PACKET_COLUMNS, Recorder
+from shared.record import PACKET_COLUMNS
 from shell import command
 from shell.command import ScenarioFlags, ScenarioName
 from shell.log import LogFormat
@@ -48,22 +49,22 @@ def emulate(argv: Sequence[str]) -> None:
     options = command.parse(Options(), argv, "skytether netem", emulate.__doc__)
     command.check_count("--flows", options.flows, 65_536)
     allow_sockets(1 + options.flows)
-    sink = command.open_record(options.record) if options.record else None
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
-    recorder = Recorder(PACKET_COLUMNS, sink) if sink else None
-    endpoint = Proxy(options.config, server=server, flows=options.flows, recorder=recorder)
-    command.drive(
-        "netem",
-        endpoint,
-        bind=bind,
-        peers=[server],
-        waiting_for=f"clients of {options.server}",
-        log=options.log,
-        json=options.json,
-    )
-    if sink:
-        sink.close()
+    record = options.record
+    with command.recorded(record, PACKET_COLUMNS) if record else nullcontext() as recording:
+        recorder = recording.recorder if recording else None
+        endpoint = Proxy(options.config, server=server, flows=options.flows, recorder=recorder)
+        command.drive(
+            "netem",
+            endpoint,
+            bind=bind,
+            peers=[server],
+            waiting_for=f"clients of {options.server}",
+            log=options.log,
+            json=options.json,
+            recording=recording,
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:

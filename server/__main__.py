@@ -4,6 +4,7 @@ import secrets
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from socket import socket
@@ -14,7 +15,7 @@ import tyro
 from server.endpoint import VEHICLES_MAX, Server
 from shared.config import Scenario
 from shared.endpoint import Address
-from shared.record import Recorder, server_columns
+from shared.record import server_columns
 from shared.stopwatch import Stopwatch
 from shell import command, workers
 from shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -58,10 +59,13 @@ def serve(argv: Sequence[str]) -> None:
     if options.workers == 1:
         _work(options, bind, "")
         return
+
+    def work(number: int, sock: socket) -> None:
+        suffix = f".{number}"
+        sys.exit(command.main(lambda _: _work(options, sock, suffix), (), f"server{suffix}"))
+
     try:
-        worst = workers.run(
-            options.workers, bind, lambda number, sock: _work(options, sock, f".{number}")
-        )
+        worst = workers.run(options.workers, bind, work)
     except AddressError as error:
         raise CommandError(str(error)) from None
     if worst:
@@ -74,27 +78,26 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
     def own(path: Path | None) -> Path | None:
         return path and path.with_name(path.name + suffix)
 
-    record = own(options.record)
-    sink = command.open_record(record) if record else None
+    record, columns = own(options.record), server_columns(options.config.model.axes)
     stopwatch = Stopwatch(time.perf_counter_ns)
-    endpoint = Server(
-        options.config,
-        boot_id=secrets.randbits(64),
-        room=options.vehicles,
-        recorder=Recorder(server_columns(options.config.model.axes), sink) if sink else None,
-        stopwatch=stopwatch,
-    )
-    command.drive(
-        f"server{suffix}",
-        endpoint,
-        bind=bind,
-        waiting_for="vehicles",
-        log=options.log,
-        json=own(options.json),
-        stopwatch=stopwatch,
-    )
-    if sink:
-        sink.close()
+    with command.recorded(record, columns) if record else nullcontext() as recording:
+        endpoint = Server(
+            options.config,
+            boot_id=secrets.randbits(64),
+            room=options.vehicles,
+            recorder=recording.recorder if recording else None,
+            stopwatch=stopwatch,
+        )
+        command.drive(
+            f"server{suffix}",
+            endpoint,
+            bind=bind,
+            waiting_for="vehicles",
+            log=options.log,
+            json=own(options.json),
+            stopwatch=stopwatch,
+            recording=recording,
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,11 +7,11 @@ many in virtual time.
 """
 
 from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Self
 
-from shared.events import Event
+from shared.events import Event, Omitted
 
 Address = tuple[str, int]
 """Host and port of a UDP socket. The host is a name, an IPv4 address or an IPv6 address without
@@ -21,7 +21,7 @@ SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000
 
 EVENTS_MAX = 1024
-"""Events kept until the driver reads them; older ones give way."""
+"""Events kept until the driver reads them; older ones give way, and are counted."""
 
 VEHICLES_TOLD_MAX = 16
 """Vehicles that `figures` tells of one by one."""
@@ -43,12 +43,39 @@ class Datagram(NamedTuple):
     """Number of the endpoint's own socket that it uses; 0 is the one that is bound."""
 
 
+class _Events(deque[Event]):
+    """Events that wait for the driver."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._omitted: Counter[str] = Counter()
+
+    def append(self, event: Event) -> None:
+        """Append an event; where there are too many, the oldest is only counted."""
+        if len(self) == EVENTS_MAX:
+            self._omitted[type(self.popleft()).__name__] += 1
+        super().append(event)
+
+    def __iadd__(self, events: Iterable[Event]) -> Self:
+        for event in events:
+            self.append(event)
+        return self
+
+    def take(self) -> Sequence[Event]:
+        """All of them, and before them how many were left out; none remain."""
+        omitted = (Omitted(kind=kind, count=count) for kind, count in self._omitted.items())
+        events = (*omitted, *self)
+        self.clear()
+        self._omitted.clear()
+        return events
+
+
 class Endpoint(ABC):
     """Something that talks UDP. `now_ns` is always the driver's monotonic clock [ns]."""
 
     def __init__(self) -> None:
         self._out: list[Datagram] = []
-        self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
+        self._events = _Events()
 
     @abstractmethod
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -80,8 +107,4 @@ class Endpoint(ABC):
 
     def events(self) -> Sequence[Event]:
         """Events since the last call; each is handed out once."""
-        if not self._events:
-            return ()
-        events = tuple(self._events)
-        self._events.clear()
-        return events
+        return self._events.take() if self._events else ()

@@ -56,6 +56,39 @@ class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return "counted so far:"
 
 
+class Omitted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """More events of a kind have happened than are told one by one."""
+
+    kind: str
+    """Name of their class; "lines" where nobody has read what was printed."""
+    count: int
+    """Number of events that are not told."""
+
+    def __str__(self) -> str:
+        return f"… and {self.count:,} more {self.kind}".replace(",", " ")
+
+
+class RecordIncomplete(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process could not write all of its part of the record; the flight goes on."""
+
+    file: str
+    reason: str
+    """What the system says of it, such as "No space left on device"."""
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.reason}: the record is incomplete, the flight goes on"
+
+
+class Fault(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process has met a mistake in its own code, and goes on."""
+
+    traceback: str
+    """Traceback in Python's words."""
+
+    def __str__(self) -> str:
+        return f"a mistake in its code, the flight goes on\n{self.traceback.rstrip()}"
+
+
 class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """New client, heard by netem."""
 
@@ -268,6 +301,9 @@ Event = (
     Listening
     | Plaintext
     | Counted
+    | Omitted
+    | RecordIncomplete
+    | Fault
     | FlowOpened
     | SessionOpened
     | SessionEnded

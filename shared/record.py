@@ -2,14 +2,14 @@
 
 Each process keeps its own part: the client what flew, the server what it thought, netem the fate of
 every packet. A part is a line of JSON that names the columns, then the rows as they are in memory.
-So a writer that is killed loses no more than its last row, and nothing is held in memory.
+So a part may end anywhere, as that of a process that is killed does: half a row is left out.
 """
 
 import json
 import math
 from pathlib import Path
 from struct import Struct
-from typing import Any, BinaryIO
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,10 +73,17 @@ PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
 """Columns of netem's part: one row for each packet."""
 
 
-class Recorder:
-    """Appends rows to a binary file."""
+class Sink(Protocol):
+    """What takes a part of the record, as a binary file does."""
 
-    def __init__(self, columns: np.dtype[np.void], sink: BinaryIO) -> None:
+    def write(self, piece: bytes, /) -> object:
+        """Take the header, or whole rows."""
+
+
+class Recorder:
+    """Appends rows to a sink."""
+
+    def __init__(self, columns: np.dtype[np.void], sink: Sink) -> None:
         self.columns = columns
         self._sink = sink
         self._row = _row(columns)

@@ -8,18 +8,19 @@ import ipaddress
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
-from functools import partial
 from inspect import cleandoc
 from pathlib import Path
 from socket import socket
-from typing import Annotated, Any, BinaryIO, Protocol, TypeVar
+from typing import Annotated, Any, BinaryIO, Protocol, TypeVar, cast
 
 import msgspec
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -33,7 +34,8 @@ from shared.events import Counted, Listening, Plaintext
 from shared.stopwatch import Stopwatch
 from shared.summary import Summary
 from shell.driver import Shell, run
-from shell.log import LogFormat, say
+from shell.log import Log, LogFormat
+from shell.recording import Recording
 from shell.udp import AddressError
 
 CONFIGURATION, RUN = 2, 1
@@ -133,16 +135,42 @@ def check_count(flag: str, given: int, most: int) -> None:
         raise CommandError(f"{flag}: got {given}, expected 1 to {most}", CONFIGURATION)
 
 
-def open_record(path: Path) -> BinaryIO:
-    """Open a file for a part of the record.
+@contextmanager
+def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[Recording]:
+    """Record into a file; a disk that fails in flight ends the command, but not the flight.
 
     Raises:
-        CommandError: it cannot be written.
+        CommandError: the file cannot be opened; at the end, it does not hold all rows.
     """
     try:
-        return path.open("w+b", buffering=0)  # a process that is killed keeps what it wrote
+        file = path.open("w+b", buffering=0)
     except OSError as error:
         raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None
+    yield from _until_the_end(Recording(str(path), columns, file))
+
+
+@contextmanager
+def recorded_meanwhile(columns: np.dtype[np.void]) -> Iterator[Recording]:
+    """Record into a temporary file; where there can be none, nothing is recorded.
+
+    Raises:
+        CommandError: at the end, the file does not hold all rows.
+    """
+    file: BinaryIO | OSError
+    try:
+        temporary = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - the recording closes it
+        file = cast(BinaryIO, temporary)
+    except OSError as error:
+        file = error
+    yield from _until_the_end(Recording("temporary record", columns, file))
+
+
+def _until_the_end(recording: Recording) -> Iterator[Recording]:
+    with closing(recording):
+        yield recording
+        recording.end()
+    if fault := recording.fault():
+        raise CommandError(fault)
 
 
 def drive(
@@ -155,6 +183,7 @@ def drive(
     log: LogFormat,
     json: Path | None = None,
     stopwatch: Stopwatch | None = None,
+    recording: Recording | None = None,
 ) -> None:
     """Run one endpoint as a process until it has finished or is told to stop.
 
@@ -165,6 +194,7 @@ def drive(
         waiting_for: whose datagrams it waits for, for the operator.
         log: form of its log on stdout.
         json: file for its last figures.
+        recording: where it records; waited for at the end.
 
     Raises:
         CommandError: it cannot start, or the file cannot be written.
@@ -173,14 +203,13 @@ def drive(
         shell = Shell(endpoint, bind, peers, stopwatch)
     except AddressError as error:
         raise CommandError(str(error)) from None
-    tell = partial(say, process=process, log=log)
     began_s = time.process_time()
 
     def start() -> None:
         host, port = shell.address
-        tell(Listening(host=host, port=port, waiting_for=waiting_for))
+        out.say(Listening(host=host, port=port, waiting_for=waiting_for))
         if not shell.is_local:
-            tell(Plaintext())
+            out.say(Plaintext())
 
     def figures() -> dict[str, Any]:
         return endpoint.figures() | {
@@ -189,11 +218,43 @@ def drive(
             "send_errors": shell.send_errors,
         }
 
-    run([shell], on_start=start, on_event=tell, on_usr1=lambda: tell(Counted(figures=figures())))
-    last = figures()
-    tell(Counted(figures=last))
-    if json:
-        write(json, msgspec.json.encode(last))
+    def each_second(*, last: bool = False) -> None:
+        if recording and (news := recording.news()):
+            out.say(news)
+        out.each_second(last=last)
+
+    with _told_once() as told, closing(Log(process, log)) as out:
+        run(
+            [shell],
+            on_start=start,
+            on_event=out.hear,
+            on_usr1=lambda: out.say(Counted(figures=figures())),
+            on_second=each_second,
+        )
+        told()
+        if recording:
+            recording.end()
+        each_second(last=True)
+        last = figures()
+        out.say(Counted(figures=last))
+        if json:
+            write(json, msgspec.json.encode(last))
+
+
+@contextmanager
+def _told_once() -> Iterator[Callable[[], None]]:
+    """Heed SIGINT and SIGTERM once: from the call of what is yielded on, an end takes its time."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def ignore() -> None:
+        for number in before:
+            signal.signal(number, signal.SIG_IGN)
+
+    try:
+        yield ignore
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Bar(Protocol):
@@ -269,12 +330,12 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
     Raises:
         CommandError: the file cannot be written.
     """
+    if json is not None:  # first: whoever was to read the table may be gone
+        write(json, msgspec.json.encode(summary))
     table = Table(title=title, title_justify="left", show_header=False)
     for row in _rows(summary):
         table.add_row(*map(Text, row))  # as text: "[m]" would be markup
     Console().print(table)
-    if json is not None:
-        write(json, msgspec.json.encode(summary))
 
 
 def write(path: Path, json: bytes) -> None:

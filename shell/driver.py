@@ -11,11 +11,13 @@ import gc
 import signal
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from socket import socket
+from typing import Any
 
 from shared.endpoint import Address, Datagram, Endpoint
-from shared.events import Event
+from shared.events import Event, Fault
 from shared.stopwatch import Stopwatch
 from shell.timer import make_timer
 from shell.udp import (
@@ -142,20 +144,20 @@ class Shell:
             self._after()
 
     def _after(self) -> None:
-        """Send what the endpoint wants sent, hand on its events, arm its timer."""
+        """Send what the endpoint wants sent, arm its timer, hand on its events."""
         endpoint = self.endpoint
         self._stopwatch.start()
         for datagram in endpoint.outbox():
             self._send(datagram)
         self._stopwatch.lap("send")
-        for event in endpoint.events():
-            self._on_event(event)
         due_ns = endpoint.next_wake_ns()
         if due_ns != self._armed:
             self._armed = due_ns
             self._timer.set(due_ns)
         if endpoint.finished and not self._done.done():
             self._done.set_result(None)
+        for event in endpoint.events():
+            self._on_event(event)
 
     def _send(self, datagram: Datagram) -> None:
         payload, peer, number = datagram
@@ -194,13 +196,15 @@ def run(
     on_start: Callable[[], None] = lambda: None,
     on_event: Callable[[Event], None] = lambda _: None,
     on_usr1: Callable[[], None] = lambda: None,
+    on_second: Callable[[], None] = lambda: None,
 ) -> None:
     """Drive several endpoints in this process until all have finished, or SIGINT or SIGTERM comes.
 
     Args:
         on_start: called once signals are heeded and the endpoints are about to be driven.
-        on_event: called with each event of an endpoint.
+        on_event: called with each event of an endpoint, and with each fault of its code.
         on_usr1: called at SIGUSR1.
+        on_second: called about once a second.
     """
     # Everything imported so far lives on; without this, a collection of it pauses for 13 ms.
     gc.collect()
@@ -212,9 +216,23 @@ def run(
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
         loop.add_signal_handler(signal.SIGUSR1, on_usr1)
+        loop.set_exception_handler(lambda _, context: on_event(_fault(context)))
+
+        def tick() -> None:
+            loop.call_later(1.0, tick)
+            on_second()
+
+        tick()
         on_start()
         with contextlib.suppress(asyncio.CancelledError):
             await task
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(main())
+
+
+def _fault(context: dict[str, Any]) -> Fault:
+    """What the loop has caught, as an event."""
+    error = context.get("exception")
+    trace = traceback.format_exception(error) if error else [context["message"]]
+    return Fault(traceback="".join(trace))

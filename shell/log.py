@@ -1,12 +1,27 @@
-"""The log of a process: its events on stdout, as text for an operator or as JSON for a program."""
+"""The log of a process: its events on stdout, as text for an operator or as JSON for a program.
 
+Nobody need read it. What is printed waits for its reader in a thread of its own, up to a bound; a
+standard output that is closed or full is silence, and no fault.
+"""
+
+import errno
+import sys
 import time
 from collections.abc import Mapping
 from typing import Any, Literal
 
 import msgspec
 
-from shared.events import Counted, Event
+from shared.events import Counted, Event, Omitted
+from shell.limit import Limit
+from shell.writer import Writer
+
+ROOM_BYTES = 256 * 1024
+"""Lines that wait for their reader [B]."""
+TOGETHER_BYTES = 4096
+"""Most bytes of lines in one write: what a pipe takes whole, whoever else writes to it."""
+PATIENCE_S = 0.5
+"""Longest time to wait at the end for a reader [s]."""
 
 LogFormat = Literal["text", "json"]
 
@@ -21,17 +36,58 @@ class Line(msgspec.Struct, frozen=True, kw_only=True):
     event: Event
 
 
-def say(event: Event, *, process: str, log: LogFormat) -> None:
-    """Print an event, at once and in one write: several workers may share the standard output."""
-    if log == "json":
-        line = Line(process=process, time_ns=time.monotonic_ns(), event=event)
-        text = f"{msgspec.json.encode(line).decode()}\n"
-    else:
-        lines = [str(event)]
+class Log:
+    """The log of a process, which never waits and never fails.
+
+    Args:
+        process: name of the process.
+        form: form of its lines.
+    """
+
+    def __init__(self, process: str, form: LogFormat) -> None:
+        self._process = process
+        self._form = form
+        closed = OSError(errno.EBADF, "the standard output is closed")
+        self._writer = Writer(sys.stdout or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
+        self._limit = Limit()
+        self._unread = 0
+        """Number of lines for which there was no room, and which are not told of yet."""
+
+    def hear(self, event: Event) -> None:
+        """Take an event of an endpoint: of each kind only a few are said in a second."""
+        for told in self._limit.admit(event, now_ns=time.monotonic_ns()):
+            self.say(told)
+
+    def say(self, event: Event) -> None:
+        """Print an event, whole lines in one write: several workers may share the output."""
+        for line in self._lines(event):
+            if not self._writer.write(line):
+                self._unread += 1
+
+    def each_second(self, *, last: bool = False) -> None:
+        """Say what was left out; to be called once a second, and at the end."""
+        now_ns = None if last else time.monotonic_ns()
+        for omitted in self._limit.omitted(now_ns=now_ns):
+            self.say(omitted)
+        if self._unread:
+            before, self._unread = self._unread, 0
+            self.say(Omitted(kind="lines", count=before))
+            if self._unread:  # still nobody reads
+                self._unread = before
+
+    def close(self) -> None:
+        """Wait for the reader, but not for long."""
+        self._writer.close(PATIENCE_S)
+
+    def _lines(self, event: Event) -> list[bytes]:
+        if self._form == "json":
+            line = Line(process=self._process, time_ns=time.monotonic_ns(), event=event)
+            return [msgspec.json.encode(line) + b"\n"]
+        lines = str(event).splitlines()
         if isinstance(event, Counted):
             lines += rendered(event.figures, indent=2)
-        text = "".join(f"{process}: {line}\n" for line in lines)
-    print(text, end="", flush=True)
+        # Not `encode()` alone: the name of a file need not be Unicode.
+        return [f"{self._process}: {line}\n".encode(errors="replace") for line in lines]
 
 
 def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:

@@ -21,7 +21,7 @@ from shell.udp import from_kernel, open_socket
 FORK = multiprocessing.get_context("fork")
 """Way to start a worker: what is imported and compiled is there at once, and in memory once."""
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-"""Signals that are passed on to every worker."""
+"""Signals that are passed on to every worker; SIGINT as SIGTERM, and either of them once."""
 
 
 def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
@@ -49,7 +49,14 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     for sock in sockets:
         sock.close()
 
+    ending = False
+
     def pass_on(number: int, _: object) -> None:
+        nonlocal ending
+        if number != signal.SIGUSR1:
+            if ending:  # a worker that is told twice would not end in order
+                return
+            number, ending = signal.SIGTERM, True
         for child in children:
             if child.is_alive() and child.pid:
                 os.kill(child.pid, number)
@@ -75,9 +82,13 @@ def _work(
             sock.close()
     for passed_on in PASSED_ON:
         signal.signal(passed_on, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, PASSED_ON)
+    # SIGINT stays blocked: a terminal sends it to all, and the parent passes it on as SIGTERM.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGUSR1))
     with closing(sockets[number - 1]) as sock:
-        work(number, sock)
+        try:
+            work(number, sock)
+        finally:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends already
 
 
 def die_with_parent() -> None:

@@ -26,7 +26,7 @@ from server.endpoint import Server
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, seconds_to_ns
-from shared.events import Event, Failure, VehicleEvent
+from shared.events import Event, Failure, RecordIncomplete, VehicleEvent
 from shared.record import (
     PACKET_COLUMNS,
     Recorder,
@@ -74,6 +74,8 @@ class Flight:
     events: tuple[FlightEvent, ...] = ()
     """Events of the run's own endpoints, and those of the server about its vehicles, in their
     order; empty for a flight over real UDP."""
+    incomplete: tuple[RecordIncomplete, ...] = ()
+    """What is missing in the record of a flight over real UDP, one for a part."""
 
     def trace_hash(self) -> str:
         """Hash of the record, equal for two flights that went the same to the last bit."""

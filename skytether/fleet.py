@@ -167,7 +167,7 @@ def _virtually(options: Options, on_second: Callable[[float], None]) -> Flown:
 def _really(options: Options, on_second: Callable[[float], None]) -> Flown:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder, Metronome(options) as machine:
         parts = Path(folder)
-        processes.run(
+        incomplete = processes.run(
             options.config,
             parts,
             on_second=on_second,
@@ -175,6 +175,8 @@ def _really(options: Options, on_second: Callable[[float], None]) -> Flown:
             workers=options.workers,
             watched=False,
         )
+        if incomplete:
+            raise CommandError("; ".join(map(str, incomplete)))
         servers = [json.loads(part.read_bytes()) for part in parts.glob("server.json*")]
         rest = {
             name: json.loads((parts / f"{name}.json").read_bytes()) for name in ("netem", "client")

@@ -1,5 +1,6 @@
 """`skytether fly`: one flight, over real UDP or in virtual time, and its summary."""
 
+import contextlib
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -7,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from lab import figures
 from shared import config, record
 from shared.config import ConfigError, Scenario
-from shared.events import Event, ServerHeard, ServerRestarted, ServerSilent
+from shared.events import Event, RecordIncomplete, ServerHeard, ServerRestarted, ServerSilent
 from shared.summary import Summary, summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -53,8 +55,10 @@ def fly(argv: Sequence[str]) -> None:
         flown = (_virtually if options.virtual else _really)(scenario, on_second)
     if flown.failure:
         raise CommandError(str(flown.failure))
+    if flown.incomplete:
+        title += ", as far as it is recorded"
     if not len(flown.client):
-        raise CommandError("ended before the first step")
+        raise CommandError(_missing(scenario, flown) or "ended before the first step")
     flights = {title: (scenario, flown)}
     if beside:
         other = flight.fly(beside)
@@ -64,6 +68,8 @@ def fly(argv: Sequence[str]) -> None:
     command.finish(_summarise(scenario, options.scenario, flown), title, options.json)
     if options.figure:
         figures.flights(options.figure, flights)
+    if missing := _missing(scenario, flown):
+        raise CommandError(missing)
 
 
 def _beside(options: Options) -> Scenario | None:
@@ -88,12 +94,36 @@ def _virtually(scenario: Scenario, on_second: Callable[[float], None]) -> flight
 def _really(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
         parts = Path(folder)
-        processes.run(scenario, parts, on_second=on_second, on_event=_tell)
-        client, server, netem = (record.read(parts / part) for part in processes.NAMES)
-        return flight.Flight(client, server, netem)
+        incomplete = processes.run(scenario, parts, on_second=on_second, on_event=_tell)
+        axes = scenario.model.axes
+        return flight.Flight(
+            client=_rows(parts / "client", record.client_columns(axes)),
+            server=_rows(parts / "server", record.server_columns(axes)),
+            netem=_rows(parts / "netem", record.PACKET_COLUMNS),
+            incomplete=tuple(incomplete),
+        )
+
+
+def _rows(part: Path, columns: np.dtype[np.void]) -> record.Rows:
+    """Rows of a part of the record; none where the disk had no room for its first line."""
+    try:
+        return record.read(part)
+    except ValueError:
+        return np.empty(0, columns)
+
+
+def _missing(scenario: Scenario, flown: flight.Flight) -> str | None:
+    """What could not be recorded, and how much of the flight could; None where all was."""
+    if not flown.incomplete:
+        return None
+    reasons = "; ".join(f"{part.file}: {part.reason}" for part in flown.incomplete)
+    steps = flown.client["step"][-1] + 1 if len(flown.client) else 0
+    recorded_s = steps * scenario.control.dt
+    return f"{reasons}: recorded up to {recorded_s:g} of {scenario.duration:g} s"
 
 
 def _tell(event: Event) -> None:
-    """Show what may happen to the link in flight, above the progress bar."""
-    if isinstance(event, ServerSilent | ServerHeard | ServerRestarted):
-        print(event, file=sys.stderr)
+    """Show what may happen to the link and the record in flight, above the progress bar."""
+    if isinstance(event, ServerSilent | ServerHeard | ServerRestarted | RecordIncomplete):
+        with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
+            print(event, file=sys.stderr)

@@ -18,7 +18,15 @@ import msgspec
 
 from shared.config import Scenario, to_toml
 from shared.endpoint import Address
-from shared.events import Counted, Event, Flying, Listening, address_text
+from shared.events import (
+    Counted,
+    Event,
+    Failure,
+    Flying,
+    Listening,
+    RecordIncomplete,
+    address_text,
+)
 from shell.command import CommandError
 from shell.driver import new_event_loop
 from shell.log import Line
@@ -46,10 +54,22 @@ class Child:
 
     name: str
     process: asyncio.subprocess.Process
+    reader: "asyncio.Task[None]" = field(init=False)
+    """Task that takes in what it says, until it has said all."""
     said: deque[str] = field(default_factory=lambda: deque(maxlen=LINES_MAX))
     """Last lines, those of events as sentences."""
     address: Address = ("", 0)
     """Address that it listens on."""
+    failed: bool = False
+    """Whether it has told of something after which it could not fly."""
+    incomplete: bool = False
+    """Whether it has told that its record is incomplete, which it ends with 1 for."""
+
+    async def end(self) -> int:
+        """Exit code, once it has ended and all that it said is known."""
+        code = await self.process.wait()
+        await asyncio.wait((self.reader,), timeout=STOP_S)
+        return code
 
     def last_words(self) -> str:
         """Why it ended, in its own words."""
@@ -91,12 +111,14 @@ async def started(
     def hear(event: Event) -> None:
         if isinstance(event, Listening) and not listening.done():
             listening.set_result((event.host, event.port))
+        child.failed |= isinstance(event, Failure)
+        child.incomplete |= isinstance(event, RecordIncomplete)
         on_event(event)
 
-    reader = asyncio.create_task(_read(child, process.stdout, hear))
+    child.reader = asyncio.create_task(_read(child, process.stdout, hear))
     try:
         done, _ = await asyncio.wait(
-            (listening, reader), timeout=START_S, return_when=asyncio.FIRST_COMPLETED
+            (listening, child.reader), timeout=START_S, return_when=asyncio.FIRST_COMPLETED
         )
         if listening not in done:
             raise CommandError(child.last_words())
@@ -111,18 +133,24 @@ async def started(
             except TimeoutError:
                 process.kill()
                 await process.wait()
-        await reader
+        await child.reader
 
 
 async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -> None:
-    async for line in stream:
+    while True:
+        try:
+            line = await stream.readline()
+        except ValueError:  # longer than the stream has room for
+            continue
+        if not line:
+            return
         try:
             said = _DECODER.decode(line)
         except (msgspec.DecodeError, UnicodeDecodeError):  # no event: a traceback, or a mistake
             child.said.append(line.decode(errors="replace").rstrip())
             continue
         if not isinstance(said.event, Counted):  # numbers are no reason for an end
-            child.said.append(f"{said.process}: {said.event}")
+            child.said.extend(f"{said.process}: {said.event}".splitlines())
         on_event(said.event)
 
 
@@ -135,23 +163,29 @@ def run(
     vehicles: int = 1,
     workers: int = 1,
     watched: bool = True,
-) -> None:
+) -> list[RecordIncomplete]:
     """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
+
+    Returns what is missing in the record, as the processes tell it; nothing in a good one.
 
     Args:
         scenario: what to fly.
         parts: the folder, for a record of each process and, as `.json`, its figures.
         on_second: called with the time flown [s], several times a second.
-        on_event: called with each event of the client.
+        on_event: called with each event of the processes.
         vehicles: number of vehicles, all in one process.
         workers: number of processes of the server.
         watched: whether server and netem record, too.
 
     Raises:
-        CommandError: one of the processes failed.
+        CommandError: one of the processes failed, or the folder cannot be written to.
     """
     file = parts / "scenario.toml"
-    file.write_bytes(to_toml(scenario))
+    try:
+        file.write_bytes(to_toml(scenario))
+    except OSError as error:
+        raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
+    incomplete: list[RecordIncomplete] = []
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
 
     def common(name: str, *, recorded: bool) -> list[str]:
@@ -163,6 +197,11 @@ def run(
     netem = [*common("netem", recorded=watched), "--flows", str(vehicles)]
     client = [*common("client", recorded=True), *fleet]
 
+    def hear(event: Event) -> None:
+        if isinstance(event, RecordIncomplete):
+            incomplete.append(event)
+        on_event(event)
+
     async def main() -> None:
         task = asyncio.current_task()
         assert task is not None
@@ -171,11 +210,12 @@ def run(
             loop.add_signal_handler(number, task.cancel)
         with contextlib.suppress(asyncio.CancelledError):
             await _fly(
-                server, netem, client, timeout_s=timeout_s, on_second=on_second, on_event=on_event
+                server, netem, client, timeout_s=timeout_s, on_second=on_second, on_event=hear
             )
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(main())
+    return incomplete
 
 
 async def _fly(
@@ -198,12 +238,14 @@ async def _fly(
 
     anywhere = ("--bind", "127.0.0.1:0")
     async with (
-        started(*server_command, *anywhere) as server,
-        started(*netem_command, *anywhere, "--server", address_text(*server.address)) as netem,
+        started(*server_command, *anywhere, on_event=hear) as server,
+        started(
+            *netem_command, *anywhere, "--server", address_text(*server.address), on_event=hear
+        ) as netem,
         started(*client_command, "--server", address_text(*netem.address), on_event=hear) as client,
     ):
         began_s = loop.time()
-        ended = [asyncio.create_task(child.process.wait()) for child in (client, netem, server)]
+        ended = [asyncio.create_task(child.end()) for child in (client, netem, server)]
         try:
             while not any(task.done() for task in ended):
                 await asyncio.wait(ended, timeout=0.2, return_when=asyncio.FIRST_COMPLETED)
@@ -215,5 +257,7 @@ async def _fly(
                 task.cancel()
         for child in (server, netem, client):
             code = child.process.returncode
-            if code is not None and (code != 0 or child is not client):
+            # A record that is incomplete is told of at the end, by whoever has wanted one.
+            flown = child is client and (code == 0 or (child.incomplete and not child.failed))
+            if code is not None and not flown:
                 raise CommandError(child.last_words())

@@ -131,7 +131,9 @@ def _really(out: Path, table: Study, method: str, scale: Scale) -> report.Real:
         part.mkdir(parents=True, exist_ok=True)
         title = f"flying over UDP: {method}"
         with command.progress(title, scale.real_s) as on_second:
-            processes.run(scenario, part, on_second=on_second)
+            incomplete = processes.run(scenario, part, on_second=on_second)
+        if incomplete:
+            raise CommandError("; ".join(map(str, incomplete)))
         steps = record.read(part / "client")["step"]
         if not len(steps) or steps[-1] < scenario.steps - 2:
             raise CommandError(

@@ -3,23 +3,35 @@
 import json
 import os
 import re
+import resource
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 import skytether.__main__
 from shared import config
 from shared.endpoint import Address
-from shared.events import Counted, Finished, Flying, Listening, address_text
-from shared.record import client_columns
+from shared.events import (
+    Counted,
+    Finished,
+    Flying,
+    Listening,
+    Omitted,
+    SessionRefused,
+    address_text,
+)
+from shared.protocol import Hello, encode
+from shared.record import client_columns, read
 from shell import command
 from shell.command import parse
 from shell.log import Line
@@ -53,7 +65,7 @@ def skytether_(*argv: str, timeout_s: float = 60.0) -> subprocess.CompletedProce
 class Process:
     """A command that goes on, and what it has said."""
 
-    def __init__(self, stack: ExitStack, *argv: str) -> None:
+    def __init__(self, stack: ExitStack, *argv: str, file_bytes: int | None = None) -> None:
         self.popen = stack.enter_context(
             subprocess.Popen(
                 [sys.executable, "-P", "-u", "-m", *argv],
@@ -62,6 +74,9 @@ class Process:
                 text=True,
             )
         )
+        if file_bytes is not None:  # a full disk, for users who may make none
+            _, hard = resource.prlimit(self.popen.pid, resource.RLIMIT_FSIZE)
+            resource.prlimit(self.popen.pid, resource.RLIMIT_FSIZE, (file_bytes, hard))
         stack.callback(self.popen.kill)
         assert self.popen.stdout is not None
         self._stdout = self.popen.stdout
@@ -105,7 +120,7 @@ class Process:
 def start() -> Iterator[Callable[..., Process]]:
     """Starts processes; what is still running at the end of the test is killed."""
     with ExitStack() as stack:
-        yield lambda *argv: Process(stack, *argv)
+        yield partial(Process, stack)
 
 
 # -- mistakes ------------------------------------------------------------------------------------
@@ -434,6 +449,162 @@ def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> Non
     assert times_ns == sorted(times_ns)
     assert json.loads(run.stdout.splitlines()[1])["event"] == {"type": "Flying", "vehicle": 1}
     assert server.end() == 0
+
+
+# -- nobody reads, nothing can be written --------------------------------------------------------
+
+
+@pytest.fixture(params=["a pipe that is full", "a disk that is full", "a pipe without a reader"])
+def unread(request: pytest.FixtureRequest) -> Iterator[int]:
+    """A standard output that takes nothing."""
+    if request.param == "a disk that is full":
+        number = os.open("/dev/full", os.O_WRONLY)
+        yield number
+        os.close(number)
+        return
+    reading, writing = os.pipe()
+    if request.param == "a pipe that is full":
+        os.set_blocking(writing, False)
+        with suppress(BlockingIOError):
+            while os.write(writing, bytes(4096)):
+                pass
+        os.set_blocking(writing, True)
+    else:
+        os.close(reading)
+    yield writing
+    os.close(writing)
+    if request.param == "a pipe that is full":
+        os.close(reading)
+
+
+def test_a_server_whose_output_nobody_reads_flies_vehicles_and_ends_in_order(
+    unread: int, tmp_path: Path
+) -> None:
+    """However many strangers it has to tell of."""
+    figures = tmp_path / "server.json"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-P", "-m", "server", "demo", "--bind", f"127.0.0.1:{port}", *QUICK]
+    client = ["client", "demo", "--server", f"127.0.0.1:{port}", "--duration", "1", *QUICK]
+    with subprocess.Popen([*command, "--json", str(figures)], stdout=unread) as server:
+        try:
+            first = skytether_(*client, "--link.connect-s", "30")
+            assert first.returncode == 0, first.stderr
+            call_as_strangers(port, 2000)
+            second = skytether_(*client, "--id", "2")
+            assert second.returncode == 0, second.stderr
+            server.send_signal(signal.SIGTERM)
+            assert server.wait(PATIENCE_S) == 0
+        finally:
+            server.kill()
+    assert json.loads(figures.read_text())["vehicles"] == 2
+
+
+def call_as_strangers(port: int, count: int) -> None:
+    """Say HELLO with other terms to a server, by other numbers, and hear its answer to each."""
+    demo = config.load("demo")
+    control = msgspec.structs.replace(demo.control, dt=0.02, horizon=100)
+    terms = msgspec.structs.replace(demo, control=control).terms()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.settimeout(PATIENCE_S)
+        for number in range(count):
+            stranger.sendto(encode(Hello(1000 + number, number, terms)), ("127.0.0.1", port))
+            stranger.recv(65536)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_workers_that_are_told_to_end_twice_end_in_order(number: signal.Signals) -> None:
+    """By a terminal or a supervisor, which tells every process, and by their parent."""
+    argv = ["server", "demo", "--bind", "127.0.0.1:0", "--workers", "2"]
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", *argv],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+    ) as server:
+        try:
+            assert server.stdout is not None
+            said = [server.stdout.readline() for _ in range(2)]
+            os.killpg(server.pid, number)
+            rest, mistakes = server.communicate(timeout=PATIENCE_S)
+        finally:
+            server.kill()
+    assert (server.returncode, mistakes) == (0, "")
+    for worker in ("server.1", "server.2"):
+        assert any(line.startswith(f"{worker}: listening on") for line in said)
+        assert f"{worker}: counted so far:" in rest
+
+
+def test_a_flood_of_strangers_is_counted_in_a_line(start: Callable[..., Process]) -> None:
+    """A few of them are told; the others are a number, and none is missing in it."""
+    server = start("server", "demo", "--bind", "127.0.0.1:0", "--log", "json")
+    server.wait_for("Listening")
+    listening = msgspec.json.decode(server.said[-1], type=Line)
+    assert isinstance(listening.event, Listening)
+    call_as_strangers(listening.event.port, 2000)
+    assert server.end() == 0
+    events = [msgspec.json.decode(line, type=Line).event for line in server.said]
+    told = sum(isinstance(event, SessionRefused) for event in events)
+    omitted = [event for event in events if isinstance(event, Omitted)]
+    assert {event.kind for event in omitted} == {"SessionRefused"}
+    assert told + sum(event.count for event in omitted) == 2000
+    assert told <= 5 * (len(omitted) + 1)
+
+
+def test_a_full_disk_costs_the_record_and_not_the_flight(
+    start: Callable[..., Process], tmp_path: Path
+) -> None:
+    """Each process says so once, goes on, and ends with 1; what it has recorded is kept."""
+    parts = {name: tmp_path / name for name in ("server", "netem", "client")}
+    full = {"file_bytes": 1500}
+
+    def argv(name: str) -> list[str]:
+        return [name, "demo", *QUICK, "--record", str(parts[name])]
+
+    server = start(*argv("server"), "--bind", "127.0.0.1:0", **full)
+    to_server = ["--bind", "127.0.0.1:0", "--server", server.address()]
+    netem = start(*argv("netem"), *to_server, **full)
+    summary = tmp_path / "summary.json"
+    to_netem = ["--server", netem.address(), "--duration", "4", "--json", str(summary)]
+    client = start(*argv("client"), *to_netem, **full)
+    assert (client.ended(), netem.end(), server.end()) == (1, 1, 1)
+    assert any("vehicle 1: flown to the end, " in line for line in client.said)
+    for name, process in {"server": server, "netem": netem, "client": client}.items():
+        told = f"{name}: {parts[name]}: File too large"
+        once = [line for line in process.said if "the record is incomplete" in line]
+        assert once == [f"{told}: the record is incomplete, the flight goes on"]
+        end = re.fullmatch(
+            re.escape(told) + r": (\d+) of (\d+) rows are recorded", process.said[-1]
+        )
+        assert end is not None, process.said
+        kept, rows = map(int, end.groups())
+        part = read(parts[name])
+        assert 0 < kept == len(part) < rows
+        if name != "netem":
+            assert (np.diff(part["step"]) >= 1).all()
+    assert any("client, as far as it is recorded" in line for line in client.said)
+    assert json.loads(summary.read_text())["steps"] == len(read(parts["client"]))
+
+
+def test_a_flight_whose_disk_fills_is_flown_and_shown_as_far_as_it_is_recorded(
+    start: Callable[..., Process], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One command: exit code 1, the summary of what there is, and how much of the flight it is."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    file = tmp_path / "summary.json"
+    argv = ["fly", "demo", *QUICK, "--duration", "4", "--json", str(file)]
+    fly = start("skytether", *argv, file_bytes=5000)
+    assert fly.ended() == 1, fly.said
+    *said, last = fly.said
+    told = re.findall(r"/(\w+): File too large: the record is incomplete", "\n".join(said))
+    assert sorted(told) == ["client", "server"]
+    steps = json.loads(file.read_text())["steps"]
+    assert 0 < steps < 80
+    assert any("as far as it is" in line for line in said)
+    assert any(re.search(rf"steps +│ {steps} in ", line) for line in said)
+    assert re.fullmatch(r"fly: .*: File too large: recorded up to [\d.]+ of 4 s", last)
 
 
 @pytest.mark.parametrize("victim", ["server", "netem", "client"])

@@ -1,15 +1,22 @@
 """Events: a sentence for the operator, tagged JSON for a program, figures in columns."""
 
-import io
+import os
+import re
+import sys
 import typing
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import IO
 
 import msgspec
 import pytest
 
+from shared.endpoint import EVENTS_MAX, Datagram, Endpoint
 from shared.events import (
     Counted,
     Difference,
     Event,
+    Fault,
     Finished,
     FlowOpened,
     Flying,
@@ -17,7 +24,9 @@ from shared.events import (
     NoAnswer,
     NoSession,
     NumberTaken,
+    Omitted,
     Plaintext,
+    RecordIncomplete,
     ServerFull,
     ServerHeard,
     ServerRestarted,
@@ -27,7 +36,7 @@ from shared.events import (
     SessionRefused,
     address_text,
 )
-from shell.log import Line, LogFormat, rendered, say
+from shell.log import Line, Log, rendered
 
 SENTENCES = [
     (
@@ -36,6 +45,15 @@ SENTENCES = [
     ),
     (Plaintext(), "plaintext and unauthenticated: only for a network that you trust"),
     (Counted(figures={"missed": 3, "spent_ns": {"plan": 7}}), "counted so far:"),
+    (Omitted(kind="SessionRefused", count=4312), "… and 4 312 more SessionRefused"),
+    (
+        RecordIncomplete(file="netem.part", reason="No space left on device"),
+        "netem.part: No space left on device: the record is incomplete, the flight goes on",
+    ),
+    (
+        Fault(traceback="Traceback:\nZeroDivisionError\n"),
+        "a mistake in its code, the flight goes on\nTraceback:\nZeroDivisionError",
+    ),
     (FlowOpened(flow=2, host="192.0.2.1", port=5), "flow 2 for 192.0.2.1:5"),
     (SessionOpened(vehicle=1, host="::1", port=5), "vehicle 1 flies, from [::1]:5"),
     (SessionEnded(vehicle=1), "vehicle 1 is gone"),
@@ -140,29 +158,133 @@ def test_figures_are_names_and_numbers_in_two_columns() -> None:
     ]
 
 
-@pytest.mark.parametrize("log", ["text", "json"])
-def test_an_event_is_one_write(log: LogFormat, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With its end of line: workers that share a pipe must not mix up their lines."""
-    written: list[str] = []
+@contextmanager
+def piped(monkeypatch: pytest.MonkeyPatch) -> Iterator[IO[bytes]]:
+    """A standard output whose every write is read as one."""
+    reading, writing = os.pipe2(os.O_DIRECT)
+    with os.fdopen(reading, "rb", buffering=0) as read, os.fdopen(writing, "w") as stdout:
+        monkeypatch.setattr("sys.stdout", stdout)
+        yield read
 
-    class Pipe(io.StringIO):
-        def write(self, text: str) -> int:
-            """Note what is written, but for nothing."""
-            written.extend([text] if text else [])
-            return len(text)
 
-    monkeypatch.setattr("sys.stdout", Pipe())
-    say(Counted(figures={"missed": 3}), process="server.1", log=log)
-    assert len(written) == 1
-    assert written[0].endswith("\n")
+FIGURES_LONG = {f"vehicle {number}": {"step": number, "missed": 0} for number in range(200)}
+
+
+def test_workers_who_share_a_pipe_do_not_mix_up_their_lines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No write is longer than what a pipe takes whole, and each ends with a line."""
+    with piped(monkeypatch) as pipe:
+        log = Log("server.1", "text")
+        log.say(Counted(figures=FIGURES_LONG))
+        log.close()
+        blocks = []
+        while sum(block.count(b"\n") for block in blocks) < 601:
+            blocks.append(pipe.read(65536))
+        assert max(map(len, blocks)) <= 4096
+        assert all(block.startswith(b"server.1: ") and block.endswith(b"\n") for block in blocks)
+
+
+def test_an_event_in_json_is_one_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its end of line."""
+    with piped(monkeypatch) as pipe:
+        log = Log("server.1", "json")
+        log.say(Counted(figures={"missed": 3}))
+        log.close()
+        line = pipe.read(65536)
+        assert line.endswith(b"\n")
+        assert msgspec.json.decode(line, type=Line).event == Counted(figures={"missed": 3})
+
+
+def test_lines_that_nobody_reads_are_counted_for_whoever_reads_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first ones are kept; those for which there is no room are a line themselves."""
+    with piped(monkeypatch) as pipe:
+        line = b"client: vehicle 1: session open, flying\n"
+        monkeypatch.setattr("shell.log.ROOM_BYTES", 10 * len(line))
+        monkeypatch.setattr("shell.log.TOGETHER_BYTES", 1)
+        filled = 0
+        os.set_blocking(sys.stdout.fileno(), False)
+        with suppress(BlockingIOError):
+            while os.write(sys.stdout.fileno(), b"before"):
+                filled += 1
+        os.set_blocking(sys.stdout.fileno(), True)
+        log = Log("client", "text")
+        for _ in range(1000):
+            log.say(Flying(vehicle=1))
+        log.each_second()
+        assert [pipe.read(4096) for _ in range(filled)] == [b"before"] * filled
+        assert [pipe.read(4096) for _ in range(10)] == [line] * 10
+        os.set_blocking(pipe.fileno(), False)
+        while (told := pipe.read(4096)) is None:  # until the thread knows that there is room
+            log.each_second()
+        assert told.decode() == "client: … and 990 more lines\n"
+        log.close()
 
 
 def test_a_log_of_text_names_its_process_in_every_line(capfd: pytest.CaptureFixture[str]) -> None:
-    """Also in those of the figures."""
-    say(Flying(vehicle=1), process="client", log="text")
-    say(Counted(figures={"missed": 3}), process="client", log="text")
+    """Also in those of the figures, and of a traceback."""
+    log = Log("client", "text")
+    log.say(Flying(vehicle=1))
+    log.say(Counted(figures={"missed": 3}))
+    log.say(Fault(traceback="Traceback:\nZeroDivisionError\n"))
+    log.close()
     assert capfd.readouterr().out.splitlines() == [
         "client: vehicle 1: session open, flying",
         "client: counted so far:",
         "client:   missed  3",
+        "client: a mistake in its code, the flight goes on",
+        "client: Traceback:",
+        "client: ZeroDivisionError",
     ]
+
+
+def test_an_endpoints_events_are_told_as_far_as_they_can_be_read(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """What a process says of itself is always told; what is left out is told before the end."""
+    log = Log("client", "text")
+    for vehicle in range(4318):
+        log.hear(Flying(vehicle=vehicle))
+    log.each_second(last=True)
+    for _ in range(9):
+        log.say(Plaintext())
+    log.close()
+    lines = capfd.readouterr().out.splitlines()
+    told = [line for line in lines if "flying" in line]
+    assert told[:5] == [f"client: vehicle {number}: session open, flying" for number in range(5)]
+    left_out = [int(found[1].replace(" ", "")) for found in re.finditer(OMITTED, "\n".join(lines))]
+    assert len(told) + sum(left_out) == 4318
+    assert len(told) < 500  # five in each second that this takes
+    assert sum("plaintext" in line for line in lines) == 9
+
+
+OMITTED = re.compile("^client: … and ([0-9 ]+) more Flying$", re.MULTILINE)
+
+
+class Talker(Endpoint):
+    """Says that vehicles fly, as many as it is woken for."""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Take nothing."""
+
+    def wake(self, *, now_ns: int) -> None:
+        """Say that so many vehicles fly."""
+        self._events += [Flying(vehicle=number) for number in range(now_ns)]
+
+    def next_wake_ns(self) -> int | None:
+        """Time of no wake."""
+        return None
+
+
+def test_events_that_nobody_takes_give_way_and_are_counted() -> None:
+    """The oldest of them; once taken, there is room again."""
+    talker = Talker()
+    talker.wake(now_ns=EVENTS_MAX + 7)
+    omitted, *events = talker.events()
+    assert omitted == Omitted(kind="Flying", count=7)
+    assert events == [Flying(vehicle=number) for number in range(7, EVENTS_MAX + 7)]
+    talker.wake(now_ns=2)
+    assert talker.events() == (Flying(vehicle=0), Flying(vehicle=1))
+    assert talker.events() == ()

@@ -1,8 +1,11 @@
 """Processes as children: what is known of one is what it says, as events; and its last words."""
 
+import asyncio
 import os
 import signal
+from typing import cast
 
+import msgspec
 import pytest
 
 from shared.events import (
@@ -13,13 +16,15 @@ from shared.events import (
     Flying,
     Listening,
     Plaintext,
+    RecordIncomplete,
     ServerHeard,
     ServerRestarted,
     ServerSilent,
 )
 from shell.command import CommandError
+from shell.log import Line
 from skytether.fly import _tell
-from skytether.processes import started
+from skytether.processes import Child, _read, started
 
 
 async def test_a_child_is_known_by_its_events() -> None:
@@ -57,11 +62,42 @@ async def test_a_child_that_is_killed_leaves_its_last_event() -> None:
     assert netem.last_words().startswith("netem: listening on 127.0.0.1:")
 
 
+async def test_a_child_whose_record_is_incomplete_has_told_so() -> None:
+    """It is no failure of the child, which goes on and ends with 1."""
+    heard: list[Event] = []
+    argv = ("demo", "--bind", "127.0.0.1:0", "--record", "/dev/full")
+    async with started("netem", *argv, on_event=heard.append) as netem:
+        pass
+    assert RecordIncomplete(file="/dev/full", reason="No space left on device") in heard
+    assert (netem.incomplete, netem.failed, netem.process.returncode) == (True, False, 1)
+    assert (
+        netem.last_words() == "netem: /dev/full: No space left on device: 0 of 0 rows are recorded"
+    )
+
+
+async def test_a_line_without_end_hides_nothing_that_follows() -> None:
+    """Whatever a child prints, what it says later is heard."""
+    heard: list[Event] = []
+    stream = asyncio.StreamReader(limit=1000)
+    event = Flying(vehicle=1)
+    line = msgspec.json.encode(Line(process="client", time_ns=5, event=event))
+    stream.feed_data(b"x" * 5000 + b"\n" + line + b"\n")
+    stream.feed_eof()
+    process = cast(asyncio.subprocess.Process, None)
+    await _read(Child("client", process), stream, heard.append)
+    assert heard == [event]
+
+
 def test_a_flight_shows_what_happens_to_its_server_and_nothing_else(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     """On stderr, where the progress bar is."""
-    shown = [ServerSilent(vehicle=1), ServerHeard(vehicle=1), ServerRestarted(vehicle=1)]
+    shown = [
+        ServerSilent(vehicle=1),
+        ServerHeard(vehicle=1),
+        ServerRestarted(vehicle=1),
+        RecordIncomplete(file="netem", reason="No space left on device"),
+    ]
     quiet = [
         Flying(vehicle=1),
         FlowOpened(flow=0, host="::1", port=1),

@@ -1,0 +1,100 @@
+"""Writing in the background: nobody waits for a full pipe, a slow disk or a reader that is gone."""
+
+import contextlib
+import os
+import select
+import threading
+from queue import Empty, SimpleQueue
+from typing import IO, Any
+
+
+class Writer:
+    """Writes to a file in a thread of its own; pieces for which there is no room are left out.
+
+    The thread starts at once: a process that forks makes its writers in its children. It keeps no
+    process from ending, whatever it waits for. A killed process loses what gathered in the pause.
+
+    Args:
+        file: file to write to, past its own buffer; or the error for which there is none.
+        room: most bytes that wait to be written.
+        together: most bytes of several pieces in one write; none is spread over two by us.
+        pause_s: time for which pieces gather before they are written [s].
+    """
+
+    def __init__(
+        self, file: IO[Any] | OSError, *, room: int, together: int, pause_s: float = 0.0
+    ) -> None:
+        self._file = file
+        self._room = room
+        self._together = together
+        self._pause_s = pause_s
+        # Each number is changed by one thread alone: the first two by the caller's.
+        self.offered = 0
+        """Number of bytes that `write` was called with."""
+        self.refused = 0
+        """Number of bytes among them for which there was no room."""
+        self.written = 0
+        """Number of bytes that the file has taken."""
+        self._handled = 0
+        """Number of bytes that wait no longer, written or not."""
+        self._pieces: SimpleQueue[bytes] = SimpleQueue()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    @property
+    def failure(self) -> OSError | None:
+        """Error since which nothing is written."""
+        return self._file if isinstance(self._file, OSError) else None
+
+    def write(self, piece: bytes) -> bool:
+        """Have a piece written soon; returns whether there was room. Never waits, never raises."""
+        self.offered += len(piece)
+        if self.offered - self.refused - self._handled > self._room:
+            self.refused += len(piece)
+            return False
+        self._pieces.put(piece)
+        return True
+
+    def close(self, patience_s: float) -> bool:
+        """Wait until all is written, but not for longer; returns whether the thread has ended.
+
+        Only then may the file be closed.
+        """
+        self._closed.set()
+        self._pieces.put(b"")
+        self._thread.join(patience_s)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        while not (self._closed.is_set() and self._pieces.empty()):
+            pieces = [self._pieces.get()]
+            self._closed.wait(self._pause_s)
+            with contextlib.suppress(Empty):
+                while True:
+                    pieces.append(self._pieces.get_nowait())
+            block: list[bytes] = []
+            size = 0
+            for piece in pieces:
+                if size + len(piece) > self._together:
+                    self._put(b"".join(block))
+                    block, size = [], 0
+                block.append(piece)
+                size += len(piece)
+            self._put(b"".join(block))
+
+    def _put(self, block: bytes) -> None:
+        rest = memoryview(block)
+        while rest and not isinstance(self._file, OSError):
+            try:
+                count = os.write(self._file.fileno(), rest)
+            except BlockingIOError:  # a pipe that somebody has made non-blocking
+                room = select.poll()
+                room.register(self._file, select.POLLOUT)
+                room.poll()
+            except OSError as error:
+                self._file = error
+            else:
+                self.written += count
+                rest = rest[count:]
+        self._handled += len(block)

@@ -1,0 +1,57 @@
+"""The driver: mistakes of an endpoint's code are told, and the endpoint is driven on."""
+
+from shared.endpoint import Datagram, Endpoint
+from shared.events import Event, Fault, Flying
+from shell.driver import Shell, run
+
+
+class Faulty(Endpoint):
+    """An endpoint that fails at its first wake, and has finished after its second."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wakes = 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether it was woken twice."""
+        return self.wakes == 2
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Take nothing."""
+
+    def wake(self, *, now_ns: int) -> None:  # noqa: ARG002
+        """Say something, then fail, once."""
+        self.wakes += 1
+        self._events.append(Flying(vehicle=self.wakes))
+        if self.wakes == 1:
+            raise ZeroDivisionError("by zero")
+
+    def next_wake_ns(self) -> int | None:
+        """Time of the next wake: at once."""
+        return 0
+
+
+def test_a_mistake_in_the_code_is_an_event_and_does_not_end_the_flight() -> None:
+    """With its traceback, in the log like any other: a flood of them is as bounded."""
+    events: list[Event] = []
+    run([Shell(Faulty(), ("127.0.0.1", 0))], on_event=events.append)
+    kinds = [type(event) for event in events]
+    assert sorted(kinds, key=lambda kind: kind.__name__) == [Fault, Flying, Flying]
+    fault = next(event for event in events if isinstance(event, Fault))
+    assert fault.traceback.startswith("Traceback (most recent call last):")
+    assert fault.traceback.endswith("ZeroDivisionError: by zero\n")
+
+
+def test_a_log_that_fails_does_not_stop_the_endpoints_clock() -> None:
+    """The timer is armed before anybody is told anything."""
+    endpoint, failed = Faulty(), []
+
+    def fail(event: Event) -> None:
+        if not isinstance(event, Fault):
+            failed.append(event)
+            raise BrokenPipeError
+
+    run([Shell(endpoint, ("127.0.0.1", 0))], on_event=fail)
+    assert endpoint.wakes == 2
+    assert failed == [Flying(vehicle=1), Flying(vehicle=2)]

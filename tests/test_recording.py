@@ -1,0 +1,136 @@
+"""A part of the record on its way to a file: all rows, or as many as fit and a line about it."""
+
+import os
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import pytest
+
+from shared.events import RecordIncomplete
+from shared.record import PACKET_COLUMNS, read
+from shell import recording
+from shell.command import CommandError, recorded, recorded_meanwhile
+from shell.recording import Recording
+
+
+def append(to: Recording, count: int) -> None:
+    """Record rows, numbered from 0."""
+    for number in range(count):
+        to.recorder.append(1, number=number)
+
+
+def test_rows_are_in_the_file_at_the_end(tmp_path: Path) -> None:
+    """All of them, and nothing is said."""
+    path = tmp_path / "netem"
+    with recorded(path, PACKET_COLUMNS) as part:
+        append(part, 1000)
+        part.end()
+        assert part.rows()["number"].tolist() == list(range(1000))
+        assert (part.news(), part.fault()) == (None, None)
+    np.testing.assert_array_equal(read(path)["number"], np.arange(1000))
+
+
+def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
+    """Nobody has to end anything for it: a process that is killed keeps them."""
+    path = tmp_path / "netem"
+    with recorded(path, PACKET_COLUMNS) as part:
+        append(part, 10)
+        while path.stat().st_size < part._header_bytes + 10 * PACKET_COLUMNS.itemsize:
+            time.sleep(0.01)
+        assert read(path)["number"].tolist() == list(range(10))
+
+
+def test_a_full_disk_is_said_once_and_ends_the_command_when_all_is_done() -> None:
+    """With what there is of the record; the flight, which is the block, goes on to its end."""
+    flown = []
+
+    def fly() -> None:
+        with recorded(Path("/dev/full"), PACKET_COLUMNS) as part:
+            append(part, 3)
+            part.end()
+            flown.extend([part.news(), part.news(), len(part.rows())])
+
+    with pytest.raises(CommandError) as error:
+        fly()
+    told = RecordIncomplete(file="/dev/full", reason="No space left on device")
+    assert flown == [told, None, 0]
+    assert error.value.code == 1
+    assert str(error.value) == "/dev/full: No space left on device: 0 of 3 rows are recorded"
+
+
+def test_without_a_temporary_file_a_flight_is_flown_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is recorded, and this is said."""
+
+    def nowhere(*_: object, **__: object) -> BinaryIO:
+        raise FileNotFoundError(2, "No usable temporary directory found in ['/tmp']")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", nowhere)
+    flown = []
+
+    def fly() -> None:
+        with recorded_meanwhile(PACKET_COLUMNS) as part:
+            append(part, 3)
+            part.end()
+            flown.extend(part.rows())
+
+    with pytest.raises(CommandError, match=r"temporary record: No usable .*: 0 of 3 rows"):
+        fly()
+    assert flown == []
+
+
+def test_a_disk_that_is_too_slow_loses_whole_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those for which there is no room in memory, and those not written when patience ends."""
+    monkeypatch.setattr(recording, "ROOM_BYTES", 1000)
+    monkeypatch.setattr(recording, "PATIENCE_S", 0.01)
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    filled = os.write(writing, bytes(10**6))
+    os.set_blocking(writing, True)
+    with (
+        os.fdopen(reading, "rb", buffering=0) as slow,
+        os.fdopen(writing, "wb", buffering=0) as file,
+    ):
+        part = Recording("netem", PACKET_COLUMNS, file)
+        append(part, 1000)
+        assert part.news() == RecordIncomplete(file="netem", reason="the disk is too slow")
+        part.end()
+        assert part.fault() == "netem: the disk is too slow: 0 of 1000 rows are recorded"
+        slow.read(filled)
+        monkeypatch.setattr(recording, "PATIENCE_S", 30.0)
+        part.end()
+        kept = (1000 - part._header_bytes) // PACKET_COLUMNS.itemsize
+        assert part.fault() == f"netem: the disk is too slow: {kept} of 1000 rows are recorded"
+
+
+def test_a_file_of_any_name_can_be_told_of() -> None:
+    """Its name need not be Unicode, but a line of JSON is."""
+    part = Recording("netem\udcff", PACKET_COLUMNS, OSError(28, "No space left on device"))
+    part.end()
+    assert part.news() == RecordIncomplete(file="netem?", reason="No space left on device")
+    part.close()
+
+
+def test_a_command_that_fails_otherwise_says_only_that() -> None:
+    """A vehicle that was refused is the reason, whatever is in the record."""
+
+    def fly() -> None:
+        with recorded(Path("/dev/full"), PACKET_COLUMNS) as part:
+            append(part, 3)
+            raise CommandError("refused")
+
+    with pytest.raises(CommandError, match="refused"):
+        fly()
+
+
+def test_a_file_that_cannot_be_opened_is_a_mistake_before_the_flight(tmp_path: Path) -> None:
+    """Exit code 2, and nothing is flown."""
+    with (
+        pytest.raises(CommandError, match="cannot be written: No such file or directory") as error,
+        recorded(tmp_path / "none" / "netem", PACKET_COLUMNS),
+    ):
+        pytest.fail("flown")
+    assert error.value.code == 2

@@ -1,0 +1,110 @@
+"""Writing in the background: in order, whole, bounded; never waited for, and never a fault."""
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+from shell.writer import Writer
+
+PATIENCE_S = 30.0
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[IO[bytes], IO[bytes]]]:
+    """A pipe of 4096 bytes whose every write is read as one: what to read from, and write to."""
+    reading, writing = os.pipe2(os.O_DIRECT)
+    with (
+        os.fdopen(reading, "rb", buffering=0) as read,
+        os.fdopen(writing, "wb", buffering=0) as write,
+    ):
+        yield read, write
+
+
+def test_what_is_written_arrives_in_order(tmp_path: Path) -> None:
+    """All of it, and it is counted."""
+    pieces = [b"%d\n" % number for number in range(10_000)]
+    with (tmp_path / "file").open("wb") as file:
+        writer = Writer(file, room=10**6, together=100, pause_s=0.001)
+        assert all(writer.write(piece) for piece in pieces)
+        assert writer.close(PATIENCE_S)
+    assert (tmp_path / "file").read_bytes() == b"".join(pieces)
+    assert writer.written == writer.offered == len(b"".join(pieces))
+    assert (writer.refused, writer.failure) == (0, None)
+
+
+def test_pieces_share_a_write_but_none_is_torn(pipe: tuple[IO[bytes], IO[bytes]]) -> None:
+    """No write is longer than it may be, and each ends where a piece ends."""
+    reading, writing = pipe
+    writer = Writer(writing, room=10**6, together=100, pause_s=0.1)
+    for _ in range(9):
+        writer.write(b"x" * 29 + b"\n")
+    assert writer.close(PATIENCE_S)
+    assert [len(reading.read(4096)) for _ in range(3)] == [90, 90, 90]
+
+
+def test_nobody_waits_for_a_reader_who_does_not_read(pipe: tuple[IO[bytes], IO[bytes]]) -> None:
+    """What finds no room is left out whole and counted; what has found some still arrives."""
+    reading, writing = pipe
+    pages = 0
+    os.set_blocking(writing.fileno(), False)
+    while writing.write(b"before") is not None:
+        pages += 1
+    os.set_blocking(writing.fileno(), True)
+    writer = Writer(writing, room=100, together=1)
+    taken = [writer.write(b"%09d\n" % number) for number in range(1000)]
+    assert taken == [True] * 10 + [False] * 990
+    assert (writer.offered, writer.refused, writer.written) == (10_000, 9900, 0)
+    assert not writer.close(0.01)
+    assert {reading.read(4096) for _ in range(pages)} == {b"before"}
+    assert [reading.read(4096) for _ in range(10)] == [b"%09d\n" % number for number in range(10)]
+    assert writer.close(PATIENCE_S)
+
+
+def test_a_pipe_that_does_not_block_loses_nothing(pipe: tuple[IO[bytes], IO[bytes]]) -> None:
+    """Such is what another program may have made of a standard output that it shares."""
+    reading, writing = pipe
+    os.set_blocking(writing.fileno(), False)
+    writer = Writer(writing, room=10**6, together=10)
+    for number in range(1000):
+        writer.write(b"%09d\n" % number)
+    assert [int(reading.read(4096)) for _ in range(1000)] == list(range(1000))
+    assert writer.close(PATIENCE_S)
+    assert writer.failure is None
+
+
+def test_a_full_disk_ends_the_writing_and_nothing_else() -> None:
+    """The system's reason is kept."""
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        writer = Writer(full, room=100, together=100)
+        for _ in range(1000):
+            writer.write(b"row")
+        assert writer.close(PATIENCE_S)
+    assert writer.failure is not None
+    assert writer.failure.errno == errno.ENOSPC
+    assert (writer.offered, writer.written) == (3000, 0)
+
+
+def test_a_reader_who_is_gone_ends_the_writing_and_nothing_else() -> None:
+    """As a full disk does."""
+    reading, number = os.pipe()
+    os.close(reading)
+    with os.fdopen(number, "wb", buffering=0) as writing:
+        writer = Writer(writing, room=100, together=100)
+        writer.write(b"line\n")
+        assert writer.close(PATIENCE_S)
+        writer.write(b"line\n")
+    assert isinstance(writer.failure, BrokenPipeError)
+
+
+def test_without_a_file_all_is_left_out() -> None:
+    """As much as anybody likes."""
+    closed = OSError(errno.EBADF, "closed")
+    writer = Writer(closed, room=100, together=100)
+    for _ in range(1000):
+        writer.write(b"row")
+    assert writer.close(PATIENCE_S)
+    assert (writer.failure, writer.written) == (closed, 0)
