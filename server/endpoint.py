@@ -12,7 +12,7 @@ import numpy as np
 
 from server.clock import ClockMap
 from server.controller import BLOCK, Controller, Decisions
-from server.plausibility import Plausibility, Verdict
+from server.plausibility import ANEW, BELIEVED, Plausibility, Verdict
 from server.scheme import in_a_row
 from server.sessions import Session, Sessions
 from shared.config import Scenario
@@ -165,9 +165,9 @@ class Server(Endpoint):
         epoch_ns = stamp_ns - observation.step * self._terms.dt_ns
         forward_ns, backward_ns = now_ns - stamp_ns, observation.received_ns - echo_ns
         verdict = self._plausibility.judge(row, observation, epoch_ns, forward_ns, backward_ns)
-        if verdict > Verdict.BELIEVED:
-            raise ProtocolError(f"implausible: {verdict.name.lower()}")
-        if verdict == Verdict.ANEW:
+        if verdict > BELIEVED:
+            raise ProtocolError(f"implausible: {Verdict(verdict).name.lower()}")
+        if verdict == ANEW:
             self._anew(row)
         session.heard_ns = now_ns
         self._clock.observe(row, forward_ns, backward_ns, echo_ns=echo_ns, now_ns=now_ns)

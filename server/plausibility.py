@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.endpoint import MILLISECOND_NS
-from shared.kernel import F4, kernel, part, record, records
+from shared.kernel import F4, R2, kernel, part, record, records
 from shared.protocol import Observation
 from shared.terms import Terms
 
@@ -86,7 +86,7 @@ class Plausibility:
         """Begin anew with a vehicle, or with a new life of it."""
         self._said.numbers["step"][:, row] = -1
 
-    def judge(self, row: int, observation: Observation, epoch: int, F: int, G: int) -> Verdict:
+    def judge(self, row: int, observation: Observation, epoch: int, F: int, G: int) -> int:
         """What becomes of an observation of a vehicle.
 
         Args:
@@ -94,14 +94,16 @@ class Plausibility:
             observation: what it says.
             epoch: begin of step 0, by its stamp and its step [ns; vehicle's clock].
             F, G: of the observation and its echo, see `server.clock` [ns].
+
+        Returns:
+            a `Verdict`.
         """
         _, _, step, _, in_force, since, _, _, state = observation
-        self._said.numbers[NEW, row] = (epoch, step, in_force, since, F, G, 0)
-        self._said.states[NEW, row] = state
-        return VERDICTS[_judge(self._said, row, self._H, self._dt_s)]
+        return _judge(
+            self._said, row, state, epoch, step, in_force, since, F, G, self._H, self._dt_s
+        )
 
 
-VERDICTS = {int(verdict): verdict for verdict in Verdict}
 ANEW, BELIEVED, EPOCH, CLOCK, HORIZON, JUMP = map(int, Verdict)
 """As kernels take them."""
 
@@ -145,9 +147,25 @@ def _jumps(said: Said, row: int, which: int, time: float) -> bool:
 
 
 @kernel
-def _judge(said: Said, row: int, H: int, dt: float) -> int:
-    """The verdict on the new observation of a vehicle, which takes its place among the others."""
+def _judge(
+    said: Said,
+    row: int,
+    state: R2,
+    epoch: int,
+    step: int,
+    in_force: int,
+    since: int,
+    F: int,
+    G: int,
+    H: int,
+    dt: float,
+) -> int:
+    """The verdict on a new observation, which takes its place among those of its vehicle."""
     numbers, place = said.numbers, LAST
+    new = numbers[NEW, row]
+    new.epoch, new.step, new.in_force, new.since = epoch, step, in_force, since
+    new.forward, new.backward, new.count = F, G, 0
+    said.states[NEW, row] = state
     verdict = _against(said, row, LAST, H, dt)
     if verdict != BELIEVED:
         place = DOUBTED

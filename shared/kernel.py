@@ -25,6 +25,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 F1 = Annotated[NDArray[np.float64], numba.float64[::1]]
 F2 = Annotated[NDArray[np.float64], numba.float64[:, ::1]]
+R2 = Annotated[NDArray[np.float64], numba.types.Array(numba.float64, 2, "C", readonly=True)]
 F3 = Annotated[NDArray[np.float64], numba.float64[:, :, ::1]]
 F4 = Annotated[NDArray[np.float64], numba.float64[:, :, :, ::1]]
 F5 = Annotated[NDArray[np.float64], numba.float64[:, :, :, :, ::1]]
@@ -35,7 +36,8 @@ S1 = Annotated[NDArray[np.float32], numba.float32[::1]]
 S3 = Annotated[NDArray[np.float32], numba.float32[:, :, ::1]]
 S4 = Annotated[NDArray[np.float32], numba.float32[:, :, :, ::1]]
 B1 = Annotated[NDArray[np.bool_], numba.boolean[::1]]
-"""Contiguous arrays of float64 (F), int64 (I), float32 (S) and bool (B), by number of axes."""
+"""Contiguous arrays of float64 (F; R where they are only read), int64 (I), float32 (S) and bool
+(B), by number of axes."""
 
 SCALARS = {int: numba.int64, float: numba.float64, bool: numba.boolean}
 
