@@ -73,8 +73,9 @@ def _work(
     for other, sock in enumerate(sockets, start=1):
         if other != number:
             sock.close()
-    for passed_on in PASSED_ON:
+    for passed_on in (signal.SIGINT, signal.SIGTERM):
         signal.signal(passed_on, signal.SIG_DFL)
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until there is what to count
     signal.pthread_sigmask(signal.SIG_UNBLOCK, PASSED_ON)
     with closing(sockets[number - 1]) as sock:
         work(number, sock)

@@ -49,12 +49,15 @@ def fly(argv: Sequence[str]) -> None:
     beside = _beside(options)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{options.scenario}, {where}, seed {scenario.seed}"
-    with command.progress(f"flying {title}", scenario.duration) as on_second:
-        flown = (_virtually if options.virtual else _really)(scenario, on_second)
+    with (
+        command.interruptible() as interrupted,
+        command.progress(f"flying {title}", scenario.duration) as on_second,
+    ):
+        flown = (_virtually if options.virtual else _really)(scenario, on_second, interrupted)
     if flown.failure:
         raise CommandError(str(flown.failure))
     if not len(flown.client):
-        raise CommandError("ended before the first step")
+        raise CommandError("interrupted before the first step", command.INTERRUPTED)
     flights = {title: (scenario, flown)}
     if beside:
         other = flight.fly(beside)
@@ -80,15 +83,18 @@ def _summarise(scenario: Scenario, name: str, flown: flight.Flight) -> Summary:
     return summarise(scenario, name, flown.client, flown.server, flown.netem)
 
 
-def _virtually(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
-    with command.interruptible() as interrupted:
-        return flight.fly(scenario, on_second=on_second, stopped=interrupted)
+def _virtually(
+    scenario: Scenario, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> flight.Flight:
+    return flight.fly(scenario, on_second=on_second, stopped=interrupted)
 
 
-def _really(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
+def _really(
+    scenario: Scenario, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> flight.Flight:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
         parts = Path(folder)
-        processes.run(scenario, parts, on_second=on_second, on_event=_tell)
+        processes.run(scenario, parts, on_second=on_second, interrupted=interrupted, on_event=_tell)
         client, server, netem = (record.read(parts / part) for part in processes.NAMES)
         return flight.Flight(client, server, netem)
 
