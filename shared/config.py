@@ -49,6 +49,8 @@ MeanTime = Annotated[float, Meta(ge=1e-9, le=1e9)]
 
 FILE_BYTES_MAX = 1_000_000
 """Largest size of a scenario's file [B]."""
+EXTENDS_MAX = 20
+"""Largest number of scenarios that a scenario is laid over, each over the next."""
 GIVEN_MAX = 200
 """Largest number of characters that a message repeats of what was given."""
 
@@ -121,7 +123,7 @@ class ReferenceConfig(Section, frozen=True):
 
     shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
     """Shape of the desired trajectory."""
-    radius_m: Annotated[float, Meta(gt=0, le=shapes.FAR_M)] = 1.55
+    radius_m: Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)] = 1.55
     """Half the width of circle, figure-eight and square [m]."""
     period_s: Annotated[float, Meta(ge=0.1, le=86400)] = 27.5
     """Time for one round of circle, figure-eight or square [s]."""
@@ -344,7 +346,7 @@ def load(name: str) -> Scenario:
     try:
         return check(_read(name), name)
     except RecursionError:
-        raise ConfigError(f"{name}: tables or scenarios nested too deeply") from None
+        raise ConfigError(f"{name}: nested too deeply") from None
 
 
 def check(raw: Mapping[str, Any], source: str) -> Scenario:
@@ -392,6 +394,8 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
     if (path, entry) in seen:
         circle = " → ".join([*seen.values(), name])
         raise ConfigError(f"{seen[path, entry]}: extends: got a circle of {circle}")
+    if len(seen) > EXTENDS_MAX:
+        raise ConfigError(f"{name}: extends: got a chain of more than {EXTENDS_MAX} scenarios")
     table = raw.get("reference")
     if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
         table["file"] = str((path.parent / table["file"]).absolute())
@@ -411,7 +415,7 @@ def _path(file: str) -> Path:
         return Path(str(resources.files("scenarios") / f"{file}.toml"))
     try:
         return Path(file).resolve()
-    except (ValueError, OSError, RuntimeError) as error:  # a zero byte, too long, a circle of links
+    except (ValueError, OSError, RuntimeError) as error:  # a zero byte, or a circle of links
         raise ConfigError(f"{file}: cannot be read: {error}") from None
 
 
@@ -573,6 +577,11 @@ def _no_reference(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]
     for point in ref.points_m:
         if len(point) != axes:
             yield "reference.points_m", list(point), f"{axes} numbers a point"
+    if ref.shape in ("circle", "figure-eight", "square"):
+        most_m = shapes.FAST_MPS * ref.period_s / 8.0  # a square's round is eight radii long
+        if ref.radius_m > most_m:
+            most = f"at most {most_m:g} with reference.period_s = {ref.period_s:g}"
+            yield "reference.radius_m", ref.radius_m, most
     route = ref.points_m + ref.points_m[:1] * ref.loop
     if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
         yield "reference.points_m", [list(point) for point in route], "no point twice in a row"

@@ -152,7 +152,7 @@ def from_csv(path: Path, axes: int) -> Reference:
     names = ["t", "x", "y", "z"][: axes + 1]
     text = io.StringIO(read(path).decode("utf-8-sig"), newline="")
     table = csv.DictReader(text, skipinitialspace=True)
-    rows = []
+    rows: list[list[float]] = []
     try:
         if any(name not in (table.fieldnames or ()) for name in names):
             raise ValueError(f"line 1: expected the columns {', '.join(names)}")
