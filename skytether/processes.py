@@ -3,6 +3,8 @@
 Each process writes its events as JSON on its standard output (`--log json`); they are all that is
 known here of what goes on in it. Anything else that it prints, a traceback or its one line for a
 mistake, is kept for its last words.
+
+The loop is asyncio's own: uvloop's would start them with signals that are no longer ignored.
 """
 
 import asyncio
@@ -19,7 +21,6 @@ from shared.config import Scenario, to_toml
 from shared.endpoint import Address
 from shared.events import Counted, Event, Flying, Listening, address_text
 from shell.command import INTERRUPTED, CommandError
-from shell.driver import new_event_loop
 from shell.log import Line
 from shell.workers import die_with_parent
 
@@ -104,6 +105,9 @@ async def started(
             (listening, reader), timeout=START_S, return_when=asyncio.FIRST_COMPLETED
         )
         if listening not in done:
+            if reader in done:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(process.wait(), STOP_S)
             raise CommandError(child.last_words())
         child.address = listening.result()
         yield child
@@ -182,8 +186,7 @@ def run(
         with contextlib.suppress(asyncio.CancelledError):
             await flight
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        runner.run(main())
+    asyncio.run(main())
     if interrupted() and not (parts / "client.json").exists():
         raise CommandError("interrupted before the first step", INTERRUPTED)
 

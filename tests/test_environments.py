@@ -69,10 +69,10 @@ def test_a_command_does_the_same_in_any_environment(environment: str, tmp_path: 
         assert fleet.stdout == ""
     else:
         assert "server's plan [" in fleet.stdout
-    mistake = run(["fly", "papr"], environment)
+    mistake = run(["scenarios", "papr"], environment)
     assert mistake.returncode == 2
     if "2>&-" not in ENVIRONMENTS[environment][1]:
-        assert mistake.stderr == "fly: papr: no such scenario; did you mean paper?\n"
+        assert mistake.stderr == "scenarios: got 'papr', expected nothing\n"
 
 
 def test_a_flight_over_udp_needs_neither_streams_nor_home(tmp_path: Path) -> None:
