@@ -35,15 +35,16 @@ def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
 def begin() -> None:
     """Give this process its three streams, and let SIGUSR1 wait until there is what to count.
 
-    A stream that is closed becomes /dev/null: the next socket would take its number, and be printed
-    to. What a stream cannot encode is written as an escape. SIGUSR1 is ignored until there is a
-    handler, by the children as well.
+    A stream that is closed becomes /dev/null, for the children as well: the next socket would take
+    its number, and be printed to. What a stream cannot encode is written as an escape. SIGUSR1 is
+    ignored until there is a handler, by the children as well.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+            os.set_inheritable(number, True)
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
     for stream in (sys.stdout, sys.stderr):

@@ -84,6 +84,17 @@ def test_a_flight_over_udp_needs_neither_streams_nor_home(tmp_path: Path) -> Non
     assert re.search(r'"steps": \d\d', file.read_text())
 
 
+def test_streams_that_were_closed_are_there_for_children_too(tmp_path: Path) -> None:
+    """A worker that prints must not print to a socket."""
+    file = tmp_path / "streams"
+    names = " ".join(f"/proc/$$/fd/{number}" for number in range(3))
+    child = f"readlink {names} >{file}"
+    code = f"import os, shell.start; shell.start.begin(); os.execlp('sh', 'sh', '-c', {child!r})"
+    line = f"{shlex.join([sys.executable, '-P', '-c', code])} <&- >&- 2>&-"
+    subprocess.run(["sh", "-c", line], check=True)
+    assert file.read_text().split() == ["/dev/null"] * 3
+
+
 def test_a_sweep_needs_neither_streams_nor_home(tmp_path: Path) -> None:
     """In its workers, too."""
     out = tmp_path / "swept"
