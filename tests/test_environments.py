@@ -87,9 +87,14 @@ def test_a_flight_over_udp_needs_neither_streams_nor_home(tmp_path: Path) -> Non
 def test_streams_that_were_closed_are_there_for_children_too(tmp_path: Path) -> None:
     """A worker that prints must not print to a socket."""
     file = tmp_path / "streams"
-    names = " ".join(f"/proc/$$/fd/{number}" for number in range(3))
-    child = f"readlink {names} >{file}; true"  # in a process of its own
-    code = f"import os, shell.start; shell.start.begin(); os.execlp('sh', 'sh', '-c', {child!r})"
+    child = (
+        "import os, pathlib; names = [os.readlink(f'/proc/self/fd/{n}') for n in range(3)]; "
+        f"pathlib.Path({str(file)!r}).write_text(' '.join(names))"
+    )
+    code = (
+        "import shell.start, subprocess, sys; shell.start.begin(); "
+        f"subprocess.run([sys.executable, '-c', {child!r}], check=True)"
+    )
     line = f"{shlex.join([sys.executable, '-P', '-c', code])} <&- >&- 2>&-"
     subprocess.run(["sh", "-c", line], check=True)
     assert file.read_text().split() == ["/dev/null"] * 3
