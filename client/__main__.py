@@ -1,7 +1,13 @@
 """`python -m client`: one simulated UAV as a process."""
 
-import secrets
 import sys
+
+from shell.start import run
+
+if __name__ == "__main__":  # before the imports below, which take a while
+    sys.exit(run("client.__main__:fly", "client"))
+
+import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +27,6 @@ from shared.summary import summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
 from shell.log import LogFormat
-from shell.udp import allow_sockets
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,7 @@ def fly(argv: Sequence[str]) -> None:
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
         given = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else numbers[0]
         raise CommandError(f"--id: got {given}, expected 0 to 65535", 2)
-    allow_sockets(len(numbers))
+    command.check_sockets("--vehicles", len(numbers))
     columns = client_columns(scenario.model.axes)
     with (
         command.recorded(options.record, columns)
@@ -100,12 +105,3 @@ def fly(argv: Sequence[str]) -> None:
         if failure := endpoint.failure:
             refused = isinstance(failure, SessionRefused | NoSession)
             raise CommandError(str(failure), command.CONFIGURATION if refused else command.RUN)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    return command.main(fly, argv, "client")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

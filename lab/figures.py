@@ -21,15 +21,13 @@ FORMATS = (".png", ".pdf", ".svg")
 
 
 def check(path: Path) -> None:
-    """Refuse a file that no picture can be written to, before anything is flown.
+    """Refuse a file that is none of a picture, before anything is flown.
 
     Raises:
         ConfigError: with what would do.
     """
     if path.suffix not in FORMATS:
         raise ConfigError(f"{path}: expected a file in {', '.join(FORMATS)}")
-    if not path.absolute().parent.is_dir():
-        raise ConfigError(f"{path}: there is no folder {path.parent}")
 
 
 def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:

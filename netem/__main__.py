@@ -1,6 +1,12 @@
 """`python -m netem`: the network as a process."""
 
 import sys
+
+from shell.start import run
+
+if __name__ == "__main__":  # before the imports below, which take a while
+    sys.exit(run("netem.__main__:emulate", "netem"))
+
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -15,7 +21,7 @@ from shared.record import PACKET_COLUMNS
 from shell import command
 from shell.command import ScenarioFlags, ScenarioName
 from shell.log import LogFormat
-from shell.udp import allow_sockets
+from shell.udp import files_max, sockets_max
 
 
 @dataclass(frozen=True)
@@ -34,8 +40,9 @@ class Options:
     """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
     """File for netem's part of the record: the fate of every packet."""
-    flows: Annotated[int, tyro.conf.arg(metavar="N")] = FLOWS_MAX
-    """Most clients at once; each takes a socket."""
+    flows: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Most clients at once, each of which takes a socket: 512 unless given, or as many as the
+    system allows."""
     json: Path | None = None
     """File for what was counted, and the CPU time it took."""
     config: ScenarioFlags = Scenario()
@@ -47,14 +54,13 @@ def emulate(argv: Sequence[str]) -> None:
     SIGUSR1 prints what was counted so far.
     """
     options = command.parse(Options(), argv, "skytether netem", emulate.__doc__)
-    command.check_count("--flows", options.flows, 65_536)
-    allow_sockets(1 + options.flows)
+    flows = _flows(options.flows)
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
     record = options.record
     with command.recorded(record, PACKET_COLUMNS) if record else nullcontext() as recording:
         recorder = recording.recorder if recording else None
-        endpoint = Proxy(options.config, server=server, flows=options.flows, recorder=recorder)
+        endpoint = Proxy(options.config, server=server, flows=flows, recorder=recorder)
         command.drive(
             "netem",
             endpoint,
@@ -67,10 +73,19 @@ def emulate(argv: Sequence[str]) -> None:
         )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    return command.main(emulate, argv, "netem")
+def _flows(given: int | None) -> int:
+    """Most clients at once; less than usual, and then said, where the system allows no more.
 
-
-if __name__ == "__main__":
-    sys.exit(main())
+    Raises:
+        CommandError: so many cannot be.
+    """
+    flows = max(1, min(FLOWS_MAX, sockets_max())) if given is None else given
+    command.check_count("--flows", flows, 65_536)
+    command.check_sockets("--flows", flows)
+    if given is None and flows < FLOWS_MAX:
+        print(
+            f"netem: room for {flows} clients and not {FLOWS_MAX}: {files_max()} files may be open "
+            "here (ulimit -n)",
+            file=sys.stderr,
+        )
+    return flows

@@ -1,7 +1,13 @@
 """`python -m server`: the server as a process."""
 
-import secrets
 import sys
+
+from shell.start import run
+
+if __name__ == "__main__":  # before the imports below, which take a while
+    sys.exit(run("server.__main__:serve", "server"))
+
+import secrets
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -55,6 +61,7 @@ def serve(argv: Sequence[str]) -> None:
     options = command.parse(Options(), argv, "skytether server", serve.__doc__)
     command.check_count("--vehicles", options.vehicles, 65_536)
     command.check_count("--workers", options.workers, 64)
+    command.check_sockets("--workers", options.workers)
     bind = command.address("--bind", options.bind)
     if options.workers == 1:
         _work(options, bind, "")
@@ -98,12 +105,3 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
             stopwatch=stopwatch,
             recording=recording,
         )
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    return command.main(serve, argv, "server")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

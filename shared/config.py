@@ -21,7 +21,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from shared import policy
+from shared import files, policy
 from shared import reference as shapes
 from shared.endpoint import seconds_to_ns
 from shared.hint import hint
@@ -31,10 +31,31 @@ from shared.terms import Terms
 TINY = 1e-9
 """As much as floating point may make of 40 · 0.011."""
 
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
+# Bounds of numbers lie far beyond any vehicle, and near enough that no time overflows its 63 bits
+# of nanoseconds, and no product of some of them a float.
+Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
+"""Property of a vehicle, from a thousandth of its unit to a thousand."""
+Strength = Annotated[float, Meta(ge=0, le=1e3)]
+"""Property that may be missing: from nothing to a thousand of its unit."""
+Speed = Annotated[float, Meta(ge=-1e3, le=1e3)]
+"""Speed either way along an axis [m/s]."""
+Position = Annotated[float, Meta(ge=-shapes.FAR_M, le=shapes.FAR_M)]
+"""Coordinate [m]."""
+Amount = Annotated[float, Meta(ge=0, le=1e9)]
+"""Weight, cost or tolerance, in whatever unit."""
 Duration = Annotated[float, Meta(ge=0, le=3600)]
 """Time from nothing to an hour [s]."""
+Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
+"""Time from a millisecond to an hour [s]."""
+MeanTime = Annotated[float, Meta(ge=1e-9, le=1e9)]
+"""Mean of a random time [s]."""
+
+FILE_BYTES_MAX = 1_000_000
+"""Largest size of a scenario's file [B]."""
+EXTENDS_MAX = 20
+"""Largest number of scenarios that a scenario is laid over, each over the next."""
+GIVEN_MAX = 200
+"""Largest number of characters that a message repeats of what was given."""
 
 
 class ConfigError(Exception):
@@ -50,9 +71,9 @@ class ModelConfig(Section, frozen=True):
 
     axes: Literal[2, 3] = 2
     """Number of axes: 2 to fly in the plane, 3 in space."""
-    tau_s: tuple[Positive, ...] = (0.84,)
+    tau_s: tuple[Factor, ...] = (0.84,)
     """Time constant of the velocity loop [s]: one for all axes, or one each."""
-    u_max: tuple[Positive, ...] = (1.6,)
+    u_max: tuple[Factor, ...] = (1.6,)
     """Largest desired velocity [m/s]: one for all axes, or one each."""
 
 
@@ -67,7 +88,7 @@ class ControlConfig(Section, frozen=True):
     """Delay compensation: committed inputs, these with feedback, eq. (11) and (13), or none."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """Longest time from making a horizon to its being in force [s]; auto: as was seen."""
-    observer_s: NonNegative = 4.0
+    observer_s: Duration = 4.0
     """Time constant of learning steady wind and a wrong gain [s], longer where observations are
     old; 0: they are not learned."""
     trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "cost_gap | silence(1)"
@@ -76,21 +97,21 @@ class ControlConfig(Section, frozen=True):
     """Number of steps between two horizons of the policy `periodic`."""
     solver: Literal["exact", "osqp"] = "exact"
     """Solver of eq. (9): a Riccati active set, exact and fast, or OSQP, the reference."""
-    epsilon: NonNegative = 3.6
+    epsilon: Amount = 3.6
     """Tolerance ε of eq. (16)."""
-    decay_rate: NonNegative = 1.5
+    decay_rate: Amount = 1.5
     """Decay rate λ of eq. (16) [1/s]."""
-    cost_gap: NonNegative = 1.0
+    cost_gap: Amount = 1.0
     """Extra cost of flying on with what was sent, above which the policy `cost_gap` sends."""
-    deviation_m: NonNegative = 0.05
+    deviation_m: Amount = 0.05
     """Distance from the plan, above which the policy `deviation` sends [m]."""
-    state_weight: tuple[NonNegative, NonNegative] = (7.0, 1.0)
+    state_weight: tuple[Amount, Amount] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
-    terminal_weight: tuple[NonNegative, NonNegative] = (50.0, 20.0)
+    terminal_weight: tuple[Amount, Amount] = (50.0, 20.0)
     """Weight P of eq. (5) and (16) on the final position [1/m²] and velocity [s²/m²]."""
-    input_weight: Positive = 0.01
+    input_weight: Annotated[float, Meta(ge=1e-9, le=1e9)] = 0.01
     """Weight R of eq. (5) on the input [s²/m²]."""
-    change_weight: NonNegative = 0.0
+    change_weight: Amount = 0.0
     """Weight S of eq. (9) on the change against the horizon before [s²/m²]."""
     input_reference: bool = False
     """Whether R weighs u - v_ref instead of u, so that it does not ask for standing still."""
@@ -106,15 +127,15 @@ class ReferenceConfig(Section, frozen=True):
 
     shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
     """Shape of the desired trajectory."""
-    radius_m: Positive = 1.55
+    radius_m: Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)] = 1.55
     """Half the width of circle, figure-eight and square [m]."""
-    period_s: Positive = 27.5
+    period_s: Annotated[float, Meta(ge=0.1, le=86400)] = 27.5
     """Time for one round of circle, figure-eight or square [s]."""
-    altitude_m: float = 0.0
+    altitude_m: Position = 0.0
     """Altitude of circle, figure-eight and square in space [m]."""
-    points_m: tuple[tuple[float, ...], ...] = ()
+    points_m: tuple[tuple[Position, ...], ...] = ()
     """Waypoints [m], at least two, or the one point to hover at."""
-    speed_mps: Positive = 1.0
+    speed_mps: Factor = 1.0
     """Speed between waypoints [m/s]."""
     loop: bool = False
     """Whether the waypoints are flown round and round."""
@@ -127,25 +148,25 @@ class VehicleConfig(Section, frozen=True):
 
     exhausted: Literal["hold", "brake"] = "brake"
     """Answer to a horizon that has run out: hold its last input (the paper), or brake and hover."""
-    brake_mps2: Positive = 2.0
+    brake_mps2: Factor = 2.0
     """Deceleration of the desired velocity when `brake` stops the vehicle [m/s²]."""
-    tau_s: tuple[Positive, ...] = ()
+    tau_s: tuple[Factor, ...] = ()
     """True time constant [s], one for all axes, or one each; left out: the model's."""
-    gain: Positive = 1.0
+    gain: Factor = 1.0
     """Gain of the velocity loop: velocity settled at over velocity commanded."""
     dead_time_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
     """Dead time before an input takes effect [s]."""
-    start_m: tuple[float, ...] = ()
+    start_m: tuple[Position, ...] = ()
     """Position at the start, at rest [m]; left out: that of the reference."""
-    wind: NonNegative = 0.0
+    wind: Strength = 0.0
     """Strength of white acceleration [m/s per √s]."""
-    steady_wind_mps: tuple[float, ...] = ()
+    steady_wind_mps: tuple[Speed, ...] = ()
     """Velocity that steady wind adds in the long run, for each axis [m/s]; left out: none."""
-    gust_mps2: NonNegative = 0.0
+    gust_mps2: Strength = 0.0
     """Strength of gusts [m/s²]; 0 for none."""
-    gust_every_s: Positive = 10.0
+    gust_every_s: MeanTime = 10.0
     """Mean time from the end of one gust to the next [s]."""
-    gust_s: Positive = 1.0
+    gust_s: MeanTime = 1.0
     """Mean length of a gust [s]."""
 
 
@@ -188,15 +209,15 @@ class NetworkConfig(Section, frozen=True):
 class LinkConfig(Section, frozen=True):
     """Times by which a session is kept."""
 
-    heartbeat_s: Positive = 0.1
+    heartbeat_s: Interval = 0.1
     """Longest time that the server lets pass without a packet [s]."""
     age_max_s: Annotated[float, Meta(gt=0, le=60)] = 5.0
     """Largest age of the observation behind an input [s]; with no younger one the vehicle brakes
     and hovers, or holds its last input where `vehicle.exhausted` says so."""
-    timeout_s: Positive = 1.0
+    timeout_s: Interval = 1.0
     """Time of silence after which the vehicle says HELLO again, and its number is free for another
     life [s]."""
-    connect_s: Positive = 15.0
+    connect_s: Interval = 15.0
     """Time that the vehicle waits for its first session before it gives up [s]."""
 
 
@@ -205,7 +226,7 @@ class SimulationConfig(Section, frozen=True):
 
     compute_s: Duration = 0.001
     """Time that the server takes for a step [s]."""
-    clock_offset_s: float = 0.0
+    clock_offset_s: Annotated[float, Meta(ge=-1e9, le=1e9)] = 0.0
     """Offset of the vehicle's clock from the server's at the start [s]."""
     clock_drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
     """Drift: how much faster the vehicle's clock runs than the server's [ppm]."""
@@ -218,7 +239,7 @@ class Scenario(Section, frozen=True):
     """Title: what the scenario shows, in a line."""
     duration: Annotated[float, Meta(gt=0, le=86400)] = 60.0
     """Length of the flight [s]."""
-    settle: NonNegative = 0.0
+    settle: Annotated[float, Meta(ge=0, le=86400)] = 0.0
     """Time at the start that RMSE leaves out [s]."""
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 1
     """Seed of everything random: delays, losses, wind."""
@@ -261,7 +282,7 @@ class Scenario(Section, frozen=True):
     def terms(self) -> Terms:
         """Terms that both ends must agree on before a flight."""
         control, vehicle, reference = self.control, self.vehicle, self.reference
-        table = Path(reference.file).read_bytes() if reference.shape == "csv" else b""
+        table = shapes.read(Path(reference.file)) if reference.shape == "csv" else b""
         return Terms(
             dt_ns=self.dt_ns,
             horizon=control.horizon,
@@ -337,7 +358,10 @@ def load(name: str) -> Scenario:
     Raises:
         ConfigError: it does not exist, or something in it is wrong.
     """
-    return check(_read(name), name)
+    try:
+        return check(_read(name), name)
+    except RecursionError:
+        raise ConfigError(f"{name}: nested too deeply") from None
 
 
 def check(raw: Mapping[str, Any], source: str) -> Scenario:
@@ -354,7 +378,7 @@ def check(raw: Mapping[str, Any], source: str) -> Scenario:
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {_explain(str(error), raw)}") from None
     for key, given, expected in chain(_infinite(to_table(scenario)), _contradictions(scenario)):
-        raise ConfigError(f"{source}: {key}: got {given}, expected {expected}")
+        raise ConfigError(f"{source}: {key}: got {_short(str(given))}, expected {expected}")
     return scenario
 
 
@@ -385,6 +409,8 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
     if (path, entry) in seen:
         circle = " → ".join([*seen.values(), name])
         raise ConfigError(f"{seen[path, entry]}: extends: got a circle of {circle}")
+    if len(seen) > EXTENDS_MAX:
+        raise ConfigError(f"{name}: extends: got a chain of more than {EXTENDS_MAX} scenarios")
     table = raw.get("reference")
     if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
         table["file"] = str((path.parent / table["file"]).absolute())
@@ -404,16 +430,18 @@ def _path(file: str) -> Path:
         return Path(str(resources.files("scenarios") / f"{file}.toml"))
     try:
         return Path(file).resolve()
-    except ValueError as error:
+    except (ValueError, OSError, RuntimeError) as error:  # a zero byte, or a circle of links
         raise ConfigError(f"{file}: cannot be read: {error}") from None
 
 
 def _toml(path: Path, file: str) -> dict[str, Any]:
     """The raw table of a whole file, which the user calls `file`."""
     try:
-        return tomllib.loads(path.read_bytes().decode())
+        return tomllib.loads(files.read(path, FILE_BYTES_MAX).decode())
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+    except RecursionError:
+        raise ConfigError(f"{file}: no valid TOML: nested too deeply") from None
     except ValueError as error:
         raise ConfigError(f"{file}: no valid TOML: {error}") from None
 
@@ -428,6 +456,7 @@ def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 
 
 _PLAIN = {
+    "Number out of range": "a number that is not as large",
     "float": "a number",
     "int": "a whole number",
     "bool": "true or false",
@@ -445,7 +474,7 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
     found = _ERROR.fullmatch(message)
     assert found is not None
     what, path = found["what"], found["path"] or ""
-    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what)
+    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL)
     section, given = Scenario, raw
     for part in filter(None, path.split(".")):
         key, *index = part.replace("]", "").split("[")
@@ -458,11 +487,24 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
         known = hint(unknown[1], section.__struct_fields__)
         return f"{prefix}{unknown[1]}: no such key; {known}"
     if what.startswith("Invalid enum value") or " | " in what:
-        return f"{path}: got {given!r}, expected {_choices(section)}"
+        return f"{path}: got {_written(given)}, expected {_choices(section)}"
     expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
     for theirs, ours in _PLAIN.items():
         expected = re.sub(rf"^{theirs}\b", ours, expected)
-    return f"{path or 'the scenario'}: got {given!r}, expected {expected}"
+    return f"{path or 'the scenario'}: got {_written(given)}, expected {expected}"
+
+
+def _written(given: object) -> str:
+    """A value as Python writes it, as far as a line has room for it."""
+    try:
+        return _short(repr(given))
+    except ValueError:  # Python writes no number of more than 4300 digits
+        return "a number of thousands of digits"
+
+
+def _short(given: str) -> str:
+    """What was given, as far as a line has room for it."""
+    return given if len(given) <= GIVEN_MAX else f"{given[:GIVEN_MAX]}…"
 
 
 def _choices(kind: Any) -> str:
@@ -568,13 +610,22 @@ def _no_reference(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]
     for point in ref.points_m:
         if len(point) != axes:
             yield "reference.points_m", list(point), f"{axes} numbers a point"
+    if ref.shape in ("circle", "figure-eight", "square"):
+        most_m = shapes.FAST_MPS * ref.period_s / 8.0  # a square's round is eight radii long
+        if ref.radius_m > most_m:
+            most = f"at most {most_m:g} with reference.period_s = {ref.period_s:g}"
+            yield "reference.radius_m", ref.radius_m, most
     route = ref.points_m + ref.points_m[:1] * ref.loop
     if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
         yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
-    if ref.shape == "csv":
+    elif ref.shape in ("waypoints", "csv"):
         try:
             scenario.make_reference()
         except OSError as error:
             yield "reference.file", repr(ref.file), f"a readable file ({error.strerror})"
         except ValueError as error:
-            yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
+            if ref.shape == "csv":
+                yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
+            else:
+                given = [list(point) for point in route]
+                yield "reference.points_m", given, "points that are further apart"

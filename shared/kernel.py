@@ -62,7 +62,11 @@ def kernel(function: F) -> F:
     with suppress(RuntimeError):  # no place can be written to
         dispatcher.enable_caching()
     config.CACHE_LOCATOR_CLASSES = before
-    dispatcher.compile(signature)
+    try:
+        dispatcher.compile(signature)
+    except OSError:  # the disk is full, say: it is compiled, and not kept
+        dispatcher._cache = caching.NullCache()
+        dispatcher.compile(signature)
     dispatcher.disable_compile()
     compiled: F = dispatcher
     return compiled

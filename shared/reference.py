@@ -5,12 +5,22 @@ A reference is a function of time since the epoch [s; any shape] that gives the 
 """
 
 import csv
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from shared import files
+
+FAR_M = 1e6
+"""Largest coordinate of a trajectory [m]."""
+FAST_MPS = 1e6
+"""Largest velocity along an axis of a trajectory that is given by its points [m/s]."""
+FILE_BYTES_MAX = 16_000_000
+"""Largest size of a table [B]."""
 
 Array = NDArray[np.float64]
 Reference = Callable[[NDArray[Any]], Array]
@@ -65,9 +75,15 @@ def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Refere
         times_s: rising, from 0; shape (n,).
         points_m: shape (n, axes).
         loop: start again at the end; otherwise stop at the last point and stay.
+
+    Raises:
+        ValueError: no vehicle can be told to be so far away, or so fast.
     """
     times_s, points_m = np.asarray(times_s, float), np.asarray(points_m, float)
-    slopes = np.diff(points_m, axis=0) / np.diff(times_s)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        slopes = np.diff(points_m, axis=0) / np.diff(times_s)[:, None]
+    if not ((np.abs(points_m) <= FAR_M).all() and (np.abs(slopes) <= FAST_MPS).all()):
+        raise ValueError(f"expected at most {FAR_M:g} m from the origin, and {FAST_MPS:g} m/s")
 
     def sample(t: Array) -> Array:
         t = np.asarray(t, dtype=np.float64)
@@ -83,7 +99,11 @@ def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Refere
 
 
 def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Reference:
-    """Path through the points at constant speed; `loop` flies back to the first, and on."""
+    """Path through the points at constant speed; `loop` flies back to the first, and on.
+
+    Raises:
+        ValueError: see `timed_path`; two points may be too close to each other, too.
+    """
     points = np.asarray(points_m, dtype=np.float64)
     if loop:
         points = np.concatenate([points, points[:1]])
@@ -112,31 +132,44 @@ def hover(point_m: Array) -> Reference:
     return sample
 
 
+def read(path: Path) -> bytes:
+    """The content of a table's file.
+
+    Raises:
+        OSError: it cannot be read, or is no table's.
+        ValueError: no file can have this name.
+    """
+    return files.read(path, FILE_BYTES_MAX)
+
+
 def from_csv(path: Path, axes: int) -> Reference:
     """Path from a table with the columns t [s], x, y, z [m] (as many as there are axes).
 
     Raises:
+        OSError: see `read`.
         ValueError: with what is wrong, and in which line.
     """
     names = ["t", "x", "y", "z"][: axes + 1]
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        table = csv.DictReader(file, skipinitialspace=True)
-        try:
-            missing = [name for name in names if name not in (table.fieldnames or ())]
-            lines = [] if missing else [(table.line_num, row) for row in table]
-        except csv.Error as error:
-            raise ValueError(f"line {table.reader.line_num}: {error}") from None
-    if missing:
-        raise ValueError(f"line 1: expected the columns {', '.join(names)}")
-    rows = []
-    for line, row in lines:
-        try:
-            rows.append([float(row[name]) for name in names])
-        except (TypeError, ValueError):
-            raise ValueError(f"line {line}: expected {len(names)} numbers") from None
+    text = io.StringIO(read(path).decode("utf-8-sig"), newline="")
+    table = csv.DictReader(text, skipinitialspace=True)
+    rows: list[list[float]] = []
+    try:
+        if any(name not in (table.fieldnames or ()) for name in names):
+            raise ValueError(f"line 1: expected the columns {', '.join(names)}")
+        rows += (_numbers([row[name] for name in names], table.line_num) for row in table)
+    except csv.Error as error:
+        raise ValueError(f"line {table.reader.line_num}: {error}") from None
     data = np.array(rows).reshape(-1, axes + 1)
     if len(data) < 2 or not np.isfinite(data).all():
         raise ValueError("expected at least two lines of finite numbers")
     if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
         raise ValueError("column t must start at 0 and rise from line to line")
     return timed_path(data[:, 0], data[:, 1:])
+
+
+def _numbers(words: list[str | None], line: int) -> list[float]:
+    """The numbers of one line of a table."""
+    try:
+        return [float(word) for word in words]  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ValueError(f"line {line}: expected {len(words)} numbers") from None

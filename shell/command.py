@@ -12,8 +12,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
+from errno import EMFILE
 from inspect import cleandoc
 from pathlib import Path
 from socket import socket
@@ -36,10 +37,13 @@ from shared.summary import Summary
 from shell.driver import Shell, run
 from shell.log import Log, LogFormat
 from shell.recording import Recording
-from shell.udp import AddressError
+from shell.udp import SPARE_FILES, AddressError, allow_sockets, files_max, sockets_max
 
-CONFIGURATION, RUN = 2, 1
-"""Exit codes: what the command asked for is impossible, or something went wrong on the way."""
+CONFIGURATION, RUN, INTERRUPTED = 2, 1, 128 + signal.SIGINT
+"""Exit codes: what the command asked for is impossible, something went wrong on the way, or it was
+ended by Ctrl-C."""
+OUTPUTS = ("json", "figure", "record")
+"""Options of all commands that name a file to write."""
 
 ScenarioName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
 ScenarioFlags = Annotated[Scenario, tyro.conf.arg(name="")]
@@ -83,6 +87,7 @@ def parse(defaults: O, argv: Sequence[str], prog: str, help_: str | None) -> O:
     """Parse a command line; returns its options, laid over the scenario it names.
 
     Raises:
+        CommandError: a file that it is to write cannot be written.
         ConfigError: the scenario cannot be flown.
         SystemExit: tyro has shown the help, or what is wrong with a flag.
     """
@@ -94,6 +99,8 @@ def parse(defaults: O, argv: Sequence[str], prog: str, help_: str | None) -> O:
             break
         name = options.scenario
     checked = config.check(config.to_table(options.config), f"{name} and the command line")
+    for option in OUTPUTS:
+        check_output(f"--{option}", getattr(options, option, None))
     return replace(options, config=checked)  # type: ignore[type-var]
 
 
@@ -133,6 +140,41 @@ def check_count(flag: str, given: int, most: int) -> None:
     """
     if not 1 <= given <= most:
         raise CommandError(f"{flag}: got {given}, expected 1 to {most}", CONFIGURATION)
+
+
+def check_sockets(flag: str, given: int) -> None:
+    """Let this process open a socket for each of so many things.
+
+    Raises:
+        CommandError: the system does not allow as many.
+    """
+    most = sockets_max()
+    if given > most:
+        needed = f"got {given}, which takes {given + SPARE_FILES} open files"
+        allowed = f"expected at most {max(most, 0)}, for {files_max()} may be open here (ulimit -n)"
+        raise CommandError(f"{flag}: {needed}; {allowed}", CONFIGURATION)
+    allow_sockets(given)
+
+
+def check_output(flag: str, path: Path | None) -> None:
+    """Refuse a file that cannot be written, before anything is flown for it.
+
+    Raises:
+        CommandError: with the system's reason.
+    """
+    if path is None:
+        return
+    try:
+        try:
+            path.open("xb").close()
+        except FileExistsError:
+            if path.is_file() or path.is_dir():  # opening a pipe would wait for its reader
+                path.open("ab").close()
+        else:
+            path.unlink()
+    except OSError as error:
+        said = f"{flag}: {path}: cannot be written: {error.strerror}"
+        raise CommandError(said, CONFIGURATION) from None
 
 
 @contextmanager
@@ -268,19 +310,20 @@ class Bar(Protocol):
 def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
     """A bar on stderr: title, how much of the total is done, and the time remaining.
 
-    It vanishes at the end, and is not shown where stderr is no terminal. What is printed on stderr
-    meanwhile is shown above the bar.
+    It vanishes at the end, and is not shown where stderr is no terminal, or one that cannot move
+    its cursor. What is printed on stderr meanwhile is shown above the bar.
     """
+    console = Console(stderr=True)
     with Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.completed:.0f} of {task.total:.0f} " + unit),
         TimeRemainingColumn(),
         TextColumn("{task.fields[text]}", markup=False),
-        console=Console(stderr=True),
+        console=console,
         transient=True,
         speed_estimate_period=600.0,  # a step may take minutes
-        disable=not sys.stderr.isatty(),
+        disable=not console.is_interactive,
     ) as shown:
         row = shown.add_task(title, total=total, text="")
 
@@ -292,31 +335,55 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C end work in order; yields what tells whether it has been pressed."""
+    """Let Ctrl-C, or SIGTERM, end work in order; yields what tells whether one has come."""
     interrupted = threading.Event()
-    before = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]
     try:
         yield interrupted.is_set
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, prog: str) -> int:
     """Run a command, with one line on stderr for what went wrong; returns its exit code."""
     try:
-        command(sys.argv[1:] if argv is None else argv)
+        try:
+            command(sys.argv[1:] if argv is None else argv)
+        finally:
+            sys.stdout.flush()
     except CommandError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
-        return error.code
+        return _refuse(prog, str(error), error.code)
     except ConfigError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
-        return CONFIGURATION
+        return _refuse(prog, str(error), CONFIGURATION)
     except KeyboardInterrupt:  # before there was anything to end in order
-        return 128 + signal.SIGINT
-    except BrokenPipeError:  # whoever read our output has seen enough
+        return INTERRUPTED
+    except OSError as error:  # the machine's: a full disk, too few open files, a broken pipe
+        with suppress(OSError):
+            sys.stdout.flush()
+            return _refuse(prog, _reason(error), RUN)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return RUN
+        gone = isinstance(error, BrokenPipeError)  # whoever read our output has seen enough
+        return RUN if gone else _refuse(prog, _reason(error), RUN)
     return 0
+
+
+def _refuse(prog: str, message: str, code: int) -> int:
+    """Say what went wrong in one line, whatever stands in it; returns the exit code."""
+    shown = (
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode()
+        for letter in f"{prog}: {message}"
+    )
+    print("".join(shown), file=sys.stderr)
+    return code
+
+
+def _reason(error: OSError) -> str:
+    """What the system has against it, and where."""
+    where = f"{error.filename}: " if error.filename else ""
+    allowed = f"; {files_max()} may be open here (ulimit -n)" if error.errno == EMFILE else ""
+    return f"{where}{error.strerror or error}{allowed}"
 
 
 def show(table: Table) -> None:

@@ -215,7 +215,8 @@ def run(
         task = asyncio.gather(*(shell.run(on_event) for shell in shells))
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
-        loop.add_signal_handler(signal.SIGUSR1, on_usr1)
+        # The loop would let SIGUSR1 end the process once it is closed itself.
+        signal.signal(signal.SIGUSR1, lambda *_: loop.call_soon_threadsafe(on_usr1))
         loop.set_exception_handler(lambda _, context: on_event(_fault(context)))
 
         def tick() -> None:
@@ -224,8 +225,11 @@ def run(
 
         tick()
         on_start()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        try:
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        finally:
+            signal.signal(signal.SIGUSR1, signal.SIG_IGN)
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(main())

@@ -10,6 +10,7 @@ import ipaddress
 import resource
 import socket
 import struct
+import sys
 from collections.abc import Iterable
 from typing import Any
 
@@ -19,8 +20,8 @@ from shared.events import address_text
 BUFFER_BYTES = 4 * 1024 * 1024
 """Size of a socket's buffers [B]: the default receive buffer holds 166 datagrams of 600 B."""
 
-SPARE_FILES = 64
-"""Number of open files beside the sockets."""
+SPARE_FILES = 32
+"""Number of open files that a process may need beside its sockets."""
 
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 
@@ -103,13 +104,23 @@ def to_kernel(address: Address) -> tuple[Any, ...]:
     return (host, address[1], 0, socket.if_nametoindex(scope)) if percent else address
 
 
+def files_max() -> int:
+    """Largest number of files that this process may open, if it asks for it."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return sys.maxsize if hard == resource.RLIM_INFINITY else hard
+
+
+def sockets_max() -> int:
+    """Largest number of sockets that this process may have beside its other files."""
+    return files_max() - SPARE_FILES
+
+
 def allow_sockets(count: int) -> None:
     """Let this process have so many sockets open, as far as the system does."""
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = count + SPARE_FILES
-    soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
-    if soft > resource.getrlimit(resource.RLIMIT_NOFILE)[0]:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = min(count + SPARE_FILES, files_max())
+    if soft != resource.RLIM_INFINITY and wanted > soft:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def kernel_drops(sock: socket.socket) -> int:

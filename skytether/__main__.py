@@ -2,12 +2,8 @@
 
 import sys
 from collections.abc import Sequence
-from importlib import metadata
-from pkgutil import resolve_name
 
-from shared import config
-from shared.hint import hint
-from shell import command
+from shell import start
 
 USAGE = """usage: skytether COMMAND ...
 
@@ -31,8 +27,11 @@ Each has a --help of its own. `skytether fly demo` flies a demonstration."""
 
 def list_scenarios(argv: Sequence[str]) -> None:
     """Print the scenarios that come with Skytether, a line each."""
+    from shared import config
+    from shell.command import CommandError
+
     if argv:
-        raise command.CommandError(f"got {argv[0]!r}, expected nothing", 2)
+        raise CommandError(f"got {argv[0]!r}, expected nothing", 2)
     names = config.names()
     width = max(map(len, names))
     for name in names:
@@ -59,17 +58,26 @@ compiles."""
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if not argv or argv[0] in ("-h", "--help"):
-        print(USAGE)
-        return 0
-    name, *rest = argv
-    if name == "--version":
-        print(f"skytether {metadata.version('skytether')}")
-        return 0
-    if name not in COMMANDS:
-        print(f"skytether: no command {name!r}; {hint(name, COMMANDS)}", file=sys.stderr)
-        return command.CONFIGURATION
-    return command.main(resolve_name(COMMANDS[name]), rest, name)
+    name, *rest = argv or ["--help"]
+    if name in COMMANDS:
+        return start.run(COMMANDS[name], name, rest)
+    return start.run("skytether.__main__:introduce", "skytether", argv)
+
+
+def introduce(argv: Sequence[str]) -> None:
+    """Print the commands, or the version."""
+    from importlib import metadata
+
+    from shared.hint import hint
+    from shell.command import CONFIGURATION, CommandError
+
+    match argv:
+        case [] | ["-h" | "--help", *_]:
+            print(USAGE)
+        case ["--version", *_]:
+            print(f"skytether {metadata.version('skytether')}")
+        case [name, *_]:
+            raise CommandError(f"no command {name!r}; {hint(name, COMMANDS)}", CONFIGURATION)
 
 
 if __name__ == "__main__":

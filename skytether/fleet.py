@@ -131,10 +131,13 @@ def fleet(argv: Sequence[str]) -> None:
         figures.check(options.figure)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{options.vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
-    with command.progress(f"flying {title}", options.config.duration) as on_second:
-        flown = (_virtually if options.virtual else _really)(options, on_second)
+    with (
+        command.interruptible() as interrupted,
+        command.progress(f"flying {title}", options.config.duration) as on_second,
+    ):
+        flown = (_virtually if options.virtual else _really)(options, on_second, interrupted)
     if not len(flown.client):
-        raise CommandError("ended before the first step")
+        raise CommandError("interrupted before the first step", command.INTERRUPTED)
     summary = _summarise(options, flown)
     _show(summary, title)
     if options.json:
@@ -143,16 +146,17 @@ def fleet(argv: Sequence[str]) -> None:
         figures.fleet(options.figure, title, options.config, flown.client)
 
 
-def _virtually(options: Options, on_second: Callable[[float], None]) -> Flown:
+def _virtually(
+    options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> Flown:
     began_s = time.process_time()
-    with command.interruptible() as interrupted:
-        flown = flight.fly(
-            options.config,
-            vehicles=options.vehicles,
-            stopwatch=Stopwatch(time.perf_counter_ns),
-            on_second=on_second,
-            stopped=interrupted,
-        )
+    flown = flight.fly(
+        options.config,
+        vehicles=options.vehicles,
+        stopwatch=Stopwatch(time.perf_counter_ns),
+        on_second=on_second,
+        stopped=interrupted,
+    )
     if flown.failure:
         raise CommandError(str(flown.failure))
     return Flown(
@@ -164,13 +168,16 @@ def _virtually(options: Options, on_second: Callable[[float], None]) -> Flown:
     )
 
 
-def _really(options: Options, on_second: Callable[[float], None]) -> Flown:
+def _really(
+    options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> Flown:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder, Metronome(options) as machine:
         parts = Path(folder)
         incomplete = processes.run(
             options.config,
             parts,
             on_second=on_second,
+            interrupted=interrupted,
             vehicles=options.vehicles,
             workers=options.workers,
             watched=False,

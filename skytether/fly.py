@@ -51,14 +51,19 @@ def fly(argv: Sequence[str]) -> None:
     beside = _beside(options)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{options.scenario}, {where}, seed {scenario.seed}"
-    with command.progress(f"flying {title}", scenario.duration) as on_second:
-        flown = (_virtually if options.virtual else _really)(scenario, on_second)
+    with (
+        command.interruptible() as interrupted,
+        command.progress(f"flying {title}", scenario.duration) as on_second,
+    ):
+        flown = (_virtually if options.virtual else _really)(scenario, on_second, interrupted)
     if flown.failure:
         raise CommandError(str(flown.failure))
     if flown.incomplete:
         title += ", as far as it is recorded"
     if not len(flown.client):
-        raise CommandError(_missing(scenario, flown) or "ended before the first step")
+        missing = _missing(scenario, flown)
+        code = command.RUN if missing else command.INTERRUPTED
+        raise CommandError(missing or "interrupted before the first step", code)
     flights = {title: (scenario, flown)}
     if beside:
         other = flight.fly(beside)
@@ -86,15 +91,20 @@ def _summarise(scenario: Scenario, name: str, flown: flight.Flight) -> Summary:
     return summarise(scenario, name, flown.client, flown.server, flown.netem)
 
 
-def _virtually(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
-    with command.interruptible() as interrupted:
-        return flight.fly(scenario, on_second=on_second, stopped=interrupted)
+def _virtually(
+    scenario: Scenario, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> flight.Flight:
+    return flight.fly(scenario, on_second=on_second, stopped=interrupted)
 
 
-def _really(scenario: Scenario, on_second: Callable[[float], None]) -> flight.Flight:
+def _really(
+    scenario: Scenario, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> flight.Flight:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
         parts = Path(folder)
-        incomplete = processes.run(scenario, parts, on_second=on_second, on_event=_tell)
+        incomplete = processes.run(
+            scenario, parts, on_second=on_second, interrupted=interrupted, on_event=_tell
+        )
         axes = scenario.model.axes
         return flight.Flight(
             client=_rows(parts / "client", record.client_columns(axes)),

@@ -75,7 +75,7 @@ class Interrupted(CommandError):
 
     def __init__(self, done: float, total: float, unit: str) -> None:
         said = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
-        super().__init__(f"{said}; the same command goes on from here", 128 + signal.SIGINT)
+        super().__init__(f"{said}; the same command goes on from here", command.INTERRUPTED)
 
 
 @dataclass(slots=True)

@@ -3,11 +3,12 @@
 Each process writes its events as JSON on its standard output (`--log json`); they are all that is
 known here of what goes on in it. Anything else that it prints, a traceback or its one line for a
 mistake, is kept for its last words.
+
+The loop is asyncio's own: uvloop's would start them with signals that are no longer ignored.
 """
 
 import asyncio
 import contextlib
-import signal
 import sys
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -27,20 +28,21 @@ from shared.events import (
     RecordIncomplete,
     address_text,
 )
-from shell.command import CommandError
-from shell.driver import new_event_loop
+from shell.command import INTERRUPTED, CommandError
 from shell.log import Line
 from shell.workers import die_with_parent
 
 NAMES = ("client", "server", "netem")
 """Names of the processes, and of their parts of the record."""
 
-START_S = 30.0
-"""Longest time that a process may take until it listens [s]."""
+START_S = 120.0
+"""Longest time that a process may take until it listens [s]: it may have to compile first."""
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
 STOP_S = 5.0
 """Longest time that a process may take to end once it is told to [s]."""
+POLL_S = 0.2
+"""Time after which Ctrl-C is noticed [s]."""
 LINES_MAX = 20
 """Number of last lines kept of what a process said, for when it fails."""
 
@@ -73,7 +75,11 @@ class Child:
 
     def last_words(self) -> str:
         """Why it ended, in its own words."""
-        return self.said[-1] if self.said else f"{self.name}: ended with {self.process.returncode}"
+        if self.said:
+            return self.said[-1]
+        code = self.process.returncode
+        said = f"does not listen after {START_S:.0f} s" if code is None else f"ended with {code}"
+        return f"{self.name}: {said}"
 
 
 @contextlib.asynccontextmanager
@@ -121,6 +127,9 @@ async def started(
             (listening, child.reader), timeout=START_S, return_when=asyncio.FIRST_COMPLETED
         )
         if listening not in done:
+            if child.reader in done:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(process.wait(), STOP_S)
             raise CommandError(child.last_words())
         child.address = listening.result()
         yield child
@@ -159,6 +168,7 @@ def run(
     parts: Path,
     *,
     on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
     on_event: OnEvent = lambda _: None,
     vehicles: int = 1,
     workers: int = 1,
@@ -166,19 +176,22 @@ def run(
 ) -> list[RecordIncomplete]:
     """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
 
-    Returns what is missing in the record, as the processes tell it; nothing in a good one.
+    Whoever calls it has Ctrl-C and SIGTERM under control (`command.interruptible`). Returns what is
+    missing in the record, as the processes tell it; nothing in a good one.
 
     Args:
         scenario: what to fly.
         parts: the folder, for a record of each process and, as `.json`, its figures.
         on_second: called with the time flown [s], several times a second.
+        interrupted: asked several times a second; once it says so, the flight ends in order.
         on_event: called with each event of the processes.
         vehicles: number of vehicles, all in one process.
         workers: number of processes of the server.
         watched: whether server and netem record, too.
 
     Raises:
-        CommandError: one of the processes failed, or the folder cannot be written to.
+        CommandError: one of the processes failed, the folder cannot be written to, or it was
+            interrupted before the first step.
     """
     file = parts / "scenario.toml"
     try:
@@ -203,18 +216,18 @@ def run(
         on_event(event)
 
     async def main() -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, task.cancel)
+        flight = asyncio.create_task(
+            _fly(server, netem, client, timeout_s=timeout_s, on_second=on_second, on_event=hear)
+        )
+        while not flight.done() and not interrupted():
+            await asyncio.wait((flight,), timeout=POLL_S)
+        flight.cancel()
         with contextlib.suppress(asyncio.CancelledError):
-            await _fly(
-                server, netem, client, timeout_s=timeout_s, on_second=on_second, on_event=hear
-            )
+            await flight
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        runner.run(main())
+    asyncio.run(main())
+    if interrupted() and not (parts / "client.json").exists():
+        raise CommandError("interrupted before the first step", INTERRUPTED)
     return incomplete
 
 
@@ -248,7 +261,7 @@ async def _fly(
         ended = [asyncio.create_task(child.end()) for child in (client, netem, server)]
         try:
             while not any(task.done() for task in ended):
-                await asyncio.wait(ended, timeout=0.2, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait(ended, timeout=POLL_S, return_when=asyncio.FIRST_COMPLETED)
                 on_second(0.0 if flying_s is None else loop.time() - flying_s)
                 if loop.time() - began_s > timeout_s:
                     raise CommandError(f"the flight has not ended in {timeout_s:.0f} s")

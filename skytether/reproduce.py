@@ -2,7 +2,6 @@
 
 import io
 import json
-import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -130,15 +129,17 @@ def _really(out: Path, table: Study, method: str, scale: Scale) -> report.Real:
         part = folder.with_name(folder.name + ".part")
         part.mkdir(parents=True, exist_ok=True)
         title = f"flying over UDP: {method}"
-        with command.progress(title, scale.real_s) as on_second:
-            incomplete = processes.run(scenario, part, on_second=on_second)
+        with (
+            command.interruptible() as interrupted,
+            command.progress(title, scale.real_s) as on_second,
+        ):
+            incomplete = processes.run(scenario, part, on_second=on_second, interrupted=interrupted)
         if incomplete:
             raise CommandError("; ".join(map(str, incomplete)))
         steps = record.read(part / "client")["step"]
         if not len(steps) or steps[-1] < scenario.steps - 2:
-            raise CommandError(
-                "interrupted; the same command goes on from here", 128 + signal.SIGINT
-            )
+            said = "interrupted; the same command goes on from here"
+            raise CommandError(said, command.INTERRUPTED)
         part.rename(folder)
     client, server, netem = (record.read(folder / part) for part in processes.NAMES)
     figures = json.loads((folder / "netem.json").read_bytes())

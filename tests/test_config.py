@@ -1,5 +1,6 @@
 """`shared.config`: a scenario is right, or it is refused in one line that says what is wrong."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ WRONG = {
     ),
     "no input weight": (
         "control.input_weight = 0.0",
-        "control.input_weight: got 0.0, expected a number > 0.0",
+        "control.input_weight: got 0.0, expected a number >= 1e-09",
     ),
     "a negative tolerance": (
         "control.epsilon = -1.0",
@@ -80,7 +81,7 @@ WRONG = {
         "network.uplink.minimum_s = -0.1",
         "network.uplink.minimum_s: got -0.1, expected a number >= 0.0",
     ),
-    "no gain": ("vehicle.gain = 0.0", "vehicle.gain: got 0.0, expected a number > 0.0"),
+    "no gain": ("vehicle.gain = 0.0", "vehicle.gain: got 0.0, expected a number >= 0.001"),
     "a dead time that fills the memory": (
         "vehicle.dead_time_s = 11.0",
         "vehicle.dead_time_s: got 11.0, expected a number <= 10.0",
@@ -91,8 +92,43 @@ WRONG = {
         "seed = 4294967296",
         "seed: got 4294967296, expected a whole number <= 4294967295",
     ),
-    "no bound": ("model.u_max = [0.0]", "model.u_max[0]: got 0.0, expected a number > 0.0"),
+    "no bound": ("model.u_max = [0.0]", "model.u_max[0]: got 0.0, expected a number >= 0.001"),
     "no number": ("control.epsilon = nan", "control.epsilon: got nan, expected a number >= 0.0"),
+    "a time-out that no clock can count": (
+        "link.timeout_s = 1e300",
+        "link.timeout_s: got 1e+300, expected a number <= 3600.0",
+    ),
+    "a time constant that vanishes": (
+        "model.tau_s = [1e-300]",
+        "model.tau_s[0]: got 1e-300, expected a number >= 0.001",
+    ),
+    "a true time constant that vanishes": (
+        "vehicle.tau_s = [1e-300]",
+        "vehicle.tau_s[0]: got 1e-300, expected a number >= 0.001",
+    ),
+    "a circle faster than anything": (
+        "reference.radius_m = 1e6\nreference.period_s = 0.1",
+        "reference.radius_m: got 1000000.0, expected at most 12500 with reference.period_s = 0.1",
+    ),
+    "more digits than Python reads": (
+        f"seed = 1{'0' * 5000}",
+        (
+            "no valid TOML: Exceeds the limit (4300 digits) for integer string conversion: value "
+            "has 5001 digits; use sys.set_int_max_str_digits() to increase the limit"
+        ),
+    ),
+    "more digits than Python writes": (
+        f"seed = 0x{'f' * 5000}",
+        "seed: got a number of thousands of digits, expected a whole number <= 4294967295",
+    ),
+    "more digits than a line has room for": (
+        f"control.dt = 1{'0' * 400}",
+        f"control.dt: got 1{'0' * 199}…, expected a number that is not as large",
+    ),
+    "tables nested deeply": (
+        f"model = {'{a=' * 5000}1{'}' * 5000}",
+        "no valid TOML: nested too deeply",
+    ),
     # Not one of the choices.
     "a scheme that is none": (
         'control.scheme = "papr"',
@@ -216,6 +252,13 @@ WRONG = {
     "a waypoint twice in a row": (
         'reference.shape = "waypoints"\nreference.points_m = [[1, 2], [1, 2]]',
         "reference.points_m: got [[1.0, 2.0], [1.0, 2.0]], expected no point twice in a row",
+    ),
+    "waypoints that rounding makes one": (
+        'reference.shape = "waypoints"\nreference.points_m = [[0, 0], [1, 0], [1, 1e-300]]',
+        (
+            "reference.points_m: got [[0.0, 0.0], [1.0, 0.0], [1.0, 1e-300]], "
+            "expected points that are further apart"
+        ),
     ),
     "a loop that ends where it starts": (
         (
@@ -349,6 +392,42 @@ def test_a_file_that_is_no_toml_is_refused(content: bytes, tmp_path: Path) -> No
     path = tmp_path / "mine.toml"
     path.write_bytes(content)
     assert refusal(path).startswith(f"{path}: no valid TOML: ")
+
+
+def test_only_a_plain_file_of_a_thought_of_size_is_read(tmp_path: Path) -> None:
+    """A pipe would be waited for, and a device or a flood would never end."""
+    path, link = tmp_path / "mine.toml", tmp_path / "link.toml"
+    os.mkfifo(path)
+    assert refusal(path) == f"{path}: cannot be read: it is no plain file"
+    path.unlink()
+    path.mkdir()
+    assert refusal(path) == f"{path}: cannot be read: Is a directory"
+    link.symlink_to("/dev/zero")
+    assert refusal(link) == f"{link}: cannot be read: it is no plain file"
+    link.unlink()
+    link.symlink_to(link)
+    assert refusal(link).startswith(f"{link}: cannot be read: ")
+    link.unlink()
+    link.write_bytes(b"#" * (config.FILE_BYTES_MAX + 1))
+    assert refusal(link) == f"{link}: cannot be read: it is larger than 1000000 bytes"
+
+
+def test_a_long_chain_of_scenarios_is_refused(tmp_path: Path) -> None:
+    """Twenty are enough for anybody."""
+    for number in range(30):
+        write(tmp_path, f"{number}.toml", f'extends = "{number + 1}.toml"')
+    write(tmp_path, "30.toml", "seed = 9")
+    assert config.load(str(tmp_path / "10.toml")).seed == 9
+    said = f"{tmp_path}/30.toml: extends: got a chain of more than 20 scenarios"
+    assert refusal(tmp_path / "9.toml") == said
+
+
+def test_tables_nested_deeply_in_both_of_two_scenarios_are_refused(tmp_path: Path) -> None:
+    """Each can be read, and none can be laid over the other."""
+    deep = f"model.{'.'.join('a' * 5000)} = 1"
+    write(tmp_path, "below.toml", deep)
+    path = write(tmp_path, "above.toml", f"extends = 'below.toml'\n{deep}")
+    assert refusal(path) == f"{path}: nested too deeply"
 
 
 def test_extends_needs_the_name_of_a_scenario(tmp_path: Path) -> None:
@@ -492,6 +571,28 @@ def test_a_trajectory_that_is_no_text_table_is_refused(tmp_path: Path) -> None:
     write(tmp_path, "path.csv", f"t,x,y\n0,1,{'9' * 200_000}\n")
     path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
     assert "expected a table of the trajectory" in refusal(path)
+
+
+def test_only_a_plain_table_of_a_thought_of_size_is_read(tmp_path: Path) -> None:
+    """A pipe is not waited for, and ten gigabytes are not read."""
+    trajectory = tmp_path / "path.csv"
+    path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
+    before = f"{path}: reference.file: got {str(trajectory)!r}, expected a readable file"
+    os.mkfifo(trajectory)
+    assert refusal(path) == f"{before} (it is no plain file)"
+    trajectory.unlink()
+    with trajectory.open("wb") as file:
+        file.truncate(10**10)  # takes no space
+    assert refusal(path) == f"{before} (it is larger than 16000000 bytes)"
+
+
+@pytest.mark.parametrize("table", ["t,x,y\n0,0,0\n1,2e6,0\n", "t,x,y\n0,0,0\n1e-300,1,0\n"])
+def test_a_trajectory_out_of_this_world_is_refused(table: str, tmp_path: Path) -> None:
+    """Too far away, and too fast."""
+    write(tmp_path, "path.csv", table)
+    path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
+    said = "a table of the trajectory (expected at most 1e+06 m from the origin, and 1e+06 m/s)"
+    assert refusal(path).endswith(f"expected {said}")
 
 
 def test_one_value_is_for_all_axes() -> None:

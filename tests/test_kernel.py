@@ -1,5 +1,6 @@
 """Machine code of kernels on disk is used as long as all that it was made of is the same."""
 
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -34,15 +35,24 @@ print(values[0], sum(double.stats.cache_hits.values()))
 """
 
 
-def run(folder: Path) -> str:
-    """What the caller prints: the result, and whether its machine code came from the disk."""
+def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
+    """What the caller prints: the result, and whether its machine code came from the disk.
+
+    Args:
+        file_bytes: size at which a file cannot grow, as if the disk were full.
+    """
     done = subprocess.run(
         [sys.executable, "caller.py"],
         cwd=folder,
-        env={"PYTHONPATH": f"{Path(__file__).parent.parent}:{folder}", "HOME": str(folder)},
+        env={
+            "PYTHONPATH": f"{Path(__file__).parent.parent}:{folder}",
+            "HOME": str(folder),
+            "PYTHONDONTWRITEBYTECODE": "1",  # Python itself keeps what it could write half of
+        },
         capture_output=True,
         text=True,
         check=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes)),
     )
     return done.stdout.strip()
 
@@ -80,3 +90,12 @@ def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path)
     (tmp_path / "__pycache__").write_text("a file, where a folder should be")
     (tmp_path / ".cache").write_text("likewise")
     assert run(tmp_path) == "2.0 0"
+
+
+def test_a_full_disk_is_no_reason_to_fail(tmp_path: Path) -> None:
+    """What can be opened and not written: it compiles, and keeps nothing."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER)
+    assert run(tmp_path, file_bytes=100) == "2.0 0"
+    assert run(tmp_path) == "2.0 0"
+    assert run(tmp_path) == "2.0 1"

@@ -48,3 +48,20 @@ def test_lock_files_carry_hashes_and_no_addresses() -> None:
         assert all("==" in pin for pin in pins)
         assert sum("--hash=sha256:" in line for line in lines) >= len(pins)
         assert not any("://" in line or "index" in line for line in lines)
+
+
+def test_folders_with_our_names_are_not_taken_for_ours(tmp_path: Path) -> None:
+    """Where the user happens to be: by the command, its workers and processes, and `python -P`."""
+    for package in PACKAGES:
+        (tmp_path / package).mkdir()
+        for name in ("__init__.py", "__main__.py"):
+            (tmp_path / package / name).write_text("raise SystemExit('somebody else')")
+    skytether = str(Path(sys.executable).with_name("skytether"))
+    flags = ["--duration", "1", "--settle", "0"]
+    for argv in (
+        [skytether, "fly", "demo", *flags],
+        [skytether, "sweep", "demo", *flags, "--runs", "1", "--workers", "1", "--out", "swept"],
+        [sys.executable, "-P", "-m", "server", "--help"],
+    ):
+        done = subprocess.run(argv, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, "")

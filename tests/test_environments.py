@@ -1,0 +1,319 @@
+"""Commands where something is missing: streams, files, a home, a language, a terminal, patience."""
+
+import os
+import pty
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from skytether.__main__ import main
+
+SKYTETHER = [sys.executable, "-P", "-m", "skytether"]
+PATIENCE_S = 60.0
+SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
+"""Bit of SIGUSR1 in the mask of ignored signals."""
+
+VIRTUAL = ["--virtual", "--vehicles", "2", "--duration", "1", "--settle", "0"]
+SHORT = ["--duration", "1", "--settle", "0"]
+
+ASCII: dict[str, str | None] = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+ENVIRONMENTS: dict[str, tuple[dict[str, str | None], str]] = {
+    "warnings are errors": ({"PYTHONWARNINGS": "error"}, "{}"),
+    "64 open files": ({}, "ulimit -n 64; {}"),
+    "no stdin": ({}, "{} <&-"),
+    "no stdout": ({}, "{} >&-"),
+    "no stderr": ({}, "{} 2>&-"),
+    "no stream at all": ({}, "{} <&- >&- 2>&-"),
+    "only ASCII": (ASCII, "{}"),
+    "a dumb terminal": ({"TERM": "dumb"}, "{}"),
+    "no home": ({"HOME": None}, "{}"),
+    "no temporary folder": ({"TMPDIR": "/nowhere"}, "{}"),
+    "everything at once": (
+        {"PYTHONWARNINGS": "error", "HOME": None, "TERM": "dumb"} | ASCII,
+        "ulimit -n 64; {} </dev/null >&- 2>&-",
+    ),
+}
+"""What differs from this environment: variables, and the line of shell around a command."""
+
+
+def run(argv: list[str], environment: str = "") -> subprocess.CompletedProcess[str]:
+    """One command to its end, in one of the environments."""
+    variables, line = ENVIRONMENTS.get(environment, ({}, "{}"))
+    merged = {**os.environ, **variables}
+    return subprocess.run(
+        ["sh", "-c", line.replace("{}", shlex.join([*SKYTETHER, *argv]))],
+        env={name: value for name, value in merged.items() if value is not None},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_a_command_does_the_same_in_any_environment(environment: str, tmp_path: Path) -> None:
+    """It ends with 0 and says nothing on stderr; where there is a stream, it has its table."""
+    file = tmp_path / "summary.json"
+    fleet = run(["fleet", *VIRTUAL, "--json", str(file)], environment)
+    assert (fleet.returncode, fleet.stderr) == (0, "")
+    assert '"vehicles": 2' in file.read_text()
+    if "no stdout" in environment or ">&-" in ENVIRONMENTS[environment][1].replace("2>&-", ""):
+        assert fleet.stdout == ""
+    else:
+        assert "server's plan [" in fleet.stdout
+    mistake = run(["scenarios", "papr"], environment)
+    assert mistake.returncode == 2
+    if "2>&-" not in ENVIRONMENTS[environment][1]:
+        assert mistake.stderr == "scenarios: got 'papr', expected nothing\n"
+
+
+def test_a_flight_over_udp_needs_neither_streams_nor_home(tmp_path: Path) -> None:
+    """Nor many open files: no socket of its own is taken for a stream, in none of its processes."""
+    file = tmp_path / "summary.json"
+    flags = ["--network.uplink.minimum-s", "0.03", "--network.downlink.minimum-s", "0.03"]
+    fly = run(["fly", "demo", *SHORT, *flags, "--json", str(file)], "everything at once")
+    assert fly.returncode == 0
+    assert re.search(r'"steps": \d\d', file.read_text())
+
+
+def test_streams_that_were_closed_are_there_for_children_too(tmp_path: Path) -> None:
+    """A worker that prints must not print to a socket."""
+    file = tmp_path / "streams"
+    child = (
+        "import os, pathlib; names = [os.readlink(f'/proc/self/fd/{n}') for n in range(3)]; "
+        f"pathlib.Path({str(file)!r}).write_text(' '.join(names))"
+    )
+    code = (
+        "import shell.start, subprocess, sys; shell.start.begin(); "
+        f"subprocess.run([sys.executable, '-c', {child!r}], check=True)"
+    )
+    line = f"{shlex.join([sys.executable, '-P', '-c', code])} <&- >&- 2>&-"
+    subprocess.run(["sh", "-c", line], check=True)
+    assert file.read_text().split() == ["/dev/null"] * 3
+
+
+def test_a_sweep_needs_neither_streams_nor_home(tmp_path: Path) -> None:
+    """In its workers, too."""
+    out = tmp_path / "swept"
+    argv = ["sweep", "demo", *SHORT, "--runs", "2", "--workers", "1", "--out", str(out)]
+    assert run(argv, "everything at once").returncode == 0
+    assert len((out / "runs.csv").read_text().splitlines()) == 3
+
+
+@pytest.mark.parametrize("term", ["dumb", "xterm"])
+def test_a_terminal_that_cannot_move_its_cursor_is_not_told_to(term: str) -> None:
+    """No escape sequence is sent to it; another has a progress bar."""
+    ours, theirs = pty.openpty()
+    argv = [*SKYTETHER, "fleet", *VIRTUAL]
+    environment = os.environ | {"TERM": term}
+    with subprocess.Popen(argv, stdout=theirs, stderr=theirs, env=environment) as command:
+        os.close(theirs)
+        shown = b""
+        with suppress(OSError):  # its other end is closed
+            while True:
+                shown += os.read(ours, 65536)
+    os.close(ours)
+    assert command.returncode == 0
+    assert b"server's plan" in shown
+    assert (b"\x1b" in shown) == (term == "xterm")
+
+
+# -- a machine that gives nothing more -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("argv", "flag"),
+    [
+        (["client", "--vehicles", "200"], "--vehicles"),
+        (["netem", "--flows", "200"], "--flows"),
+        (["fleet", "--vehicles", "200", "--duration", "1", "--settle", "0"], "--flows"),
+    ],
+)
+def test_too_few_open_files_are_told_before_anything_flies(argv: list[str], flag: str) -> None:
+    """How many are needed, how many there may be, and what to do."""
+    done = run(argv, "64 open files")
+    assert done.returncode in (1, 2)
+    said = f"{flag}: got 200, which takes 232 open files; expected at most 32, for 64 may be open"
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_netem_takes_as_many_clients_as_files_may_be_open() -> None:
+    """Unless it is told how many; and says so."""
+    line = f"ulimit -n 64; exec {shlex.join([*SKYTETHER, 'netem', '--bind', '127.0.0.1:0'])}"
+    with subprocess.Popen(
+        ["sh", "-c", line], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as netem:
+        assert netem.stdout is not None
+        assert "listening" in netem.stdout.readline()
+        netem.terminate()
+        _, said = netem.communicate(timeout=PATIENCE_S)
+    room = "netem: room for 32 clients and not 512: 64 files may be open here (ulimit -n)\n"
+    assert (netem.returncode, said) == (0, room)
+
+
+@pytest.mark.parametrize("flag", ["--json", "--figure"])
+@pytest.mark.parametrize("command", ["fly", "fleet"])
+def test_a_file_that_cannot_be_written_is_told_before_the_flight(
+    command: str, flag: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A folder that is missing, a folder in the file's place; nothing else changes."""
+    kept = tmp_path / "kept.png"
+    kept.write_text("kept")
+    argv = [command, "--virtual", "--duration", "86400"]
+    for file, reason in (
+        (tmp_path / "none" / "a.png", "No such file or directory"),
+        (kept / "a.png", "Not a directory"),
+        (tmp_path, "Is a directory"),
+    ):
+        assert main([*argv, flag, str(file)]) == 2
+        said = f"{command}: {flag}: {file}: cannot be written: {reason}\n"
+        assert capfd.readouterr().err == said
+    for fine in (kept, tmp_path / "new.png"):  # and what is wrong is something else
+        assert main([*argv, flag, str(fine), "--control.horizon", "1"]) == 2
+        assert "control.horizon" in capfd.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["kept.png"]
+    assert kept.read_text() == "kept"
+
+
+@pytest.mark.parametrize("process", ["server", "netem", "client"])
+@pytest.mark.parametrize("flag", ["--json", "--record"])
+def test_a_process_that_cannot_write_does_not_start(
+    process: str, flag: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It is told in one line."""
+    file = tmp_path / "none" / "a"
+    assert main([process, flag, str(file)]) == 2
+    said = f"{process}: {flag}: {file}: cannot be written: No such file or directory\n"
+    assert capfd.readouterr().err == said
+
+
+def test_a_full_disk_is_one_line() -> None:
+    """Where output goes to it, and where a file does."""
+    full = subprocess.run(
+        ["sh", "-c", f"{shlex.join([*SKYTETHER, 'scenarios'])} >/dev/full"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (full.returncode, full.stderr) == (1, "scenarios: No space left on device\n")
+    flown = run(["fly", "--virtual", *SHORT, "--json", "/dev/full"])
+    said = "fly: /dev/full: cannot be written: No space left on device\n"
+    assert (flown.returncode, flown.stderr) == (1, said)
+
+
+def test_a_mistake_is_one_line_whatever_stands_in_it() -> None:
+    """Control characters, and bytes that are no text, are shown and not sent to the terminal."""
+    done = run(["fly", "a\n\x1b[31m\udcff"])
+    said = r"fly: a\n\x1b[31m\udcff: no such scenario; there are "
+    assert done.returncode == 2
+    assert done.stderr.startswith(said)
+    assert len(done.stderr.splitlines()) == 1
+
+
+# -- signals -------------------------------------------------------------------------------------
+
+
+def until(found: Callable[[], object]) -> None:
+    """Wait for something."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not found():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def ignores_usr1(pid: int) -> bool:
+    """Whether a process has come so far as to ignore SIGUSR1."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    found = re.search(r"SigIgn:\s*(\w+)", status)
+    assert found is not None
+    return bool(int(found[1], 16) & SIGUSR1_IGNORED)
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a process has started."""
+    return [int(pid) for pid in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["skytether", "fly"],
+        ["skytether", "sweep", "--out", "swept"],
+        ["server", "--bind", "127.0.0.1:0"],
+        ["netem", "--bind", "127.0.0.1:0"],
+        ["client", "--server", "127.0.0.1:9"],
+    ],
+    ids=lambda argv: " ".join(argv[:2]),
+)
+def test_sigusr1_ends_no_process_that_starts(argv: list[str], tmp_path: Path) -> None:
+    """It asks for figures, which there are none of yet: it is ignored from the first moment."""
+    command = [sys.executable, "-P", "-m", *argv]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        until(lambda: ignores_usr1(process.pid))
+        for _ in range(20):
+            process.send_signal(signal.SIGUSR1)
+            time.sleep(0.01)
+        assert process.poll() is None
+        process.terminate()
+    assert process.returncode != -signal.SIGUSR1
+
+
+def test_a_flight_and_its_processes_outlive_sigusr1() -> None:
+    """While they start, and when they fly."""
+    argv = [*SKYTETHER, "fly", *SHORT]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fly:
+        until(lambda: ignores_usr1(fly.pid))
+        while fly.poll() is None:
+            for pid in (fly.pid, *children(fly.pid)):
+                if ignores_usr1(pid):
+                    os.kill(pid, signal.SIGUSR1)
+            time.sleep(0.02)
+        out, err = fly.communicate()
+    assert (fly.returncode, err) == (0, "")
+    assert "RMSE" in out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_flight_that_is_ended_while_it_starts_leaves_nothing(
+    count: int, number: int, tmp_path: Path
+) -> None:
+    """One line, no file, and none of the processes that were there, one, two or all of them."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    # A horizon that never comes: the flight cannot begin before the signal does.
+    argv = [*SKYTETHER, "fly", "--network.uplink.loss", "1"]
+    environment = os.environ | {"TMPDIR": str(folder)}
+    with subprocess.Popen(
+        argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as fly:
+        until(lambda: len(children(fly.pid)) == count)
+        started = children(fly.pid)
+        fly.send_signal(number)
+        out, err = fly.communicate(timeout=PATIENCE_S)
+    assert (fly.returncode, out, err) == (130, "", "fly: interrupted before the first step\n")
+    assert list(folder.iterdir()) == []
+    assert not any(Path(f"/proc/{pid}").exists() for pid in started)
+
+
+def test_ctrl_c_while_a_command_is_imported_is_no_traceback() -> None:
+    """It ends at once, as if nothing had begun."""
+    argv = [*SKYTETHER, "fly"]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fly:
+        until(lambda: ignores_usr1(fly.pid))
+        time.sleep(0.1)
+        fly.send_signal(signal.SIGINT)
+        out, err = fly.communicate(timeout=PATIENCE_S)
+    assert fly.returncode in (-signal.SIGINT, 130)
+    assert (out, err) == ("", "")

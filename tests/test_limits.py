@@ -1,0 +1,110 @@
+"""Every scenario that is not refused can be flown, however extreme its values are."""
+
+import os
+import typing
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+import hypothesis.strategies as st
+import msgspec
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+
+from shared import config
+from shared.config import ConfigError, Scenario
+from sim import flight
+
+TRIGGERS = ["always", "periodic", "state_gap", "cost_gap | silence(1)", "budget(1000000, 1000000)"]
+
+
+def values(kind: Any) -> st.SearchStrategy[Any]:
+    """Values of a type of a scenario: the extremes of its range, and anything between."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        return bounded(*arguments)
+    if origin is Literal:
+        return st.sampled_from(arguments)
+    if origin is tuple:
+        items = [values(each) for each in arguments if each is not Ellipsis]
+        return st.lists(items[0], max_size=3) if Ellipsis in arguments else st.tuples(*items)
+    if arguments:
+        return st.one_of(*map(values, arguments))
+    return {bool: st.booleans(), str: st.just("")}[kind]
+
+
+def bounded(base: type, meta: msgspec.Meta) -> st.SearchStrategy[Any]:
+    """Values of an annotated type: of a text, triggers."""
+    if base is str:
+        return st.sampled_from(TRIGGERS)
+    low, high = meta.gt if meta.ge is None else meta.ge, meta.le
+    assert low is not None
+    assert high is not None
+    if base is int:
+        return st.sampled_from([low, high]) | st.integers(int(low), int(high))
+    inner = [float(np.nextafter(end, 1.0)) for end in (low, high)]
+    wild = [0.0, 1e-300, -1e-300, 1e-3, 1.0, 1e3]
+    extremes = [
+        value for value in (low, high, *inner, *wild) if low <= value <= high and value != meta.gt
+    ]
+    between = st.floats(low, high, exclude_min=meta.gt is not None)
+    return st.sampled_from(extremes) | between
+
+
+def keys(section: type[msgspec.Struct], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every key of a scenario, as it is written there, and its type."""
+    for key, kind in typing.get_type_hints(section, include_extras=True).items():
+        if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+            yield from keys(kind, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", kind
+
+
+KEYS = dict(keys(Scenario))
+
+
+@st.composite
+def drawn(draw: st.DrawFn) -> dict[str, Any]:
+    """Keys and values of a scenario: a few of them, or there would hardly be two that agree."""
+    chosen = draw(st.lists(st.sampled_from(sorted(KEYS)), min_size=1, max_size=6, unique=True))
+    return {key: draw(values(KEYS[key])) for key in chosen}
+
+
+def made(flat: Mapping[str, Any]) -> Scenario:
+    """The scenario with these keys, which takes at most fifty steps and two seconds to connect."""
+    table: dict[str, Any] = {}
+    for key, value in {"settle": 0.0, **flat}.items():
+        *sections, last = key.split(".")
+        inner = table
+        for section in sections:
+            inner = inner.setdefault(section, {})
+        inner[last] = value
+    scenario = config.check(table, "drawn")
+    duration = min(scenario.duration, 0.5, 50 * scenario.control.dt)
+    link = msgspec.structs.replace(scenario.link, connect_s=min(scenario.link.connect_s, 2.0))
+    return msgspec.structs.replace(scenario, duration=duration, link=link)
+
+
+def fly(scenario: Scenario) -> str:
+    """Fly a scenario; returns why it was not flown. What was flown and sent are numbers."""
+    flown = flight.fly(scenario)
+    assert np.isfinite(flown.client["state"]).all()
+    assert np.isfinite(flown.client["input"]).all()
+    assert np.isfinite(flown.server["input"]).all()
+    return str(flown.failure or "")
+
+
+@settings(
+    max_examples=int(os.environ.get("LIMITS_EXAMPLES", "150")),
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+)
+@given(drawn())
+def test_extreme_values_are_flown_or_refused_in_one_line(flat: dict[str, Any]) -> None:
+    """No number overflows, no step is divided by zero, and no warning is given."""
+    try:
+        scenario = made(flat)
+    except ConfigError as error:
+        said = str(error)
+    else:
+        said = fly(scenario)
+    assert len(said.splitlines()) <= 1
