@@ -20,6 +20,7 @@ from rich.text import Text
 from lab import figures
 from shared import record
 from shared.config import Scenario
+from shared.events import Event, NotFlown
 from shared.record import Rows
 from shared.stopwatch import Stopwatch
 from shared.summary import summarise
@@ -108,6 +109,8 @@ class Flown:
     """Figures of netem."""
     processes: dict[str, dict[str, Any]]
     """Figures of "client" and "netem", where these are processes."""
+    failure: Event | None = None
+    """Event of the first vehicle that was not flown, or not to the end."""
     machine: "Metronome | None" = None
     """Measure of what the machine took, over real UDP."""
     cpu_s: float | None = None
@@ -144,6 +147,8 @@ def fleet(argv: Sequence[str]) -> None:
         command.write(options.json, msgspec.json.encode(summary))
     if options.figure:
         figures.fleet(options.figure, title, options.config, flown.client)
+    if flown.failure:
+        raise CommandError(str(flown.failure))
 
 
 def _virtually(
@@ -157,13 +162,14 @@ def _virtually(
         on_second=on_second,
         stopped=interrupted,
     )
-    if flown.failure:
+    if flown.failure and not isinstance(flown.failure, NotFlown):
         raise CommandError(str(flown.failure))
     return Flown(
         client=flown.client,
         servers=[flown.figures["server"]],
         netem=flown.figures["netem"],
         processes={},
+        failure=flown.failure,
         cpu_s=time.process_time() - began_s,
     )
 
@@ -173,7 +179,7 @@ def _really(
 ) -> Flown:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder, Metronome(options) as machine:
         parts = Path(folder)
-        incomplete = processes.run(
+        shortfalls = processes.run(
             options.config,
             parts,
             on_second=on_second,
@@ -182,13 +188,16 @@ def _really(
             workers=options.workers,
             watched=False,
         )
+        incomplete = [each for each in shortfalls if not isinstance(each, NotFlown)]
         if incomplete:
             raise CommandError("; ".join(map(str, incomplete)))
         servers = [json.loads(part.read_bytes()) for part in parts.glob("server.json*")]
         rest = {
             name: json.loads((parts / f"{name}.json").read_bytes()) for name in ("netem", "client")
         }
-        return Flown(record.read(parts / "client"), servers, rest["netem"], rest, machine)
+        failure = next(iter(shortfalls), None)
+        client = record.read(parts / "client")
+        return Flown(client, servers, rest["netem"], rest, failure, machine)
 
 
 class Metronome:

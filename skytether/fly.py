@@ -13,12 +13,28 @@ import numpy as np
 from lab import figures
 from shared import config, record
 from shared.config import ConfigError, Scenario
-from shared.events import Event, RecordIncomplete, ServerHeard, ServerRestarted, ServerSilent
+from shared.events import (
+    Event,
+    NotFlown,
+    PlanEnded,
+    PlanningStopped,
+    PlanResumed,
+    RecordIncomplete,
+    ServerHeard,
+    ServerRestarted,
+    ServerSilent,
+)
 from shared.summary import Summary, summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
 from skytether import processes
+
+TOLD = (
+    *(ServerSilent, ServerHeard, ServerRestarted),
+    *(PlanEnded, PlanResumed, PlanningStopped, RecordIncomplete),
+)
+"""Events that are shown while it flies."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +72,7 @@ def fly(argv: Sequence[str]) -> None:
         command.progress(f"flying {title}", scenario.duration) as on_second,
     ):
         flown = (_virtually if options.virtual else _really)(scenario, on_second, interrupted)
-    if flown.failure:
+    if flown.failure and not len(flown.client):
         raise CommandError(str(flown.failure))
     if flown.incomplete:
         title += ", as far as it is recorded"
@@ -75,6 +91,8 @@ def fly(argv: Sequence[str]) -> None:
         figures.flights(options.figure, flights)
     if missing := _missing(scenario, flown):
         raise CommandError(missing)
+    if flown.failure:
+        raise CommandError(str(flown.failure))
 
 
 def _beside(options: Options) -> Scenario | None:
@@ -102,7 +120,7 @@ def _really(
 ) -> flight.Flight:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
         parts = Path(folder)
-        incomplete = processes.run(
+        shortfalls = processes.run(
             scenario, parts, on_second=on_second, interrupted=interrupted, on_event=_tell
         )
         axes = scenario.model.axes
@@ -110,7 +128,8 @@ def _really(
             client=_rows(parts / "client", record.client_columns(axes)),
             server=_rows(parts / "server", record.server_columns(axes)),
             netem=_rows(parts / "netem", record.PACKET_COLUMNS),
-            incomplete=tuple(incomplete),
+            failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
+            incomplete=tuple(each for each in shortfalls if not isinstance(each, NotFlown)),
         )
 
 
@@ -134,6 +153,6 @@ def _missing(scenario: Scenario, flown: flight.Flight) -> str | None:
 
 def _tell(event: Event) -> None:
     """Show what may happen to the link and the record in flight, above the progress bar."""
-    if isinstance(event, ServerSilent | ServerHeard | ServerRestarted | RecordIncomplete):
+    if isinstance(event, TOLD):
         with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
             print(event, file=sys.stderr)

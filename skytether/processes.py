@@ -25,6 +25,7 @@ from shared.events import (
     Failure,
     Flying,
     Listening,
+    NotFlown,
     RecordIncomplete,
     address_text,
 )
@@ -47,6 +48,8 @@ LINES_MAX = 20
 """Number of last lines kept of what a process said, for when it fails."""
 
 OnEvent = Callable[[Event], None]
+Shortfall = RecordIncomplete | NotFlown
+"""Events of a flight that goes on, and of which there is something to show."""
 _DECODER = msgspec.json.Decoder(Line)
 
 
@@ -64,8 +67,8 @@ class Child:
     """Address that it listens on."""
     failed: bool = False
     """Whether it has told of something after which it could not fly."""
-    incomplete: bool = False
-    """Whether it has told that its record is incomplete, which it ends with 1 for."""
+    fell_short: bool = False
+    """Whether it has told of a shortfall, for which it ends with 1."""
 
     async def end(self) -> int:
         """Exit code, once it has ended and all that it said is known."""
@@ -117,8 +120,8 @@ async def started(
     def hear(event: Event) -> None:
         if isinstance(event, Listening) and not listening.done():
             listening.set_result((event.host, event.port))
-        child.failed |= isinstance(event, Failure)
-        child.incomplete |= isinstance(event, RecordIncomplete)
+        child.fell_short |= isinstance(event, Shortfall)
+        child.failed |= isinstance(event, Failure) and not isinstance(event, NotFlown)
         on_event(event)
 
     child.reader = asyncio.create_task(_read(child, process.stdout, hear))
@@ -173,11 +176,11 @@ def run(
     vehicles: int = 1,
     workers: int = 1,
     watched: bool = True,
-) -> list[RecordIncomplete]:
+) -> list[Shortfall]:
     """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
 
-    Whoever calls it has Ctrl-C and SIGTERM under control (`command.interruptible`). Returns what is
-    missing in the record, as the processes tell it; nothing in a good one.
+    Whoever calls it has Ctrl-C and SIGTERM under control (`command.interruptible`). Returns what
+    the flight or its record fell short of, as the processes tell it; nothing in a good one.
 
     Args:
         scenario: what to fly.
@@ -198,7 +201,7 @@ def run(
         file.write_bytes(to_toml(scenario))
     except OSError as error:
         raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
-    incomplete: list[RecordIncomplete] = []
+    shortfalls: list[Shortfall] = []
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
 
     def common(name: str, *, recorded: bool) -> list[str]:
@@ -211,8 +214,8 @@ def run(
     client = [*common("client", recorded=True), *fleet]
 
     def hear(event: Event) -> None:
-        if isinstance(event, RecordIncomplete):
-            incomplete.append(event)
+        if isinstance(event, Shortfall):
+            shortfalls.append(event)
         on_event(event)
 
     async def main() -> None:
@@ -228,7 +231,7 @@ def run(
     asyncio.run(main())
     if interrupted() and not (parts / "client.json").exists():
         raise CommandError("interrupted before the first step", INTERRUPTED)
-    return incomplete
+    return shortfalls
 
 
 async def _fly(
@@ -270,7 +273,7 @@ async def _fly(
                 task.cancel()
         for child in (server, netem, client):
             code = child.process.returncode
-            # A record that is incomplete is told of at the end, by whoever has wanted one.
-            flown = child is client and (code == 0 or (child.incomplete and not child.failed))
+            # What it fell short of is told at the end, beside what was flown.
+            flown = child is client and (code == 0 or (child.fell_short and not child.failed))
             if code is not None and not flown:
                 raise CommandError(child.last_words())

@@ -133,9 +133,9 @@ def _really(out: Path, table: Study, method: str, scale: Scale) -> report.Real:
             command.interruptible() as interrupted,
             command.progress(title, scale.real_s) as on_second,
         ):
-            incomplete = processes.run(scenario, part, on_second=on_second, interrupted=interrupted)
-        if incomplete:
-            raise CommandError("; ".join(map(str, incomplete)))
+            shortfalls = processes.run(scenario, part, on_second=on_second, interrupted=interrupted)
+        if shortfalls:
+            raise CommandError("; ".join(map(str, shortfalls)))
         steps = record.read(part / "client")["step"]
         if not len(steps) or steps[-1] < scenario.steps - 2:
             said = "interrupted; the same command goes on from here"
