@@ -9,12 +9,13 @@ vehicle's clock minus server's. Half of any asymmetry of the two smallest delays
 offset is right to within the bound and no better. Step k begins at epoch + k Δt of the vehicle.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
-from shared.kernel import I1, I2, I3, kernel, part, plain
+from shared.kernel import I1, I2, I3, kernel, part, plain, record, records
 from shared.model import Indices
 
 BUCKET_NS = SECOND_NS // 2
@@ -37,25 +38,25 @@ UNSEEN = 2**61
 """In place of a minimum where nothing was seen."""
 
 
+VEHICLE = record(
+    ("newest", "i8"), ("echo", "i8"), ("heard", "i8"), ("adopted", "i8"), ("epoch", "i8")
+)
+"""Of one vehicle: half second of the newest sample; stamp of ours that the newest echo is of, and
+number of echoes so far; offset that is reckoned with, or UNSEEN; begin of step 0 on the vehicle's
+clock [ns]."""
+
+
 class Seen(NamedTuple):
     """What was seen of the clocks and delays of up to `capacity` vehicles."""
 
+    vehicles: Annotated[NDArray[np.void], records(VEHICLE, 1)]
+    """Shape (capacity,)."""
     minimum: I3
     """Smallest F and G of each half second [ns], a ring; shape (capacity, 2, BUCKETS)."""
     samples: I2
     """Number of both in each half second; shape (capacity, BUCKETS)."""
-    newest: I1
-    """Half second of the newest sample; shape (capacity,)."""
     echoes: I2
     """Newest G, each of another packet of ours [ns], a ring; shape (capacity, ECHOES)."""
-    echo: I1
-    """Stamp of ours that the newest of them is of [ns]; shape (capacity,)."""
-    heard: I1
-    """Number of them so far; shape (capacity,)."""
-    adopted: I1
-    """Offset that is reckoned with [ns], or UNSEEN; shape (capacity,)."""
-    epoch: I1
-    """Begin of step 0 [ns; vehicle's clock]; shape (capacity,)."""
 
 
 class ClockMap:
@@ -67,18 +68,13 @@ class ClockMap:
 
     def __init__(self, capacity: int, dt_ns: int) -> None:
         self._dt_ns = dt_ns
-        numbers = np.zeros((5, capacity), dtype=np.int64)
         self.seen = Seen(
+            vehicles=np.zeros(capacity, dtype=VEHICLE),
             minimum=np.empty((capacity, 2, BUCKETS), dtype=np.int64),
             samples=np.empty((capacity, BUCKETS), dtype=np.int64),
-            newest=numbers[0],
             echoes=np.empty((capacity, ECHOES), dtype=np.int64),
-            echo=numbers[1],
-            heard=numbers[2],
-            adopted=numbers[3],
-            epoch=numbers[4],
         )
-        self.epoch_ns = self.seen.epoch
+        self.epoch_ns = self.seen.vehicles["epoch"]
         """Begin of step 0 [vehicle's clock]; shape (capacity,)."""
         for row in range(capacity):
             self.forget(row)
@@ -86,8 +82,8 @@ class ClockMap:
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle, or with a new life of it."""
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
-        self.seen.echoes[row], self.seen.heard[row] = -UNSEEN, 0
-        self.seen.adopted[row] = UNSEEN
+        self.seen.echoes[row], self.seen.vehicles["heard"][row] = -UNSEEN, 0
+        self.seen.vehicles["adopted"][row] = UNSEEN
 
     def observe(
         self, row: int, forward_ns: int, backward_ns: int, *, echo_ns: int, now_ns: int
@@ -108,7 +104,8 @@ class ClockMap:
     def offset_ns(self, rows: Indices) -> Indices:
         """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
         self.steps(rows, 0)
-        return self.seen.adopted[rows]
+        offsets: Indices = self.seen.vehicles["adopted"][rows]
+        return offsets
 
     def bound_ns(self, row: int) -> int:
         """How far the offset of a vehicle may be off [ns]."""
@@ -127,21 +124,22 @@ def shortest_ns(seen: Seen, row: int) -> int:
 
     It is negative while there are fewer.
     """
-    return seen.echoes[row].min() - seen.adopted[row]
+    return seen.echoes[row].min() - seen.vehicles[row].adopted
 
 
 @kernel
 def _observe(seen: Seen, row: int, forward: int, backward: int, echo: int, bucket: int) -> None:
     """Take F and G [ns] of a vehicle into the half second `bucket`."""
-    if echo != seen.echo[row]:
-        seen.echo[row] = echo
-        seen.echoes[row, seen.heard[row] % ECHOES] = backward
-        seen.heard[row] += 1
-    for passed in range(max(seen.newest[row] + 1, bucket - BUCKETS + 1), bucket + 1):
+    vehicle = seen.vehicles[row]
+    if echo != vehicle.echo:
+        vehicle.echo = echo
+        seen.echoes[row, vehicle.heard % ECHOES] = backward
+        vehicle.heard += 1
+    for passed in range(max(vehicle.newest + 1, bucket - BUCKETS + 1), bucket + 1):
         slot = passed % BUCKETS
         seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
         seen.samples[row, slot] = 0
-    seen.newest[row] = max(seen.newest[row], bucket)
+    vehicle.newest = max(vehicle.newest, bucket)
     slot = bucket % BUCKETS
     seen.minimum[row, 0, slot] = min(seen.minimum[row, 0, slot], forward)
     seen.minimum[row, 1, slot] = min(seen.minimum[row, 1, slot], backward)
@@ -164,7 +162,7 @@ def _change(minimum: I1, newest: int) -> int:
 @part
 def _drop_stepped(seen: Seen, row: int) -> None:
     """Keep only what came since, where one of a vehicle's two clocks has stepped."""
-    recent, old, newest = 0, 0, seen.newest[row]
+    recent, old, newest = 0, 0, seen.vehicles[row].newest
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]
         if age < RECENT:
@@ -190,7 +188,7 @@ def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
         row = rows[i]
         _drop_stepped(seen, row)
         estimate = (seen.minimum[row, 1].min() - seen.minimum[row, 0].min()) // 2
-        adopted = seen.adopted[row]
-        if adopted == UNSEEN or abs(estimate - adopted) > dt // 2:
-            adopted = seen.adopted[row] = estimate
-        steps[i] = (now + adopted - seen.epoch[row]) // dt
+        vehicle = seen.vehicles[row]
+        if vehicle.adopted == UNSEEN or abs(estimate - vehicle.adopted) > dt // 2:
+            vehicle.adopted = estimate
+        steps[i] = (now + vehicle.adopted - vehicle.epoch) // dt

@@ -568,10 +568,10 @@ def _too_slow(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
     if control.scheme == "predictive" and H * dt < delay_s - TINY:
         yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to cover {seen}"
     vehicle, u_max = scenario.vehicle, max(scenario.model.u_max)
-    brake_s = u_max / (2.0 * vehicle.brake_mps2)
+    brake_s = u_max / vehicle.brake_mps2
     if vehicle.exhausted == "brake" and control.scheme != "none" and H * dt < brake_s - TINY:
-        # Else braking at its end would take the vehicle further than its plan does.
-        brakes = f"at least {brake_s:g} s, half of what braking from u_max takes"
+        # Where packets are lost, the vehicle would be braking more than it follows plans.
+        brakes = f"at least {brake_s:g} s, what braking from u_max takes"
         yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to be {brakes}"
     if control.commits:
         if bound_s != "auto" and bound_s < delay_s - TINY:
