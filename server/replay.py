@@ -37,7 +37,7 @@ from server.model import AXIS_FIELDS, advance, bounded, entry, flown, lasting, l
 from server.mpc import stationary_gain
 from server.scheme import Foresight
 from shared.config import ControlConfig
-from shared.kernel import B1, F1, F2, I1, S4, kernel, part, record, records
+from shared.kernel import B1, F1, F2, I1, R2, S4, kernel, part, record, records
 from shared.model import Flags, Indices
 from shared.protocol import NO_HORIZON, Observation, committed_max
 from shared.terms import Terms
@@ -168,13 +168,8 @@ class Replay:
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
-        seen, state = self._memory.seen[row], self._memory.state[row]
-        if observation.step <= self.observed_step[row]:
-            return False
-        self.observed_step[row] = observation.step
-        seen["in_force"], seen["since"] = observation.in_force, observation.since
-        state["p"], state["v"] = observation.state.T
-        return True
+        _, _, step, _, in_force, since, _, _, state = observation
+        return _keep(self._memory, row, step, in_force, since, state)
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
         """See `Scheme`: planning starts at k + d."""
@@ -205,6 +200,18 @@ class Track(NamedTuple):
     """Inputs [m/s]."""
     states: F2
     """Position [m] and velocity [m/s] at each step and after the last."""
+
+
+@kernel
+def _keep(memory: Memory, row: int, step: int, in_force: int, since: int, state: R2) -> bool:
+    """Write down an observation, see `Replay.observe`."""
+    if step <= memory.observed[row]:
+        return False
+    memory.observed[row] = step
+    memory.seen[row].in_force, memory.seen[row].since = in_force, since
+    for axis in range(len(state)):
+        memory.state[row, axis].p, memory.state[row, axis].v = state[axis, 0], state[axis, 1]
+    return True
 
 
 @part
