@@ -23,6 +23,8 @@ SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
 
 VIRTUAL = ["--virtual", "--vehicles", "2", "--duration", "1", "--settle", "0"]
 SHORT = ["--duration", "1", "--settle", "0"]
+for _direction in ("uplink", "downlink"):  # a plan comes at once
+    SHORT += [f"--network.{_direction}.delay", "none"]
 
 ASCII: dict[str, str | None] = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ENVIRONMENTS: dict[str, tuple[dict[str, str | None], str]] = {
