@@ -65,7 +65,7 @@ class PlannedFleet:
     def __init__(self, scenario: Scenario, count: int) -> None:
         terms = scenario.terms()
         self._planner = Planner(scenario, terms, count, BLOCK, Stopwatch())
-        self._found = foresight(BLOCK, terms.axes, terms.horizon)
+        self._found = foresight(BLOCK, terms.axes, terms.horizon, terms.horizon)
         self._vehicles = Vehicles(scenario, count)
         self._blocks = [
             np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)

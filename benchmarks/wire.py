@@ -12,6 +12,7 @@ from shared.protocol import (
     Heartbeat,
     Hello,
     Horizon,
+    Idle,
     Message,
     Observation,
     Welcome,
@@ -45,7 +46,7 @@ def messages(terms: Terms) -> list[Message]:
         Welcome(1, session, 2**60, 2**60, now_ns, terms),
         Observation(1, session, step, now_ns, step - 20, step - 10, now_ns, now_ns, state),
         Horizon(1, session, step, now_ns, now_ns, inputs),
-        Heartbeat(1, session, now_ns),
+        Heartbeat(1, session, now_ns, Idle.PLANS),
     ]
 
 
