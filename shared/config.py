@@ -583,7 +583,8 @@ def _too_slow(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
         if most < H:
             fit = f"at most {most} beside {steps} committed steps with {axes} axes"
             yield "control.horizon", H, f"{fit}, to fit one datagram"
-    trip_s = up.mean_s + down.mean_s + 2 * dt
+    ahead_s = bound_s if control.commits and bound_s != "auto" else up.mean_s
+    trip_s = max(ahead_s, up.mean_s) + down.mean_s + 2 * dt
     if link.age_max_s < trip_s - TINY:
         yield "link.age_max_s", link.age_max_s, f"at least {trip_s:g} s, a round trip and two steps"
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from shared.endpoint import SECOND_NS
+from shared.endpoint import SECOND_NS, seconds_to_ns
 from shared.events import Difference
 from shared.model import Model, discretise
 
@@ -82,7 +82,7 @@ class Terms(NamedTuple):
     @property
     def age_max(self) -> int:
         """Largest age of the observation behind an input [steps]."""
-        return int(self.age_max_s * SECOND_NS) // self.dt_ns
+        return seconds_to_ns(self.age_max_s) // self.dt_ns
 
     @property
     def brake(self) -> float:

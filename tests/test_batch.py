@@ -192,7 +192,7 @@ def test_a_flight_longer_than_a_table_of_the_reference_is_as_alone() -> None:
 def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
     """Otherwise the bytes sent would depend on the other runs of the batch."""
     sizes = {
-        len(encode(Heartbeat(vehicle, (BOOT_ID + opened) % 2**32, 86_400 * 10**9)))
+        len(encode(Heartbeat(vehicle, (BOOT_ID + opened) % 2**32, 86_400 * 10**9, 0)))
         for vehicle in (1, COMPANY_MAX)
         for opened in (1, 100, 200, 100_000)
     }

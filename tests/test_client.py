@@ -67,6 +67,7 @@ class Server:
             recorder=Recorder(client_columns(flown.model.axes), self.sink),
         )
         self.now_ns = 5 * SECOND_NS
+        self.epoch_ns = 0
         self.session = 7
 
     def wake(self) -> list[Message]:
@@ -92,11 +93,13 @@ class Server:
         terms: Terms | None = None,
     ) -> None:
         """Open a session, or refuse it."""
+        self.epoch_ns = self.epoch_ns or self.now_ns
         session, terms = self.session if refusal == ACCEPTED else 0, terms or self.terms
         self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
 
-    def horizon(self, step: int, value: float, *, observed_ns: int = 0) -> None:
-        """A horizon of one constant input."""
+    def horizon(self, step: int, value: float, *, observed: int | None = None) -> None:
+        """A horizon of one constant input, planned from a step that is its own unless told."""
+        observed_ns = self.epoch_ns + (step if observed is None else observed) * self.dt_ns
         inputs = np.full((self.terms.axes, self.terms.horizon), value, np.float32)
         self.say(Horizon(4, self.session, step, 5678, observed_ns, inputs))
 
@@ -223,7 +226,7 @@ def test_every_observation_echoes_the_newest_word_of_the_server() -> None:
     welcomed_ns = server.now_ns
     (first,) = server.wake()
     server.now_ns += 7_000_000
-    server.say(Heartbeat(4, 7, 4321))
+    server.say(Heartbeat(4, 7, 4321, 0))
     heard_ns = server.now_ns
     (second,) = server.wake()
     assert isinstance(first, Observation)
@@ -247,7 +250,7 @@ def test_an_input_is_flown_from_the_step_after_it_came() -> None:
     """Applied at the next step, felt in the state one step later."""
     server = flying()
     server.wake()
-    server.horizon(0, 1.0, observed_ns=server.now_ns)
+    server.horizon(0, 1.0)
     for _ in range(3):
         server.wake()
     rows = server.rows()
@@ -283,7 +286,7 @@ def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
     assert len(said) - len(hellos) == 65
     assert len(hellos) == 3
     assert server.client.events()[-1] == ServerSilent(vehicle=4)
-    server.say(Heartbeat(4, 7, 1))
+    server.say(Heartbeat(4, 7, 1, 0))
     assert server.client.events() == (ServerHeard(vehicle=4),)
     (only,) = server.wake()
     assert isinstance(only, Observation)
@@ -317,9 +320,10 @@ def test_an_answer_to_another_life_is_dropped() -> None:
 def test_the_flight_ends_after_its_duration() -> None:
     """As many steps as fit, then no more wakes."""
     server = flying()
-    for _ in range(200):
+    for step in range(200):
         assert not server.client.finished
         server.wake()
+        server.horizon(step, 0.0)
     assert server.client.finished
     assert server.client.events()[-1] == Finished(vehicle=4, steps=200, missed=0)
     assert server.client.next_wake_ns() is None

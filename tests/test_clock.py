@@ -23,7 +23,7 @@ def observe(
     clock: ClockMap, now_ns: int, offset_ns: int, *, down_ns: int, up_ns: int, row: int = 0
 ) -> int:
     """One observation and its echo, over a network of these delays; the offset adopted then."""
-    clock.observe(row, down_ns - offset_ns, up_ns + offset_ns, now_ns=now_ns)
+    clock.observe(row, down_ns - offset_ns, up_ns + offset_ns, echo_ns=now_ns, now_ns=now_ns)
     return int(clock.offset_ns(np.array([row]))[0])
 
 
@@ -244,7 +244,7 @@ def test_vehicles_have_clocks_of_their_own() -> None:
         stepped = HOUR if now >= 10 * S else 0
         for row, offset_ns in ((3, stepped), (0, -7 * HOUR), (2, 5 * MS)):
             delay_ns = (100 + 50 * row) * MS
-            clock.observe(row, delay_ns - offset_ns, delay_ns + offset_ns, now_ns=now)
+            observe(clock, now, offset_ns, down_ns=delay_ns, up_ns=delay_ns, row=row)
         together = clock.offset_ns(rows)
     clock.forget(1)
     assert together.tolist() == [HOUR, -7 * HOUR, 5 * MS]

@@ -42,7 +42,7 @@ def horizon(step: int, inputs: Array = INPUTS, *, observed_ns: int = 0) -> Horiz
 def holding(step: int, inputs: Array = INPUTS, **keys: str) -> Compensator:
     """A compensator that has been given one horizon."""
     compensator = Compensator(terms(**keys))
-    compensator.offer(horizon(step, inputs), step)
+    compensator.offer(horizon(step, inputs), step + 1, step)
     return compensator
 
 
@@ -70,7 +70,7 @@ def test_held_horizon_flies_its_last_input_for_ever(step: int) -> None:
 def test_horizon_for_a_later_step_begins_at_once(exhausted: str) -> None:
     """The server's idea of the step may be ahead: its first input is the nearest there is."""
     compensator = Compensator(terms(exhausted=exhausted))
-    compensator.offer(horizon(105), 100)
+    compensator.offer(horizon(105), 100, 99)
     np.testing.assert_allclose(compensator.choose(101, HERE), INPUTS[:, 0], rtol=1e-7)
 
 
@@ -111,7 +111,8 @@ def test_stale_horizon_is_ignored_after_reordering() -> None:
     """E11: the newest generation wins; what comes after it is counted."""
     compensator = Compensator(terms())
     for made in (10, 12, 11, 12, 10):
-        compensator.offer(horizon(made, INPUTS + 0.01 * (made - 10), observed_ns=made), 14)
+        new = horizon(made, INPUTS + 0.01 * (made - 10), observed_ns=made)
+        compensator.offer(new, 14, 9)
     assert (compensator.in_force, compensator.observed_ns, compensator.stale) == (12, 12, 3)
     np.testing.assert_allclose(compensator.choose(14, HERE), INPUTS[:, 2] + 0.02, rtol=1e-6)
 
@@ -122,18 +123,18 @@ def test_order_of_arrival_does_not_matter(order: list[int], step: int) -> None:
     """Once all have arrived, the newest is in force."""
     compensator = Compensator(terms())
     for made in order:
-        compensator.offer(horizon(made, INPUTS * 0.1 * (made + 1)), 4)
+        compensator.offer(horizon(made, INPUTS * 0.1 * (made + 1)), 4, 0)
     expected = INPUTS[:, min(step - 4, H - 1)] * 0.5
     np.testing.assert_allclose(compensator.choose(step, HERE), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
-@pytest.mark.parametrize("step", [7, 12, 1000])
+@pytest.mark.parametrize("step", [7, 12, 58])
 def test_without_compensation_the_newest_first_input_is_flown(step: int, exhausted: str) -> None:
-    """Whatever its age: the rest of the horizon is not looked at."""
+    """Until the age bound, 5 s after step 8: the rest of the horizon is not looked at."""
     compensator = holding(5, scheme="none", exhausted=exhausted)
-    compensator.offer(horizon(7, INPUTS + 0.2), 9)
-    compensator.offer(horizon(6, INPUTS + 0.3), 9)
+    compensator.offer(horizon(7, INPUTS + 0.2), 9, 8)
+    compensator.offer(horizon(6, INPUTS + 0.3), 9, 8)
     np.testing.assert_allclose(compensator.choose(step, HERE), INPUTS[:, 0] + 0.2, rtol=1e-6)
 
 
@@ -141,7 +142,7 @@ def test_horizon_from_the_future_is_refused() -> None:
     """One more than H steps ahead could not be replaced for long; it changes nothing."""
     compensator = holding(100)
     with pytest.raises(ProtocolError, match=r"^from the future$"):
-        compensator.offer(horizon(111 + H, INPUTS + 0.2), 110)
+        compensator.offer(horizon(111 + H, INPUTS + 0.2), 110, 109)
     assert (compensator.in_force, compensator.stale) == (100, 0)
     np.testing.assert_allclose(compensator.choose(103, HERE), INPUTS[:, 3], rtol=1e-7)
 
@@ -149,7 +150,7 @@ def test_horizon_from_the_future_is_refused() -> None:
 def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
     """The limit itself is not beyond it."""
     compensator = holding(100)
-    compensator.offer(horizon(110 + H), 110)
+    compensator.offer(horizon(110 + H), 110, 109)
     assert compensator.in_force == 110 + H
 
 
@@ -185,7 +186,7 @@ def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
     flown = terms(scheme="feedback")
     x, disturbance = np.array([[0.5, 0.25], [-1.0, 0.125]]), np.array([0.25, -0.5])
     compensator = Compensator(flown)
-    compensator.offer(with_feedback(x, disturbance), 100)
+    compensator.offer(with_feedback(x, disturbance), 100, 99)
     for u in INPUTS[:, :stage].T:
         x = flown.model.step(x, u + disturbance)
     on_course = compensator.choose(100 + stage, x)
@@ -198,7 +199,7 @@ def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
 def test_feedback_stays_within_the_bounds() -> None:
     """However far away the vehicle is."""
     compensator = Compensator(terms(scheme="feedback"))
-    compensator.offer(with_feedback(HERE, np.zeros(2)), 100)
+    compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     far = np.array([[1e6, 0.0], [-1e6, 0.0]])
     assert compensator.choose(105, far).tolist() == [-1.8, 0.9]
 
@@ -207,7 +208,7 @@ def test_feedback_stays_within_the_bounds() -> None:
 def test_there_is_no_feedback_where_there_is_no_stage(step: int) -> None:
     """Before the first and after the last: nothing says where the vehicle should be."""
     compensator, plain = Compensator(terms(exhausted="brake")), holding(100, exhausted="brake")
-    compensator.offer(with_feedback(HERE, np.zeros(2)), 99)
+    compensator.offer(with_feedback(HERE, np.zeros(2)), 99, 98)
     near, far = (compensator.choose(step, HERE + away) for away in (0.0, 3.0))
     np.testing.assert_array_equal(near, far)
     np.testing.assert_array_equal(near, plain.choose(step, HERE))
@@ -216,7 +217,7 @@ def test_there_is_no_feedback_where_there_is_no_stage(step: int) -> None:
 def test_feedback_ends_with_its_horizon() -> None:
     """The next may come without."""
     compensator = Compensator(terms(scheme="feedback"))
-    compensator.offer(with_feedback(HERE, np.zeros(2)), 100)
-    compensator.offer(horizon(101), 101)
+    compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
+    compensator.offer(horizon(101), 101, 100)
     near, far = (compensator.choose(103, HERE + away) for away in (0.0, 3.0))
     np.testing.assert_array_equal(near, far)

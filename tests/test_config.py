@@ -203,16 +203,66 @@ WRONG = {
         "vehicle.steady_wind_mps = [0.5]",
         "vehicle.steady_wind_mps: got [0.5], expected 2 numbers with model.axes = 2",
     ),
-    "a horizon shorter than the uplink's delay": (
-        "control.horizon = 4\ncontrol.dt = 0.1",
+    "a horizon shorter than the delay": (
+        'extends = "paper"\ncontrol.horizon = 4\ncontrol.dt = 0.1',
         (
-            "control.horizon: got 4, expected horizon · dt (now 0.4 s) to cover "
-            "the uplink's mean delay, 0.44 s"
+            "control.horizon: got 4, expected horizon · dt (now 0.4 s) to cover the delay of "
+            "0.44 s (half of the smallest round trip, and the uplink's jitter)"
         ),
     ),
-    "a delay bound that leaves nothing to plan": (
-        "control.delay_bound = 3",
-        "control.delay_bound: got 3.0, expected less than horizon · dt = 2 s",
+    "a horizon shorter than half of the round trip, a fast uplink notwithstanding": (
+        (
+            'extends = "paper"\ncontrol.horizon = 10\n'
+            "network.uplink.minimum_s = 0.0\nnetwork.downlink.minimum_s = 1.0"
+        ),
+        (
+            "control.horizon: got 10, expected horizon · dt (now 0.5 s) to cover the delay of "
+            "0.54 s (half of the smallest round trip, and the uplink's jitter)"
+        ),
+    ),
+    "a delay bound below the delay": (
+        "control.delay_bound = 0.3",
+        (
+            "control.delay_bound: got 0.3, expected at least the delay of "
+            "0.44 s (half of the smallest round trip, and the uplink's jitter)"
+        ),
+    ),
+    "a delay bound below half of the round trip, a fast uplink notwithstanding": (
+        (
+            "control.delay_bound = 0.3\nnetwork.uplink.delay = 'none'\n"
+            "network.downlink.minimum_s = 1.5"
+        ),
+        (
+            "control.delay_bound: got 0.3, expected at least the delay of "
+            "0.75 s (half of the smallest round trip, and the uplink's jitter)"
+        ),
+    ),
+    "a delay of more steps than fit a datagram": (
+        "control.dt = 0.002\ncontrol.horizon = 1",
+        (
+            "control.dt: got 0.002, expected more, for the delay of 0.44 s (half of the smallest "
+            "round trip, and the uplink's jitter) to take fewer than 220 steps"
+        ),
+    ),
+    "a round trip beyond the age bound": (
+        "link.age_max_s = 0.9",
+        "link.age_max_s: got 0.9, expected at least 0.98 s, a round trip and two steps",
+    ),
+    "a downlink beyond the age bound": (
+        "network.downlink.minimum_s = 5.0",
+        "link.age_max_s: got 5.0, expected at least 5.58 s, a round trip and two steps",
+    ),
+    "a downlink beyond the age bound without compensation": (
+        'extends = "paper-no-compensation"\nnetwork.downlink.minimum_s = 5.0',
+        "link.age_max_s: got 5.0, expected at least 5.58 s, a round trip and two steps",
+    ),
+    "a delay bound beyond the age bound": (
+        "control.delay_bound = 6.0\ncontrol.dt = 0.1",
+        "link.age_max_s: got 5.0, expected at least 6.64 s, a round trip and two steps",
+    ),
+    "an age bound of none": (
+        "link.age_max_s = 0",
+        "link.age_max_s: got 0, expected a number > 0.0",
     ),
     "a horizon in space that fits no datagram": (
         "model.axes = 3\ncontrol.horizon = 91",
@@ -331,7 +381,8 @@ def test_a_delay_that_no_clock_can_count_is_refused(key: str, tmp_path: Path) ->
 @pytest.mark.parametrize(("horizon", "dt"), [(40, 0.011), (44, 0.01), (22, 0.02)])
 def test_a_horizon_that_just_covers_the_delay_is_right(horizon: int, dt: float) -> None:
     """Whatever floating point makes of 40 · 0.011 s = 0.44 s."""
-    table = {"control": {"horizon": horizon, "dt": dt}}
+    control = {"scheme": "predictive", "trigger": "always", "horizon": horizon, "dt": dt}
+    table = {"control": control}
     assert config.check(table, "mine.toml").control.horizon == horizon
 
 
@@ -345,12 +396,22 @@ def test_a_delay_bound_is_a_time_or_seen(bound: float | str, tmp_path: Path) -> 
     assert config.load(str(path)) == scenario
 
 
-def test_a_delay_bound_of_the_whole_horizon_is_refused() -> None:
-    """Whatever floating point makes of 40 · 0.011 s = 0.44 s."""
-    control = {"horizon": 40, "dt": 0.011}
-    assert config.check({"control": control | {"delay_bound": 0.43}}, "mine.toml")
-    with pytest.raises(ConfigError, match=r"less than horizon · dt = 0\.44 s"):
-        config.check({"control": control | {"delay_bound": 0.44}}, "mine.toml")
+@pytest.mark.parametrize("bound", [0.44, 1.5, 4.4])
+def test_a_delay_bound_may_be_longer_than_the_horizon(bound: float) -> None:
+    """From the very delay on; what fits the datagram and the age bound is planned beyond it."""
+    control = {"horizon": 10, "dt": 0.05, "delay_bound": bound}
+    assert config.check({"control": control}, "mine.toml").control.delay_bound == bound
+
+
+def test_the_network_of_a_former_flyaway_is_flown_now() -> None:
+    """Half of its round trip is 0.775 s, and its horizon 0.4 s; issue 12, item 1."""
+    table = config.to_table(config.load("demo"))
+    table["control"] |= {"dt": 0.02, "horizon": 20}
+    table["network"] = {
+        "uplink": {"delay": "constant", "minimum_s": 0.05},
+        "downlink": {"delay": "constant", "minimum_s": 1.5},
+    }
+    assert config.check(table, "mine.toml")
 
 
 def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:
@@ -618,7 +679,7 @@ def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
     terms = Scenario().terms()
     assert terms[:5] == (50_000_000, 40, 2, (0.84, 0.84), (1.6, 1.6))
     assert terms[5:9] == ("committed", "brake", 2.0, 0.1)
-    assert terms[9:] == ("circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
+    assert terms[9:] == (5.0, "circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
 
 
 @pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])

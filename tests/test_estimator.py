@@ -35,7 +35,7 @@ def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
 
 def computed(inputs: Array) -> Foresight:
     """Horizons that begin with these inputs [m/s; shape (n, axes)]."""
-    found = foresight(len(inputs), 2, H)
+    found = foresight(len(inputs), 2, H, 1)
     found.horizons[:] = inputs[:, :, None]
     return found
 
@@ -48,7 +48,7 @@ def remember(estimator: Estimator, inputs: Array, *, start: int = 0) -> None:
 
 def estimates(estimator: Estimator, rows: Indices, step: Indices) -> Array:
     """Estimates x̂(step), which are where planning starts: d is 0."""
-    found = foresight(len(rows), 2, H)
+    found = foresight(len(rows), 2, H, 1)
     estimator.foresee(rows, step, found)
     np.testing.assert_array_equal(found.start, found.estimate)
     assert not found.ahead.any()
@@ -252,12 +252,12 @@ def controller(request: pytest.FixtureRequest) -> Controller:
 
 
 @pytest.mark.parametrize(
-    ("observed", "now", "able"), [(5, 5, True), (5, 45, True), (5, 46, False), (60, 46, True)]
+    ("observed", "now", "able"), [(5, 5, True), (5, 105, True), (5, 106, False), (120, 106, True)]
 )
 def test_old_observations_are_out_of_reach(
     controller: Controller, observed: int, now: int, *, able: bool
 ) -> None:
-    """Two seconds are bridged, a step more is not; one from ahead of us is as good as new."""
+    """Five seconds are bridged, a step more is not; one from ahead of us is as good as new."""
     controller.forget(0)
     controller.observe(0, seen(observed, np.zeros((2, 2))))
     assert controller.able(ROW, np.array([now])).tolist() == [able]

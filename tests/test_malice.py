@@ -30,7 +30,7 @@ def hostile(rng: random.Random) -> Iterator[bytes]:
             Observation(1, 7, 5, 10, 4, 4, 8, 9, np.zeros((2, 2))),
             Horizon(1, 7, 5, 10, 9, inputs),
             Horizon(1, 7, 5, 10, 9, inputs, np.ones((2, FEEDBACK), np.float32)),
-            Heartbeat(1, 7, 10),
+            Heartbeat(1, 7, 10, 0),
         )
     ]
     while True:

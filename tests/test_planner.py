@@ -117,7 +117,7 @@ def plan(planner: Planner, rows: Indices, step: Indices, found: Foresight) -> Pl
 
 def seen(estimates: Array) -> Foresight:
     """Foresight of vehicles that are known to be there; shape (n, axes, 2)."""
-    found = foresight(len(estimates), 2, H)
+    found = foresight(len(estimates), 2, H, H)
     found.start[:] = estimates
     return found
 
@@ -299,7 +299,7 @@ def test_batch_is_planned_as_its_singles(solver: str) -> None:
 def crowd(rng: np.random.Generator, ahead: Indices) -> Foresight:
     """Foresight of vehicles beside the circle, told this and that, and blown about."""
     n = len(ahead)
-    found = foresight(n, 2, H)
+    found = foresight(n, 2, H, H)
     found.ahead[:] = ahead
     found.start[:] = START + rng.normal(scale=2.0, size=found.start.shape)
     for field in (found.committed, found.held):

@@ -20,6 +20,7 @@ from shared.protocol import (
     Heartbeat,
     Hello,
     Horizon,
+    Idle,
     Message,
     Observation,
     ProtocolError,
@@ -57,6 +58,7 @@ terms = st.builds(
     exhausted=text,
     brake_mps2=positive,
     heartbeat_s=positive,
+    age_max_s=positive,
     shape=text,
     radius_m=positive,
     period_s=positive,
@@ -93,7 +95,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
         stamp,
         arrays(
             "<f4",
-            st.tuples(st.just(2), st.integers(40, 80)),
+            st.tuples(st.just(2), st.integers(40, 135)),
             elements=st.floats(-1.75, 1.75, width=32),
         ),
         arrays(
@@ -102,7 +104,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
             elements=st.floats(allow_nan=False, allow_infinity=False, width=32),
         ),
     ),
-    st.builds(Heartbeat, u16, u32, stamp),
+    st.builds(Heartbeat, u16, u32, stamp, st.sampled_from(Idle)),
 )
 
 
@@ -149,7 +151,7 @@ def test_documented_sizes_are_the_real_ones() -> None:
     assert len(encode(committing._replace(feedback=aboard))) == 355 + 11 * 8 + 40
     observation = Observation(1, session, 500, stamp_ns, 480, 490, stamp_ns, stamp_ns, state)
     assert len(encode(observation)) == 79
-    assert len(encode(Heartbeat(1, session, stamp_ns))) == 18
+    assert len(encode(Heartbeat(1, session, stamp_ns, Idle.DELAY))) == 19
 
 
 def test_a_horizon_made_of_bytes_is_the_message() -> None:
@@ -171,6 +173,7 @@ def body(message: Message) -> list[object]:
 
 OBSERVATION = Observation(1, 7, 5, 10, 4, 5, 8, 9, np.array([[1.0, 2.0], [3.0, 4.0]]))
 HORIZON = Horizon(1, 7, 5, 10, 9, np.full((2, 40), 0.5, np.float32))
+HEARTBEAT = Heartbeat(1, 7, 10, Idle.PLANS)
 HELLO = Hello(1, 99, TERMS)
 WELCOME = Welcome(1, 7, 99, 98, 10, 0, TERMS)
 
@@ -203,7 +206,7 @@ def terms_with(**wrong: object) -> list[object]:
         (OBSERVATION, 10, np.array([1, 2, 3, math.inf]).tobytes(), "not finite"),
         (HORIZON, 7, np.zeros(79, np.float32).tobytes(), "shape"),
         (HORIZON, 7, np.zeros(81, np.float32).tobytes(), "shape"),
-        (HORIZON, 7, np.zeros(162, np.float32).tobytes(), "shape"),
+        (HORIZON, 7, np.zeros(272, np.float32).tobytes(), "shape"),
         (HORIZON, 7, np.full(80, np.nan, np.float32).tobytes(), "not finite"),
         (HORIZON, 7, np.full(80, 1.81, np.float32).tobytes(), "input out of range"),
         (HORIZON, 7, np.full(80, -1.81, np.float32).tobytes(), "input out of range"),
@@ -217,7 +220,11 @@ def terms_with(**wrong: object) -> list[object]:
         (WELCOME, 7, -1, "field"),
         (WELCOME, 7, 4, "field"),
         (WELCOME, 7, False, "field"),
+        (HEARTBEAT, 5, -1, "field"),
+        (HEARTBEAT, 5, len(Idle), "field"),
+        (HEARTBEAT, 5, True, "field"),
         (HELLO, 4, terms_with(dt_ns=0.05), "field"),
+        (HELLO, 4, terms_with(age_max_s=5), "field"),
         (HELLO, 4, terms_with(horizon=True), "field"),
         (HELLO, 4, terms_with(tau_s=0.8), "field"),
         (HELLO, 4, terms_with(u_max=(1.8, math.nan)), "field"),
@@ -256,7 +263,7 @@ def test_a_wrong_field_is_the_peers_mistake(
         (msgpack.packb(7), "not a message"),
         (msgpack.packb([3]), "not a message"),
         (msgpack.packb([3, 5, 1, 7]), "not a message"),
-        (msgpack.packb([3, 5, 1, 7, 8, 9]), "not a message"),
+        (msgpack.packb([3, 5, 1, 7, 8, 9, 9]), "not a message"),
         (msgpack.packb([[[[[[]]]]]]), "not a message"),
         (b"\xdd\xff\xff\xff\xff", "not msgpack"),
         (b"\x91" * 1200, "not msgpack"),
@@ -272,7 +279,7 @@ def test_what_is_no_message_is_refused(payload: bytes, reason: str) -> None:
 
 def test_no_field_of_any_message_goes_unchecked() -> None:
     """Each field in turn made a string: never accepted."""
-    for message in (HELLO, WELCOME, OBSERVATION, HORIZON, Heartbeat(1, 7, 10)):
+    for message in (HELLO, WELCOME, OBSERVATION, HORIZON, HEARTBEAT):
         for field in range(len(message) + 2):
             fields = body(message)
             fields[field] = "x"

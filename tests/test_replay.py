@@ -19,7 +19,7 @@ from shared.record import UPLINK
 from shared.summary import summarise
 from sim.flight import Flight, fly, fly_batch
 
-H, BOUND = 6, 4
+H, BOUND, MOST = 6, 4, 50
 ROW = np.array([0])
 HORIZON_BYTES = 300
 """More than a heartbeat has."""
@@ -43,18 +43,20 @@ def lossy(loss: float, down: float = 0.1) -> dict[str, Any]:
 # -- by hand -------------------------------------------------------------------------------------
 
 
-def small(exhausted: str = "brake", **control: Any) -> Scenario:
+def small(exhausted: str = "brake", age_max_s: float = 5.0, **control: Any) -> Scenario:
     """Six stages of 0.1 s, of which a delay takes up to four."""
     return scenario(
         model={"tau_s": [0.81, 0.3], "u_max": [1.8, 0.9]},
         control={"dt": 0.1, "horizon": H, "delay_bound": 0.1 * BOUND, **control},
         vehicle={"exhausted": exhausted, "brake_mps2": 2.0},
+        network={"uplink": {"delay": "none"}, "downlink": {"delay": "none"}},
+        link={"age_max_s": age_max_s},
     )
 
 
-def make(flown: Scenario, *, reach: int = 40) -> Replay:
+def make(flown: Scenario) -> Replay:
     """Room for one vehicle."""
-    return Replay(flown.terms(), flown.control, 1, reach, ClockMap(1, flown.dt_ns))
+    return Replay(flown.terms(), flown.control, 1, ClockMap(1, flown.dt_ns))
 
 
 def see(replay: Replay, step: int, state: Array, in_force: int, since: int = 0) -> bool:
@@ -64,14 +66,16 @@ def see(replay: Replay, step: int, state: Array, in_force: int, since: int = 0) 
 
 def foresee(replay: Replay, step: int) -> Foresight:
     """What is foreseen of the one vehicle at a step."""
-    found = foresight(1, 2, H)
+    found = foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found
 
 
 def send(replay: Replay, step: int, inputs: Array, feedback: Array | None = None) -> None:
-    """A horizon of H or more inputs is sent [inputs: (axes, length)]."""
-    found, length = foresight(1, 2, H), inputs.shape[1]
+    """A horizon of d + H inputs is sent, from an observation of before [inputs: (axes, d + H)]."""
+    if replay.observed_step[0] < 0:
+        see(replay, step - 1, np.zeros((2, 2)), NO_HORIZON)
+    found, length = foresight(1, 2, H, MOST), inputs.shape[1]
     found.ahead[:], found.horizons[0, :, :length] = length - H, inputs
     if feedback is not None:
         found.feedback[0] = feedback
@@ -88,7 +92,7 @@ def plans(seed: int, *lengths: int) -> list[Array]:
 def test_a_horizon_in_flight_is_in_force_when_it_had_its_time() -> None:
     """The one before is flown until then, and the state rolled on accordingly."""
     flown = small()
-    old, new = plans(1, 2 * H, H)
+    old, new = plans(1, 2 * H, BOUND + H)
     replay, x = make(flown), np.array([[1.0, 0.2], [-1.0, 0.1]])
     send(replay, 100, old)
     send(replay, 103, new)
@@ -103,7 +107,7 @@ def test_a_horizon_in_flight_is_in_force_when_it_had_its_time() -> None:
 
 def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:
     """Such a horizon is counted once, and forgotten until it comes after all."""
-    old, lost, late = plans(2, 2 * H, H, H)
+    old, lost, late = plans(2, 2 * H, BOUND + H, BOUND + H)
     replay = make(small())
     send(replay, 100, old)
     send(replay, 102, lost)
@@ -166,19 +170,20 @@ def test_an_observation_from_ahead_is_taken_as_it_is(scheme: str, ahead: int) ->
 
 def test_many_horizons_are_kept_and_no_more() -> None:
     """The ring turns; one that has fallen out is not known any more."""
-    replay = make(small(), reach=10)
-    sent = plans(3, *[H] * 40)
-    for step, inputs in enumerate(sent):
-        send(replay, step, inputs)
-    see(replay, 40, np.zeros((2, 2)), 36)
-    seen = foresee(replay, 40)
-    np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(sent[36][:, 4]))
-    replay = make(small(), reach=10)
-    for step, inputs in enumerate(sent):
-        send(replay, step, inputs)
-    see(replay, 41, np.ones((2, 2)), 2)
-    seen = foresee(replay, 41)
-    np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(sent[38][:, 3]) * 0 + 1.0)
+    sent = plans(3, *[BOUND + H] * 40)
+
+    def told(in_force: int) -> list[float]:
+        """What is known of the input at step 40, with that horizon in force."""
+        replay = make(small(age_max_s=1.0))  # a ring of 16
+        for step, inputs in enumerate(sent):
+            see(replay, max(step - 1, 0), np.zeros((2, 2)), NO_HORIZON)
+            send(replay, step, inputs)
+        see(replay, 40, np.full((2, 2), 0.5), in_force)
+        return foresee(replay, 40).committed[0, :, 0].tolist()
+
+    assert told(36) == np.float32(sent[36][:, 4]).tolist()
+    assert told(31) == np.float32(sent[31][:, 9]).tolist()
+    assert told(23) == [0.5, 0.5]
 
 
 # -- feedback aboard, by hand --------------------------------------------------------------------
@@ -193,7 +198,7 @@ def test_it_makes_no_difference_when_a_horizon_with_feedback_arrives() -> None:
     before, after = Compensator(terms), Compensator(terms)
     gain = stationary_gain(terms.model, flown.control)
     feedback = np.concatenate([x, np.zeros((2, 1)), gain], axis=1).astype(np.float32)
-    before.offer(Horizon(1, 1, 100, 0, 0, inputs.astype(np.float32), feedback), 100)
+    before.offer(Horizon(1, 1, 100, 0, 0, inputs.astype(np.float32), feedback), 100, 99)
     send(replay, 100, inputs, feedback)
     x = x + 0.05  # a gust
     see(replay, 102, x, 100)
@@ -201,7 +206,7 @@ def test_it_makes_no_difference_when_a_horizon_with_feedback_arrives() -> None:
     horizon = seen.committed[0].astype(np.float32)
     horizon[:, BOUND:] = 0.0
     np.testing.assert_array_equal(seen.feedback[0, :, 3:], gain.astype(np.float32))
-    after.offer(Horizon(1, 1, 103, 0, 0, horizon, seen.feedback[0]), 103)
+    after.offer(Horizon(1, 1, 103, 0, 0, horizon, seen.feedback[0]), 103, 102)
     for step in range(103, 103 + BOUND):
         x = x + 0.03  # another
         told = before.choose(step, x)

@@ -14,19 +14,27 @@ from server.scheme import Foresight, foresight
 from shared import rule
 from shared.config import Scenario, check
 from shared.model import Array
-from shared.protocol import Horizon, Observation
-from shared.rule import bounded, entry, flown, led_back, stage_at
+from shared.protocol import NO_HORIZON, Horizon, Observation
+from shared.rule import bounded, entry, flown, lasting, late_max, led_back
 
 quick = settings(max_examples=200, deadline=None)
 
 # -- in plain numbers ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("step", "stage"), [(97, -3), (100, 0), (107, 7), (10**12, 10**12 - 100)])
-def test_a_stage_is_the_steps_since_the_horizon_was_made(step: int, stage: int) -> None:
-    """Without compensation it is the first, whatever the step."""
-    assert stage_at(step, 100, True) == stage
-    assert stage_at(step, 100, False) == 0
+@pytest.mark.parametrize(
+    ("observed", "count"),
+    [(99, 10), (60, 10), (59, 10), (58, 9), (51, 2), (50, 1), (49, 0), (0, -49)],
+)
+def test_no_input_is_flown_for_longer_than_the_age_bound_allows(observed: int, count: int) -> None:
+    """Ten inputs from step 100 on, none of them later than 50 steps after the observation."""
+    assert lasting(10, 100, observed, 50) == count
+
+
+@pytest.mark.parametrize(("horizon", "steps"), [(1, 2), (11, 2), (12, 3), (40, 10), (120, 30)])
+def test_a_horizon_may_be_late_by_a_quarter_of_itself(horizon: int, steps: int) -> None:
+    """By two steps at least."""
+    assert late_max(horizon) == steps
 
 
 @pytest.mark.parametrize(("stage", "index"), [(-3, 0), (0, 0), (4, 4), (9, 9), (10, 9), (999, 9)])
@@ -93,20 +101,19 @@ def test_compiled_it_says_the_same(
     assert compiled.led_back(*numbers[:4]) == led_back(*numbers[:4])
     assert compiled.bounded(numbers[0], numbers[4]) == bounded(numbers[0], numbers[4])
     assert compiled.entry(stage, length) == entry(stage, length)
-    for indexed in (True, False):
-        assert compiled.stage_at(stage, length, indexed) == stage_at(stage, length, indexed)
+    assert compiled.lasting(length, 100, 100 - stage, 20) == lasting(length, 100, 100 - stage, 20)
 
 
 # -- at both ends --------------------------------------------------------------------------------
 
-H, BOUND = 6, 4
+H, BOUND, MOST = 6, 4, 70
 ROW = np.array([0])
 FIRST = 100
 """Step that the horizon in force is made for."""
 
 
-def scenario(scheme: str, exhausted: str) -> Scenario:
-    """Six stages of 0.1 s, of which a delay takes up to four."""
+def scenario(scheme: str, exhausted: str, age_max: int) -> Scenario:
+    """Six stages of 0.1 s, and a delay of up to four; the age bound is in steps."""
     raw = {
         "model": {"tau_s": [0.81, 0.3], "u_max": [1.8, 0.9]},
         "control": {
@@ -119,17 +126,18 @@ def scenario(scheme: str, exhausted: str) -> Scenario:
         },
         "vehicle": {"exhausted": exhausted, "brake_mps2": 2.0},
         "network": {"uplink": {"delay": "none"}, "downlink": {"delay": "none"}},
+        "link": {"age_max_s": 0.1 * age_max},
     }
     return check(raw, "test")
 
 
-def make_horizon(rng: np.random.Generator, step: int, near: Array, gain: Array) -> Horizon:
-    """A horizon of any length and inputs, some beyond the bound, that leads on from near a state.
+def make_horizon(rng: np.random.Generator, step: int, d: int, near: Array, gain: Array) -> Horizon:
+    """A horizon of any inputs, some beyond the bound, d committed, that leads on from near a state.
 
     It brings feedback if there is a gain.
     """
     bound = np.array([[1.8], [0.9]])
-    inputs = rng.uniform(-1.2, 1.2, (2, rng.integers(H, 2 * H, endpoint=True))) * bound
+    inputs = rng.uniform(-1.2, 1.2, (2, d + H)) * bound
     origin = near + 0.1 * rng.normal(size=(2, 2))
     feedback = np.column_stack([origin, 0.1 * rng.normal(size=2), gain]) if gain.size else gain
     return Horizon(
@@ -139,7 +147,7 @@ def make_horizon(rng: np.random.Generator, step: int, near: Array, gain: Array) 
 
 def send(replay: Replay, horizon: Horizon) -> None:
     """The server remembers that it has sent a horizon."""
-    found, length = foresight(1, 2, H), horizon.inputs.shape[1]
+    found, length = foresight(1, 2, H, MOST), horizon.inputs.shape[1]
     found.ahead[:], found.horizons[0, :, :length] = length - H, horizon.inputs
     if horizon.feedback.size:
         found.feedback[0] = horizon.feedback
@@ -148,7 +156,7 @@ def send(replay: Replay, horizon: Horizon) -> None:
 
 def foresee(replay: Replay, step: int) -> Foresight:
     """What the server foresees at a step."""
-    found = foresight(1, 2, H)
+    found = foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found
 
@@ -161,35 +169,56 @@ def foresee(replay: Replay, step: int) -> Foresight:
     age=st.integers(-H, 30),
     in_flight=st.sets(st.integers(1 - BOUND, 4), max_size=3),
     later=st.integers(0, 5),
+    observed=st.integers(1, 20),
+    spare=st.integers(0, 30),
 )
 def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
-    *, seed: int, scheme: str, exhausted: str, age: int, in_flight: set[int], later: int
+    *,
+    seed: int,
+    scheme: str,
+    exhausted: str,
+    age: int,
+    in_flight: set[int],
+    later: int,
+    observed: int,
+    spare: int,
 ) -> None:
     """To the last bit, before the first stage of a horizon, within, and after the last.
 
-    The vehicle was last seen `age` stages into its horizon; others in flight were made so many
-    steps after that, and come into force when they have had their time. The observer sees that
-    nothing else acts on the vehicle.
+    The vehicle was last seen `age` stages into its horizon, which was planned from what was seen
+    `observed` steps before it came; others in flight were made so many steps after that, and come
+    into force when each has had its time. The age bound is `spare` steps more than is needed, and
+    cuts horizons off. The observer sees that nothing else acts on the vehicle.
     """
-    setting, rng = scenario(scheme, exhausted), np.random.default_rng(seed)
+    rng, seen = np.random.default_rng(seed), FIRST + age
+    begin = min(FIRST, seen)
+    first, made, due = int(rng.integers(H + 1)), dict[int, int](), 0
+    for step in sorted(seen + after for after in in_flight if seen + after > FIRST):
+        # The delay bound falls by no more than a step at a time.
+        due = max(due, seen + 1, step + int(rng.integers(1, 2 * H)))
+        made[step] = due - step
+    now = max([seen, *made]) + later
+    age_max = max(BOUND, now - seen, FIRST + first - begin + observed) + spare
+    setting = scenario(scheme, exhausted, age_max)
     terms = setting.terms()
+    assert terms.age_max == age_max
     gain = stationary_gain(terms.model, setting.control) if terms.feeds_back else np.zeros((2, 0))
     vehicle = Compensator(terms)
-    replay = Replay(terms, setting.control, 1, 40, ClockMap(1, terms.dt_ns))
-    seen = FIRST + age
-    begin = min(FIRST, seen)
-    made = {seen + after for after in in_flight if seen + after > FIRST}
-    now = max({seen} | made) + later
+    replay = Replay(terms, setting.control, 1, ClockMap(1, terms.dt_ns))
 
     x, states, inputs = rng.normal(size=(2, 2)), [], []
-    arriving = {begin: make_horizon(rng, FIRST, x, gain)}
-    send(replay, arriving[begin])
+    arriving = {begin: (make_horizon(rng, FIRST, first, x, gain), begin - observed)}
+    replay.observe(0, Observation(1, 1, begin - observed, 0, NO_HORIZON, 0, 0, 0, x))
+    send(replay, arriving[begin][0])
     for step in range(begin, now + BOUND + H):
-        if step in made:
-            arriving[step + BOUND] = make_horizon(rng, step, x, gain)
-            send(replay, arriving[step + BOUND])
+        last_seen = int(replay.observed_step[0])
+        if step in made and step + made[step] - last_seen <= age_max:  # others are not sent
+            due = step + made[step]
+            arriving[due] = make_horizon(rng, step, made[step], x, gain), last_seen
+            send(replay, arriving[due][0])
         if step in arriving:
-            vehicle.offer(arriving[step], step)
+            horizon, last_seen = arriving[step]
+            vehicle.offer(horizon, step, last_seen)
         if step in {begin, seen}:
             replay.observe(0, Observation(1, 1, step, 0, FIRST, begin, 0, 0, x))
             foresee(replay, step)
@@ -208,5 +237,5 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
 
 def test_the_server_compiles_the_very_functions_that_the_vehicle_calls() -> None:
     """There is one source of the rule."""
-    for name in ("stage_at", "entry", "bounded", "led_back", "flown"):
+    for name in ("lasting", "entry", "bounded", "led_back", "flown"):
         assert getattr(compiled, name).py_func is getattr(rule, name)

@@ -16,6 +16,8 @@ from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
 from shared.events import (
     Difference,
     NumberTaken,
+    PlanningResumed,
+    PlanningStopped,
     ServerFull,
     SessionEnded,
     SessionOpened,
@@ -30,6 +32,7 @@ from shared.protocol import (
     Heartbeat,
     Hello,
     Horizon,
+    Idle,
     Message,
     Observation,
     ProtocolError,
@@ -65,6 +68,8 @@ class Vehicles:
         self.server = Server(flown, boot_id=boot_id, room=room, recorder=recorder)
         # Ticks lie on multiples of 50 ms: the first comes 30 ms after what is said first.
         self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
+        self.epochs_ns: dict[int, int] = {}
+        """Begin of step 0 of each session, by the vehicle's clock."""
 
     def say(self, message: Message, sender: Address = HERE) -> list[tuple[Message, Address]]:
         """One datagram, and the answers to it."""
@@ -95,8 +100,10 @@ class Vehicles:
         state: object = ((1.0, 0.0), (0.0, 0.0)),
         sender: Address = HERE,
     ) -> None:
-        """An observation that took no time: both clocks run alike, a day apart."""
-        stamp_ns = self.now_ns + DAY_NS
+        """An observation that took no time, unless it is an old one; the clocks are a day apart."""
+        epoch_ns = self.now_ns + DAY_NS - step * self.dt_ns
+        stamp_ns = self.epochs_ns.setdefault(welcome.session, epoch_ns) + step * self.dt_ns
+        self.now_ns = max(self.now_ns, stamp_ns - DAY_NS)
         observation = Observation(
             welcome.vehicle,
             welcome.session,
@@ -104,7 +111,7 @@ class Vehicles:
             stamp_ns,
             in_force=NO_HORIZON,
             since=0,
-            server_ns=self.now_ns,
+            server_ns=stamp_ns - DAY_NS,
             received_ns=stamp_ns,
             state=np.array(state),
         )
@@ -344,12 +351,20 @@ def test_a_silent_server_sends_heartbeats() -> None:
 
 
 def test_no_estimate_without_a_recent_observation() -> None:
-    """Two seconds after the last one the server plans no more, but stays in touch."""
+    """Five seconds after the last one the server plans no more, says why, and stays in touch."""
     vehicles = Vehicles(scenario())
-    vehicles.observe(vehicles.open(), 0)
-    kinds = [[type(message) for message, _ in vehicles.tick()] for _ in range(62)]
-    assert kinds[:41] == [[Horizon]] * 41
-    assert [kind for kind in kinds[41:] if kind] == [[Heartbeat]]
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    said = [[message for message, _ in vehicles.tick()] for _ in range(122)]
+    assert [[type(message) for message in each] for each in said[:101]] == [[Horizon]] * 101
+    ((heartbeat,),) = (each for each in said[101:] if each)
+    assert isinstance(heartbeat, Heartbeat)
+    assert heartbeat.idle == Idle.OBSERVATION
+    stopped = PlanningStopped(vehicle=1, why=str(Idle.OBSERVATION))
+    assert vehicles.server.events()[-1] == stopped
+    vehicles.observe(welcome, 123)
+    assert [type(message) for message, _ in vehicles.tick()] == [Horizon]
+    assert vehicles.server.events() == (PlanningResumed(vehicle=1),)
 
 
 def test_a_vehicle_unheard_for_long_is_forgotten() -> None:

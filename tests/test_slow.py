@@ -1,0 +1,237 @@
+"""Networks that are slow, or get slower in flight: flown while they can be, hovered through then.
+
+Delays are given by hand, as functions of the time since the first packet. Safeguards are switched
+off one after the other to show that the flight leaves without them.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import client.compensator
+import netem.proxy
+import sim.flight
+from netem.fate import Fate
+from netem.proxy import Proxy
+from server.clock import ClockMap
+from shared import config
+from shared.config import DirectionConfig, Scenario
+from shared.endpoint import SECOND_NS, Datagram
+from shared.events import (
+    Finished,
+    NotFlown,
+    PlanEnded,
+    PlanningResumed,
+    PlanningStopped,
+    PlanResumed,
+)
+from shared.protocol import IDLE_TEXTS, Idle
+from shared.summary import summarise
+from sim.flight import Flight, fly
+
+Delay = Callable[[float], float]
+"""Delay of a packet [s], by the time since the first [s]."""
+
+OUTSIDE_M = 3.2
+"""How far from the centre of the figure eight, of 2 m, a vehicle may get."""
+
+
+def scenario(
+    uplink_s: float = 0.05, downlink_s: float = 0.05, *, duration: float = 60.0, **sections: Any
+) -> Scenario:
+    """A figure eight in calm air, over constant delays; sections are laid over."""
+    table = config.to_table(config.load("demo")) | {"duration": duration}
+    table["vehicle"]["wind"] = 0.0
+    for direction, delay_s in (("uplink", uplink_s), ("downlink", downlink_s)):
+        table["network"][direction] |= {"delay": "constant", "minimum_s": delay_s}
+    for section, values in sections.items():
+        table[section] |= values
+    return config.check(table, "test")
+
+
+def fly_over(
+    monkeypatch: pytest.MonkeyPatch, flown: Scenario, uplink: Delay, downlink: Delay
+) -> Flight:
+    """A flight over delays that change with time, without loss."""
+    times_ns: list[int] = []
+
+    class Clocked(Proxy):
+        """Notes when packets come."""
+
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            """See `Endpoint`."""
+            times_ns[1:] = [now_ns]
+            super().receive(datagram, now_ns=now_ns)
+
+    def fates(direction: DirectionConfig, seed: int, name: str, flow: int) -> Iterator[Fate]:  # noqa: ARG001
+        delay = uplink if name == "uplink" else downlink
+        while True:
+            yield Fate(round(delay((times_ns[-1] - times_ns[0]) / SECOND_NS) * SECOND_NS), False)
+
+    monkeypatch.setattr(sim.flight, "Proxy", Clocked)
+    monkeypatch.setattr(netem.proxy, "fates", fates)
+    return fly(flown)
+
+
+def far_m(flight: Flight) -> float:
+    """Largest distance from the centre of the figure eight [m]."""
+    return float(np.linalg.norm(flight.client["state"][:, :, 0], axis=1).max())
+
+
+# -- delays that are known before ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("uplink_s", "downlink_s", "error_m"), [(0.05, 1.5, 0.2), (1.5, 0.05, 0.2)]
+)
+def test_a_round_trip_much_longer_than_the_horizon_is_flown(
+    uplink_s: float, downlink_s: float, error_m: float
+) -> None:
+    """1.55 s with a horizon of 0.4 s, one packet in ten lost, in wind: the flyaway of issue 12."""
+    control = {"dt": 0.02, "horizon": 20}
+    flown = scenario(uplink_s, downlink_s, duration=40.0, control=control, vehicle={"wind": 0.05})
+    flight = fly(flown)
+    assert flight.failure is None
+    error = summarise(flown, "test", flight.client).error_max
+    assert error is not None
+    assert error < error_m
+
+
+# -- delays that grow in flight --------------------------------------------------------------------
+
+
+def short(_: float) -> float:
+    """A delay that stays."""
+    return 0.05
+
+
+GROWING: dict[str, Delay] = {
+    "slowly": lambda t: 0.05 + max(0.0, t - 10.0) * 0.1,
+    "fast": lambda t: 0.05 + max(0.0, t - 10.0) * 0.3,
+    "to 1.4 s": lambda t: 0.05 if t < 15.0 else 1.4,
+    "to 2.8 s": lambda t: 0.05 if t < 15.0 else 2.8,
+    "to 6 s": lambda t: 0.05 if t < 15.0 else 6.0,
+}
+"""Delays that grow from 0.05 s."""
+
+
+def ways(side: str, delay: Delay) -> tuple[Delay, Delay]:
+    """Delay of the uplink and of the downlink, of which one or both grow."""
+    return delay if side != "downlink" else short, delay if side != "uplink" else short
+
+
+@pytest.mark.parametrize("side", ["uplink", "downlink", "both"])
+@pytest.mark.parametrize("growing", GROWING)
+@pytest.mark.parametrize(("dt", "horizon"), [(0.02, 20), (0.05, 40)])
+@pytest.mark.parametrize("scheme", ["committed", "feedback"])
+def test_a_delay_that_grows_in_flight_ends_in_hover_or_is_flown(
+    scheme: str, dt: float, horizon: int, growing: str, side: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing flies away; where a flight ends without a plan, both ends have said why."""
+    flown = scenario(control={"scheme": scheme, "dt": dt, "horizon": horizon})
+    flight = fly_over(monkeypatch, flown, *ways(side, GROWING[growing]))
+    assert far_m(flight) < OUTSIDE_M
+    if flight.failure is None:
+        assert isinstance(flight.events[-1].event, Finished)
+        return
+    assert isinstance(flight.failure, NotFlown)
+    assert np.abs(flight.client["state"][-1, :, 1]).max() < 0.01
+    said = [(host.split()[0], event) for _, host, event in flight.events]
+    here = [event for host, event in said if host == "client" and isinstance(event, PlanEnded)]
+    there = [event for host, event in said if host == "server"]
+    assert here
+    assert flight.failure.why in (IDLE_TEXTS[Idle.DELAY], IDLE_TEXTS[Idle.OBSERVATION], SILENT)
+    assert isinstance(there[-1], PlanningStopped)
+    assert there[-1].why in (IDLE_TEXTS[Idle.DELAY], IDLE_TEXTS[Idle.OBSERVATION])
+
+
+SILENT = "the server is silent"
+
+
+def test_a_delay_that_comes_and_goes_is_flown_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six seconds for ten: hover, then the plan goes on, and the flight is one to the end."""
+    flown = scenario(control={"dt": 0.02, "horizon": 20})
+    flight = fly_over(monkeypatch, flown, short, lambda t: 6.0 if 15.0 < t < 25.0 else 0.05)
+    assert flight.failure is None
+    said = [type(event) for _, _, event in flight.events]
+    for kind in (PlanningStopped, PlanEnded, PlanningResumed, PlanResumed):
+        assert kind in said
+    assert far_m(flight) < OUTSIDE_M
+    assert summarise(flown, "test", flight.client).steps == 3000
+    assert flight.client["covered"][-500:].all()
+
+
+# -- without its safeguards ------------------------------------------------------------------------
+
+
+def forget_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation: a horizon is taken however late it comes."""
+    monkeypatch.setattr(client.compensator, "late_max", lambda _: 10**9)
+
+
+def forget_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation: what every packet takes just now is not known: no `at_least`, no `Idle.DELAY`."""
+    observe = ClockMap.observe
+
+    def deaf(
+        self: ClockMap, row: int, forward_ns: int, backward_ns: int, *, echo_ns: int, now_ns: int
+    ) -> None:
+        observe(self, row, forward_ns, backward_ns, echo_ns=0 * echo_ns, now_ns=now_ns)
+
+    monkeypatch.setattr(ClockMap, "observe", deaf)
+
+
+@pytest.mark.parametrize(
+    ("growing", "side"), [("slowly", "uplink"), ("slowly", "both"), ("fast", "uplink")]
+)
+def test_without_a_bound_on_lateness_it_flies_away(
+    growing: str, side: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Horizons that come after other inputs were flown make the plans swing."""
+    forget_late(monkeypatch)
+    flown = scenario(control={"dt": 0.02, "horizon": 20})
+    assert far_m(fly_over(monkeypatch, flown, *ways(side, GROWING[growing]))) > 2 * OUTSIDE_M
+
+
+@pytest.mark.parametrize("growing", ["to 1.4 s", "to 2.8 s"])
+@pytest.mark.parametrize("side", ["uplink", "downlink"])
+def test_without_echoes_a_longer_delay_is_never_flown_again(
+    growing: str, side: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All horizons are too late then, and so nothing is acknowledged that could raise d."""
+    covered = []
+    for without in (False, True):
+        if without:
+            forget_echoes(monkeypatch)
+        flown = scenario(control={"dt": 0.02, "horizon": 20})
+        flight = fly_over(monkeypatch, flown, *ways(side, GROWING[growing]))
+        covered.append(flight.client["covered"].mean())
+    assert covered[0] > covered[1] + 0.25
+    assert flight.failure is not None
+
+
+@pytest.mark.parametrize(("growing", "side"), [("slowly", "downlink"), ("to 2.8 s", "uplink")])
+def test_without_echoes_and_bound_on_lateness_it_flies_away(
+    growing: str, side: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the delay stops growing, or only observations are delayed."""
+    forget_late(monkeypatch)
+    forget_echoes(monkeypatch)
+    flown = scenario(control={"dt": 0.02, "horizon": 20})
+    assert far_m(fly_over(monkeypatch, flown, *ways(side, GROWING[growing]))) > 2 * OUTSIDE_M
+
+
+def test_the_age_bound_alone_ends_a_flight_that_would_leave(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without the other safeguards: within 5 s it hovers, with a bound of 60 s it flies away."""
+    forget_late(monkeypatch)
+    forget_echoes(monkeypatch)
+    far = []
+    for age_max_s in (5.0, 60.0):
+        flown = scenario(control={"dt": 0.02, "horizon": 20}, link={"age_max_s": age_max_s})
+        far.append(far_m(fly_over(monkeypatch, flown, *ways("both", GROWING["to 2.8 s"]))))
+    assert far[0] < OUTSIDE_M
+    assert far[1] > 10 * OUTSIDE_M
