@@ -41,7 +41,7 @@ UNSEEN = 2**61
 VEHICLE = record(
     ("newest", "i8"), ("echo", "i8"), ("heard", "i8"), ("adopted", "i8"), ("epoch", "i8")
 )
-"""Of one vehicle: half second of the newest sample; stamp of ours that the newest echo is of, and
+"""A vehicle: half second of the newest sample; stamp of ours that the newest echo is of, and
 number of echoes so far; offset that is reckoned with, or UNSEEN; begin of step 0 on the vehicle's
 clock [ns]."""
 

@@ -568,11 +568,13 @@ def _too_slow(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
     if control.scheme == "predictive" and H * dt < delay_s - TINY:
         yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to cover {seen}"
     vehicle, u_max = scenario.vehicle, max(scenario.model.u_max)
-    brake_s = u_max / vehicle.brake_mps2
-    if vehicle.exhausted == "brake" and control.scheme != "none" and H * dt < brake_s - TINY:
-        # Where packets are lost, the vehicle would be braking more than it follows plans.
-        brakes = f"at least {brake_s:g} s, what braking from u_max takes"
-        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to be {brakes}"
+    # Shorter, and the vehicle brakes further than it follows plans; the more so, the more are lost.
+    least_s = u_max / vehicle.brake_mps2 / 2.0 / min(max(2.0 * (1.0 - up.loss), 0.2), 1.0)
+    if vehicle.exhausted == "brake" and control.scheme != "none" and H * dt < least_s - TINY:
+        half = f"at least {least_s:g} s, half of what braking from u_max takes"
+        lossy = ", and more with over half of the packets to the vehicle lost"
+        least = half + lossy * (up.loss > 0.5)
+        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to be {least}"
     if control.commits:
         if bound_s != "auto" and bound_s < delay_s - TINY:
             yield "control.delay_bound", bound_s, f"at least {seen}"
