@@ -87,7 +87,7 @@ class ClockMap:
         """Begin anew with a vehicle, or with a new life of it."""
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row], self.seen.heard[row] = -UNSEEN, 0
-        self.seen.adopted[row] = UNSEEN
+        self.seen.adopted[row], self.seen.newest[row] = UNSEEN, 0
 
     def observe(
         self, row: int, forward_ns: int, backward_ns: int, *, echo_ns: int, now_ns: int

@@ -95,6 +95,8 @@ class Plausibility:
             epoch: begin of step 0, by its stamp and its step [ns; vehicle's clock].
             F, G: of the observation and its echo, see `server.clock` [ns].
         """
+        if epoch < 0:  # before its clock began, and maybe more than an int64 holds
+            return Verdict.EPOCH
         _, _, step, _, in_force, since, _, _, state = observation
         self._said.numbers[NEW, row] = (epoch, step, in_force, since, F, G, 0)
         self._said.states[NEW, row] = state

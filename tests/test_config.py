@@ -220,7 +220,10 @@ WRONG = {
         "control.delay_bound = 6.0\ncontrol.dt = 0.1",
         "link.age_max_s: got 5.0, expected at least 6.64 s, a round trip and two steps",
     ),
-    "an age bound of none": ("link.age_max_s = 0", "link.age_max_s: got 0, expected a number > 0.0"),
+    "an age bound of none": (
+        "link.age_max_s = 0",
+        "link.age_max_s: got 0, expected a number > 0.0",
+    ),
     "a horizon in space that fits no datagram": (
         "model.axes = 3\ncontrol.horizon = 91",
         "control.horizon: got 91, expected at most 90 with 3 axes, to fit one datagram",

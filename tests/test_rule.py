@@ -23,7 +23,8 @@ quick = settings(max_examples=200, deadline=None)
 
 
 @pytest.mark.parametrize(
-    ("observed", "count"), [(99, 10), (60, 10), (59, 10), (58, 9), (51, 2), (50, 1), (49, 0), (0, -49)]
+    ("observed", "count"),
+    [(99, 10), (60, 10), (59, 10), (58, 9), (51, 2), (50, 1), (49, 0), (0, -49)],
 )
 def test_no_input_is_flown_for_longer_than_the_age_bound_allows(observed: int, count: int) -> None:
     """Ten inputs from step 100 on, none of them later than 50 steps after the observation."""
@@ -197,7 +198,7 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
         due = max(due, seen + 1, step + int(rng.integers(1, 2 * H)))
         made[step] = due - step
     now = max([seen, *made]) + later
-    age_max = max(BOUND, now - seen, FIRST + first - begin + observed) + spare
+    age_max = max(BOUND + 2, now - seen, FIRST + first - begin + observed) + spare
     setting = scenario(scheme, exhausted, age_max)
     terms = setting.terms()
     assert terms.age_max == age_max
