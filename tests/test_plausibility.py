@@ -246,7 +246,7 @@ def test_the_largest_numbers_on_the_wire_overflow_nothing(
 ) -> None:
     """A grid that began before the vehicle's clock did is none, be it the first that is heard."""
     plausibility = Plausibility(TERMS, 1) if first else after()
-    odd = seen(105)._replace(step=step, stamp_ns=stamp_ns)
+    odd = seen(105)._replace(step=step, stamp_ns=stamp_ns, in_force=-1, since=0)
     impossible = stamp_ns < step * DT_NS
     expected = Verdict.EPOCH if impossible or not first else Verdict.BELIEVED
     assert judge(plausibility, odd, step=105) == expected
