@@ -175,8 +175,10 @@ WRONG = {
         ),
     ),
     "a horizon shorter than half of the round trip, a fast uplink notwithstanding": (
-        'extends = "paper"\ncontrol.horizon = 10\n'
-        "network.uplink.minimum_s = 0.0\nnetwork.downlink.minimum_s = 1.0",
+        (
+            'extends = "paper"\ncontrol.horizon = 10\n'
+            "network.uplink.minimum_s = 0.0\nnetwork.downlink.minimum_s = 1.0"
+        ),
         (
             "control.horizon: got 10, expected horizon · dt (now 0.5 s) to cover the delay of "
             "0.54 s (half of the smallest round trip, and the uplink's jitter)"
@@ -190,8 +192,10 @@ WRONG = {
         ),
     ),
     "a delay bound below half of the round trip, a fast uplink notwithstanding": (
-        "control.delay_bound = 0.3\nnetwork.uplink.delay = 'none'\n"
-        "network.downlink.minimum_s = 1.5",
+        (
+            "control.delay_bound = 0.3\nnetwork.uplink.delay = 'none'\n"
+            "network.downlink.minimum_s = 1.5"
+        ),
         (
             "control.delay_bound: got 0.3, expected at least the delay of "
             "0.75 s (half of the smallest round trip, and the uplink's jitter)"
@@ -357,7 +361,7 @@ def test_a_delay_bound_may_be_longer_than_the_horizon(bound: float) -> None:
 
 
 def test_the_network_of_a_former_flyaway_is_flown_now() -> None:
-    """Half of its round trip is 0.775 s, and its horizon 0.4 s; issue 12, item 1."""
+    """Half of its round trip is 0.775 s, and its horizon 0.4 s."""
     table = config.to_table(config.load("demo"))
     table["control"] |= {"dt": 0.02, "horizon": 20}
     table["network"] = {
