@@ -152,13 +152,13 @@ def test_a_flight_with_a_gap_is_a_flight(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_after_a_restart_a_vehicle_is_flown_that_drifts_faster_than_any_input(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Wind of 2.5 m/s against inputs of up to 1.6 m/s: what is committed is kept within these."""
-    wind = {"steady_wind_mps": [2.5, 0.0], "start_m": [-10.0, 0.0]}
+    """Wind of 4 m/s against inputs of up to 1.6 m/s: what is committed is kept within these."""
+    wind = {"steady_wind_mps": [4.0, 0.0], "start_m": [-10.0, 0.0]}
     flown = scenario(vehicle=wind, model={"u_max": [1.6]})
     flight = interrupted(monkeypatch, flown, 3.0, 10.0)
     before, after = flight.client[199], flight.client[-1]
-    assert before["state"][0, 1] > 1.6
+    assert before["state"][0, 1] > 3.9
     assert not before["covered"]
     assert flight.client["covered"][-100:].all()
     assert after["in_force"] > 200
-    assert after["state"][0, 1] < 1.0
+    assert after["state"][0, 1] < 2.5  # all that 1.6 m/s can do
