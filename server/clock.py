@@ -82,8 +82,8 @@ class ClockMap:
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle, or with a new life of it."""
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
-        self.seen.echoes[row], self.seen.vehicles["heard"][row] = -UNSEEN, 0
-        self.seen.vehicles["adopted"][row] = UNSEEN
+        self.seen.echoes[row] = -UNSEEN
+        self.seen.vehicles[row] = (0, 0, 0, UNSEEN, 0)
 
     def observe(
         self, row: int, forward_ns: int, backward_ns: int, *, echo_ns: int, now_ns: int

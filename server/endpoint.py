@@ -177,8 +177,9 @@ class Server(Endpoint):
         session.address = address
         session.observed_ns = stamp_ns
         self._clock.epoch_ns[row] = epoch_ns
-        if self._due_ns is None:
-            self._due_ns = -(-now_ns // self._terms.dt_ns) * self._terms.dt_ns  # the next, or now
+        dt_ns = self._terms.dt_ns
+        if self._due_ns is None or self._due_ns > now_ns + dt_ns:  # also where our clock went back
+            self._due_ns = -(-now_ns // dt_ns) * dt_ns  # the next, or now
 
     def _anew(self, row: int) -> None:
         """Forget all that is known of a vehicle but its session."""

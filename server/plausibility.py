@@ -98,6 +98,8 @@ class Plausibility:
         Returns:
             a `Verdict`.
         """
+        if epoch < 0:  # before its clock began, and maybe more than an int64 holds
+            return Verdict.EPOCH
         _, _, step, _, in_force, since, _, _, state = observation
         return _judge(
             self._said, row, state, epoch, step, in_force, since, F, G, self._H, self._dt_s

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server import clock as clocks
-from server.clock import ClockMap
+from server.clock import ECHOES, ClockMap, shortest_ns
 from shared.endpoint import MILLISECOND_NS as MS
 from shared.endpoint import SECOND_NS as S
 
@@ -249,6 +249,39 @@ def test_vehicles_have_clocks_of_their_own() -> None:
     clock.forget(1)
     assert together.tolist() == [HOUR, -7 * HOUR, 5 * MS]
     assert [clock.bound_ns(row) for row in (3, 0, 2)] == [250 * MS, 100 * MS, 200 * MS]
+
+
+def shortest_ms(clock: ClockMap, row: int = 0) -> float:
+    """Shortest delay of the newest packets to a vehicle [ms], or -1 where it is not known."""
+    clock.offset_ns(np.array([row]))
+    shortest = int(shortest_ns.py_func(clock.seen, row))
+    return shortest / MS if shortest >= 0 else -1.0
+
+
+def test_the_shortest_of_the_newest_echoes_tells_the_delay_of_now() -> None:
+    """It follows once all of them have grown; the map itself knows the smallest of 20 s."""
+    clock, known = ClockMap(1, DT_NS), []
+    delays_ms = [400] * 6 + [700, 900, 800, 750, 900, 900, 410, 900]
+    for now, up_ms in zip(times(1, 10), delays_ms, strict=False):
+        observe(clock, now, HOUR, down_ns=400 * MS, up_ns=up_ms * MS)
+        known.append(shortest_ms(clock))
+    assert known[:ECHOES] == [-1.0] * (ECHOES - 1) + [400.0]
+    assert known[ECHOES:] == [400.0] * 5 + [700.0, 750.0, 750.0, 410.0, 410.0]
+    assert clock.bound_ns(0) == 400 * MS
+
+
+def test_a_word_of_ours_that_is_echoed_again_is_no_new_echo() -> None:
+    """While nothing comes to the vehicle nothing is known of how long that takes now."""
+    clock = ClockMap(1, DT_NS)
+    for _ in range(10 * ECHOES):
+        clock.observe(0, 400 * MS, 400 * MS, echo_ns=7 * S, now_ns=8 * S)
+    assert shortest_ms(clock) == -1.0
+    for echo_ns in range(ECHOES):
+        clock.observe(0, 400 * MS, 400 * MS, echo_ns=8 * S + echo_ns, now_ns=9 * S)
+    assert shortest_ms(clock) == 400.0
+    clock.forget(0)
+    clock.observe(0, 400 * MS, 400 * MS, echo_ns=9 * S, now_ns=9 * S)
+    assert shortest_ms(clock) == -1.0
 
 
 @pytest.mark.parametrize("seed", range(5))

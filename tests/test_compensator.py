@@ -21,7 +21,7 @@ HERE = np.zeros((2, 2))
 
 
 def terms(*, scheme: str = "predictive", exhausted: str = "hold") -> Terms:
-    """Ten stages of 0.1 s, on a network of no delay."""
+    """Ten stages of 0.1 s, on a network of no delay; the age bound is 50 steps."""
     direction = {"delay": "none"}
     return check(
         {
@@ -166,6 +166,79 @@ def test_chosen_input_is_the_caller_s_own() -> None:
     for compensator in (holding(0), holding(0, scheme="none"), holding(0, exhausted="brake")):
         compensator.choose(0, HERE)[:] = 9.0
         np.testing.assert_allclose(compensator.choose(0, HERE), INPUTS[:, 0], rtol=1e-7)
+
+
+# -- too old, too late ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["none", "predictive", "committed", "feedback"])
+@pytest.mark.parametrize(
+    ("step", "observed", "reason"),
+    [
+        (100, 99, None),
+        (100, 50, None),  # its first input is 50 steps younger than that
+        (100, 49, "too old"),
+        (100, 0, "too old"),
+        (100, 101, "observation"),
+        (100, 102, "observation"),
+        (100, -1, "observation"),  # no stamp of its own
+    ],
+)
+def test_a_horizon_from_an_old_or_impossible_observation_is_refused(
+    scheme: str, step: int, observed: int, reason: str | None
+) -> None:
+    """The vehicle flies on with what it holds."""
+    compensator = Compensator(terms(scheme=scheme))
+    compensator.offer(horizon(95), 96, 95)
+    if reason is None:
+        compensator.offer(horizon(step), 101, observed)
+        assert compensator.in_force == step
+        return
+    with pytest.raises(ProtocolError, match=f"^{reason}$"):
+        compensator.offer(horizon(step), 101, observed)
+    assert (compensator.in_force, compensator.stale) == (95, 0)
+    np.testing.assert_allclose(
+        compensator.choose(96, HERE), INPUTS[:, int(scheme != "none")], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize(("exhausted", "after"), [("hold", 1.0), ("brake", 0.8)])
+def test_a_horizon_is_flown_no_longer_than_the_age_bound(exhausted: str, after: float) -> None:
+    """Seen at step 54, no input is flown after step 104; then it is held or braked along."""
+    compensator = Compensator(terms(exhausted=exhausted))
+    compensator.offer(horizon(100, np.tile([[0.6], [0.8]], H)), 101, 54)
+    flown = []
+    for step in (103, 104, 105):
+        flown.append(float(np.linalg.norm(compensator.choose(step, HERE))))
+        assert compensator.covered == (step <= 104)
+    assert flown == pytest.approx([1.0, 1.0, after], abs=1e-6)
+
+
+@pytest.mark.parametrize("exhausted", ["hold", "brake"])
+def test_without_compensation_the_age_bound_ends_the_input(exhausted: str) -> None:
+    """The paper's scheme of no compensation, too, brakes once what it flies is too old."""
+    compensator = holding(5, np.tile([[0.6], [0.8]], H), scheme="none", exhausted=exhausted)
+    speeds = [float(np.linalg.norm(compensator.choose(step, HERE))) for step in (55, 56, 57)]
+    assert speeds == pytest.approx([1.0, 0.8, 0.6] if exhausted == "brake" else [1.0] * 3, abs=1e-6)
+
+
+@pytest.mark.parametrize("scheme", ["predictive", "committed", "feedback"])
+@pytest.mark.parametrize("d", [0, 3, 20])
+def test_a_horizon_that_comes_long_after_its_committed_steps_is_refused(
+    scheme: str, d: int
+) -> None:
+    """By more than a quarter of itself, two steps; the paper's scheme commits to nothing."""
+    inputs = np.concatenate([np.zeros((2, d)), INPUTS], axis=1)
+    in_time, late = Compensator(terms(scheme=scheme)), Compensator(terms(scheme=scheme))
+    in_time.offer(horizon(100, inputs), 102 + d, 99)
+    assert in_time.in_force == 100
+    if scheme == "predictive":
+        late.offer(horizon(100, inputs), 103 + d, 99)
+        assert late.in_force == 100
+        return
+    with pytest.raises(ProtocolError, match=r"^too late$"):
+        late.offer(horizon(100, inputs), 103 + d, 99)
+    assert late.in_force == NO_HORIZON
 
 
 # -- feedback aboard -----------------------------------------------------------------------------

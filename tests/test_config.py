@@ -404,7 +404,7 @@ def test_a_delay_bound_may_be_longer_than_the_horizon(bound: float) -> None:
 
 
 def test_the_network_of_a_former_flyaway_is_flown_now() -> None:
-    """Half of its round trip is 0.775 s, and its horizon 0.4 s; issue 12, item 1."""
+    """Half of its round trip is 0.775 s, and its horizon 0.4 s."""
     table = config.to_table(config.load("demo"))
     table["control"] |= {"dt": 0.02, "horizon": 20}
     table["network"] = {

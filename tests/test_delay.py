@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from netem.fate import fates
 from server import delay
-from server.delay import DelayBound, acknowledge, begin, delay_bound, forget
+from server.delay import DelayBound, acknowledge, at_least, begin, delay_bound, forget
 from shared.config import DirectionConfig
 from shared.endpoint import seconds_to_ns
 
@@ -82,6 +82,27 @@ def test_it_rises_at_once_and_no_further_than_most() -> None:
 def test_a_guess_too_high_is_left_step_by_step_once_it_is_known_to_be() -> None:
     """After the 16 newest, as after a sample."""
     assert known([9] * 22, first=14) == [14] * 15 + [13, 12, 11, 10] + [9] * 3
+
+
+def test_what_every_packet_takes_raises_it_at_once_and_never_lowers_it() -> None:
+    """Acknowledged or not, up to the most; a delay that is not known is as good as none."""
+    bound, steps = estimated(), []
+    begin(bound, 0, 11)
+    for delay_now in (-(2**40), 0, 10, 11, 12, 30, 12, 90):
+        at_least(bound, 0, delay_now)
+        steps += bound.steps.tolist()
+    assert steps == [11, 11, 11, 11, 12, 30, 30, MOST]
+
+
+def test_what_was_raised_falls_step_by_step() -> None:
+    """As after a late horizon: once none of the newest needed it."""
+    bound, steps = estimated(), []
+    begin(bound, 0, 9)
+    at_least(bound, 0, 14)
+    for _ in range(22):
+        acknowledge(bound, 0, 9)
+        steps += bound.steps.tolist()
+    assert steps == [14] * 15 + [13, 12, 11, 10] + [9] * 3
 
 
 LONE = [11] * 128 + [30] + [11] * 40

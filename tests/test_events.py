@@ -23,9 +23,14 @@ from shared.events import (
     Listening,
     NoAnswer,
     NoSession,
+    NotFlown,
     NumberTaken,
     Omitted,
     Plaintext,
+    PlanEnded,
+    PlanningResumed,
+    PlanningStopped,
+    PlanResumed,
     RecordIncomplete,
     ServerFull,
     ServerHeard,
@@ -93,6 +98,28 @@ SENTENCES = [
     (ServerSilent(vehicle=1), "vehicle 1: the server is silent"),
     (ServerHeard(vehicle=1), "vehicle 1: the server is heard again"),
     (ServerRestarted(vehicle=1), "vehicle 1: the server has restarted"),
+    (
+        PlanningStopped(vehicle=1, why="the solver has found none"),
+        "vehicle 1 is sent no plan: the solver has found none",
+    ),
+    (PlanningResumed(vehicle=1), "vehicle 1 is planned for again"),
+    (
+        PlanEnded(vehicle=1, brakes=True, why="the server is silent"),
+        "vehicle 1 brakes and hovers, its plan has ended: the server is silent",
+    ),
+    (
+        PlanEnded(vehicle=1, brakes=False, why="the server is silent"),
+        "vehicle 1 holds its last input, its plan has ended: the server is silent",
+    ),
+    (PlanResumed(vehicle=1), "vehicle 1 flies a plan again"),
+    (
+        NotFlown(vehicle=1, covered=0, steps=200, why="no newer horizon has come"),
+        "vehicle 1 was never flown: no newer horizon has come",
+    ),
+    (
+        NotFlown(vehicle=1, covered=90, steps=200, why="the server is silent"),
+        ("vehicle 1 ended without a plan, after 90 of 200 steps with one: the server is silent"),
+    ),
     (
         Finished(vehicle=1, steps=200, missed=3),
         "vehicle 1: flown to the end, 3 of 200 steps missed",

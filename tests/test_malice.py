@@ -12,7 +12,16 @@ from server.endpoint import VEHICLES_MAX, Server
 from shared import config
 from shared.chance import stream
 from shared.endpoint import EVENTS_MAX, SECOND_NS, Datagram, Endpoint
-from shared.protocol import FEEDBACK, Heartbeat, Hello, Horizon, Observation, Welcome, encode
+from shared.protocol import (
+    FEEDBACK,
+    Heartbeat,
+    Hello,
+    Horizon,
+    Observation,
+    Welcome,
+    decode,
+    encode,
+)
 
 SCENARIO = config.load("paper")
 TERMS = SCENARIO.terms()
@@ -107,3 +116,32 @@ def test_an_answer_is_no_longer_than_its_question() -> None:
     server.receive(Datagram(hello, STRANGER), now_ns=3 * 10**14)
     ((answer, _, _),) = server.outbox()
     assert len(answer) < 1.5 * len(hello)
+
+
+@pytest.mark.parametrize("step", [0, 5, 2**36, 2**40])
+@pytest.mark.parametrize("stamp_ns", [0, SECOND_NS, 2**63 - 1])
+@pytest.mark.parametrize("echo_ns", [(0, 0), (0, 2**63 - 1), (2**63 - 1, 0)])
+def test_no_observation_in_a_session_stops_the_server(
+    step: int, stamp_ns: int, echo_ns: tuple[int, int]
+) -> None:
+    """The largest and the smallest of all numbers, said first, and said again."""
+    server = Server(SCENARIO, boot_id=1)
+    server.receive(Datagram(encode(Hello(1, 2, TERMS)), STRANGER), now_ns=SECOND_NS)
+    ((payload, _, _),) = server.outbox()
+    welcome = decode(payload, TERMS)
+    assert isinstance(welcome, Welcome)
+    server_ns, received_ns = echo_ns
+    state = np.full((2, 2), 1e308)
+    told = Observation(
+        1, welcome.session, step, stamp_ns, 2**40, 2**40, server_ns, received_ns, state
+    )
+    for number in range(10):
+        now_ns = SECOND_NS + number * TERMS.dt_ns
+        with np.errstate(all="ignore"):
+            server.receive(Datagram(encode(told), STRANGER), now_ns=now_ns)
+            server.receive(Datagram(encode(told._replace(in_force=-1)), STRANGER), now_ns=now_ns)
+            server.receive(Datagram(encode(told._replace(since=0)), STRANGER), now_ns=now_ns)
+            server.receive(
+                Datagram(encode(told._replace(in_force=-1, since=0)), STRANGER), now_ns=now_ns
+            )
+            server.wake(now_ns=now_ns)

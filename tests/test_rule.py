@@ -198,7 +198,7 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
         due = max(due, seen + 1, step + int(rng.integers(1, 2 * H)))
         made[step] = due - step
     now = max([seen, *made]) + later
-    age_max = max(BOUND, now - seen, FIRST + first - begin + observed) + spare
+    age_max = max(BOUND + 2, now - seen, FIRST + first - begin + observed) + spare
     setting = scenario(scheme, exhausted, age_max)
     terms = setting.terms()
     assert terms.age_max == age_max

@@ -89,7 +89,7 @@ def far_m(flight: Flight) -> float:
 def test_a_round_trip_much_longer_than_the_horizon_is_flown(
     uplink_s: float, downlink_s: float, error_m: float
 ) -> None:
-    """1.55 s with a horizon of 0.4 s, one packet in ten lost, in wind: the flyaway of issue 12."""
+    """1.55 s with a horizon of 0.4 s, one packet in ten lost, in wind: 42 m off without d > H."""
     control = {"dt": 0.02, "horizon": 20}
     flown = scenario(uplink_s, downlink_s, duration=40.0, control=control, vehicle={"wind": 0.05})
     flight = fly(flown)

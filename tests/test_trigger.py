@@ -235,6 +235,13 @@ def test_silence_ends_in_time() -> None:
         assert events(trigger, 3, 40) == list(range(3, 41, steps))
 
 
+@pytest.mark.parametrize(("horizon", "steps"), [(40, 20), (41, 20), (3, 1), (2, 1), (1, 1)])
+def test_silence_is_no_longer_than_half_a_horizon(horizon: int, steps: int) -> None:
+    """However long a scenario allows: one that is lost can be made good; a step at least."""
+    control = msgspec.structs.replace(CONTROL, trigger="silence(60)", horizon=horizon)
+    assert events(make_trigger(control, 1), 0, 80) == list(range(0, 81, steps))
+
+
 def test_budget_spends_its_burst_and_then_what_comes_in() -> None:
     """Two at once, then one every 0.2 s: four steps of 0.05 s."""
     trigger = trigger_of("budget(5, 2)", dt=0.05)

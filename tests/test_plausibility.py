@@ -1,0 +1,408 @@
+"""Which observations are believed: those that a vehicle can make, and those that repeat."""
+
+import random
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sim.flight
+from client import vehicle
+from netem.proxy import Proxy
+from server.plausibility import REPEATS, Plausibility, Verdict
+from shared import config
+from shared.config import Scenario
+from shared.endpoint import MILLISECOND_NS as MS
+from shared.endpoint import SECOND_NS as S
+from shared.endpoint import Datagram
+from shared.protocol import Observation
+from shared.summary import summarise
+from sim.flight import Flight, fly
+from sim.world import Clock
+
+quick = settings(max_examples=60, deadline=None)
+
+TERMS = config.load("demo").terms()
+DT_NS, H = TERMS.dt_ns, TERMS.horizon
+HOUR = 3600 * S
+DELAY_NS = 440 * MS
+BEGAN_NS = 10 * HOUR
+"""Begin of step 0, by the vehicle's clock."""
+CLOCK_NS = 7 * HOUR
+"""Vehicle's clock minus server's."""
+
+
+def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
+    """What a vehicle says that flies a circle of 2 m at 0.5 m/s, with some fields changed."""
+    angle, pace = 0.25 * step * TERMS.dt_s, 0.5
+    x = 2.0 * np.array([[np.cos(angle), 0.0], [np.sin(angle), 0.0]])
+    x[:, 1] = -pace * np.sin(angle), pace * np.cos(angle)
+    stamp_ns = BEGAN_NS + step * DT_NS
+    told = Observation(
+        1,
+        1,
+        step,
+        stamp_ns,
+        in_force=step - 12,
+        since=step - 2,
+        server_ns=stamp_ns - CLOCK_NS - DELAY_NS,
+        received_ns=stamp_ns,
+        state=x,
+    )
+    return told._replace(**changed or {})
+
+
+def judge(
+    plausibility: Plausibility, told: Observation, *, row: int = 0, step: int = -1
+) -> Verdict:
+    """The verdict on an observation that arrives after its delay, or when that of `step` would."""
+    now_ns = BEGAN_NS + (told.step if step < 0 else step) * DT_NS - CLOCK_NS + DELAY_NS
+    forward_ns, backward_ns = now_ns - told.stamp_ns, told.received_ns - told.server_ns
+    epoch_ns = told.stamp_ns - told.step * DT_NS
+    return plausibility.judge(row, told, epoch_ns, forward_ns, backward_ns)
+
+
+def after(count: int = 5) -> Plausibility:
+    """What has believed the steps from 100 on, so many of them."""
+    plausibility = Plausibility(TERMS, 2)
+    for step in range(100, 100 + count):
+        assert judge(plausibility, seen(step)) == Verdict.BELIEVED
+    return plausibility
+
+
+def moved(metres: float, speed: float = 0.0) -> np.ndarray:
+    """The state of step 105, so far off along the first axis."""
+    return seen(105).state + np.array([[metres, speed], [0.0, 0.0]])
+
+
+ODD: dict[str, tuple[dict[str, Any], Verdict]] = {
+    "step 2^36": ({"step": 2**36}, Verdict.EPOCH),
+    "a step ahead": ({"step": 106}, Verdict.EPOCH),
+    "a stamp an hour ahead": ({"stamp_ns": BEGAN_NS + 105 * DT_NS + HOUR}, Verdict.EPOCH),
+    "a stamp a nanosecond ahead": ({"stamp_ns": BEGAN_NS + 105 * DT_NS + 1}, Verdict.EPOCH),
+    "an echo an hour ahead": (
+        {"server_ns": BEGAN_NS + 105 * DT_NS - CLOCK_NS + HOUR},
+        Verdict.CLOCK,
+    ),
+    "an echo that came before it was sent": ({"received_ns": 0}, Verdict.CLOCK),
+    "a horizon from far ahead": ({"in_force": 105 + H + 1}, Verdict.HORIZON),
+    "a horizon of before": ({"in_force": 91}, Verdict.HORIZON),
+    "no horizon any more": ({"in_force": -1}, Verdict.HORIZON),
+    "in force since a later step": ({"since": 106}, Verdict.HORIZON),
+    "in force since long ago": ({"since": 101}, Verdict.HORIZON),
+    "a jump": ({"state": moved(2.0)}, Verdict.JUMP),
+    "a jump in speed": ({"state": moved(0.0, 5.0)}, Verdict.JUMP),
+    "the end of the world": ({"state": moved(1e300, 1e300)}, Verdict.JUMP),
+}
+"""What is odd in the observation of step 105, and what is said of it."""
+
+
+@pytest.mark.parametrize(("changed", "verdict"), ODD.values(), ids=ODD)
+def test_an_odd_observation_is_not_believed_and_changes_nothing(
+    changed: dict[str, Any], verdict: Verdict
+) -> None:
+    """Once or twice; the next that follows from those before is believed as ever."""
+    for times in (1, 2):
+        plausibility = after()
+        for _ in range(times):
+            assert judge(plausibility, seen(105, changed), step=105) == verdict
+        assert judge(plausibility, seen(106)) == Verdict.BELIEVED
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
+    """What is odd for one may be the first that is heard of another."""
+    expected = Verdict.EPOCH if row == 0 else Verdict.BELIEVED
+    assert judge(after(), seen(105, {"stamp_ns": 90 * HOUR}), row=row) == expected
+
+
+def elsewhere(step: int) -> Observation:
+    """What the vehicle says once its clock has stepped, and it has been carried away."""
+    told = seen(step)
+    return told._replace(
+        stamp_ns=told.stamp_ns + HOUR,
+        received_ns=told.received_ns + HOUR,
+        state=told.state + np.array([[100.0, 0.0], [0.0, 0.0]]),
+    )
+
+
+def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
+    """The first two are not; from the third on it is the others that are odd."""
+    plausibility = after()
+    verdicts = [judge(plausibility, elsewhere(step)) for step in range(105, 110)]
+    assert verdicts == [
+        *[Verdict.EPOCH] * (REPEATS - 1),
+        Verdict.ANEW,
+        Verdict.BELIEVED,
+        Verdict.BELIEVED,
+    ]
+    assert judge(plausibility, seen(110)) == Verdict.EPOCH
+
+
+def test_three_that_do_not_agree_are_not_believed() -> None:
+    """Each contradicts the one before it."""
+    plausibility = after()
+    for n, step in enumerate(range(105, 125)):
+        odd = seen(step, {"stamp_ns": BEGAN_NS + step * DT_NS + (n + 1) * S})
+        assert judge(plausibility, odd, step=step) == Verdict.EPOCH
+    assert judge(plausibility, seen(125)) == Verdict.BELIEVED
+
+
+def test_two_among_believed_ones_are_not_in_a_row() -> None:
+    """However many there are of them."""
+    plausibility = after()
+    for step in range(105, 205, 3):
+        assert judge(plausibility, elsewhere(step)) == Verdict.EPOCH
+        assert judge(plausibility, elsewhere(step + 1)) == Verdict.EPOCH
+        assert judge(plausibility, seen(step + 2)) == Verdict.BELIEVED
+
+
+def test_an_odd_one_among_those_that_agree_begins_the_row_anew() -> None:
+    """One that follows neither from what is believed nor from what is doubted."""
+    plausibility = after()
+    told = [
+        elsewhere(105),
+        elsewhere(106),
+        seen(107, {"stamp_ns": 90 * HOUR}),
+        elsewhere(108),
+        elsewhere(109),
+    ]
+    assert all(judge(plausibility, each) > Verdict.BELIEVED for each in told)
+    assert judge(plausibility, elsewhere(110)) == Verdict.ANEW
+
+
+def test_a_late_observation_tells_of_the_clocks_alone() -> None:
+    """Its horizon and its state are of before; what is held against the next is the newest."""
+    plausibility = after()
+    assert judge(plausibility, seen(90)) == Verdict.BELIEVED
+    assert judge(plausibility, seen(105)) == Verdict.BELIEVED
+    assert judge(plausibility, seen(90, {"stamp_ns": 90 * HOUR})) == Verdict.EPOCH
+    assert (
+        judge(plausibility, seen(104, {"in_force": -1, "state": moved(50.0)})) == Verdict.BELIEVED
+    )
+    assert judge(plausibility, seen(106)) == Verdict.BELIEVED
+
+
+def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
+    """As one that was never heard; its neighbour is not forgotten."""
+    plausibility = after()
+    assert judge(plausibility, seen(100), row=1) == Verdict.BELIEVED
+    plausibility.forget(0)
+    assert judge(plausibility, elsewhere(3)) == Verdict.BELIEVED
+    assert judge(plausibility, elsewhere(101), row=1) == Verdict.EPOCH
+
+
+def test_an_odd_first_observation_is_forgotten_after_three() -> None:
+    """Nothing is known that would speak against it."""
+    plausibility = Plausibility(TERMS, 1)
+    assert judge(plausibility, seen(100, {"stamp_ns": 90 * HOUR})) == Verdict.BELIEVED
+    verdicts = [judge(plausibility, seen(step)) for step in range(101, 105)]
+    assert verdicts == [Verdict.EPOCH, Verdict.EPOCH, Verdict.ANEW, Verdict.BELIEVED]
+
+
+@quick
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(-300, 300),
+    st.integers(0, 3000),
+    st.lists(st.integers(1, 60), max_size=30),
+)
+def test_whatever_a_vehicle_may_say_is_believed(
+    seed: int, drift_ppm: int, jitter_ms: int, gaps: list[int]
+) -> None:
+    """Drifting clocks, delays that vary by seconds, losses, and wind."""
+    rng, plausibility, step = np.random.default_rng(seed), Plausibility(TERMS, 1), 100
+    for gap in gaps:
+        step += gap
+        told = seen(step)
+        told = told._replace(state=told.state + rng.normal(scale=0.1, size=(2, 2)))
+        up_ns, down_ns = (int(rng.integers(jitter_ms * MS + 1)) for _ in range(2))
+        # The server's clock drifts away from the vehicle's.
+        drift_ns = (step - 100) * DT_NS * drift_ppm // 1_000_000
+        now_ns = told.stamp_ns - CLOCK_NS + drift_ns + down_ns
+        backward_ns = CLOCK_NS - drift_ns + up_ns
+        epoch_ns = told.stamp_ns - step * DT_NS
+        verdict = plausibility.judge(0, told, epoch_ns, now_ns - told.stamp_ns, backward_ns)
+        assert verdict == Verdict.BELIEVED
+
+
+@quick
+@given(st.sampled_from(["step", "stamp_ns"]), st.integers(0, 39), st.sampled_from([105, 2**20 - 1]))
+def test_no_flipped_bit_of_a_step_or_a_stamp_is_believed(field: str, bit: int, step: int) -> None:
+    """Neither comes without the other."""
+    plausibility = Plausibility(TERMS, 1)
+    assert judge(plausibility, seen(step - 1)) == Verdict.BELIEVED
+    told = seen(step)
+    odd = told._replace(**{field: getattr(told, field) ^ 1 << bit})
+    assert judge(plausibility, odd, step=step) > Verdict.BELIEVED
+
+
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize(("step", "stamp_ns"), [(2**40, 0), (2**40, 2**63 - 1), (0, 2**63 - 1)])
+def test_the_largest_numbers_on_the_wire_overflow_nothing(
+    step: int, stamp_ns: int, *, first: bool
+) -> None:
+    """A grid that began before the vehicle's clock did is none, be it the first that is heard."""
+    plausibility = Plausibility(TERMS, 1) if first else after()
+    odd = seen(105)._replace(step=step, stamp_ns=stamp_ns, in_force=-1, since=0)
+    impossible = stamp_ns < step * DT_NS
+    expected = Verdict.EPOCH if impossible or not first else Verdict.BELIEVED
+    assert judge(plausibility, odd, step=105) == expected
+
+
+@quick
+@given(st.integers(0, 3), st.integers(0, 63))
+def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit: int) -> None:
+    """Within a metre or so, and two metres per second."""
+    told = seen(105)
+    state = told.state.copy()
+    state.view(np.uint64).ravel()[number] ^= np.uint64(1 << bit)
+    if np.isfinite(state).all() and judge(after(), told._replace(state=state)) == Verdict.BELIEVED:
+        assert np.abs(state - told.state).max() < 5.0
+    else:
+        assert np.abs(state - told.state).max() > 0.9 or not np.isfinite(state).all()
+
+
+# -- in flight -------------------------------------------------------------------------------------
+
+
+def scenario(**changes: Any) -> Scenario:
+    """The demo, with some keys changed."""
+    return config.check(config.to_table(config.load("demo")) | changes, "test")
+
+
+def flipped(monkeypatch: pytest.MonkeyPatch, share: float, seed: int) -> Flight:
+    """A flight with one bit flipped in a share of the packets to the server."""
+    rng = random.Random(seed)
+
+    class Flipping(Proxy):
+        """Netem of a bad cable."""
+
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            """See `Endpoint`."""
+            if datagram.socket == 0 and rng.random() < share:
+                payload = bytearray(datagram.payload)
+                bit = rng.randrange(8 * len(payload))
+                payload[bit // 8] ^= 1 << bit % 8
+                datagram = datagram._replace(payload=bytes(payload))
+            super().receive(datagram, now_ns=now_ns)
+
+    monkeypatch.setattr(sim.flight, "Proxy", Flipping)
+    return fly(scenario(seed=seed))
+
+
+SEEDS = range(1, 7)
+
+
+def rmse(flights: list[Flight]) -> float:
+    """Mean RMSE xy of flights [m]."""
+    errors = [summarise(scenario(), "test", flight.client).rmse_xy or 0.0 for flight in flights]
+    return float(np.mean(errors))
+
+
+def believe(*_: Any) -> Verdict:
+    """Ablation: the verdict of the credulous."""
+    return Verdict.BELIEVED
+
+
+def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """RMSE within a tenth of that of a good cable; if all is believed it is several times that."""
+    good = rmse([flipped(monkeypatch, 0.0, seed) for seed in SEEDS])
+    bad = [flipped(monkeypatch, 0.01, seed) for seed in SEEDS]
+    assert rmse(bad) == pytest.approx(good, rel=0.1)
+    counts = [flight.figures["server"]["counts"] for flight in bad]
+    assert sum(each.get("dropped: implausible: epoch", 0) for each in counts) > 0
+    assert all(flight.failure is None for flight in bad)
+    monkeypatch.setattr(Plausibility, "judge", believe)
+    assert rmse([flipped(monkeypatch, 0.01, seed) for seed in SEEDS]) > 2.0 * good
+
+
+def oddly(monkeypatch: pytest.MonkeyPatch, number: int, field: str, value: int) -> Flight:
+    """A flight of which one observation, by its number from 0, has a field changed."""
+    send, said = vehicle.Client._send, iter(range(10**9))
+
+    def lie(self: vehicle.Client, message: Any) -> None:
+        if isinstance(message, Observation) and next(said) == number:
+            message = message._replace(**{field: getattr(message, field) + value})
+        send(self, message)
+
+    monkeypatch.setattr(vehicle.Client, "_send", lie)
+    return fly(scenario(network={"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}))
+
+
+@pytest.mark.parametrize("number", [0, 300])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("step", 2**36), ("stamp_ns", HOUR), ("server_ns", HOUR), ("since", -1), ("in_force", 2**30)],
+)
+def test_one_odd_observation_costs_a_few_steps_at_most(
+    number: int, field: str, value: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it is the first of its session."""
+    flight = oddly(monkeypatch, number, field, value)
+    assert flight.failure is None
+    steps = flight.server["step"]
+    assert steps[0] <= 12 + REPEATS + 1
+    assert np.diff(steps).max() <= 2
+    error = summarise(scenario(), "test", flight.client).error_max
+    assert error is not None
+    assert error < 0.5
+
+
+@pytest.mark.parametrize("field", ["step", "stamp_ns"])
+def test_believed_one_odd_observation_leaves_the_vehicle_alone(
+    field: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ablation: no observation is newer than step 2^36, no horizon is for a step of now."""
+    monkeypatch.setattr(Plausibility, "judge", believe)
+    flight = oddly(monkeypatch, 300, field, 2**36 if field == "step" else HOUR)
+    error = summarise(scenario(), "test", flight.client).error_max
+    assert flight.failure is not None or (error or 0.0) > 0.5
+
+
+class Stepped(NamedTuple):
+    """A clock that is set by an hour while it runs."""
+
+    clock: Clock
+    at_ns: int
+    """Time of the world at which it is set."""
+    by_ns: int
+
+    def local(self, time_ns: int) -> int:
+        """See `Clock`."""
+        return self.clock.local(time_ns) + self.by_ns * (time_ns >= self.at_ns)
+
+    def world(self, local_ns: int) -> int:
+        """See `Clock`."""
+        before_ns = self.clock.world(local_ns)
+        if before_ns < self.at_ns:
+            return before_ns
+        return max(self.at_ns, self.clock.world(local_ns - self.by_ns))
+
+
+@pytest.mark.parametrize("by_ns", [HOUR, -HOUR])
+def test_a_server_whose_clock_steps_goes_on_planning(
+    by_ns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By an hour, in flight: the vehicle is without a plan for as long as a session takes to open.
+
+    No observation of before the step agrees with those after it.
+    """
+    ours = iter([False, True])
+
+    def clock(*numbers: int) -> Clock | Stepped:
+        """The client's, then the server's."""
+        made = Clock(*numbers)
+        return Stepped(made, 15 * S, by_ns) if next(ours) else made
+
+    monkeypatch.setattr(sim.flight, "Clock", clock)
+    flown = scenario(network={"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}})
+    flight = fly(flown)
+    assert flight.failure is None
+    covered = flight.client["covered"]
+    assert covered[600:].all()
+    assert np.linalg.norm(flight.client["state"][:, :, 0], axis=1).max() < 3.0
