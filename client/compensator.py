@@ -74,9 +74,7 @@ class Compensator:
             raise ProtocolError("observation")
         if length < 1:
             raise ProtocolError("too old")
-        stage = step - horizon.step
-        late = self._commits and stage > given - self._H + self._late_max
-        if late or (self._brake and stage >= length):  # braking is not begun anew
+        if self._comes_too_late(step - horizon.step, given - self._H, length):
             raise ProtocolError("too late")
         self.in_force, self._new = horizon.step, True
         self.observed_ns = horizon.observed_ns
@@ -87,6 +85,17 @@ class Compensator:
         self._feedback = horizon.feedback.tolist() if horizon.feedback.size else []
         self._led = [(p, v) for p, v, *_ in self._feedback]
         self._led_stage = 0
+
+    def _comes_too_late(self, stage: int, committed: int, length: int) -> bool:
+        """Whether a horizon that would come into force at a stage is of no use any more.
+
+        Args:
+            stage: where in the horizon the step is.
+            committed: number of its inputs that were committed, d.
+            length: number of its inputs that may be flown.
+        """
+        ended = bool(self._brake) and stage >= length  # braking is not begun anew
+        return ended or (self._commits and stage > committed + self._late_max)
 
     def choose(self, step: int, state: Array) -> Array:
         """Input u* for `step` [m/s]; shape (axes,).

@@ -124,7 +124,7 @@ def shortest_ns(seen: Seen, row: int) -> int:
 
     It is negative while there are fewer.
     """
-    return seen.echoes[row].min() - seen.vehicles[row].adopted
+    return seen.echoes[row].min() - seen.vehicles[row]["adopted"]
 
 
 @kernel
@@ -162,7 +162,7 @@ def _change(minimum: I1, newest: int) -> int:
 @part
 def _drop_stepped(seen: Seen, row: int) -> None:
     """Keep only what came since, where one of a vehicle's two clocks has stepped."""
-    recent, old, newest = 0, 0, seen.vehicles[row].newest
+    recent, old, newest = 0, 0, seen.vehicles[row]["newest"]
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]
         if age < RECENT:
@@ -189,6 +189,6 @@ def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
         _drop_stepped(seen, row)
         estimate = (seen.minimum[row, 1].min() - seen.minimum[row, 0].min()) // 2
         vehicle = seen.vehicles[row]
-        if vehicle.adopted == UNSEEN or abs(estimate - vehicle.adopted) > dt // 2:
-            vehicle.adopted = estimate
-        steps[i] = (now + vehicle.adopted - vehicle.epoch) // dt
+        if vehicle["adopted"] == UNSEEN or abs(estimate - vehicle["adopted"]) > dt // 2:
+            vehicle["adopted"] = estimate
+        steps[i] = (now + vehicle["adopted"] - vehicle["epoch"]) // dt

@@ -567,14 +567,6 @@ def _too_slow(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
     H, dt, bound_s = control.horizon, control.dt, control.delay_bound
     if control.scheme == "predictive" and H * dt < delay_s - TINY:
         yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to cover {seen}"
-    vehicle, u_max = scenario.vehicle, max(scenario.model.u_max)
-    # Shorter, and the vehicle brakes further than it follows plans; the more so, the more are lost.
-    least_s = u_max / vehicle.brake_mps2 / 2.0 / min(max(2.0 * (1.0 - up.loss), 0.2), 1.0)
-    if vehicle.exhausted == "brake" and control.scheme != "none" and H * dt < least_s - TINY:
-        half = f"at least {least_s:g} s, half of what braking from u_max takes"
-        lossy = ", and more with over half of the packets to the vehicle lost"
-        least = half + lossy * (up.loss > 0.5)
-        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to be {least}"
     if control.commits:
         if bound_s != "auto" and bound_s < delay_s - TINY:
             yield "control.delay_bound", bound_s, f"at least {seen}"
@@ -585,6 +577,14 @@ def _too_slow(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
         if most < H:
             fit = f"at most {most} beside {steps} committed steps with {axes} axes"
             yield "control.horizon", H, f"{fit}, to fit one datagram"
+    vehicle, u_max = scenario.vehicle, max(scenario.model.u_max)
+    # Shorter, and the vehicle brakes further than it follows plans; the more so, the more are lost.
+    least_s = u_max / vehicle.brake_mps2 / 2.0 / min(max(2.0 * (1.0 - up.loss), 0.2), 1.0)
+    if vehicle.exhausted == "brake" and control.scheme != "none" and H * dt < least_s - TINY:
+        half = f"at least {least_s:g} s, half of what braking from u_max takes"
+        lossy = ", and more with over half of the packets to the vehicle lost"
+        least = half + lossy * (up.loss > 0.5)
+        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to be {least}"
     ahead_s = bound_s if control.commits and bound_s != "auto" else up.mean_s
     trip_s = max(ahead_s, up.mean_s) + down.mean_s + 2 * dt
     if link.age_max_s < trip_s - TINY:

@@ -360,11 +360,11 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
     except KeyboardInterrupt:  # before there was anything to end in order
         return INTERRUPTED
     except OSError as error:  # the machine's: a full disk, too few open files, a broken pipe
+        gone = isinstance(error, BrokenPipeError)  # whoever read our output has seen enough
         with suppress(OSError):
             sys.stdout.flush()
-            return _refuse(prog, _reason(error), RUN)
+            return RUN if gone else _refuse(prog, _reason(error), RUN)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        gone = isinstance(error, BrokenPipeError)  # whoever read our output has seen enough
         return RUN if gone else _refuse(prog, _reason(error), RUN)
     return 0
 

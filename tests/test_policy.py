@@ -118,7 +118,7 @@ def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
     deep = "(" * 97 + "always" + ")" * 97
     assert len(deep) == TEXT_MAX
     assert policy.parse(deep) == ALWAYS
-    assert refusal(deep + " ").endswith(" ', expected a text of length <= 200")
+    assert refusal(deep + " ").endswith(", expected a text of length <= 200")
     longest = " | ".join(["state_gap"] * 16)
     assert list(policies(policy.parse(longest))) == [STATE_GAP] * 16
 

@@ -69,7 +69,7 @@ async def test_a_child_whose_record_is_incomplete_has_told_so() -> None:
     async with started("netem", *argv, on_event=heard.append) as netem:
         pass
     assert RecordIncomplete(file="/dev/full", reason="No space left on device") in heard
-    assert (netem.incomplete, netem.failed, netem.process.returncode) == (True, False, 1)
+    assert (netem.fell_short, netem.failed, netem.process.returncode) == (True, False, 1)
     assert (
         netem.last_words() == "netem: /dev/full: No space left on device: 0 of 0 rows are recorded"
     )
