@@ -30,7 +30,7 @@ NOISE = np.array([0.001, 0.01])
 """Standard deviation of a step's noise on position [m] and velocity [m/s]; shape (2,)."""
 DELAY_S = 0.44
 """Delay of an observation [s]: the mean of the paper's network."""
-AHEAD_NS = 10 * SECOND_NS
+AHEAD_NS = 1000 * SECOND_NS
 """Offset of the vehicles' clock from the server's [ns]."""
 START_NS = 20 * SECOND_NS
 """Time of the first tick on the server's clock [ns]."""
