@@ -340,7 +340,7 @@ def test_a_refused_point_has_the_line_that_a_user_would_read() -> None:
     """The scenario, the key, what was given and what was expected."""
     point = DEMO.fly(0)
     assert point.outcome == "refused"
-    assert point.line.startswith("demo: control.horizon: got 1, expected horizon · dt (now 0.005")
+    assert point.line.startswith("demo: control.dt: got 0.005685, expected more, for the delay of ")
 
 
 def test_a_point_that_raises_has_crashed(monkeypatch: pytest.MonkeyPatch) -> None:
