@@ -31,6 +31,9 @@ from shared.terms import Terms
 TINY = 1e-9
 """As much as floating point may make of 40 · 0.011."""
 
+LOSSY = 0.3
+"""Share of lost packets to the vehicle above which horizons must be longer."""
+
 # Bounds of numbers lie far beyond any vehicle, and near enough that no time overflows its 63 bits
 # of nanoseconds, and no product of some of them a float.
 Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
@@ -579,12 +582,13 @@ def _too_slow(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
             yield "control.horizon", H, f"{fit}, to fit one datagram"
     vehicle, u_max = scenario.vehicle, max(scenario.model.u_max)
     # Shorter, and the vehicle brakes further than it follows plans; the more so, the more are lost.
-    least_s = u_max / vehicle.brake_mps2 / 2.0 / min(max(2.0 * (1.0 - up.loss), 0.2), 1.0)
+    lossy = up.loss > LOSSY
+    least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
     if vehicle.exhausted == "brake" and control.scheme != "none" and H * dt < least_s - TINY:
-        half = f"at least {least_s:g} s, half of what braking from u_max takes"
-        lossy = ", and more with over half of the packets to the vehicle lost"
-        least = half + lossy * (up.loss > 0.5)
-        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to be {least}"
+        what = "what" if lossy else "half of what"
+        least = f"at least {least_s:g} s, {what} braking from u_max takes"
+        lost = f", with over {LOSSY:.0%} of the packets to the vehicle lost" if lossy else ""
+        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to be {least}{lost}"
     ahead_s = bound_s if control.commits and bound_s != "auto" else up.mean_s
     trip_s = max(ahead_s, up.mean_s) + down.mean_s + 2 * dt
     if link.age_max_s < trip_s - TINY:
