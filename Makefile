@@ -26,7 +26,7 @@ reproduce: setup  ## the paper's table and figures, and more, in results/report.
 	$(BIN)/skytether reproduce --out results
 
 test: setup  ## everything but Docker, in five minutes on two cores
-	$(BIN)/pytest -q -m "not docker" -n 2 --dist loadfile
+	$(BIN)/pytest -q -m "not docker" -n 3 --dist loadfile
 
 check: setup  ## style, types, and who imports whom
 	$(BIN)/ruff format --check .

@@ -286,8 +286,10 @@ def test_a_flight_and_its_processes_outlive_sigusr1() -> None:
     assert "RMSE" in out
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("count", "number"),
+    [(1, signal.SIGINT), (2, signal.SIGTERM), (3, signal.SIGINT)],
+)
 def test_a_flight_that_is_ended_while_it_starts_leaves_nothing(
     count: int, number: int, tmp_path: Path
 ) -> None:
