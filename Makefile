@@ -26,6 +26,7 @@ reproduce: setup  ## the paper's table and figures, and more, in results/report.
 	$(BIN)/skytether reproduce --out results
 
 test: setup  ## everything but Docker, in five minutes on two cores
+	@$(BIN)/python -c "import server.__main__"  # kernels are compiled once, not by each worker
 	$(BIN)/pytest -q -m "not docker" -n 3 --dist loadfile
 
 check: setup  ## style, types, and who imports whom
