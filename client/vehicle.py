@@ -271,9 +271,8 @@ class Client(Endpoint):
         self._covered_last = self._step if has else self._covered_last
         why = "the server is silent" if self._hello_due_ns is not None else str(self._idle)
         if self.finished:
-            if (
-                self._step - self._covered_last
-            ) * self._dt_ns <= self._timeout_ns and self._covered:
+            without_ns = (self._step - self._covered_last) * self._dt_ns
+            if self._covered and without_ns <= self._timeout_ns:
                 finished = Finished(vehicle=self.vehicle, steps=self._steps, missed=self.missed)
                 self._events.append(finished)
             else:

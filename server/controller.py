@@ -73,7 +73,7 @@ class Controller:
         block = min(room, BLOCK)
         self._age_max = terms.age_max
         self._clock = clock
-        most = max(committed_max(terms), 1)
+        most = committed_max(terms)
         self._uplink_max_ns = (most if terms.commits else terms.horizon) * terms.dt_ns
         """Longest delay to a vehicle that a horizon has room for [ns]."""
         if not terms.indexed:

@@ -51,7 +51,7 @@ def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) ->
         most: the largest d, what a horizon has room for.
         fixed_s: a bound that is known [s]; None to estimate it.
     """
-    least, most = 1, max(most, 1)
+    least = 1
     if fixed_s is not None:
         fixed = -(-seconds_to_ns(fixed_s) // seconds_to_ns(dt_s))
         least = most = min(max(fixed, 1), most)

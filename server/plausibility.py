@@ -41,8 +41,8 @@ SAID = record(
     ("count", "i8"),
 )
 """An observation: begin of step 0 [ns; vehicle's clock]; its step, or -1 where there is none; the
-horizon in force, and its first step; F and G of `server.clock` [ns]; and how many before it agree
-with it."""
+horizon in force, and its first step; F and G of `server.clock` [ns]; and, of one that is doubted,
+how many in a row agree, itself included."""
 
 
 class Verdict(IntEnum):

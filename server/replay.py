@@ -123,7 +123,7 @@ class Replay:
     def __init__(
         self, terms: Terms, control: ControlConfig, capacity: int, clock: ClockMap
     ) -> None:
-        axes, H, most = terms.axes, terms.horizon, max(committed_max(terms), 1)
+        axes, H, most = terms.axes, terms.horizon, committed_max(terms)
         self.counts: Counter[str] = Counter()
         rule = np.zeros(axes, dtype=RULE)
         for name, numbers in terms.model._asdict().items():

@@ -11,7 +11,7 @@ import tomllib
 import typing
 from collections.abc import Mapping
 from importlib import resources
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -23,16 +23,11 @@ from numpy.typing import NDArray
 
 from shared import files, policy
 from shared import reference as shapes
+from shared.contradictions import contradictions
 from shared.endpoint import seconds_to_ns
 from shared.hint import hint
 from shared.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 from shared.terms import Terms
-
-TINY = 1e-9
-"""As much as floating point may make of 40 · 0.011."""
-
-LOSSY = 0.3
-"""Share of lost packets to the vehicle above which horizons must be longer."""
 
 # Bounds of numbers lie far beyond any vehicle, and near enough that no time overflows its 63 bits
 # of nanoseconds, and no product of some of them a float.
@@ -380,7 +375,7 @@ def check(raw: Mapping[str, Any], source: str) -> Scenario:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {_explain(str(error), raw)}") from None
-    for key, given, expected in chain(_infinite(to_table(scenario)), _contradictions(scenario)):
+    for key, given, expected in chain(_infinite(to_table(scenario)), contradictions(scenario)):
         raise ConfigError(f"{source}: {key}: got {_short(str(given))}, expected {expected}")
     return scenario
 
@@ -528,111 +523,3 @@ def _infinite(value: object, key: str = "") -> typing.Iterator[tuple[str, object
     elif isinstance(value, list | tuple):
         for index, inner in enumerate(value):
             yield from _infinite(inner, f"{key}[{index}]")
-
-
-def _contradictions(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
-    """Values that are right one by one and impossible together: key, given, expected."""
-    model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
-    axes = model.axes
-    for key, values in (
-        ("model.tau_s", model.tau_s),
-        ("model.u_max", model.u_max),
-        ("vehicle.tau_s", vehicle.tau_s or (1.0,)),
-    ):
-        if len(values) not in (1, axes):
-            yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
-    for key, values in (
-        ("vehicle.start_m", vehicle.start_m),
-        ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
-    ):
-        if len(values) not in (0, axes):
-            yield key, list(values), f"{axes} numbers with model.axes = {axes}"
-    if control.horizon * axes > INPUTS_MAX:
-        fit = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
-        yield "control.horizon", control.horizon, fit
-    if scenario.settle >= scenario.duration:
-        yield "settle", scenario.settle, f"less than the duration of {scenario.duration:g} s"
-    link = scenario.link
-    if link.timeout_s <= link.heartbeat_s:
-        yield "link.timeout_s", link.timeout_s, f"more than link.heartbeat_s = {link.heartbeat_s:g}"
-    yield from _too_slow(scenario)
-    yield from _no_trigger(control)
-    yield from _no_reference(scenario)
-
-
-def _too_slow(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
-    """Why no horizon can come in time over the scenario's network: key, given, expected."""
-    control, link, axes = scenario.control, scenario.link, scenario.model.axes
-    up, down = scenario.network.uplink, scenario.network.downlink
-    # As the server sees it, whose clock map knows no more than half of the smallest round trip.
-    delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
-    seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
-    H, dt, bound_s = control.horizon, control.dt, control.delay_bound
-    if control.scheme == "predictive" and H * dt < delay_s - TINY:
-        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to cover {seen}"
-    if control.commits:
-        if bound_s != "auto" and bound_s < delay_s - TINY:
-            yield "control.delay_bound", bound_s, f"at least {seen}"
-        steps = max(1, math.ceil((delay_s if bound_s == "auto" else bound_s) / dt - TINY))
-        most = INPUTS_MAX // axes - steps
-        if most < 1:
-            yield "control.dt", dt, f"more, for {seen} to take fewer than {steps} steps"
-        if most < H:
-            fit = f"at most {most} beside {steps} committed steps with {axes} axes"
-            yield "control.horizon", H, f"{fit}, to fit one datagram"
-    vehicle, u_max = scenario.vehicle, max(scenario.model.u_max)
-    # Shorter, and the vehicle brakes further than it follows plans; the more so, the more are lost.
-    lossy = up.loss > LOSSY
-    least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
-    if vehicle.exhausted == "brake" and control.scheme != "none" and H * dt < least_s - TINY:
-        what = "what" if lossy else "half of what"
-        least = f"at least {least_s:g} s, {what} braking from u_max takes"
-        lost = f", with over {LOSSY:.0%} of the packets to the vehicle lost" if lossy else ""
-        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to be {least}{lost}"
-    ahead_s = bound_s if control.commits and bound_s != "auto" else up.mean_s
-    trip_s = max(ahead_s, up.mean_s) + down.mean_s + 2 * dt
-    if link.age_max_s < trip_s - TINY:
-        yield "link.age_max_s", link.age_max_s, f"at least {trip_s:g} s, a round trip and two steps"
-
-
-def _no_trigger(control: ControlConfig) -> typing.Iterator[tuple[str, object, str]]:
-    """Why there can be no such trigger: key, given, expected."""
-    try:
-        trigger = policy.parse(control.trigger)
-    except policy.PolicyError as error:
-        yield "control.trigger", repr(error.given), error.expected
-        return
-    for name in (part.name for part in policy.policies(trigger)):
-        if policy.SIGNATURES[name].committed and not control.commits:
-            schemes = "'committed' or 'feedback'"
-            yield "control.scheme", repr(control.scheme), f"{schemes} with the trigger {name}"
-
-
-def _no_reference(scenario: Scenario) -> typing.Iterator[tuple[str, object, str]]:
-    """Why the desired trajectory cannot be made: key, given, expected."""
-    ref, axes = scenario.reference, scenario.model.axes
-    least = {"waypoints": 2, "hover": 1}.get(ref.shape, 0)
-    if len(ref.points_m) < least:
-        yield "reference.points_m", list(ref.points_m), f"at least {least} with shape {ref.shape!r}"
-    for point in ref.points_m:
-        if len(point) != axes:
-            yield "reference.points_m", list(point), f"{axes} numbers a point"
-    if ref.shape in ("circle", "figure-eight", "square"):
-        most_m = shapes.FAST_MPS * ref.period_s / 8.0  # a square's round is eight radii long
-        if ref.radius_m > most_m:
-            most = f"at most {most_m:g} with reference.period_s = {ref.period_s:g}"
-            yield "reference.radius_m", ref.radius_m, most
-    route = ref.points_m + ref.points_m[:1] * ref.loop
-    if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
-        yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
-    elif ref.shape in ("waypoints", "csv"):
-        try:
-            scenario.make_reference()
-        except OSError as error:
-            yield "reference.file", repr(ref.file), f"a readable file ({error.strerror})"
-        except ValueError as error:
-            if ref.shape == "csv":
-                yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
-            else:
-                given = [list(point) for point in route]
-                yield "reference.points_m", given, "points that are further apart"

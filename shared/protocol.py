@@ -230,8 +230,8 @@ def _feedback(value: object, ours: Terms) -> NDArray[np.float32]:
 
 
 def committed_max(terms: Terms) -> int:
-    """Most committed steps that a horizon has room for beside those that are planned."""
-    return min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max)
+    """Most committed steps that a horizon has room for beside those that are planned; 1 or more."""
+    return max(1, min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max))
 
 
 def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
