@@ -315,8 +315,7 @@ def test_ctrl_c_while_a_command_is_imported_is_no_traceback() -> None:
     """It ends at once, as if nothing had begun."""
     argv = [*SKYTETHER, "fly"]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fly:
-        until(lambda: ignores_usr1(fly.pid))
-        time.sleep(0.1)
+        until(lambda: ignores_usr1(fly.pid))  # the imports have just begun
         fly.send_signal(signal.SIGINT)
         out, err = fly.communicate(timeout=PATIENCE_S)
     assert fly.returncode in (-signal.SIGINT, 130)
