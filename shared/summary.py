@@ -61,6 +61,8 @@ def summarise(
     client: Rows,
     server: Rows | None = None,
     netem: Rows | None = None,
+    *,
+    secure: bool = False,
 ) -> Summary:
     """The summary of one vehicle's flight.
 
@@ -69,6 +71,7 @@ def summarise(
         client: its rows, of one vehicle.
         server: rows of the server, of any vehicles.
         netem: rows of netem; all flows count.
+        secure: whether the link was sealed.
     """
     error = position_error(scenario, client)
     settled = error[client["step"] * scenario.control.dt >= scenario.settle]
@@ -107,6 +110,7 @@ def summarise(
         solve_ms_p50=_quantile(solve_ms, 0.5),
         solve_ms_p99=_quantile(solve_ms, 0.99),
         deadline_misses=missed,
+        secure=secure,
     )
 
 
