@@ -77,7 +77,7 @@ def fly(argv: Sequence[str]) -> None:
         given = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else numbers[0]
         raise CommandError(f"--id: got {given}, expected 0 to 65535", 2)
     command.check_sockets("--vehicles", len(numbers))
-    keyring = options.keys and keys.load(options.keys)
+    keyring = keys.load(options.keys) if options.keys else None
 
     def link(number: int) -> Link:
         if keyring is None:

@@ -94,7 +94,7 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
         return path and path.with_name(path.name + suffix)
 
     # Each worker knows sessions of its own.
-    keyring = options.keys and keys.load(options.keys)
+    keyring = keys.load(options.keys) if options.keys else None
     gate = Secure(keyring, entropy=secrets.token_bytes) if keyring else Plain()
     record, columns = own(options.record), server_columns(options.config.model.axes)
     stopwatch = Stopwatch(time.perf_counter_ns)

@@ -205,7 +205,7 @@ def run(
     except OSError as error:
         raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
     if secure:
-        keygen.write(parts / "keys", range(1, vehicles + 1))
+        keygen.make(parts / "keys", range(1, vehicles + 1))
     keys = ["--keys", str(parts / "keys")] if secure else []
     shortfalls: list[Shortfall] = []
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
