@@ -68,7 +68,7 @@ def test_a_key_that_is_missing_is_named() -> None:
 
 
 def test_what_is_derived_from_a_secret_depends_on_all_of_it() -> None:
-    """And what is used for one purpose says nothing of the other."""
+    """Key and MAC have nothing in common, and one bit of the secret changes both."""
     key, other = Key.of(1, 1, A), Key.of(1, 1, A[:-1] + b"\0")
     assert len({key.psk, key.mac, other.psk, other.mac, A}) == 5
 
