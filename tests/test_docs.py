@@ -98,6 +98,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether scenarios", "skytether calibrate ", "skytether envelope ")
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py
+    known += ("skytether keygen ",)  # by test_keys.py
     known += ("docker compose up",)
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:
