@@ -22,6 +22,7 @@ from server.endpoint import VEHICLES_MAX, Server
 from shared.config import Scenario
 from shared.endpoint import Address
 from shared.record import server_columns
+from shared.steady import Steady
 from shared.stopwatch import Stopwatch
 from shell import command, workers
 from shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -98,7 +99,7 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
         )
         command.drive(
             f"server{suffix}",
-            endpoint,
+            Steady(endpoint),
             bind=bind,
             waiting_for="vehicles",
             log=options.log,
