@@ -58,7 +58,7 @@ class Options:
     """File of the keys of all vehicles that may fly, made by `skytether keygen`. Without it the
     link is plaintext, which is refused where other machines can reach it."""
     insecure: bool = False
-    """Do without keys even where other machines can reach it: anybody there can fly the vehicles."""
+    """Do without keys even where other machines can reach it: anybody there can fly vehicles."""
     config: ScenarioFlags = Scenario()
 
 

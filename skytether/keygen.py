@@ -34,6 +34,8 @@ class Options:
     add: bool = False
     """Add to a file that is there: keys of more vehicles, or the next key of those that have
     one."""
+    if_missing: bool = False
+    """Leave a file that is there as it is, and end well."""
 
 
 def keygen(argv: Sequence[str]) -> None:
@@ -52,17 +54,35 @@ def keygen(argv: Sequence[str]) -> None:
         raise CommandError(
             f"--key-id: got {options.key_id}, expected 0 to {NUMBERS[-1]}", CONFIGURATION
         )
-    present = keys.load(options.file) if options.add else keys.Keyring(str(options.file), {})
-    lines = []
-    for vehicle in vehicles:
-        number = _number(present, vehicle, options.key_id)
-        lines.append(keys.write(vehicle, number, secrets.token_bytes(SECRET_BYTES)))
-    _write(options.file, lines, add=options.add)
-    many = len(lines) > 1
+    if options.if_missing and options.file.exists():
+        print(f"{options.file}: is there, and stays as it is.")
+        return
+    make(options.file, vehicles, options.key_id, add=options.add)
+    many = len(vehicles) > 1
     named = f"vehicles {vehicles[0]} to {vehicles[-1]}" if many else f"vehicle {vehicles[0]}"
-    print(f"{options.file}: wrote {len(lines)} key{'s' if many else ''}, of {named}.")
+    print(f"{options.file}: wrote {len(vehicles)} key{'s' if many else ''}, of {named}.")
     print(f"Next: start the server with `--keys {options.file}`; give each vehicle a file of mode")
     print("0600 with its own line alone, by a way that nobody reads, and start it with `--keys`.")
+
+
+def make(
+    file: Path, vehicles: Sequence[int], number: int | None = None, *, add: bool = False
+) -> None:
+    """Make a key for each of some vehicles, in a new file or at the end of one that is there.
+
+    Args:
+        number: number of the new keys; unless given, the next of each vehicle.
+
+    Raises:
+        CommandError: a vehicle cannot have one more, or the file cannot be written.
+        ConfigError: the file that is there is none of keys.
+    """
+    present = keys.load(file) if add else keys.Keyring(str(file), {})
+    lines = []
+    for vehicle in vehicles:
+        own = _number(present, vehicle, number)
+        lines.append(keys.write(vehicle, own, secrets.token_bytes(SECRET_BYTES)))
+    _write(file, lines, add=add)
 
 
 def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
