@@ -119,6 +119,8 @@ class Server(Endpoint):
         """When to look for vehicles that are gone."""
         self.missed = 0
         """Number of ticks that were slept through."""
+        self.observations = 0
+        """Number of observations that were believed, in whatever order they came."""
         self.ticks = Histogram(TICK_BIN_NS)
         """How long each tick took, as far as the stopwatch runs."""
         self._dropped: Counter[str] = Counter()
@@ -228,6 +230,7 @@ class Server(Endpoint):
         if verdict == ANEW:
             self._anew(row)
         session.heard_ns = now_ns
+        self.observations += 1
         self._clock.observe(row, forward_ns, backward_ns, echo_ns=echo_ns, now_ns=now_ns)
         if not self.controller.observe(row, observation):
             session.stale += 1
@@ -403,6 +406,7 @@ class Server(Endpoint):
         return {
             "vehicles": len(self.sessions),
             "missed": self.missed,
+            "observations": self.observations,
             "tick_ms_p50": self.ticks.quantile_ms(0.5),
             "tick_ms_p99": self.ticks.quantile_ms(0.99),
             "spent_ns": dict(self.stopwatch.spent_ns),
