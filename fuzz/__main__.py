@@ -1,4 +1,4 @@
-"""`python -m fuzz`: coverage-guided where atheris is installed, else random; or random by number."""
+"""`python -m fuzz`: guided by coverage where atheris is installed; else, or by number, random."""
 
 import argparse
 import multiprocessing
