@@ -12,6 +12,7 @@ from server.controller import BLOCK
 from server.endpoint import Server
 from server.planner import Planner
 from server.scheme import foresight
+from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
 from shared.model import Array, Indices, discretise
@@ -105,7 +106,9 @@ class Airspace:
     """
 
     def __init__(self, scenario: Scenario, count: int, stopwatch: Stopwatch | None = None) -> None:
-        self.server = Server(scenario, boot_id=1, room=count, stopwatch=stopwatch)
+        self.server = Server(
+            scenario, boot_id=1, entropy=stream(1, "entropy").bytes, room=count, stopwatch=stopwatch
+        )
         self._vehicles = Vehicles(scenario, count)
         self._dt_ns = scenario.dt_ns
         self._late = round(DELAY_S / scenario.control.dt)

@@ -52,6 +52,12 @@ class Fleet(Endpoint):
             self._clients[n].wake(now_ns=now_ns)
             self._after(n)
 
+    def close(self, *, now_ns: int) -> None:
+        """Let every vehicle say that it ends."""
+        for n, client in enumerate(self._clients):
+            client.close(now_ns=now_ns)
+            self._after(n)
+
     def _after(self, n: int) -> None:
         """Take over what a client that was driven wants sent and said, and its next wake."""
         client = self._clients[n]

@@ -10,6 +10,7 @@ from collections import Counter
 from typing import Any, Literal
 
 from client.compensator import Compensator
+from client.link import Link, Plain
 from client.plant import Plant
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
@@ -29,13 +30,16 @@ from shared.events import (
 )
 from shared.protocol import (
     ACCEPTED,
+    CLOSES,
     FULL,
     REFUSALS,
     TAKEN,
+    Close,
     Heartbeat,
     Hello,
     Horizon,
     Idle,
+    Mode,
     Observation,
     ProtocolError,
     Welcome,
@@ -57,6 +61,7 @@ class Client(Endpoint):
         server: address of the server, or of the netem before it.
         vehicle: number of the vehicle, unlike that of any other vehicle of the server.
         boot_id: number that no other life of this vehicle has had.
+        link: how messages become datagrams.
         recorder: takes one row a step.
     """
 
@@ -68,6 +73,7 @@ class Client(Endpoint):
         server: Address,
         vehicle: int,
         boot_id: int,
+        link: Link | None = None,
         recorder: Recorder | None = None,
     ) -> None:
         super().__init__()
@@ -81,6 +87,7 @@ class Client(Endpoint):
         self._server = server
         self.vehicle = vehicle
         self._boot_id = boot_id
+        self._link = link or Plain()
         self._recorder = recorder
 
         self._hello_due_ns: int | None = 0
@@ -122,7 +129,11 @@ class Client(Endpoint):
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Take WELCOME, HORIZON and HEARTBEAT of this session; drop and count anything else."""
         try:
-            match decode(datagram.payload, self._terms):
+            payload = self._link.open(datagram.payload, now_ns=now_ns)
+            if payload is None:
+                self._hello_due_ns = now_ns if self._hello_due_ns is not None else None
+                return
+            match decode(payload, self._terms):
                 case Welcome() as welcome:
                     self._welcome(welcome, now_ns)
                 case Horizon() as horizon:
@@ -153,6 +164,7 @@ class Client(Endpoint):
         if self._server_boot_id not in (None, welcome.server_boot_id):
             self._events.append(ServerRestarted(vehicle=self.vehicle))
         self._session, self._server_boot_id = welcome.session, welcome.server_boot_id
+        self._link.adopt(now_ns=now_ns)
         self._heard(welcome, now_ns)
         if self._epoch_ns is None:
             self._epoch_ns = now_ns
@@ -222,7 +234,8 @@ class Client(Endpoint):
                 self._hello_due_ns = now_ns
         if self._hello_due_ns is not None and now_ns >= self._hello_due_ns:
             self._hello_due_ns = now_ns + HELLO_NS
-            self._send(Hello(self.vehicle, self._boot_id, self._terms))
+            hello = encode(Hello(self.vehicle, self._boot_id, self._terms))
+            self._out.append(Datagram(self._link.hello(hello, now_ns=now_ns), self._server))
 
     def _fly(self, now_ns: int, epoch_ns: int) -> None:
         """Advance to the present step; one that was slept through was flown with the old input."""
@@ -247,7 +260,10 @@ class Client(Endpoint):
                 self._compensator.since,
                 server_ns,
                 received_ns,
+                Mode.TRACK if self._compensator.covered else Mode.HOVER,
+                1,
                 state,
+                self._input,
             )
         )
         if self._recorder is None:
@@ -284,8 +300,14 @@ class Client(Endpoint):
         elif has and not had and self._covered > 1:
             self._events.append(PlanResumed(vehicle=self.vehicle))
 
-    def _send(self, message: Hello | Observation) -> None:
-        self._out.append(Datagram(encode(message), self._server))
+    def _send(self, message: Observation | Close) -> None:
+        self._out.append(Datagram(self._link.seal(encode(message)), self._server))
+
+    def close(self, *, now_ns: int) -> None:  # noqa: ARG002 - see `Endpoint`
+        """Tell the server that the vehicle ends."""
+        if self._session is not None:
+            for _ in range(CLOSES):
+                self._send(Close(self.vehicle, self._session))
 
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""

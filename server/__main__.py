@@ -91,6 +91,7 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
         endpoint = Server(
             options.config,
             boot_id=secrets.randbits(64),
+            entropy=secrets.token_bytes,
             room=options.vehicles,
             recorder=recording.recorder if recording else None,
             stopwatch=stopwatch,

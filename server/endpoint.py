@@ -6,12 +6,14 @@ passed is skipped and counted, never caught up with.
 """
 
 from collections import Counter, deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from server.clock import ClockMap
 from server.controller import BLOCK, Controller, Decisions
+from server.gate import Call, Gate, Plain
 from server.plausibility import ANEW, BELIEVED, Plausibility, Verdict
 from server.scheme import in_a_row
 from server.sessions import Session, Sessions
@@ -26,6 +28,7 @@ from shared.endpoint import (
     seconds_to_ns,
 )
 from shared.events import (
+    Degraded,
     Event,
     NumberTaken,
     PlanningResumed,
@@ -34,19 +37,23 @@ from shared.events import (
     SessionEnded,
     SessionOpened,
     SessionRefused,
+    Unauthenticated,
     address_text,
 )
 from shared.histogram import Histogram
 from shared.protocol import (
     ACCEPTED,
+    CLOSES,
     FEEDBACK,
     FULL,
     OTHER_TERMS,
     REFUSALS,
     TAKEN,
+    Close,
     Heartbeat,
     Hello,
     Idle,
+    Message,
     Observation,
     ProtocolError,
     Welcome,
@@ -61,6 +68,10 @@ VEHICLES_MAX = 64
 """Vehicles at once, unless room is made for more."""
 REFUSALS_TOLD_MAX = 64
 """Newest refusals that are remembered, so as not to tell the operator of each HELLO anew."""
+TELL_NS = 10 * SECOND_NS
+"""Time from one word about datagrams of strangers to the next [ns]."""
+MISSES_MAX = 5
+"""Number of ticks that may be missed in a second before the server calls itself degraded."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
@@ -71,6 +82,8 @@ class Server(Endpoint):
     Args:
         scenario: what to fly, and how to plan.
         boot_id: a number that no other life of the server has had.
+        entropy: makes so many random bytes.
+        gate: who may speak, and how.
         room: for how many vehicles at once.
         recorder: takes one row a tick and vehicle.
         stopwatch: measures the parts of a tick; the core has no clock of its own.
@@ -81,6 +94,8 @@ class Server(Endpoint):
         scenario: Scenario,
         *,
         boot_id: int,
+        entropy: Callable[[int], bytes],
+        gate: Gate | None = None,
         room: int = VEHICLES_MAX,
         recorder: Recorder | None = None,
         stopwatch: Stopwatch | None = None,
@@ -89,12 +104,13 @@ class Server(Endpoint):
         self._terms = scenario.terms()
         self._heartbeat_ns = seconds_to_ns(self._terms.heartbeat_s)
         self._boot_id = boot_id
+        self._gate = gate or Plain()
         self._recorder = recorder
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, self._terms.dt_ns)
         self._plausibility = Plausibility(self._terms, room)
         self.controller = Controller(scenario, self._terms, room, self._clock, self.stopwatch)
-        self.sessions = Sessions(room, boot_id, seconds_to_ns(scenario.link.timeout_s))
+        self.sessions = Sessions(room, entropy, seconds_to_ns(scenario.link.timeout_s))
         """Who flies."""
         self._idle = np.zeros(room, dtype=np.int64)
         """Why no plan is made for each vehicle, as it was told last; shape (room,)."""
@@ -109,33 +125,75 @@ class Server(Endpoint):
         """Number of datagrams dropped, and of vehicles refused, by reason."""
         self._told: deque[tuple[int, int, int]] = deque(maxlen=REFUSALS_TOLD_MAX)
         """Vehicle, boot id and refusal of the newest refusals that the operator was told."""
+        self._strangers = 0
+        """Number of datagrams that no vehicle with a key has sent."""
+        self._tell_ns = 0
+        """When the operator may be told of these again."""
+        self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)
+        """Times of the newest ticks that were missed."""
+        self._degraded = False
 
     # -- datagrams ---------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """HELLO opens a session, OBSERVATION feeds it; anything else is dropped and counted."""
+        """HELLO opens a session, OBSERVATION feeds it, CLOSE ends it; all else is only counted."""
         self.stopwatch.start()
         try:
-            message = decode(datagram.payload, self._terms)
-            self.stopwatch.lap("decode")
-            if isinstance(message, Observation):
-                self._observe(message, datagram.peer, now_ns)
-            elif isinstance(message, Hello):
-                self._hello(message, datagram.peer, now_ns)
-            else:
-                raise ProtocolError("not for a server")
+            call = self._gate.open(datagram, now_ns=now_ns)
+        except ProtocolError as error:
+            self._dropped[f"dropped: {error.reason}"] += 1
+            self._strangers += 1
+            if now_ns >= self._tell_ns:
+                self._tell_of_strangers(datagram.peer, error.reason, now_ns)
+            return
+        finally:
+            self.stopwatch.lap("open")
+        if call is None:
+            self._out += self._gate.outbox()
+            return
+        try:
+            self._hear(call, datagram.peer, now_ns)
         except ProtocolError as error:
             self._dropped[f"dropped: {error.reason}"] += 1
         self.stopwatch.lap("observe")
 
-    def _hello(self, hello: Hello, address: Address, now_ns: int) -> None:
+    def _hear(self, call: Call, address: Address, now_ns: int) -> None:
+        """Take one message.
+
+        Raises:
+            ProtocolError: it is not one of a vehicle's, or not its own.
+        """
+        message = decode(call.payload, self._terms)
+        self.stopwatch.lap("decode")
+        if call.vehicle not in (None, message.vehicle):
+            raise ProtocolError("of another vehicle")
+        match message:
+            case Observation():
+                self._observe(message, call, address, now_ns)
+            case Hello():
+                self._hello(message, call, address, now_ns)
+            case Close():
+                self.sessions.end(message.vehicle, message.session)
+                self._events.append(SessionEnded(vehicle=message.vehicle))
+            case _:
+                raise ProtocolError("not for a server")
+
+    def _tell_of_strangers(self, address: Address, reason: str, now_ns: int) -> None:
+        host, port = address
+        told = Unauthenticated(count=self._strangers, host=host, port=port, reason=reason)
+        self._events.append(told)
+        self._tell_ns = now_ns + TELL_NS
+
+    def _hello(self, hello: Hello, call: Call, address: Address, now_ns: int) -> None:
         refusal, number = self._refusal(hello, address, now_ns), 0
         if refusal == ACCEPTED:
-            number = self.sessions.welcome(hello, address, now_ns).number
+            number = self.sessions.welcome(hello, address, call.line, now_ns).number
         welcome = Welcome(
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
-        self._out.append(Datagram(encode(welcome), address))
+        self._out.append(Datagram(call.line.seal(encode(welcome)), address))
+        if refusal == ACCEPTED:
+            self._gate.admit(call, now_ns=now_ns)
 
     def _refusal(self, hello: Hello, address: Address, now_ns: int) -> int:
         """Why a HELLO is refused, if not ACCEPTED; the operator is told once a life and reason."""
@@ -159,8 +217,8 @@ class Server(Endpoint):
             self._events.append(event)
         return refusal
 
-    def _observe(self, observation: Observation, address: Address, now_ns: int) -> None:
-        session = self.sessions.find(observation) or self._begin(observation, now_ns)
+    def _observe(self, observation: Observation, call: Call, address: Address, now_ns: int) -> None:
+        session = self.sessions.find(observation) or self._begin(observation, call, now_ns)
         row, stamp_ns, echo_ns = session.row, observation.stamp_ns, observation.server_ns
         epoch_ns = stamp_ns - observation.step * self._terms.dt_ns
         forward_ns, backward_ns = now_ns - stamp_ns, observation.received_ns - echo_ns
@@ -174,7 +232,8 @@ class Server(Endpoint):
         if not self.controller.observe(row, observation):
             session.stale += 1
             return
-        session.address = address
+        if call.moves:
+            session.address, session.line = address, call.line
         session.observed_ns = stamp_ns
         self._clock.epoch_ns[row] = epoch_ns
         dt_ns = self._terms.dt_ns
@@ -187,9 +246,10 @@ class Server(Endpoint):
         self.controller.forget(row)
         self._idle[row] = Idle.PLANS
 
-    def _begin(self, observation: Observation, now_ns: int) -> Session:
+    def _begin(self, observation: Observation, call: Call, now_ns: int) -> Session:
         """The session of a first observation, now live."""
         session = self.sessions.begin(observation, now_ns)
+        session.line = call.line
         self._plausibility.forget(session.row)
         self._anew(session.row)
         host, port = session.address
@@ -209,6 +269,7 @@ class Server(Endpoint):
         dt_ns = self._terms.dt_ns
         late = (now_ns - self._due_ns) // dt_ns
         self.missed += late
+        self._note_missed(late, now_ns)
         tick_ns = self._due_ns + late * dt_ns
         self._due_ns = tick_ns + dt_ns
         if now_ns >= self._expire_ns:
@@ -220,6 +281,14 @@ class Server(Endpoint):
             self._tick(tick_ns, now_ns)
         else:
             self._due_ns = None
+
+    def _note_missed(self, count: int, now_ns: int) -> None:
+        """Note the ticks that were missed, and whether these are too many in a second."""
+        self._missed_ns += [now_ns] * min(count, MISSES_MAX + 1)
+        many = len(self._missed_ns) > MISSES_MAX and now_ns - self._missed_ns[0] <= SECOND_NS
+        if many != self._degraded:
+            self._degraded = many
+            self._events.append(Degraded(degraded=many))
 
     def _tick(self, tick_ns: int, now_ns: int) -> None:
         self.stopwatch.start()
@@ -240,8 +309,10 @@ class Server(Endpoint):
             if now_ns - session.sent_ns >= self._heartbeat_ns:
                 session.sent_ns = now_ns
                 idle = int(self._idle[session.row])
-                heartbeat = Heartbeat(session.vehicle, session.number, now_ns, idle)
-                self._out.append(Datagram(encode(heartbeat), session.address))
+                self._say(
+                    session,
+                    Heartbeat(session.vehicle, session.number, now_ns, idle, int(self._degraded)),
+                )
         self.stopwatch.lap("encode")
         self.ticks.add(self.stopwatch.spent_ns.total() - before_ns)
 
@@ -279,7 +350,16 @@ class Server(Endpoint):
                 feedback[i * told : (i + 1) * told],
             )
             session.sent_ns, begin = now_ns, end
-            self._out.append(Datagram(payload, session.address))
+            self._out.append(Datagram(session.line.seal(payload), session.address))
+
+    def _say(self, session: Session, message: Message) -> None:
+        self._out.append(Datagram(session.line.seal(encode(message)), session.address))
+
+    def close(self, *, now_ns: int) -> None:  # noqa: ARG002 - see `Endpoint`
+        """Tell every vehicle that the server ends."""
+        for _ in range(CLOSES):
+            for session in self.sessions:
+                self._say(session, Close(session.vehicle, session.number))
 
     def _record(self, decisions: Decisions) -> None:
         if self._recorder is None:

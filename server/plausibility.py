@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from shared.endpoint import MILLISECOND_NS
 from shared.kernel import F4, R2, kernel, part, record, records
-from shared.protocol import Observation
+from shared.protocol import NO_HORIZON, Observation
 from shared.terms import Terms
 
 REPEATS = 3
@@ -100,9 +100,10 @@ class Plausibility:
         """
         if epoch < 0:  # before its clock began, and maybe more than an int64 holds
             return Verdict.EPOCH
-        _, _, step, _, in_force, since, _, _, state = observation
+        told = observation
         return _judge(
-            self._said, row, state, epoch, step, in_force, since, F, G, self._H, self._dt_s
+            *(self._said, row, told.state, epoch, told.step, told.in_force, told.since),
+            *(F, G, self._H, self._dt_s),
         )
 
 
@@ -124,7 +125,8 @@ def _against(said: Said, row: int, which: int, H: int, dt: float) -> int:
         elif min(trip, new.forward + new.backward) < -SLACK_NS:
             verdict = CLOCK
         elif new.step > before.step:  # an older one tells of the clocks alone
-            if new.in_force < before.in_force or new.since < before.since:
+            back = new.in_force < before.in_force or new.since < before.since
+            if new.in_force != NO_HORIZON and back:
                 verdict = HORIZON
             elif _jumps(said, row, which, (new.step - before.step) * dt):
                 verdict = JUMP

@@ -37,7 +37,7 @@ from server.model import AXIS_FIELDS, advance, bounded, entry, flown, lasting, l
 from server.mpc import stationary_gain
 from server.scheme import Foresight
 from shared.config import ControlConfig
-from shared.kernel import B1, F1, F2, I1, R2, S4, kernel, part, record, records
+from shared.kernel import B1, F1, F2, I1, R1, R2, S4, kernel, part, record, records
 from shared.model import Flags, Indices
 from shared.protocol import NO_HORIZON, Observation, committed_max
 from shared.terms import Terms
@@ -48,7 +48,8 @@ TRIP_NS = 1_500_000_000
 """Longest trip, from an observation to the plan made from it, that `control.observer_s` is meant
 for [ns]; over a longer one an observer as fast as that makes the plans swing."""
 HOVERS, UNKNOWN = -1, -2
-"""In place of the number of a horizon: none yet; one that was sent in an earlier life of ours."""
+"""In place of the number of a horizon: none, so that it brakes and stands still; one that was sent
+in an earlier life of ours."""
 
 RULE = record(*AXIS_FIELDS, ("bound", "f8"), ("gain_p", "f8"), ("gain_v", "f8"))
 """Eq. (4) on one axis, u_max [m/s], and K on position [1/s] and velocity, 0 without feedback."""
@@ -60,14 +61,25 @@ SEEN = record(
     ("acknowledged", "i8"),
     ("judged", "i8"),
     ("sent", "i8"),
+    ("takes", "i8"),
+    ("base_takes", "i8"),
 )
 """What is known of one vehicle: horizon in force, and first step flown with it, of its newest
 observation; step and horizon of the one before, or -1; the horizon last seen to have come into
-force; the step up to which horizons were seen in force, or lost, or overtaken; and the number of
-horizons sent so far."""
-STATE = record(("p", "f8"), ("v", "f8"), ("base_p", "f8"), ("base_v", "f8"), ("w", "f8"))
-"""On one axis of a vehicle: position [m] and velocity [m/s] of its newest observation and of the
-one before, and the disturbance [m/s]."""
+force; the step up to which horizons were seen in force, or lost, or overtaken; the number of
+horizons sent so far; and whether it flies those that come, at its newest observation and at the one
+before."""
+STATE = record(
+    ("p", "f8"),
+    ("v", "f8"),
+    ("u", "f8"),
+    ("base_p", "f8"),
+    ("base_v", "f8"),
+    ("base_u", "f8"),
+    ("w", "f8"),
+)
+"""On one axis of a vehicle: position [m], velocity [m/s] and input [m/s] of its newest observation
+and of the one before, and the disturbance [m/s]."""
 SENT = record(("step", "i8"), ("due", "i8"), ("length", "i8"), ("speed", "f8"))
 """A horizon that was sent: the step it was made for; that at which it is in force, or lost; how
 many inputs it has; and the magnitude of the last [m/s]."""
@@ -162,14 +174,23 @@ class Replay:
         """See `Scheme`."""
         memory = self._memory
         memory.observed[row] = -1
-        memory.seen[row] = (NO_HORIZON, 0, -1, NO_HORIZON, NO_HORIZON, 0, 0)
+        memory.seen[row] = (NO_HORIZON, 0, -1, NO_HORIZON, NO_HORIZON, 0, 0, 1, 1)
         memory.state["w"][row] = 0.0
         delay.forget(self.delay_bound, row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
-        _, _, step, _, in_force, since, _, _, state = observation
-        return _keep(self._memory, row, step, in_force, since, state)
+        told = observation
+        return _keep(
+            self._memory,
+            row,
+            told.step,
+            told.in_force,
+            told.since,
+            told.takes,
+            told.state,
+            told.input,
+        )
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
         """See `Scheme`: planning starts at k + d."""
@@ -203,15 +224,28 @@ class Track(NamedTuple):
 
 
 @kernel
-def _keep(memory: Memory, row: int, step: int, in_force: int, since: int, state: R2) -> bool:
+def _keep(
+    memory: Memory, row: int, step: int, in_force: int, since: int, takes: int, state: R2, flown: R1
+) -> bool:
     """Write down an observation, see `Replay.observe`."""
     if step <= memory.observed[row]:
         return False
     memory.observed[row] = step
-    memory.seen[row].in_force, memory.seen[row].since = in_force, since
+    seen = memory.seen[row]
+    seen.in_force, seen.since, seen.takes = in_force, since, takes
     for axis in range(len(state)):
         memory.state[row, axis].p, memory.state[row, axis].v = state[axis, 0], state[axis, 1]
+        memory.state[row, axis].u = flown[axis]
     return True
+
+
+@part
+def _speed(inputs: R1) -> float:
+    """Magnitude of an input over all axes [m/s]."""
+    squares = 0.0
+    for u in inputs:
+        squares += u * u
+    return np.sqrt(squares)
 
 
 @part
@@ -283,12 +317,18 @@ def _roll(
     course: Course,
     legs: int,
     end: int,
-    x: tuple[float, float],
+    x: tuple[float, float, float, float],
     track: Track,
 ) -> None:
-    """Fly one axis along a course from its begin to step `end`, from x = (p, v), into `track`."""
+    """Fly one axis along a course from its begin to step `end`, into `track`.
+
+    Args:
+        x: position [m] and velocity [m/s] at the begin, the input flown from there on [m/s], and
+            the magnitude of that over all axes [m/s].
+    """
     rule, room, begin = settings.rule[axis], memory.sent.shape[1], course.begins[0]
-    (p, v), w = x, memory.state[row, axis].w
+    (p, v, u, speed_told), w = x, memory.state[row, axis].w
+    told_first = u
     for leg in range(legs):
         first = course.begins[leg]
         last = min(end, course.begins[leg + 1] if leg + 1 < legs else end)
@@ -296,9 +336,10 @@ def _roll(
         if first >= last:
             continue
         if number < 0:
+            # Of a horizon that is unknown it is as good a guess as any that it flies on.
+            brake = settings.brake if number == HOVERS else 0.0
             for step in range(first, last):
-                # As good a guess as any: it flies on.
-                u = 0.0 if number == HOVERS else min(max(v, -rule.bound), rule.bound)
+                u = flown(step - begin, 1, told_first, 0.0, speed_told, brake, rule.bound)
                 track.commands[step - begin] = u
                 track.states[step - begin, 0], track.states[step - begin, 1] = p, v
                 p, v = advance(rule, p, v, u + w)
@@ -319,6 +360,8 @@ def _roll(
             if settings.feeds_back:
                 back = led_back(rule.gain_p, rule.gain_v, led_p - p, led_v - v)
             u = flown(stage, length, told, back, speed, settings.brake, rule.bound)
+            if step == begin:
+                u = told_first  # as it says itself, whatever the rule
             if settings.feeds_back and 0 <= stage < length - 1:
                 led_p, led_v = advance(rule, led_p, led_v, told + led_w)
             track.commands[step - begin] = u
@@ -342,7 +385,8 @@ def _observe_disturbance(
     if end == begin:
         return
     before, after = _number(memory, row, seen.base_in_force), _number(memory, row, seen.in_force)
-    if min(before, after) > UNKNOWN and begin >= 0 and end - begin <= settings.age_max:
+    by_rule = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
+    if by_rule and begin >= 0 and end - begin <= settings.age_max:
         first = _first_under_way(memory, row, seen.base_in_force, begin)
         legs = _chart(course, memory, row, begin, before, range(first, after))
         # What came into force, and when, is known.
@@ -353,12 +397,11 @@ def _observe_disturbance(
         elif seen.since < end:
             course.begins[legs], course.numbers[legs] = seen.since, after
             legs += 1
-        m = end - begin
+        m, speed = end - begin, _speed(memory.state[row].base_u)
         for axis in range(len(settings.rule)):
             state, rule = memory.state[row, axis], settings.rule[axis]
-            _roll(
-                settings, memory, row, axis, course, legs, end, (state.base_p, state.base_v), track
-            )
+            x = (state.base_p, state.base_v, state.base_u, speed)
+            _roll(settings, memory, row, axis, course, legs, end, x, track)
             # A change of w changes the velocity after m steps by 1 - a11^m of it.
             off = (state.v - track.states[m, 1]) / (1.0 - rule.a11**m)
             slower = max(1.0, trip * settings.dt_ns / TRIP_NS)
@@ -367,7 +410,9 @@ def _observe_disturbance(
     for axis in range(len(settings.rule)):
         state = memory.state[row, axis]
         memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v
+        memory.state[row, axis].base_u = state.u
     memory.seen[row].base_step, memory.seen[row].base_in_force = end, seen.in_force
+    memory.seen[row].base_takes = seen.takes
 
 
 @part
@@ -416,12 +461,15 @@ def _foresee(
         for number in range(_first_after(memory, row, seen.in_force), first):
             lost += memory.sent[row, number % room].due > seen.judged
         memory.seen[row].judged = observed
-        flying = _number(memory, row, seen.in_force)
-        legs = _chart(course, memory, row, observed, flying, range(first, seen.sent))
-        found.ahead[i] = d
+        flying, under_way = HOVERS, range(0)
+        if seen.takes == 1:
+            flying, under_way = _number(memory, row, seen.in_force), range(first, seen.sent)
+        legs = _chart(course, memory, row, observed, flying, under_way)
+        found.ahead[i], speed = d, _speed(memory.state[row].u)
         for axis in range(axes):
             state, rule = memory.state[row, axis], settings.rule[axis]
-            _roll(settings, memory, row, axis, course, legs, k + d + H, (state.p, state.v), track)
+            x = (state.p, state.v, state.u, speed)
+            _roll(settings, memory, row, axis, course, legs, k + d + H, x, track)
             # An observation from ahead of k, where clocks disagree, is taken as it is.
             now, then = k - observed, k + d - observed
             for j in range(2):

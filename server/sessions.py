@@ -8,13 +8,14 @@ that are free are used again, lowest first, so that what is in use lies close to
 """
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import islice
 
 import numpy as np
 
+from server.gate import Line
 from shared.endpoint import SECOND_NS, Address
 from shared.model import Indices
 from shared.protocol import Hello, Observation, ProtocolError
@@ -37,6 +38,8 @@ class Session:
     """Number of this life of the vehicle."""
     address: Address
     """Where its newest observation came from."""
+    line: Line
+    """Way to answer it."""
     row: int = -1
     """Where its numbers lie in every array; -1 until its first observation."""
     observed_ns: int = -1
@@ -54,12 +57,12 @@ class Sessions:
 
     Args:
         room: vehicles at once.
-        first: the number before that of the first session.
+        entropy: makes so many random bytes, of which the numbers of sessions are made.
         silence_ns: time after which a vehicle that is not heard may be taken for gone [ns].
     """
 
-    def __init__(self, room: int, first: int, silence_ns: int) -> None:
-        self._opened = first
+    def __init__(self, room: int, entropy: Callable[[int], bytes], silence_ns: int) -> None:
+        self._entropy = entropy
         self._silence_ns = silence_ns
         self._live: dict[int, Session] = {}
         """Sessions by vehicle."""
@@ -113,7 +116,7 @@ class Sessions:
         oldest = next(iter(self.coming.values()), None)
         return oldest is None or _is_expected(oldest, now_ns)
 
-    def welcome(self, hello: Hello, address: Address, now_ns: int) -> Session:
+    def welcome(self, hello: Hello, address: Address, line: Line, now_ns: int) -> Session:
         """The session of the life that says HELLO, a new one or the one it has.
 
         There must be room for it, if only that of a vehicle that was welcomed and did not come.
@@ -124,13 +127,16 @@ class Sessions:
         waiting = self._waiting(hello.vehicle)
         session = waiting.pop(hello.vehicle, None)
         if session is None or session.boot_id != hello.boot_id:
-            self._opened += 1
-            session = Session(hello.vehicle, self._opened % 2**32, hello.boot_id, address)
+            session = Session(hello.vehicle, self._number(), hello.boot_id, address, line)
         session.heard_ns = now_ns
         if waiting is self.coming and len(waiting) == len(self._free_rows):
             self.coming.popitem(last=False)
         waiting[hello.vehicle] = session
         return session
+
+    def _number(self) -> int:
+        """Number of a new session, which nobody can guess, and as long on the wire as any other."""
+        return int.from_bytes(self._entropy(4)) | 2**31
 
     def _waiting(self, vehicle: int) -> dict[int, Session]:
         """Where the welcomed session of a vehicle is kept, if it has one."""
@@ -166,18 +172,31 @@ class Sessions:
         self._note_rows()
         return session
 
+    def end(self, vehicle: int, number: int) -> None:
+        """Forget the live session of a vehicle.
+
+        Raises:
+            ProtocolError: it has none with this number.
+        """
+        session = self._live.get(vehicle)
+        if session is None or session.number != number:
+            raise ProtocolError("unknown session")
+        self._forget(session)
+
     def expire(self, now_ns: int) -> list[Session]:
         """The sessions that are forgotten now."""
         gone = [each for each in self if now_ns - each.heard_ns > SESSION_NS]
         for session in gone:
-            del self._live[session.vehicle], self._by_row[session.row]
-            heappush(self._free_rows, session.row)
-            again = self._again.pop(session.vehicle, None)
-            if again is not None:
-                self.coming[session.vehicle] = again
-        if gone:
-            self._note_rows()
+            self._forget(session)
         return gone
+
+    def _forget(self, session: Session) -> None:
+        del self._live[session.vehicle], self._by_row[session.row]
+        heappush(self._free_rows, session.row)
+        again = self._again.pop(session.vehicle, None)
+        if again is not None:
+            self.coming[session.vehicle] = again
+        self._note_rows()
 
     def _note_rows(self) -> None:
         self.rows = np.array(sorted(self._by_row), dtype=np.int64)

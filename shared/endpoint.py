@@ -89,6 +89,9 @@ class Endpoint(ABC):
     def next_wake_ns(self) -> int | None:
         """Time of the next wake, or None: only a datagram matters now."""
 
+    def close(self, *, now_ns: int) -> None:  # noqa: B027 - most have nothing to say
+        """Say what peers must know before the driver ends; nothing else is called after it."""
+
     def figures(self) -> dict[str, Any]:
         """Numbers counted so far, by name; a nested dictionary is a group of them."""
         return {}

@@ -101,6 +101,31 @@ class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"flow {self.flow} for {address_text(self.host, self.port)}"
 
 
+class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A server with keys has dropped datagrams that no vehicle with one of them has sent."""
+
+    count: int
+    """Number of them so far."""
+    host: str
+    """Host that the newest came from."""
+    port: int
+    reason: str
+    """What is wrong with the newest."""
+
+    def __str__(self) -> str:
+        newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"
+        return f"{self.count} datagrams so far are of no vehicle with a key, {newest}"
+
+
+class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """The server misses more of its ticks than it may, or has stopped doing so."""
+
+    degraded: bool
+
+    def __str__(self) -> str:
+        return "degraded: it misses ticks" if self.degraded else "it is in time again"
+
+
 class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Base of the events of one vehicle."""
 
@@ -305,6 +330,8 @@ Event = (
     | RecordIncomplete
     | Fault
     | FlowOpened
+    | Unauthenticated
+    | Degraded
     | SessionOpened
     | SessionEnded
     | SessionRefused

@@ -25,6 +25,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 F1 = Annotated[NDArray[np.float64], numba.float64[::1]]
 F2 = Annotated[NDArray[np.float64], numba.float64[:, ::1]]
+R1 = Annotated[NDArray[np.float64], numba.types.Array(numba.float64, 1, "C", readonly=True)]
 R2 = Annotated[NDArray[np.float64], numba.types.Array(numba.float64, 2, "C", readonly=True)]
 F3 = Annotated[NDArray[np.float64], numba.float64[:, :, ::1]]
 F4 = Annotated[NDArray[np.float64], numba.float64[:, :, :, ::1]]

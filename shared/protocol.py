@@ -1,4 +1,4 @@
-"""The wire: five messages, each one msgpack array in one UDP datagram.
+"""The wire: six messages, each one msgpack array in one UDP datagram, sealed or plain.
 
     [version, type, vehicle, ...]
 
@@ -8,9 +8,10 @@
 | 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, refusal,      |
 |      |             |         | terms                                                      |
 | 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
-|      |             |         | received_ns, state                                         |
+|      |             |         | received_ns, mode, takes, state, input                     |
 | 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback    |
-| 5    | HEARTBEAT   | server  | session, server_ns, idle                                   |
+| 5    | HEARTBEAT   | server  | session, server_ns, idle, degraded                         |
+| 6    | CLOSE       | both    | session                                                    |
 
 `docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
 Those that control uses are the client's; `server_ns` is the server's own, which the client only
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 
 from shared.terms import Terms
 
-VERSION = 3
+VERSION = 4
 PAYLOAD_BYTES_MAX = 1200
 """So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
 
@@ -88,8 +89,34 @@ class Welcome(NamedTuple):
     terms: Terms
 
 
+class Mode(IntEnum):
+    """What a vehicle does, see `client.failsafe`."""
+
+    INIT = 0
+    """It has no session yet."""
+    SYNC = 1
+    """Its link is not good for long enough yet."""
+    READY = 2
+    """It waits for a horizon, and to be armed."""
+    TRACK = 3
+    """It flies a horizon."""
+    COAST = 4
+    """It flies on along a horizon for want of a newer one."""
+    BRAKE = 5
+    """It takes the input that it flew last to zero."""
+    HOVER = 6
+    """It stands still."""
+    LAND = 7
+    """It descends, and stays down."""
+    FAULT = 8
+    """Something is wrong aboard; it stands still, and flies nothing more."""
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
 class Observation(NamedTuple):
-    """The vehicle's state at the start of one step."""
+    """The vehicle's state at the start of one step, and what it does from there on."""
 
     vehicle: int
     session: int
@@ -104,8 +131,14 @@ class Observation(NamedTuple):
     """Newest `server_ns` seen, echoed [server clock]."""
     received_ns: int
     """When that stamp came [client clock]."""
+    mode: int
+    """What the vehicle does, one of `Mode`."""
+    takes: int
+    """1 if a horizon that comes now would be flown, else 0."""
     state: NDArray[np.float64]
     """Position [m] and velocity [m/s]; shape (axes, 2)."""
+    input: NDArray[np.float64]
+    """Desired velocity that is flown from `step` on [m/s]; shape (axes,)."""
 
 
 class Horizon(NamedTuple):
@@ -158,9 +191,21 @@ class Heartbeat(NamedTuple):
     server_ns: int
     idle: int
     """Why no plan is made for the vehicle, one of `Idle`."""
+    degraded: int
+    """1 if the server sleeps through more of its ticks than it may, else 0."""
 
 
-Message = Hello | Welcome | Observation | Horizon | Heartbeat
+class Close(NamedTuple):
+    """The sender is about to end; said `CLOSES` times."""
+
+    vehicle: int
+    session: int
+
+
+CLOSES = 3
+"""Number of times that CLOSE is said, for some of them may be lost."""
+
+Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close
 
 _Check = range | Callable[[object, Terms], object]
 """The integers a field may be, or what makes the field of what was sent, or refuses it."""
@@ -208,6 +253,16 @@ def _state(value: object, ours: Terms) -> NDArray[np.float64]:
     return state
 
 
+def _input(value: object, ours: Terms) -> NDArray[np.float64]:
+    flown = _array(value, _FLOAT64, ours.axes, (1, 1))[:, 0]
+    for u, bound in zip(flown.tolist(), ours.u_max, strict=True):
+        if not math.isfinite(u):
+            raise ProtocolError("not finite")
+        if abs(u) > bound * INPUT_TOLERANCE:
+            raise ProtocolError("input out of range")
+    return flown
+
+
 def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
     most = ours.horizon + committed_max(ours)
     inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, most))
@@ -246,6 +301,7 @@ def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, in
 
 _FLOAT32 = np.dtype("<f4")
 _FLOAT64 = np.dtype("<f8")
+_FLAG = range(2)
 _U16 = range(2**16)
 _U32 = range(2**32)
 _U64 = range(2**64)
@@ -256,9 +312,16 @@ _STEP_OR_NONE = range(NO_HORIZON, 2**40 + 1)
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),
     (Welcome, (_U16, _U32, _U64, _U64, _STAMP, range(len(REFUSALS)), _terms)),
-    (Observation, (_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP, _state)),
+    (
+        Observation,
+        (
+            *(_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP),
+            *(range(len(Mode)), _FLAG, _state, _input),
+        ),
+    ),
     (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback)),
-    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)))),
+    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG)),
+    (Close, (_U16, _U32)),
 )
 """Message of each type number (from 1) and the check of each of its fields."""
 

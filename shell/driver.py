@@ -103,6 +103,9 @@ class Shell:
         finally:
             resolver.cancel()
             self._timer.close()
+            self.endpoint.close(now_ns=time.monotonic_ns())
+            for datagram in self.endpoint.outbox():
+                self._send(datagram)
             self._drops = self.kernel_drops()
             for sock in self._sockets.values():
                 self._loop.remove_reader(sock)

@@ -235,7 +235,10 @@ def _fly(
 ) -> list[Flight]:
     def on_event(time_ns: int, host: str, event: Event) -> None:
         if host == SERVER[0]:
-            assert isinstance(event, VehicleEvent)
+            if not isinstance(event, VehicleEvent):
+                for run in runs:
+                    run.hear(time_ns, host, event)
+                return
             runs[(event.vehicle - 1) // vehicles].hear(time_ns, host, event)
         else:
             run_of[host].hear(time_ns, host, event)
@@ -244,6 +247,7 @@ def _fly(
     server = Server(
         scenario,
         boot_id=BOOT_ID,
+        entropy=stream(scenario.seed, "entropy").bytes,
         room=len(seeds) * vehicles,
         recorder=Recorder(server_columns(scenario.model.axes), sink),
         stopwatch=stopwatch,

@@ -58,7 +58,11 @@ def flown(count: int, *, together: bool) -> Rows:
     """What so many vehicles record in virtual time, in one process or in one each."""
     world = World()
     # Ticks 7 ms into the vehicles' steps: no horizon comes at the very instant that a step begins.
-    server = world.add("server", Server(GUSTY, boot_id=1, room=count), clock=Clock(13_000_000))
+    server = world.add(
+        "server",
+        Server(GUSTY, boot_id=1, entropy=stream(1, "entropy").bytes, room=count),
+        clock=Clock(13_000_000),
+    )
     netem = world.add("netem", Proxy(GUSTY, server=server))
     vehicles, sink = clients(GUSTY, count, netem)
     fleet = Fleet(vehicles)

@@ -324,7 +324,10 @@ async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = No
     sinks = [io.BytesIO() for _ in range(3)]
     columns = (client_columns(axes), server_columns(axes), PACKET_COLUMNS)
     recorders = [Recorder(column, sink) for column, sink in zip(columns, sinks, strict=True)]
-    server = Shell(Server(flown, boot_id=1, recorder=recorders[1]), LOOPBACK)
+    server = Shell(
+        Server(flown, boot_id=1, entropy=stream(1, "entropy").bytes, recorder=recorders[1]),
+        LOOPBACK,
+    )
     netem = Shell(Proxy(flown, server=server.address, recorder=recorders[2]), LOOPBACK)
     clients = [
         Shell(

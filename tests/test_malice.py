@@ -66,7 +66,7 @@ def endpoints() -> list[Endpoint]:
     """A server and a client, as they are before any session."""
     plant = FirstOrderPlant(SCENARIO, stream(1, "wind"))
     return [
-        Server(SCENARIO, boot_id=2**40),
+        Server(SCENARIO, boot_id=2**40, entropy=stream(1, "entropy").bytes),
         Client(SCENARIO, plant, server=("server", 0), vehicle=1, boot_id=2**50),
     ]
 
@@ -98,7 +98,7 @@ def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
     """Many vehicles with many lives each: one answer each, no more kept than there is room, and
     each refusal told.
     """
-    server = Server(SCENARIO, boot_id=1)
+    server = Server(SCENARIO, boot_id=1, entropy=stream(1, "entropy").bytes)
     answers = 0
     for boot_id in range(3):
         for vehicle in range(2000):
@@ -113,7 +113,7 @@ def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
 def test_an_answer_is_no_longer_than_its_question() -> None:
     """HELLO and WELCOME: nobody can use the server to flood somebody else tenfold."""
     hello = encode(Hello(1, 2**63, TERMS))
-    server = Server(SCENARIO, boot_id=2**63)
+    server = Server(SCENARIO, boot_id=2**63, entropy=stream(1, "entropy").bytes)
     server.receive(Datagram(hello, STRANGER), now_ns=3 * 10**14)
     ((answer, _, _),) = server.outbox()
     assert len(answer) < 1.5 * len(hello)
@@ -126,7 +126,7 @@ def test_no_observation_in_a_session_stops_the_server(
     step: int, stamp_ns: int, echo_ns: tuple[int, int]
 ) -> None:
     """The largest and the smallest of all numbers, said first, and said again."""
-    server = Server(SCENARIO, boot_id=1)
+    server = Server(SCENARIO, boot_id=1, entropy=stream(1, "entropy").bytes)
     server.receive(Datagram(encode(Hello(1, 2, TERMS)), STRANGER), now_ns=SECOND_NS)
     ((payload, _, _),) = server.outbox()
     welcome = decode(payload, TERMS)

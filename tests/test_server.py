@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from server.endpoint import VEHICLES_MAX, Server
 from server.sessions import SESSION_NS, WELCOME_NS, Sessions
 from shared import config
+from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
 from shared.events import (
@@ -65,7 +66,9 @@ class Vehicles:
         self.dt_ns = flown.dt_ns
         self.sink = io.BytesIO()
         recorder = Recorder(server_columns(flown.model.axes), self.sink)
-        self.server = Server(flown, boot_id=boot_id, room=room, recorder=recorder)
+        self.server = Server(
+            flown, boot_id=boot_id, entropy=stream(1, "entropy").bytes, room=room, recorder=recorder
+        )
         # Ticks lie on multiples of 50 ms: the first comes 30 ms after what is said first.
         self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
         self.epochs_ns: dict[int, int] = {}

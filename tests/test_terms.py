@@ -89,7 +89,7 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
 
 def shake_hands(ours: Scenario, theirs: Scenario) -> tuple[Server, Client]:
     """A server of one scenario and a client of another, after HELLO and WELCOME."""
-    server = Server(ours, boot_id=7)
+    server = Server(ours, boot_id=7, entropy=stream(1, "entropy").bytes)
     plant = FirstOrderPlant(theirs, stream(1, "wind"))
     client = Client(theirs, plant, server=("server", 0), vehicle=1, boot_id=9)
     client.wake(now_ns=0)

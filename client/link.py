@@ -1,0 +1,57 @@
+"""The vehicle's side of the link: how messages become datagrams, and the other way round.
+
+`Plain` sends them as they are. `client.secure` seals them with the vehicle's key.
+"""
+
+from typing import Protocol
+
+
+class Link(Protocol):
+    """Turns messages into datagrams for the server, and its datagrams into messages."""
+
+    secure: bool
+    """Whether what comes out of `open` is known to come from the server."""
+
+    def hello(self, payload: bytes, *, now_ns: int) -> bytes:
+        """Datagram that carries a HELLO."""
+
+    def seal(self, payload: bytes) -> bytes:
+        """Datagram that carries any other message."""
+
+    def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
+        """Message in a datagram; None of one after which HELLO is to be said again at once.
+
+        Raises:
+            ProtocolError: it is not the server's.
+        """
+
+    def adopt(self, *, now_ns: int) -> None:
+        """Seal from now on as the WELCOME that was opened last agrees to."""
+
+    def wants_hello(self, now_ns: int) -> bool:
+        """Whether new keys are due, which a HELLO gets."""
+
+
+class Plain:
+    """Link without keys: anybody may read and write what passes."""
+
+    secure = False
+
+    def hello(self, payload: bytes, *, now_ns: int) -> bytes:  # noqa: ARG002 - as of any `Link`
+        """See `Link`."""
+        return payload
+
+    def seal(self, payload: bytes) -> bytes:
+        """See `Link`."""
+        return payload
+
+    def open(self, datagram: bytes, *, now_ns: int) -> bytes:  # noqa: ARG002
+        """See `Link`."""
+        return datagram
+
+    def adopt(self, *, now_ns: int) -> None:
+        """See `Link`."""
+
+    def wants_hello(self, now_ns: int) -> bool:  # noqa: ARG002
+        """See `Link`."""
+        return False
