@@ -19,6 +19,7 @@ from shared.model import Array, Indices, discretise
 from shared.protocol import (
     NO_HORIZON,
     Hello,
+    Mode,
     Observation,
     Welcome,
     committed_max,
@@ -135,7 +136,8 @@ class Airspace:
             self._sessions, step, self._past[0], strict=True
         ):
             stamps = (stamp_ns, NO_HORIZON, 0, echo_ns, echo_ns + late_ns + AHEAD_NS)
-            observation = Observation(vehicle, session, k, *stamps, x)
+            still = np.zeros(len(x))
+            observation = Observation(vehicle, session, k, *stamps, Mode.TRACK, 1, x, still)
             self.server.receive(Datagram(encode(observation), address), now_ns=now_ns)
 
     def wake(self) -> None:

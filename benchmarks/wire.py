@@ -14,6 +14,7 @@ from shared.protocol import (
     Horizon,
     Idle,
     Message,
+    Mode,
     Observation,
     Welcome,
     decode,
@@ -41,12 +42,13 @@ def messages(terms: Terms) -> list[Message]:
     inputs = rng.uniform(-1.0, 1.0, (terms.axes, terms.horizon)).astype(np.float32)
     state = rng.normal(0.0, 1.0, (terms.axes, 2))
     session, step = 2**31, 5000
+    told = now_ns, now_ns, Mode.TRACK, 1, state, np.zeros(terms.axes)
     return [
         Hello(1, 2**60, terms),
         Welcome(1, session, 2**60, 2**60, now_ns, 0, terms),
-        Observation(1, session, step, now_ns, step - 20, step - 10, now_ns, now_ns, state),
+        Observation(1, session, step, now_ns, step - 20, step - 10, *told),
         Horizon(1, session, step, now_ns, now_ns, inputs),
-        Heartbeat(1, session, now_ns, Idle.PLANS),
+        Heartbeat(1, session, now_ns, Idle.PLANS, 0),
     ]
 
 

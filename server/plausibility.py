@@ -102,8 +102,17 @@ class Plausibility:
             return Verdict.EPOCH
         told = observation
         return _judge(
-            *(self._said, row, told.state, epoch, told.step, told.in_force, told.since),
-            *(F, G, self._H, self._dt_s),
+            self._said,
+            row,
+            told.state,
+            epoch,
+            told.step,
+            told.in_force,
+            told.since,
+            F,
+            G,
+            self._H,
+            self._dt_s,
         )
 
 

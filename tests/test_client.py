@@ -226,7 +226,7 @@ def test_every_observation_echoes_the_newest_word_of_the_server() -> None:
     welcomed_ns = server.now_ns
     (first,) = server.wake()
     server.now_ns += 7_000_000
-    server.say(Heartbeat(4, 7, 4321, 0))
+    server.say(Heartbeat(4, 7, 4321, 0, 0))
     heard_ns = server.now_ns
     (second,) = server.wake()
     assert isinstance(first, Observation)
@@ -286,7 +286,7 @@ def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
     assert len(said) - len(hellos) == 65
     assert len(hellos) == 3
     assert server.client.events()[-1] == ServerSilent(vehicle=4)
-    server.say(Heartbeat(4, 7, 1, 0))
+    server.say(Heartbeat(4, 7, 1, 0, 0))
     assert server.client.events() == (ServerHeard(vehicle=4),)
     (only,) = server.wake()
     assert isinstance(only, Observation)

@@ -499,7 +499,9 @@ def test_a_server_whose_output_nobody_reads_flies_vehicles_and_ends_in_order(
             assert server.wait(PATIENCE_S) == 0
         finally:
             server.kill()
-    assert json.loads(figures.read_text())["vehicles"] == 2
+    counted = json.loads(figures.read_text())
+    assert counted["vehicles"] == 0  # both have said that they end
+    assert counted["counts"]["steps"] > 40
 
 
 def call_as_strangers(port: int, count: int) -> None:

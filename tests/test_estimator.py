@@ -11,7 +11,7 @@ from server.estimator import Estimator
 from server.scheme import Foresight, foresight
 from shared import config
 from shared.model import Array, Indices, discretise
-from shared.protocol import NO_HORIZON, Observation
+from shared.protocol import NO_HORIZON, Mode, Observation
 from shared.stopwatch import Stopwatch
 
 quick = settings(max_examples=60, deadline=None)
@@ -25,7 +25,7 @@ SENT = np.array([True])
 
 def seen(step: int, state: Array) -> Observation:
     """Observation of the one vehicle."""
-    return Observation(1, 1, step, 0, NO_HORIZON, 0, 0, 0, state)
+    return Observation(1, 1, step, 0, NO_HORIZON, 0, 0, 0, Mode.TRACK, 1, state, np.zeros(2))
 
 
 def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:

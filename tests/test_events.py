@@ -14,6 +14,7 @@ import pytest
 from shared.endpoint import EVENTS_MAX, Datagram, Endpoint
 from shared.events import (
     Counted,
+    Degraded,
     Difference,
     Event,
     Fault,
@@ -39,6 +40,7 @@ from shared.events import (
     SessionEnded,
     SessionOpened,
     SessionRefused,
+    Unauthenticated,
     address_text,
 )
 from shell.log import Line, Log, rendered
@@ -60,6 +62,12 @@ SENTENCES = [
         "a mistake in its code, the flight goes on\nTraceback:\nZeroDivisionError",
     ),
     (FlowOpened(flow=2, host="192.0.2.1", port=5), "flow 2 for 192.0.2.1:5"),
+    (
+        Unauthenticated(count=3, host="::1", port=5, reason="forged"),
+        "3 datagrams so far are of no vehicle with a key, the newest from [::1]:5: forged",
+    ),
+    (Degraded(degraded=True), "degraded: it misses ticks"),
+    (Degraded(degraded=False), "it is in time again"),
     (SessionOpened(vehicle=1, host="::1", port=5), "vehicle 1 flies, from [::1]:5"),
     (SessionEnded(vehicle=1), "vehicle 1 is gone"),
     (

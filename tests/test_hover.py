@@ -64,7 +64,7 @@ class Interrupted(Server):
         if not isinstance(message, Horizon):
             return payload
         vehicle, session, _, server_ns, *_ = message
-        return encode(Heartbeat(vehicle, session, server_ns, Idle.PLANS))
+        return encode(Heartbeat(vehicle, session, server_ns, Idle.PLANS, 0))
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Endpoint`."""

@@ -15,9 +15,11 @@ from shared.endpoint import EVENTS_MAX, SECOND_NS, Datagram, Endpoint
 from shared.events import Omitted
 from shared.protocol import (
     FEEDBACK,
+    Close,
     Heartbeat,
     Hello,
     Horizon,
+    Mode,
     Observation,
     Welcome,
     decode,
@@ -37,10 +39,11 @@ def hostile(rng: random.Random) -> Iterator[bytes]:
         encode(message)
         for message in (
             Welcome(1, 7, 5, 3, 10, 0, TERMS),
-            Observation(1, 7, 5, 10, 4, 4, 8, 9, np.zeros((2, 2))),
+            Observation(1, 7, 5, 10, 4, 4, 8, 9, 3, 1, np.zeros((2, 2)), np.zeros(2)),
             Horizon(1, 7, 5, 10, 9, inputs),
             Horizon(1, 7, 5, 10, 9, inputs, np.ones((2, FEEDBACK), np.float32)),
-            Heartbeat(1, 7, 10, 0),
+            Heartbeat(1, 7, 10, 0, 0),
+            Close(1, 7),
         )
     ]
     while True:
@@ -134,7 +137,18 @@ def test_no_observation_in_a_session_stops_the_server(
     server_ns, received_ns = echo_ns
     state = np.full((2, 2), 1e308)
     told = Observation(
-        1, welcome.session, step, stamp_ns, 2**40, 2**40, server_ns, received_ns, state
+        vehicle=1,
+        session=welcome.session,
+        step=step,
+        stamp_ns=stamp_ns,
+        in_force=2**40,
+        since=2**40,
+        server_ns=server_ns,
+        received_ns=received_ns,
+        mode=Mode.TRACK,
+        takes=1,
+        state=state,
+        input=np.array(TERMS.u_max),
     )
     for number in range(10):
         now_ns = SECOND_NS + number * TERMS.dt_ns

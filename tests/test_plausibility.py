@@ -17,7 +17,7 @@ from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS as MS
 from shared.endpoint import SECOND_NS as S
 from shared.endpoint import Datagram
-from shared.protocol import Observation
+from shared.protocol import Mode, Observation
 from shared.summary import summarise
 from sim.flight import Flight, fly
 from sim.world import Clock
@@ -49,7 +49,10 @@ def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
         since=step - 2,
         server_ns=stamp_ns - CLOCK_NS - DELAY_NS,
         received_ns=stamp_ns,
+        mode=Mode.TRACK,
+        takes=1,
         state=x,
+        input=np.zeros(2),
     )
     return told._replace(**changed or {})
 
@@ -89,7 +92,6 @@ ODD: dict[str, tuple[dict[str, Any], Verdict]] = {
     "an echo that came before it was sent": ({"received_ns": 0}, Verdict.CLOCK),
     "a horizon from far ahead": ({"in_force": 105 + H + 1}, Verdict.HORIZON),
     "a horizon of before": ({"in_force": 91}, Verdict.HORIZON),
-    "no horizon any more": ({"in_force": -1}, Verdict.HORIZON),
     "in force since a later step": ({"since": 106}, Verdict.HORIZON),
     "in force since long ago": ({"since": 101}, Verdict.HORIZON),
     "a jump": ({"state": moved(2.0)}, Verdict.JUMP),

@@ -17,11 +17,13 @@ from shared.protocol import (
     NO_HORIZON,
     PAYLOAD_BYTES_MAX,
     TEXT_MAX,
+    Close,
     Heartbeat,
     Hello,
     Horizon,
     Idle,
     Message,
+    Mode,
     Observation,
     ProtocolError,
     Welcome,
@@ -84,7 +86,10 @@ messages: st.SearchStrategy[Message] = st.one_of(
         step,
         stamp,
         stamp,
+        st.sampled_from(Mode),
+        st.integers(0, 1),
         arrays("<f8", (2, 2), elements=st.floats(allow_nan=False, allow_infinity=False)),
+        arrays("<f8", 2, elements=st.floats(-1.8, 1.8)),
     ),
     st.builds(
         Horizon,
@@ -104,7 +109,8 @@ messages: st.SearchStrategy[Message] = st.one_of(
             elements=st.floats(allow_nan=False, allow_infinity=False, width=32),
         ),
     ),
-    st.builds(Heartbeat, u16, u32, stamp, st.sampled_from(Idle)),
+    st.builds(Heartbeat, u16, u32, stamp, st.sampled_from(Idle), st.integers(0, 1)),
+    st.builds(Close, u16, u32),
 )
 
 
@@ -118,7 +124,7 @@ def same(one: Message, other: Message) -> bool:
 
 @given(messages)
 def test_every_message_is_read_as_it_was_written(message: Message) -> None:
-    """Round trip of all five."""
+    """Round trip of all six."""
     assert same(decode(encode(message), TERMS), message)
 
 
@@ -149,9 +155,10 @@ def test_documented_sizes_are_the_real_ones() -> None:
     assert len(encode(committing)) == 355 + 11 * 8
     aboard = np.zeros((2, FEEDBACK), np.float32)
     assert len(encode(committing._replace(feedback=aboard))) == 355 + 11 * 8 + 40
-    observation = Observation(1, session, 500, stamp_ns, 480, 490, stamp_ns, stamp_ns, state)
-    assert len(encode(observation)) == 79
-    assert len(encode(Heartbeat(1, session, stamp_ns, Idle.DELAY))) == 19
+    told = 480, 490, stamp_ns, stamp_ns, Mode.TRACK, 1, state, np.zeros(2)
+    assert len(encode(Observation(1, session, 500, stamp_ns, *told))) == 99
+    assert len(encode(Heartbeat(1, session, stamp_ns, Idle.DELAY, 0))) == 20
+    assert len(encode(Close(1, session))) == 9
 
 
 def test_a_horizon_made_of_bytes_is_the_message() -> None:
@@ -171,9 +178,10 @@ def body(message: Message) -> list[object]:
     return fields
 
 
-OBSERVATION = Observation(1, 7, 5, 10, 4, 5, 8, 9, np.array([[1.0, 2.0], [3.0, 4.0]]))
+STATE = np.array([[1.0, 2.0], [3.0, 4.0]])
+OBSERVATION = Observation(1, 7, 5, 10, 4, 5, 8, 9, Mode.TRACK, 1, STATE, np.array([0.5, -0.5]))
 HORIZON = Horizon(1, 7, 5, 10, 9, np.full((2, 40), 0.5, np.float32))
-HEARTBEAT = Heartbeat(1, 7, 10, Idle.PLANS)
+HEARTBEAT = Heartbeat(1, 7, 10, Idle.PLANS, 0)
 HELLO = Hello(1, 99, TERMS)
 WELCOME = Welcome(1, 7, 99, 98, 10, 0, TERMS)
 
@@ -189,7 +197,7 @@ def terms_with(**wrong: object) -> list[object]:
         (OBSERVATION, 0, 1, "version"),
         (OBSERVATION, 0, True, "version"),
         (OBSERVATION, 1, 0, "type"),
-        (OBSERVATION, 1, 6, "type"),
+        (OBSERVATION, 1, 7, "type"),
         (OBSERVATION, 1, "3", "type"),
         (OBSERVATION, 2, 2**16, "field"),
         (OBSERVATION, 2, True, "field"),
@@ -200,10 +208,16 @@ def terms_with(**wrong: object) -> list[object]:
         (OBSERVATION, 5, 2**63, "field"),
         (OBSERVATION, 6, -2, "field"),
         (OBSERVATION, 7, -1, "field"),
-        (OBSERVATION, 10, b"", "shape"),
-        (OBSERVATION, 10, [1.0, 2.0, 3.0, 4.0], "shape"),
-        (OBSERVATION, 10, np.array([1, 2, 3, math.nan]).tobytes(), "not finite"),
-        (OBSERVATION, 10, np.array([1, 2, 3, math.inf]).tobytes(), "not finite"),
+        (OBSERVATION, 10, len(Mode), "field"),
+        (OBSERVATION, 11, 2, "field"),
+        (OBSERVATION, 11, True, "field"),
+        (OBSERVATION, 12, b"", "shape"),
+        (OBSERVATION, 12, [1.0, 2.0, 3.0, 4.0], "shape"),
+        (OBSERVATION, 12, np.array([1, 2, 3, math.nan]).tobytes(), "not finite"),
+        (OBSERVATION, 12, np.array([1, 2, 3, math.inf]).tobytes(), "not finite"),
+        (OBSERVATION, 13, np.zeros(3).tobytes(), "shape"),
+        (OBSERVATION, 13, np.array([0.0, math.nan]).tobytes(), "not finite"),
+        (OBSERVATION, 13, np.array([1.81, 0.0]).tobytes(), "input out of range"),
         (HORIZON, 7, np.zeros(79, np.float32).tobytes(), "shape"),
         (HORIZON, 7, np.zeros(81, np.float32).tobytes(), "shape"),
         (HORIZON, 7, np.zeros(272, np.float32).tobytes(), "shape"),
@@ -223,6 +237,7 @@ def terms_with(**wrong: object) -> list[object]:
         (HEARTBEAT, 5, -1, "field"),
         (HEARTBEAT, 5, len(Idle), "field"),
         (HEARTBEAT, 5, True, "field"),
+        (HEARTBEAT, 6, 2, "field"),
         (HELLO, 4, terms_with(dt_ns=0.05), "field"),
         (HELLO, 4, terms_with(age_max_s=5), "field"),
         (HELLO, 4, terms_with(horizon=True), "field"),
@@ -261,9 +276,9 @@ def test_a_wrong_field_is_the_peers_mistake(
         (b"\x80", "not a message"),
         (b"\x81\x01\x02", "not msgpack"),
         (msgpack.packb(7), "not a message"),
-        (msgpack.packb([3]), "not a message"),
-        (msgpack.packb([3, 5, 1, 7]), "not a message"),
-        (msgpack.packb([3, 5, 1, 7, 8, 9, 9]), "not a message"),
+        (msgpack.packb([4]), "not a message"),
+        (msgpack.packb([4, 5, 1, 7]), "not a message"),
+        (msgpack.packb([4, 5, 1, 7, 8, 9, 9, 9]), "not a message"),
         (msgpack.packb([[[[[[]]]]]]), "not a message"),
         (b"\xdd\xff\xff\xff\xff", "not msgpack"),
         (b"\x91" * 1200, "not msgpack"),

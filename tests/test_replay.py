@@ -11,10 +11,10 @@ from server.mpc import stationary_gain
 from server.planner import Planner
 from server.replay import Replay
 from server.scheme import Foresight, foresight
-from shared import config
+from shared import config, rule
 from shared.config import Scenario
 from shared.model import Array, Flags, Indices
-from shared.protocol import NO_HORIZON, Horizon, Observation
+from shared.protocol import NO_HORIZON, Horizon, Mode, Observation
 from shared.record import UPLINK
 from shared.summary import summarise
 from sim.flight import Flight, fly, fly_batch
@@ -59,9 +59,37 @@ def make(flown: Scenario) -> Replay:
     return Replay(flown.terms(), flown.control, 1, ClockMap(1, flown.dt_ns))
 
 
-def see(replay: Replay, step: int, state: Array, in_force: int, since: int = 0) -> bool:
-    """An observation comes."""
-    return replay.observe(0, Observation(1, 1, step, 0, in_force, since, 0, 0, state))
+def see(
+    replay: Replay,
+    step: int,
+    state: Array,
+    in_force: int,
+    since: int = 0,
+    flown: Array | None = None,
+    takes: int = 1,
+) -> bool:
+    """An observation comes, of a vehicle that flies by the rule unless it is told what it flies."""
+    u = by_rule(replay, step, in_force) if flown is None else flown
+    told = Mode.TRACK, takes, state, u
+    return replay.observe(0, Observation(1, 1, step, 0, in_force, since, 0, 0, *told))
+
+
+def by_rule(replay: Replay, step: int, in_force: int) -> Array:
+    """Input flown at a step with a horizon that was sent; zero without one, or with another's."""
+    memory, brake = replay._memory, replay._settings.brake
+    bounds = replay._settings.rule["bound"].tolist()
+    for slot in range(min(int(memory.seen["sent"][0]), memory.sent.shape[1])):
+        made_for, _, length, speed = memory.sent[0, slot].tolist()
+        if made_for == in_force:
+            stage = step - made_for
+            told = memory.inputs[0, slot, :, rule.entry(stage, length)].tolist()
+            return np.array(
+                [
+                    rule.flown(stage, length, rule.bounded(u, bound), 0.0, speed, brake, bound)
+                    for u, bound in zip(told, bounds, strict=True)
+                ]
+            )
+    return np.zeros(2)
 
 
 def foresee(replay: Replay, step: int) -> Foresight:
@@ -135,9 +163,9 @@ def test_a_vehicle_without_a_horizon_hovers() -> None:
 
 
 def test_a_horizon_of_an_earlier_life_is_taken_for_flying_on() -> None:
-    """What it told is not known; the velocity is."""
+    """What else it told is not known; the input that is flown is."""
     replay = make(small())
-    see(replay, 50, np.array([[0.0, 1.0], [0.0, -0.5]]), 45)
+    see(replay, 50, np.array([[0.0, 1.0], [0.0, -0.5]]), 45, flown=np.array([1.0, -0.5]))
     seen = foresee(replay, 60)
     np.testing.assert_allclose(seen.estimate[0, :, 1], [1.0, -0.5], atol=1e-12)
     np.testing.assert_allclose(seen.estimate[0, :, 0], [1.0, -0.5], atol=1e-12)
@@ -178,12 +206,44 @@ def test_many_horizons_are_kept_and_no_more() -> None:
         for step, inputs in enumerate(sent):
             see(replay, max(step - 1, 0), np.zeros((2, 2)), NO_HORIZON)
             send(replay, step, inputs)
-        see(replay, 40, np.full((2, 2), 0.5), in_force)
+        known = 40 - in_force < 16
+        still = None if known else np.full(2, 0.5)
+        see(replay, 40, np.full((2, 2), 0.5), in_force, flown=still)
         return foresee(replay, 40).committed[0, :, 0].tolist()
 
     assert told(36) == np.float32(sent[36][:, 4]).tolist()
     assert told(31) == np.float32(sent[31][:, 9]).tolist()
     assert told(23) == [0.5, 0.5]
+
+
+def test_what_is_flown_is_believed_and_not_what_the_rule_says() -> None:
+    """A limit of the vehicle's own holds for the step that it tells of; then the rule goes on."""
+    flown = small(observer_s=0.0)
+    (inputs,), x = plans(5, 2 * H), np.array([[1.0, 0.2], [-1.0, 0.1]])
+    replay, own = make(flown), np.array([0.3, -0.2])
+    send(replay, 100, inputs)
+    see(replay, 102, x, 100, flown=own)
+    seen = foresee(replay, 104)
+    x = flown.terms().model.step(x, own)
+    x = flown.terms().model.step(x, np.float64(np.float32(inputs[:, 3])))
+    np.testing.assert_allclose(seen.estimate[0], x, rtol=0, atol=1e-12)
+
+
+def test_a_vehicle_that_takes_no_horizon_brakes_and_stands_still() -> None:
+    """What is under way to it comes to nothing, until it says that it takes them again."""
+    flown = small(observer_s=0.0)
+    old, new = plans(6, 2 * H, BOUND + H)
+    replay, x = make(flown), np.array([[1.0, 0.6], [-1.0, 0.0]])
+    send(replay, 100, old)
+    send(replay, 103, new)
+    see(replay, 104, x, NO_HORIZON, flown=np.array([0.6, 0.0]), takes=0)
+    seen = foresee(replay, 104)
+    braked = [0.6, 0.4, 0.2, 0.0]  # 2 m/s² in steps of 0.1 s
+    np.testing.assert_allclose(seen.committed[0, 0, :BOUND], braked, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(seen.held[0], 0.0, rtol=0, atol=1e-12)
+    see(replay, 105, x, NO_HORIZON, flown=np.zeros(2))
+    seen = foresee(replay, 105)
+    np.testing.assert_array_equal(seen.committed[0, :, 2], np.float32(new[:, 4]))
 
 
 # -- feedback aboard, by hand --------------------------------------------------------------------

@@ -14,7 +14,7 @@ from server.scheme import Foresight, foresight
 from shared import rule
 from shared.config import Scenario, check
 from shared.model import Array
-from shared.protocol import NO_HORIZON, Horizon, Observation
+from shared.protocol import NO_HORIZON, Horizon, Mode, Observation
 from shared.rule import bounded, entry, flown, lasting, late_max, led_back
 
 quick = settings(max_examples=200, deadline=None)
@@ -208,7 +208,10 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
 
     x, states, inputs = rng.normal(size=(2, 2)), [], []
     arriving = {begin: (make_horizon(rng, FIRST, first, x, gain), begin - observed)}
-    replay.observe(0, Observation(1, 1, begin - observed, 0, NO_HORIZON, 0, 0, 0, x))
+    replay.observe(
+        0,
+        Observation(1, 1, begin - observed, 0, NO_HORIZON, 0, 0, 0, Mode.READY, 1, x, np.zeros(2)),
+    )
     send(replay, arriving[begin][0])
     for step in range(begin, now + BOUND + H):
         last_seen = int(replay.observed_step[0])
@@ -219,11 +222,12 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
         if step in arriving:
             horizon, last_seen = arriving[step]
             vehicle.offer(horizon, step, last_seen)
-        if step in {begin, seen}:
-            replay.observe(0, Observation(1, 1, step, 0, FIRST, begin, 0, 0, x))
-            foresee(replay, step)
         states.append(x)
         inputs.append(vehicle.choose(step, x))
+        if step in {begin, seen}:
+            told = Mode.TRACK, 1, x, inputs[-1]
+            replay.observe(0, Observation(1, 1, step, 0, FIRST, begin, 0, 0, *told))
+            foresee(replay, step)
         x = terms.model.step(x, inputs[-1])
 
     found = foresee(replay, now)

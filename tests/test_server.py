@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.endpoint import VEHICLES_MAX, Server
+from server.gate import Plain
 from server.sessions import SESSION_NS, WELCOME_NS, Sessions
 from shared import config
 from shared.chance import stream
@@ -35,6 +36,7 @@ from shared.protocol import (
     Horizon,
     Idle,
     Message,
+    Mode,
     Observation,
     ProtocolError,
     Welcome,
@@ -44,6 +46,7 @@ from shared.protocol import (
 from shared.record import Recorder, Rows, parse, server_columns
 
 HERE: Address = ("vehicle", 1)
+LINE = Plain().open(Datagram(b"", ("", 0)), now_ns=0).line
 SILENCE_NS = 1500 * MILLISECOND_NS
 """Time after which another life of a vehicle may take its number, in all of these tests."""
 DAY_NS = 86_400 * SECOND_NS
@@ -116,7 +119,10 @@ class Vehicles:
             since=0,
             server_ns=stamp_ns - DAY_NS,
             received_ns=stamp_ns,
+            mode=Mode.TRACK,
+            takes=1,
             state=np.array(state),
+            input=np.zeros(2),
         )
         assert self.say(observation, sender) == []
 
@@ -438,7 +444,7 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
     moves: list[tuple[str, int, int]],
 ) -> None:
     """Any vehicles, lives and waits: never more than there is room for, and never a crash."""
-    sessions, now_ns = Sessions(3, 1, SILENCE_NS), DAY_NS
+    sessions, now_ns = Sessions(3, stream(1, "entropy").bytes, SILENCE_NS), DAY_NS
     terms = scenario().terms()
     numbers: dict[tuple[int, int], int] = {}
     due: dict[int, tuple[int, int]] = {}
@@ -448,13 +454,12 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
             case "hello":
                 hello = Hello(vehicle, boot_id, terms)
                 if sessions.holder(hello, now_ns) is None and not sessions.is_full(hello, now_ns):
-                    session = sessions.welcome(hello, HERE, now_ns)
+                    session = sessions.welcome(hello, HERE, LINE, now_ns)
                     numbers[vehicle, boot_id] = session.number
                     due[vehicle] = (boot_id, now_ns + WELCOME_NS)
             case "observe" if (vehicle, boot_id) in numbers:
-                said = Observation(
-                    vehicle, numbers[vehicle, boot_id], 0, 0, -1, 0, 0, 0, np.zeros((2, 2))
-                )
+                told = 0, 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
+                said = Observation(vehicle, numbers[vehicle, boot_id], *told)
                 granted, refused = due.get(vehicle, (-1, 0)), ""
                 try:
                     (sessions.find(said) or sessions.begin(said, now_ns)).heard_ns = now_ns
