@@ -95,8 +95,8 @@ class Failsafe:
         timeout_ns: time of silence after which the link is lost, and without a newer horizon after
             which the vehicle coasts [ns].
         land_after_ns: time of hovering with a lost link after which it lands [ns].
-        changed: called whenever mode or reason have changed, with the mode before, the cause, and
-            the time.
+        changed: called whenever mode or reason have changed, with those before, the cause, and the
+            time.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Failsafe:
         armed: bool,
         timeout_ns: int,
         land_after_ns: int,
-        changed: Callable[[Mode, Reason, int], None],
+        changed: Callable[[Mode, Reason, Reason, int], None],
     ) -> None:
         self._table = table
         self._armed = armed
@@ -215,7 +215,7 @@ class Failsafe:
         # Standing still is no reason of its own: what it braked for stays.
         self.mode, self.reason = after, self.reason if cause is Reason.STILL else cause
         if (self.mode, self.reason) != before:
-            self._changed(before[0], cause, now_ns)
+            self._changed(*before, cause, now_ns)
 
 
 def _full(times_ns: deque[int], now_ns: int) -> bool:

@@ -385,15 +385,19 @@ class Client(Endpoint):
             failsafe.reason,
         )
 
-    def _mode_changed(self, before: Mode, cause: Reason, now_ns: int) -> None:
-        """Do and say what goes with another mode or reason."""
+    def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
+        """Do and say what goes with another mode or reason.
+
+        That it coasts for a while is not said: where an event sends a horizon, that is as usual.
+        """
         if cause in DROPPING:
             self._compensator.drop(self._step - 1, self._input)
         if cause in (Reason.CLOSED, Reason.RESYNC):
             self._in_session = False
-        reason = self._failsafe.reason
-        why = self._why_no_plan(now_ns) if reason in (Reason.OLD, Reason.ENDED) else str(reason)
-        after = str(self._failsafe.mode)
+        if Reason.OLD in (was, cause) and self._failsafe.mode in (Mode.TRACK, Mode.COAST):
+            return
+        reason, after = self._failsafe.reason, str(self._failsafe.mode)
+        why = self._why_no_plan(now_ns) if reason is Reason.ENDED else str(reason)
         changed = ModeChanged(vehicle=self.vehicle, before=str(before), after=after, reason=why)
         self._events.append(changed)
 

@@ -234,7 +234,10 @@ class Flying(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ModeChanged(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle does something else from now on, or the same for another reason."""
+    """A vehicle does something else from now on, or the same for another reason.
+
+    That it coasts along a plan that still lasts is not told.
+    """
 
     before: str
     """Name of the mode that it was in, see `shared.protocol.Mode`."""
@@ -251,13 +254,13 @@ DOES = {
     "sync": "waits for a good link",
     "ready": "waits for a plan",
     "track": "flies a plan",
-    "coast": "flies on along its plan",
+    "coast": "holds its last input, as vehicle.exhausted says",
     "brake": "brakes",
     "hover": "hovers",
     "land": "lands, and is not to be flown before somebody has seen to it",
     "fault": "stands still, and is not to be flown before somebody has seen to it",
 }
-"""What a vehicle does in each mode."""
+"""What a vehicle does in each mode, as far as it is told: along a plan it coasts in silence."""
 
 
 class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
