@@ -132,6 +132,9 @@ class Client(Endpoint):
         """Step that comes next."""
         self._flown = 0
         """Step at whose start the plant's state is."""
+        self._takes_from: int | None = None
+        """Step of the first observation that said that horizons are flown; None while they are
+        not."""
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._covered = 0
@@ -198,15 +201,19 @@ class Client(Endpoint):
             raise
 
     def _offer(self, horizon: Horizon, now_ns: int) -> None:
-        """Hold a horizon from now on, if it is the newest and may be flown."""
+        """Hold a horizon from now on, if it is the newest and may be flown.
+
+        One that was planned when the vehicle had not yet said that it would fly it begins where the
+        vehicle is not: the server reckoned with none.
+        """
         H = self._terms.horizon
         if horizon.step > self._compensator.newest:
             passed = self._step - horizon.step - (horizon.inputs.shape[1] - H)
             self._failsafe.horizon_arrived(late=passed > LATE_SHARE * H, now_ns=now_ns)
-        if not self._failsafe.takes:
+        observed = self._step_at(horizon.observed_ns)
+        if self._takes_from is None or 0 <= observed < self._takes_from:
             raise ProtocolError("not taken")
         try:
-            observed = self._step_at(horizon.observed_ns)
             is_held = self._compensator.offer(horizon, self._step, observed)
         except ProtocolError as error:
             if error.reason in IMPOSSIBLE:
@@ -321,6 +328,10 @@ class Client(Endpoint):
         self._failsafe.step(late_ns=late_ns, now_ns=now_ns)
         state, stamp_ns = self._plant.state(), epoch_ns + present * self._dt_ns
         self._input = self._choose(state, now_ns)
+        if not self._failsafe.takes:
+            self._takes_from = None
+        elif self._takes_from is None:
+            self._takes_from = present
         self._step = present + 1
         self._note_end(now_ns)
         self._report(state, stamp_ns)
@@ -390,6 +401,8 @@ class Client(Endpoint):
 
         That it coasts for a while is not said: where an event sends a horizon, that is as usual.
         """
+        if not self._failsafe.takes:
+            self._takes_from = None
         if cause in DROPPING:
             self._compensator.drop(self._step - 1, self._input)
         if cause in (Reason.CLOSED, Reason.RESYNC):
