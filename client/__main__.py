@@ -17,8 +17,11 @@ import msgspec
 import tyro
 
 from client.fleet import Fleet
+from client.link import Link, Plain
 from client.plant import FirstOrderPlant
+from client.secure import Secure
 from client.vehicle import Client
+from shared import keys
 from shared.chance import stream
 from shared.config import Scenario
 from shared.events import NoSession, SessionRefused
@@ -43,6 +46,14 @@ class Options:
     """Whether plans may be flown at all; --no-arm for a vehicle that is to stay where it is."""
     vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of vehicles to fly in this process, numbered from --id on."""
+    keys: Path | None = None
+    """File with the vehicle's key, made by `skytether keygen`. Without it the link is plaintext,
+    which is refused where another machine is the server."""
+    key_id: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Number of the key to use, of a vehicle that has two; the highest unless given."""
+    insecure: bool = False
+    """Do without keys even where the server is another machine: anybody on the way can fly the
+    vehicle."""
     log: LogFormat = "text"
     """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
@@ -68,6 +79,13 @@ def fly(argv: Sequence[str]) -> None:
         given = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else numbers[0]
         raise CommandError(f"--id: got {given}, expected 0 to 65535", 2)
     command.check_sockets("--vehicles", len(numbers))
+    keyring = keys.load(options.keys) if options.keys else None
+
+    def link(number: int) -> Link:
+        if keyring is None:
+            return Plain()
+        return Secure(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
+
     columns = client_columns(scenario.model.axes)
     with (
         command.recorded(options.record, columns)
@@ -82,6 +100,7 @@ def fly(argv: Sequence[str]) -> None:
                 vehicle=number,
                 boot_id=secrets.randbits(64),
                 armed=options.arm,
+                link=link(number),
                 recorder=recording.recorder,
             )
             for number in numbers
@@ -94,12 +113,14 @@ def fly(argv: Sequence[str]) -> None:
             bind=None,
             peers=[server],
             waiting_for=f"the server at {options.server}",
+            secure=keyring is not None,
+            insecure=options.insecure,
             log=options.log,
             json=None if alone else options.json,
             recording=recording,
         )
         if alone and len(rows := recording.rows()):
-            summary = summarise(scenario, options.scenario, rows)
+            summary = summarise(scenario, options.scenario, rows, secure=keyring is not None)
             title = "client, as far as it is recorded" if recording.fault() else "client"
             if options.log == "text":
                 command.finish(summary, title, options.json)

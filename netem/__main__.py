@@ -67,6 +67,7 @@ def emulate(argv: Sequence[str]) -> None:
             bind=bind,
             peers=[server],
             waiting_for=f"clients of {options.server}",
+            secure=None,
             log=options.log,
             json=options.json,
             recording=recording,

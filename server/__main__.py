@@ -19,6 +19,9 @@ from typing import Annotated
 import tyro
 
 from server.endpoint import VEHICLES_MAX, Server
+from server.gate import Plain
+from server.secure import Secure
+from shared import keys
 from shared.config import Scenario
 from shared.endpoint import Address
 from shared.record import server_columns
@@ -50,6 +53,11 @@ class Options:
     writes files of its own, numbered, as in RECORD.1."""
     json: Path | None = None
     """File for what was counted, and the CPU time it took."""
+    keys: Path | None = None
+    """File of the keys of all vehicles that may fly, made by `skytether keygen`. Without it the
+    link is plaintext, which is refused where other machines can reach it."""
+    insecure: bool = False
+    """Do without keys even where other machines can reach it: anybody there can fly the vehicles."""
     config: ScenarioFlags = Scenario()
 
 
@@ -85,6 +93,9 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
     def own(path: Path | None) -> Path | None:
         return path and path.with_name(path.name + suffix)
 
+    # Each worker knows sessions of its own.
+    keyring = keys.load(options.keys) if options.keys else None
+    gate = Secure(keyring, entropy=secrets.token_bytes) if keyring else Plain()
     record, columns = own(options.record), server_columns(options.config.model.axes)
     stopwatch = Stopwatch(time.perf_counter_ns)
     with command.recorded(record, columns) if record else nullcontext() as recording:
@@ -92,6 +103,7 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
             options.config,
             boot_id=secrets.randbits(64),
             entropy=secrets.token_bytes,
+            gate=gate,
             room=options.vehicles,
             recorder=recording.recorder if recording else None,
             stopwatch=stopwatch,
@@ -101,6 +113,8 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
             endpoint,
             bind=bind,
             waiting_for="vehicles",
+            secure=gate.secure,
+            insecure=options.insecure,
             log=options.log,
             json=own(options.json),
             stopwatch=stopwatch,

@@ -40,10 +40,14 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process talks to, or can be reached by, other machines than its own."""
+    """A process has no keys: what it hears may be anybody's, and anybody may read what it says."""
+
+    local: bool
+    """Whether no other machine can reach it, nor be reached."""
 
     def __str__(self) -> str:
-        return "plaintext and unauthenticated: only for a network that you trust"
+        who = "on this machine" if self.local else "on the network"
+        return f"PLAINTEXT, no keys: anybody {who} can fly the vehicle; see skytether keygen"
 
 
 class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -220,9 +224,14 @@ class NoAnswer(VehicleEvent, frozen=True, kw_only=True):
     port: int
     waited_s: float
     """Time since its first HELLO [s]."""
+    secure: bool = False
+    """Whether it has a key, so that an answer counts only of those who know it."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
+        if self.secure:
+            said = f"nobody who knows this key answers at {address} in {self.waited_s:.0f} s"
+            return f"vehicle {self.vehicle}: {said}"
         return f"vehicle {self.vehicle}: no answer from {address} in {self.waited_s:.0f} s"
 
 

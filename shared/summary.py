@@ -68,6 +68,8 @@ def summarise(
     client: Rows,
     server: Rows | None = None,
     netem: Rows | None = None,
+    *,
+    secure: bool = False,
 ) -> Summary:
     """The summary of one vehicle's flight.
 
@@ -76,6 +78,7 @@ def summarise(
         client: its rows, of one vehicle.
         server: rows of the server, of any vehicles.
         netem: rows of netem; all flows count.
+        secure: whether the link was sealed.
     """
     error = position_error(scenario, client)
     settled = error[client["step"] * scenario.control.dt >= scenario.settle]
@@ -121,6 +124,7 @@ def summarise(
         solve_ms_p50=_quantile(solve_ms, 0.5),
         solve_ms_p99=_quantile(solve_ms, 0.99),
         deadline_misses=missed,
+        secure=secure,
     )
 
 

@@ -31,7 +31,7 @@ from rich.text import Text
 from shared import config
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint
-from shared.events import Counted, Listening, Plaintext
+from shared.events import Counted, Listening, Plaintext, address_text
 from shared.stopwatch import Stopwatch
 from shared.summary import Summary
 from shell.driver import Shell, run
@@ -222,6 +222,8 @@ def drive(
     bind: Address | socket | None,
     peers: Sequence[Address] = (),
     waiting_for: str,
+    secure: bool | None,
+    insecure: bool = False,
     log: LogFormat,
     json: Path | None = None,
     stopwatch: Stopwatch | None = None,
@@ -234,24 +236,31 @@ def drive(
         endpoint: what to run.
         bind, peers, stopwatch: see `Shell`.
         waiting_for: whose datagrams it waits for, for the operator.
+        secure: whether it has keys; None of one that only passes on what others say.
+        insecure: whether it may do without keys even where other machines are reached.
         log: form of its log on stdout.
         json: file for its last figures.
         recording: where it records; waited for at the end.
 
     Raises:
-        CommandError: it cannot start, or the file cannot be written.
+        CommandError: it cannot start, must not without keys, or the file cannot be written.
     """
     try:
         shell = Shell(endpoint, bind, peers, stopwatch)
     except AddressError as error:
         raise CommandError(str(error)) from None
+    if secure is False and not (shell.is_local or insecure):
+        at = ", ".join(address_text(*peer) for peer in peers) or address_text(*shell.address)
+        expected = "expected --keys FILE (see skytether keygen), or --insecure"
+        said = f"{at} is not on this machine alone, and there are no keys: {expected}"
+        raise CommandError(said, CONFIGURATION)
     began_s = time.process_time()
 
     def start() -> None:
         host, port = shell.address
         out.say(Listening(host=host, port=port, waiting_for=waiting_for))
-        if not shell.is_local:
-            out.say(Plaintext())
+        if secure is False:
+            out.say(Plaintext(local=shell.is_local))
 
     def figures() -> dict[str, Any]:
         return endpoint.figures() | {
@@ -431,6 +440,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ("downlink packets, bytes", _values("d", s.downlink_packets, s.downlink_bytes)),
         ("lost, reordered packets", _values("d", s.lost, s.reordered)),
         ("stale packets", _values("d", s.stale)),
+        ("link", "sealed" if s.secure else "plaintext"),
         ("age p50, p99 [ms]", _values(".0f", s.age_ms_p50, s.age_ms_p99)),
         ("solve p50, p99 [ms]", _values(".2f", s.solve_ms_p50, s.solve_ms_p99)),
         ("deadline misses", _values("d", s.deadline_misses)),

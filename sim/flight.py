@@ -19,14 +19,19 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from client import secure as client_secure
+from client.link import Link
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
+from server import secure as server_secure
 from server.endpoint import Server
+from shared import keys
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, seconds_to_ns
 from shared.events import Event, Failure, RecordIncomplete, VehicleEvent
+from shared.keys import Keyring
 from shared.record import (
     PACKET_COLUMNS,
     Recorder,
@@ -87,6 +92,7 @@ def fly(
     scenario: Scenario,
     *,
     vehicles: int = 1,
+    secure: bool = False,
     stopwatch: Stopwatch | None = None,
     on_second: Callable[[int], None] = lambda _: None,
     stopped: Callable[[], bool] = lambda: False,
@@ -100,11 +106,13 @@ def fly(
         scenario: what to fly.
         vehicles: number of vehicles, numbered from 1, all with the same plan and winds of their
             own.
+        secure: whether the link is sealed, with keys from the seed.
         stopwatch: measures the server; what it measures differs from flight to flight.
         on_second: called with the time flown [s], once a second of it.
         stopped: asked often; once it says so, the flight is broken off.
     """
-    (flight,) = _fly(scenario, (scenario.seed,), on_second, stopped, vehicles, stopwatch)
+    keyring = make_keys(scenario.seed, vehicles) if secure else None
+    (flight,) = _fly(scenario, (scenario.seed,), on_second, stopped, vehicles, stopwatch, keyring)
     return flight
 
 
@@ -141,10 +149,17 @@ class Run:
         server: the server of all runs.
         number: number of the run, from 0; its vehicles' numbers follow those of the runs before.
         vehicles: number of its vehicles.
+        keyring: their keys, where the link is sealed.
     """
 
     def __init__(
-        self, world: World, scenario: Scenario, server: Server, number: int, vehicles: int
+        self,
+        world: World,
+        scenario: Scenario,
+        server: Server,
+        number: int,
+        vehicles: int,
+        keyring: Keyring | None,
     ) -> None:
         self._server = server
         self._before = number * vehicles
@@ -173,6 +188,7 @@ class Run:
                 server=netem_at,
                 vehicle=self._before + vehicle,
                 boot_id=BOOT_ID,
+                link=_link(keyring, scenario.seed, self._before + vehicle),
                 recorder=recorder,
             )
             for vehicle in range(1, vehicles + 1)
@@ -225,6 +241,19 @@ class Run:
         return Flight(client, server, netem, failure, figures, tuple(self._events))
 
 
+def make_keys(seed: int, vehicles: int) -> Keyring:
+    """A key for each of the vehicles from 1 on, the same for the same seed."""
+    entropy = stream(seed, "keys").bytes
+    lines = [keys.write(vehicle, 1, entropy(keys.SECRET_BYTES)) for vehicle in range(1, vehicles + 1)]
+    return keys.parse("keys", "".join(lines).encode())
+
+
+def _link(keyring: Keyring | None, seed: int, vehicle: int) -> Link | None:
+    if keyring is None:
+        return None
+    return client_secure.Secure(keyring.of(vehicle), entropy=stream(seed, "entropy", vehicle).bytes)
+
+
 def _fly(
     scenario: Scenario,
     seeds: Sequence[int],
@@ -232,6 +261,7 @@ def _fly(
     stopped: Callable[[], bool],
     vehicles: int = 1,
     stopwatch: Stopwatch | None = None,
+    keyring: Keyring | None = None,
 ) -> list[Flight]:
     def on_event(time_ns: int, host: str, event: Event) -> None:
         if host == SERVER[0]:
@@ -244,16 +274,18 @@ def _fly(
             run_of[host].hear(time_ns, host, event)
 
     world, sink = World(on_event), io.BytesIO()
+    entropy = stream(scenario.seed, "entropy").bytes
     server = Server(
         scenario,
         boot_id=BOOT_ID,
-        entropy=stream(scenario.seed, "entropy").bytes,
+        entropy=entropy,
+        gate=server_secure.Secure(keyring, entropy=entropy) if keyring else None,
         room=len(seeds) * vehicles,
         recorder=Recorder(server_columns(scenario.model.axes), sink),
         stopwatch=stopwatch,
     )
     runs = [
-        Run(world, msgspec.structs.replace(scenario, seed=seed), server, number, vehicles)
+        Run(world, msgspec.structs.replace(scenario, seed=seed), server, number, vehicles, keyring)
         for number, seed in enumerate(seeds)
     ]
     run_of = {host: run for run in runs for host in run.hosts}

@@ -29,7 +29,7 @@ from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
 from skytether import processes
 
-STAGES = ("receive", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
+STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
 """Stages of the server's work, in their order; `record`, the price of watching, is left out."""
 
 
@@ -43,6 +43,8 @@ class Options:
     """Number of vehicles."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of the server's processes, which share the vehicles."""
+    secure: bool = False
+    """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
     virtual: bool = False
     """Fly in virtual time: everything in this process, as fast as it can."""
     json: Path | None = None
@@ -63,6 +65,8 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Time flown by the vehicle that flew longest [s]."""
     steps: int
     """Steps flown by all vehicles."""
+    secure: bool
+    """Whether the link was authenticated and encrypted."""
     server_steps: int
     """Steps that the server has planned for."""
     event_ratio: float
@@ -158,6 +162,7 @@ def _virtually(
     flown = flight.fly(
         options.config,
         vehicles=options.vehicles,
+        secure=options.secure,
         stopwatch=Stopwatch(time.perf_counter_ns),
         on_second=on_second,
         stopped=interrupted,
@@ -187,6 +192,7 @@ def _really(
             vehicles=options.vehicles,
             workers=options.workers,
             watched=False,
+            secure=options.secure,
         )
         incomplete = [each for each in shortfalls if not isinstance(each, NotFlown)]
         if incomplete:
@@ -256,6 +262,7 @@ def _summarise(options: Options, flown: Flown) -> FleetSummary:
         workers=len(servers),
         duration_s=duration_s,
         steps=len(client),
+        secure=options.secure,
         server_steps=steps,
         event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
         rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
@@ -287,6 +294,7 @@ def _show(summary: FleetSummary, title: str) -> None:
         ("vehicles, server's workers", f"{s.vehicles}, {s.workers}"),
         ("steps flown, planned for", f"{s.steps}, {s.server_steps} in {s.duration_s:g} s"),
         ("RMSE xy min, median, max [m]", s.rmse_xy and ", ".join(f"{x:.4f}" for x in s.rmse_xy)),
+        ("link", "sealed" if s.secure else "plaintext"),
         ("event ratio", f"{s.event_ratio:.3f}"),
         (
             "uplink, downlink packets/s",

@@ -30,6 +30,8 @@ class Options:
 
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    secure: bool = False
+    """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
     json: Path | None = None
@@ -58,7 +60,7 @@ def fly(argv: Sequence[str]) -> None:
         command.interruptible() as interrupted,
         command.progress(f"flying {title}", scenario.duration) as on_second,
     ):
-        flown = (_virtually if options.virtual else _really)(scenario, on_second, interrupted)
+        flown = (_virtually if options.virtual else _really)(options, on_second, interrupted)
     if flown.failure and not len(flown.client):
         raise CommandError(str(flown.failure))
     if flown.incomplete:
@@ -73,7 +75,8 @@ def fly(argv: Sequence[str]) -> None:
         other_title = f"{options.beside}, in virtual time, seed {beside.seed}"
         flights[other_title] = beside, other
         command.finish(_summarise(beside, str(options.beside), other), other_title)
-    command.finish(_summarise(scenario, options.scenario, flown), title, options.json)
+    summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
+    command.finish(summary, title, options.json)
     if options.figure:
         figures.flights(options.figure, flights)
     if missing := _missing(scenario, flown):
@@ -92,23 +95,32 @@ def _beside(options: Options) -> Scenario | None:
         raise CommandError(str(error), command.CONFIGURATION) from None
 
 
-def _summarise(scenario: Scenario, name: str, flown: flight.Flight) -> Summary:
-    return summarise(scenario, name, flown.client, flown.server, flown.netem)
+def _summarise(
+    scenario: Scenario, name: str, flown: flight.Flight, *, secure: bool = False
+) -> Summary:
+    return summarise(scenario, name, flown.client, flown.server, flown.netem, secure=secure)
 
 
 def _virtually(
-    scenario: Scenario, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+    options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
 ) -> flight.Flight:
-    return flight.fly(scenario, on_second=on_second, stopped=interrupted)
+    return flight.fly(
+        options.config, secure=options.secure, on_second=on_second, stopped=interrupted
+    )
 
 
 def _really(
-    scenario: Scenario, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+    options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
 ) -> flight.Flight:
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
-        parts = Path(folder)
+        parts, scenario = Path(folder), options.config
         shortfalls = processes.run(
-            scenario, parts, on_second=on_second, interrupted=interrupted, on_event=_tell
+            scenario,
+            parts,
+            on_second=on_second,
+            interrupted=interrupted,
+            on_event=_tell,
+            secure=options.secure,
         )
         axes = scenario.model.axes
         return flight.Flight(

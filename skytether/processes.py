@@ -32,6 +32,7 @@ from shared.events import (
 from shell.command import INTERRUPTED, CommandError
 from shell.log import Line
 from shell.workers import die_with_parent
+from skytether import keygen
 
 NAMES = ("client", "server", "netem")
 """Names of the processes, and of their parts of the record."""
@@ -176,6 +177,7 @@ def run(
     vehicles: int = 1,
     workers: int = 1,
     watched: bool = True,
+    secure: bool = False,
 ) -> list[Shortfall]:
     """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
 
@@ -191,6 +193,7 @@ def run(
         vehicles: number of vehicles, all in one process.
         workers: number of processes of the server.
         watched: whether server and netem record, too.
+        secure: whether the link is sealed, with keys that are made for this flight.
 
     Raises:
         CommandError: one of the processes failed, the folder cannot be written to, or it was
@@ -201,6 +204,9 @@ def run(
         file.write_bytes(to_toml(scenario))
     except OSError as error:
         raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
+    if secure:
+        keygen.make(parts / "keys", range(1, vehicles + 1))
+    keys = ["--keys", str(parts / "keys")] if secure else []
     shortfalls: list[Shortfall] = []
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
 
@@ -209,9 +215,9 @@ def run(
         return [name, str(file), "--json", str(parts / f"{name}.json"), *part]
 
     fleet = ["--vehicles", str(vehicles)]
-    server = [*common("server", recorded=watched), *fleet, "--workers", str(workers)]
+    server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]
     netem = [*common("netem", recorded=watched), "--flows", str(vehicles)]
-    client = [*common("client", recorded=True), *fleet]
+    client = [*common("client", recorded=True), *fleet, *keys]
 
     def hear(event: Event) -> None:
         if isinstance(event, Shortfall):

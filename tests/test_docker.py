@@ -12,6 +12,7 @@ import re
 import secrets
 import shlex
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ import msgspec
 import pytest
 
 from shared import config
+from shared.record import read
 from shared.summary import Summary
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(900)]
@@ -45,7 +47,7 @@ HOVER_M = 1.58
 
 def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
     """From `up` to the summary, with the doors that ought to be locked tried on the way."""
-    with containers(compose, FLIGHT_S) as three:
+    with containers(compose, FLIGHT_S) as three, three.capture() as captured:
         three.flies()
         for service in SERVICES:
             three.check_privileges(service)
@@ -54,6 +56,7 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
         copied = ("diff", "-r", "/opt/skytether/kernels", "/tmp/kernels")
         assert three.inside("server", *copied) == (0, "")
         say("locked in: not root, read-only, no capabilities, no way round netem")
+        three.check_key()
 
         summary = three.land(tmp_path)
         assert summary.scenario == "demo"
@@ -61,6 +64,8 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
         assert summary.rmse_xy is not None
         assert 0 < summary.rmse_xy < 0.5 * HOVER_M
         assert summary.deadline_misses < 0.1 * summary.steps
+        assert summary.secure
+        check_capture(captured, tmp_path / "client")
 
         # As they are, even if somebody has built the image anew meanwhile.
         three.compose("up", "--detach", "--no-recreate")
@@ -250,6 +255,35 @@ class Containers:
 
     # -- the locks ---------------------------------------------------------------------------
 
+    @contextlib.contextmanager
+    def capture(self) -> Iterator[Path]:
+        """File of every UDP payload that netem hears and sends meanwhile, on both networks."""
+        script = (ROOT / "tests" / "sniff.py").read_text()
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "capture.pcap"
+            argv = ["docker", "run", "--rm", "--network", f"container:{self.id('netem')}"]
+            argv += ["--user=0", "--cap-add=NET_RAW", "--entrypoint=python", "skytether"]
+            with (
+                file.open("wb") as out,
+                subprocess.Popen([*argv, "-c", script], stdout=out) as sniffer,
+            ):
+                try:
+                    yield file
+                finally:
+                    sniffer.terminate()
+                    sniffer.wait(30.0)
+
+    def check_key(self) -> None:
+        """The key is one file that only its owner can read, the same for both ends."""
+        shown = [self.inside(each, "cat", "/keys/vehicle-1") for each in ("server", "client")]
+        assert shown[0] == shown[1]
+        assert shown[0][0] == 0
+        assert self.inside("server", "stat", "-c", "%a", "/keys/vehicle-1") == (0, "600\n")
+        assert self.inside("server", "touch", "/keys/another")[0] != 0
+        assert self.inside("netem", "ls", "/keys/vehicle-1")[0] != 0
+        secret = shown[0][1].split()[-1]
+        assert all(secret not in self.said(each) for each in ("server", "client", "netem"))
+
     def check_privileges(self, service: str) -> None:
         """As Docker was told, and as the process finds it."""
         host = self.inspect(service)["HostConfig"]
@@ -302,6 +336,7 @@ class Containers:
         """Exit code and output of another client, where the client is."""
         argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}", "skytether"]
         argv += ["client", "demo", "--id=2", "--link.connect-s=2", f"--server={host}:47001"]
+        argv += ["--insecure"]
         return attempt(*argv)
 
 
@@ -336,6 +371,18 @@ def compose() -> list[str]:
     size = run("docker", "image", "inspect", "--format", "{{.Size}}", "skytether")
     say(f"the image has {int(size) / 1e6:.0f} MB")
     return command
+
+
+def check_capture(capture: Path, part: Path) -> None:
+    """No position or velocity that was flown stands in what went over the networks."""
+    payloads, rows = capture.read_bytes(), read(part)
+    assert len(payloads) > 100 * len(rows)  # an OBSERVATION a step, before netem and behind
+    states = {number.tobytes() for number in rows["state"].ravel()}
+    states = {state for state in states if len(set(state)) > 5}  # 0 and 2.0 stand everywhere
+    assert len(states) > len(rows)
+    found = [state for state in states if state in payloads]
+    assert not found
+    say(f"{len(payloads)} B captured; none of {len(states)} numbers of the state is in them")
 
 
 def works(*command: str) -> bool:

@@ -1,0 +1,137 @@
+"""The vehicle's side of a secured link: handshakes with the server, and the channels they give.
+
+A handshake is one attempt, with one ephemeral key: it is said again, with the newest cookie, until
+the WELCOME that it brings is adopted, or for ATTEMPT_NS. What answers no open attempt is dropped,
+so that nobody can open a channel a second time, whose counters would begin anew.
+"""
+
+from collections.abc import Callable
+
+from shared import channel, handshake
+from shared.channel import Channel, kind
+from shared.endpoint import SECOND_NS
+from shared.handshake import (
+    NO_COOKIE,
+    pad,
+    prologue,
+    read_challenge,
+    read_response,
+    write_initiation,
+)
+from shared.keys import Key
+from shared.noise import KEY_BYTES, Initiator, NoiseError
+from shared.protocol import ProtocolError
+
+ATTEMPT_NS = 60 * SECOND_NS
+"""Time for which an attempt is said again before another one is begun [ns]."""
+
+
+class _Attempt:
+    """A handshake that was not adopted yet."""
+
+    def __init__(self, noise: Initiator, hello: bytes, began_ns: int) -> None:
+        self.noise = noise
+        self.hello = hello
+        """Message that it carries."""
+        self.began_ns = began_ns
+        self.cookies: set[bytes] = set()
+        """Cookies that it was given: the server makes one a minute for each address."""
+
+
+class Secure:
+    """Link that only the holder of the vehicle's key can read or write.
+
+    Args:
+        key: key of the vehicle.
+        entropy: gives so many bytes that nobody else can know.
+    """
+
+    secure = True
+
+    def __init__(self, key: Key, *, entropy: Callable[[int], bytes]) -> None:
+        self._key = key
+        self._entropy = entropy
+        self._cookie = NO_COOKIE
+        """Newest cookie, also from earlier attempts."""
+        self._attempt: _Attempt | None = None
+        self._candidate: Channel | None = None
+        """Channel of the WELCOME that was opened last."""
+        self._current: Channel | None = None
+        self._previous: Channel | None = None
+
+    def hello(self, payload: bytes, *, now_ns: int) -> bytes:
+        """Datagram that carries a HELLO; one of a new attempt where the message is another."""
+        attempt = self._attempt
+        if attempt is None or attempt.hello != payload or now_ns - attempt.began_ns > ATTEMPT_NS:
+            key, private = self._key, self._entropy(KEY_BYTES)
+            noise = Initiator(key.psk, prologue(key), private, pad(payload))
+            self._attempt = attempt = _Attempt(noise, payload, now_ns)
+            self._candidate = None
+        return write_initiation(self._key, self._cookie, attempt.noise.message)
+
+    def seal(self, payload: bytes) -> bytes:
+        """Datagram that carries any other message; a WELCOME must have been adopted."""
+        assert self._current is not None
+        return self._current.seal(payload)
+
+    def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
+        """Message in a datagram; None of a CHALLENGE, after which HELLO is to be said at once.
+
+        Raises:
+            ProtocolError: it is not the server's, has come before, or answers nothing.
+        """
+        match kind(datagram):
+            case channel.DATA:
+                return self._data(datagram, now_ns)
+            case handshake.RESPONSE:
+                return self._response(datagram, now_ns)
+            case handshake.CHALLENGE:
+                self._challenge(datagram)
+                return None
+        raise ProtocolError("not for a client")
+
+    def adopt(self, *, now_ns: int) -> None:
+        """Seal in the channel of the WELCOME that was opened last, and close the attempt."""
+        assert self._candidate is not None
+        if self._current is not None:
+            self._current.retire(now_ns=now_ns)
+        self._previous, self._current = self._current, self._candidate
+        self._attempt = self._candidate = None
+
+    def wants_hello(self, now_ns: int) -> bool:
+        """Whether the channel is to be replaced; not where there is none."""
+        return self._current is not None and self._current.wants_successor(now_ns)
+
+    def _data(self, packet: bytes, now_ns: int) -> bytes:
+        _, number = channel.address(packet)
+        for each in (self._current, self._previous):
+            if each is not None and each.number == number:
+                return each.open(packet, now_ns=now_ns).payload
+        raise ProtocolError("unknown channel")
+
+    def _challenge(self, packet: bytes) -> None:
+        """Take the cookie of a CHALLENGE; one that is repeated must draw no HELLO."""
+        attempt = self._asked()
+        cookie = read_challenge(self._key, packet, attempt.noise.public)
+        if cookie in attempt.cookies:
+            raise ProtocolError("replayed")
+        attempt.cookies.add(cookie)
+        self._cookie = cookie
+
+    def _response(self, packet: bytes, now_ns: int) -> bytes:
+        """WELCOME of a RESPONSE, whose channel may be adopted."""
+        attempt = self._asked()
+        number, message = read_response(self._key, packet, attempt.noise.public)
+        try:
+            welcome, keys = attempt.noise.open(message)
+        except NoiseError:
+            raise ProtocolError("forged") from None
+        self._candidate = Channel(
+            self._key.vehicle, number, seal=keys.forth, open_=keys.back, born_ns=now_ns
+        )
+        return welcome
+
+    def _asked(self) -> _Attempt:
+        if self._attempt is None:
+            raise ProtocolError("unasked")
+        return self._attempt

@@ -1,0 +1,218 @@
+"""The server's side of secured links: who has a key, and which channel is whose.
+
+A HELLO is answered in two steps. Without a cookie of this server for the sender's address it draws
+a CHALLENGE that brings one, and nothing is kept. With it, it draws a RESPONSE with the WELCOME, and
+the channel that comes with it is pending until the vehicle's first packet in it: only then does it
+replace the live one. So a HELLO that somebody has recorded and repeats ends no flight.
+"""
+
+import hashlib
+import hmac
+from collections import deque
+from collections.abc import Callable
+
+from server.gate import Call
+from shared import channel, handshake
+from shared.channel import Channel, kind
+from shared.endpoint import SECOND_NS, Address, Datagram
+from shared.handshake import (
+    CHANNEL,
+    COOKIE_BYTES,
+    prologue,
+    read_initiation,
+    unpad,
+    write_challenge,
+    write_response,
+)
+from shared.keys import Key, Keyring
+from shared.noise import KEY_BYTES, NoiseError, Responder
+from shared.protocol import ProtocolError
+
+COOKIE_NS = 60 * SECOND_NS
+"""Time for which cookies are alike; each is good for this time and the next [ns]."""
+HANDSHAKES = 5
+"""Number of handshakes of a vehicle in a second."""
+PENDING_MAX = 16
+"""Number of pending channels of a vehicle. A HELLO that is repeated once a second gets as many
+within a round trip of so many seconds, and the vehicle uses the first of them that it hears of."""
+CHALLENGES_MAX = 1024
+"""Number of challenges that wait to be sent; older ones give way."""
+
+
+class _Vehicle:
+    """What is kept of one vehicle."""
+
+    __slots__ = ("handshakes_ns", "live", "pending", "previous")
+
+    def __init__(self, now_ns: int) -> None:
+        self.handshakes_ns = now_ns - SECOND_NS
+        """Time up to which handshakes have been granted, each a share of a second [ns]."""
+        self.live: Channel | None = None
+        """Channel that the vehicle sends in."""
+        self.previous: Channel | None = None
+        """Channel that it has sent in before."""
+        self.pending: dict[int, Channel] = {}
+        """Channels by number that it may send in next, the oldest first."""
+
+    def find(self, number: int) -> Channel | None:
+        """Channel with a number."""
+        for each in (self.live, self.previous):
+            if each is not None and each.number == number:
+                return each
+        return self.pending.get(number)
+
+    def grant(self, now_ns: int) -> bool:
+        """Whether one more handshake is granted."""
+        begun_ns = max(self.handshakes_ns, now_ns - SECOND_NS)
+        if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
+            return False
+        self.handshakes_ns = begun_ns + SECOND_NS // HANDSHAKES
+        return True
+
+    def add(self, opened: Channel) -> None:
+        """Keep a channel as pending; the oldest gives way where there are too many."""
+        self.pending[opened.number] = opened
+        if len(self.pending) > PENDING_MAX:
+            del self.pending[next(iter(self.pending))]
+
+    def promote(self, pending: Channel, now_ns: int) -> None:
+        """Make a pending channel the live one; those that were pending before it go."""
+        for number in list(self.pending):
+            del self.pending[number]
+            if number == pending.number:
+                break
+        if self.live is not None:
+            self.live.retire(now_ns=now_ns)
+        self.previous, self.live = self.live, pending
+
+
+class _Answer:
+    """Line of a HELLO: its answer brings a channel."""
+
+    def __init__(self, gate: "Secure", key: Key, noise: Responder, now_ns: int) -> None:
+        self._gate = gate
+        self._noise = noise
+        self._now_ns = now_ns
+        self.key = key
+        self.channel: Channel | None = None
+        """Channel that the answer has brought; each answer has another."""
+
+    def seal(self, payload: bytes) -> bytes:
+        """Datagram that carries a WELCOME.
+
+        Raises:
+            ProtocolError: no secret can be agreed upon with the vehicle's ephemeral key.
+        """
+        gate, vehicle = self._gate, self.key.vehicle
+        try:
+            message, keys = self._noise.answer(gate.entropy(KEY_BYTES), payload)
+        except NoiseError:
+            raise ProtocolError("forged") from None
+        number = gate.number(vehicle)
+        self.channel = Channel(
+            vehicle, number, seal=keys.back, open_=keys.forth, born_ns=self._now_ns
+        )
+        return write_response(self.key, number, message, self._noise.public)
+
+
+class Secure:
+    """Gate that only vehicles with a key pass.
+
+    Args:
+        keyring: keys of all vehicles that may come.
+        entropy: gives so many bytes that nobody else can know.
+    """
+
+    secure = True
+
+    def __init__(self, keyring: Keyring, *, entropy: Callable[[int], bytes]) -> None:
+        self._keyring = keyring
+        self.entropy = entropy
+        self._secret = entropy(hashlib.blake2s.MAX_KEY_SIZE)
+        """What cookies are made of in this life of the server."""
+        self._vehicles: dict[int, _Vehicle] = {}
+        """Vehicles that have a key and have come back with a cookie."""
+        self._challenges: deque[Datagram] = deque(maxlen=CHALLENGES_MAX)
+
+    def open(self, datagram: Datagram, *, now_ns: int) -> Call | None:
+        """Message in a datagram; None of an INITIATION that draws a CHALLENGE.
+
+        Raises:
+            ProtocolError: no vehicle that has a key made it, or it has come before or too late.
+        """
+        match kind(datagram.payload):
+            case channel.DATA:
+                return self._data(datagram.payload, now_ns)
+            case handshake.INITIATION:
+                return self._initiation(datagram, now_ns)
+        raise ProtocolError("not for a server")
+
+    def admit(self, call: Call, *, now_ns: int) -> None:  # noqa: ARG002 - as of any `Gate`
+        """Keep the channel that came with the answer to the HELLO in this call as pending."""
+        answer = call.line
+        assert isinstance(answer, _Answer)
+        assert answer.channel is not None
+        self._vehicles[answer.key.vehicle].add(answer.channel)
+
+    def outbox(self) -> list[Datagram]:
+        """Challenges to be sent; each is handed out once."""
+        challenges = list(self._challenges)
+        self._challenges.clear()
+        return challenges
+
+    def number(self, vehicle: int) -> int:
+        """Number for a new channel of a vehicle, which nobody can guess."""
+        known = self._vehicles[vehicle]
+        while True:
+            (number,) = CHANNEL.unpack(self.entropy(CHANNEL.size))
+            if known.find(number) is None:
+                return int(number)
+
+    def _data(self, packet: bytes, now_ns: int) -> Call:
+        vehicle, number = channel.address(packet)
+        known = self._vehicles.get(vehicle)
+        used = None if known is None else known.find(number)
+        if known is None or used is None:
+            raise ProtocolError("unknown channel")
+        payload, newest = used.open(packet, now_ns=now_ns)
+        if number in known.pending:
+            known.promote(used, now_ns)
+        return Call(payload, vehicle, used, moves=newest and used is known.live)
+
+    def _initiation(self, datagram: Datagram, now_ns: int) -> Call | None:
+        """Call of a HELLO with a cookie; without one it draws a CHALLENGE."""
+        packet, peer = datagram.payload, datagram.peer
+        vehicle, number = handshake.address(packet)
+        key = self._keyring.find(vehicle, number)
+        if key is None:
+            raise ProtocolError("unknown key")
+        cookie, message = read_initiation(key, packet)
+        if not self._is_valid(cookie, peer, now_ns):
+            fresh = self._cookie(peer, now_ns // COOKIE_NS)
+            challenge = write_challenge(key, fresh, message[:KEY_BYTES])
+            self._challenges.append(Datagram(challenge, peer))
+            return None
+        known = self._vehicles.get(vehicle)
+        if known is None:
+            known = self._vehicles[vehicle] = _Vehicle(now_ns)
+        if not known.grant(now_ns):
+            raise ProtocolError("too many handshakes")
+        try:
+            noise = Responder(key.psk, prologue(key), message)
+        except NoiseError:
+            raise ProtocolError("forged") from None
+        answer = _Answer(self, key, noise, now_ns)
+        return Call(unpad(noise.payload), vehicle, answer, moves=False)
+
+    def _is_valid(self, cookie: bytes, peer: Address, now_ns: int) -> bool:
+        """Whether a cookie is this server's, for the sender, of this time or the last."""
+        time = now_ns // COOKIE_NS
+        return any(
+            hmac.compare_digest(cookie, self._cookie(peer, each)) for each in (time, time - 1)
+        )
+
+    def _cookie(self, peer: Address, time: int) -> bytes:
+        """Cookie for an address in the given one of the times of COOKIE_NS."""
+        host, port = peer
+        told = f"{host} {port} {time}".encode()
+        return hashlib.blake2s(told, key=self._secret, digest_size=COOKIE_BYTES).digest()

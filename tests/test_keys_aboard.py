@@ -1,0 +1,197 @@
+"""Keys as a user meets them: real processes, sealed packets, and one line for what is wrong."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from shared import config
+from shared.events import Listening, Plaintext, Unauthenticated
+from shared.protocol import Hello, encode
+from shell.log import Line
+
+PATIENCE_S = 60.0
+QUICK = [
+    *("--network.uplink.delay", "none", "--network.downlink.delay", "none", "--settle", "0"),
+    *("--network.uplink.loss", "0", "--network.downlink.loss", "0"),
+]
+"""A network that does nothing."""
+SECRET = "6f" * 32
+
+
+def skytether_(*argv: str) -> subprocess.CompletedProcess[str]:
+    """One command to its end."""
+    command = [sys.executable, "-P", "-m", "skytether", *argv]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+
+class Server:
+    """A server process, and its events."""
+
+    def __init__(self, *argv: str) -> None:
+        command = [sys.executable, "-P", "-m", "server", "demo", "--bind", "127.0.0.1:0"]
+        self.popen = subprocess.Popen([*command, "--log", "json", *argv], stdout=subprocess.PIPE)
+        self.events: list[object] = []
+        self._listens = threading.Event()
+        self.port = 0
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+        assert self._listens.wait(PATIENCE_S)
+
+    def _read(self) -> None:
+        assert self.popen.stdout is not None
+        for line in self.popen.stdout:
+            event = msgspec.json.decode(line, type=Line).event
+            self.events.append(event)
+            if isinstance(event, Listening):
+                self.port = event.port
+                self._listens.set()
+
+    def end(self) -> list[object]:
+        """All its events, once it has ended in order."""
+        self.popen.send_signal(signal.SIGTERM)
+        assert self.popen.wait(PATIENCE_S) == 0
+        self._reader.join()
+        return self.events
+
+    def address(self) -> str:
+        """Where it listens, as a client is told."""
+        return f"127.0.0.1:{self.port}"
+
+
+@contextmanager
+def serving(*argv: str) -> Iterator[Server]:
+    """A server, which does not outlive the block."""
+    server = Server(*argv)
+    try:
+        yield server
+    finally:
+        server.popen.kill()
+        server.popen.wait()
+
+
+def key_file(folder: Path, secret: str = SECRET, *, mode: int = 0o600, name: str = "keys") -> Path:
+    """A file with the key of vehicle 1."""
+    path = folder / name
+    path.write_text(f"1 1 {secret}\n")
+    path.chmod(mode)
+    return path
+
+
+def test_a_flight_is_sealed_from_end_to_end(tmp_path: Path) -> None:
+    """`fly --secure` makes keys, flies by them over UDP, and says so."""
+    file = tmp_path / "summary.json"
+    ended = skytether_("fly", "--secure", "--duration", "4", "--json", str(file), *QUICK)
+    assert ended.returncode == 0, ended.stderr
+    summary = json.loads(file.read_text())
+    assert summary["secure"] is True
+    assert summary["covered"] > 0.3
+    assert "sealed" in ended.stdout
+
+
+def test_a_wrong_key_is_one_line_at_each_end(tmp_path: Path) -> None:
+    """The server says that it hears a stranger; the vehicle, that nobody knows its key."""
+    ours = key_file(tmp_path)
+    other = key_file(tmp_path, "70" * 32, name="other")
+    with serving("--keys", str(ours)) as server:
+        ended = skytether_(
+            *("client", "demo", "--server", server.address(), "--keys", str(other)),
+            *("--link.connect-s", "1"),
+        )
+        events = server.end()
+    assert ended.returncode == 1
+    (line,) = ended.stderr.splitlines()
+    assert "vehicle 1: nobody who knows this key answers at 127.0.0.1:" in line
+    (told,) = [event for event in events if isinstance(event, Unauthenticated)]
+    assert told.reason == "forged"
+    assert not any(isinstance(event, Plaintext) for event in events)
+
+
+def test_a_server_with_keys_answers_nothing_in_plaintext(tmp_path: Path) -> None:
+    """Neither a HELLO nor a byte of noise."""
+    with serving("--keys", str(key_file(tmp_path))) as server:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.settimeout(0.5)
+            hello = encode(Hello(1, 1, config.load("demo").terms()))
+            for payload in (hello, b"\0", os.urandom(512)):
+                stranger.sendto(payload, ("127.0.0.1", server.port))
+            with pytest.raises(TimeoutError):
+                stranger.recv(2048)
+        server.end()
+
+
+def test_plaintext_is_said_loudly() -> None:
+    """Also where only this machine can be reached."""
+    with serving() as server:
+        (told,) = [event for event in server.end() if isinstance(event, Plaintext)]
+    assert told.local
+    assert str(told).startswith("PLAINTEXT, no keys: anybody on this machine can fly the vehicle")
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ("server", "demo", "--bind", "0.0.0.0:0"),
+        ("client", "demo", "--server", "192.0.2.1:47000"),
+    ],
+    ids=["server", "client"],
+)
+def test_without_keys_no_other_machine_is_spoken_to(argv: tuple[str, ...]) -> None:
+    """Unless it is asked for by name."""
+    ended = skytether_(*argv)
+    assert ended.returncode == 2
+    (line,) = ended.stderr.splitlines()
+    assert line.endswith("expected --keys FILE (see skytether keygen), or --insecure")
+    if argv[0] == "client":
+        ended = skytether_(*argv, "--insecure", "--link.connect-s", "0.2")
+        assert ended.returncode == 1
+        assert "on the network can fly the vehicle" in ended.stdout
+
+
+BAD_FILES = {
+    "missing": (None, 0o600, "No such file or directory"),
+    "short": ("6f" * 31, 0o600, "64 hexadecimal digits"),
+    "long": ("6f" * 33, 0o600, "64 hexadecimal digits"),
+    "world-readable": (SECRET, 0o644, "600"),
+    "group-writable": (SECRET, 0o620, "600"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+@pytest.mark.parametrize("process", ["server", "client"])
+def test_a_bad_key_file_is_one_line(name: str, process: str, tmp_path: Path) -> None:
+    """It names the file and what was expected, and never the secret."""
+    secret, mode, said = BAD_FILES[name]
+    file = tmp_path / "keys" if secret is None else key_file(tmp_path, secret, mode=mode)
+    ended = skytether_(process, "demo", "--keys", str(file))
+    assert ended.returncode == 2
+    (line,) = ended.stderr.splitlines()
+    assert str(file) in line
+    assert said in line
+    assert "6f6f" not in line
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--key-id", "9"), "no key 9 of vehicle 1, expected 1"),
+        (("--id", "7"), "no key of vehicle 7, expected one"),
+    ],
+)
+def test_a_key_that_is_not_there_is_one_line(
+    more: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    """Neither a number of a key nor a vehicle that the file does not have."""
+    ended = skytether_("client", "demo", "--keys", str(key_file(tmp_path)), *more)
+    assert ended.returncode == 2
+    (line,) = ended.stderr.splitlines()
+    assert said in line
