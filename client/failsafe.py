@@ -37,6 +37,8 @@ BROKEN = frozenset(
 """Causes after which the link has to be good for `GOOD_NS` anew, in every mode."""
 LOCKING = BROKEN | {Reason.LATE}
 """Causes of braking after which no horizon is taken before the vehicle hovers on a good link."""
+CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
+"""Causes that end the session: another WELCOME is needed."""
 DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE}
 """Causes for which the horizon held is dropped."""
 
@@ -60,7 +62,7 @@ TABLE: Table = MappingProxyType(
         (Mode.HOVER, Reason.GOOD): Mode.HOVER,
         (Mode.HOVER, Reason.ALONE): Mode.LAND,
     }
-    | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN}
+    | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
     | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
     | {(Mode.TRACK, cause): Mode.BRAKE for cause in _TO_BRAKE}
     | {(Mode.COAST, cause): Mode.BRAKE for cause in _TO_BRAKE}
@@ -83,7 +85,7 @@ HOLD: Table = MappingProxyType(
     }
     | _FAULTS
 )
-"""The same with `vehicle.exhausted = "hold"`: it never brakes, hovers or lands of its own accord."""
+"""Next mode with `vehicle.exhausted = "hold"`: never does the vehicle brake or land by itself."""
 
 
 class Failsafe:
@@ -117,8 +119,8 @@ class Failsafe:
         """What the vehicle does."""
         self.reason = Reason.BEGUN
         """Newest cause that it met; what it braked for, while it hovers."""
-        self._heard_ns = 0
-        """Time of the newest packet of the session."""
+        self._heard_ns: int | None = None
+        """Time of the newest packet of the session; None without a session."""
         self._good_ns = 0
         """Time since which the link has been good, as far as it is."""
         self._horizon_ns = 0
@@ -139,8 +141,8 @@ class Failsafe:
         return may and self._armed and self.reason not in LOCKING
 
     def is_lost(self, now_ns: int) -> bool:
-        """Whether nothing of the session has come for the time-out."""
-        return now_ns - self._heard_ns > self._timeout_ns
+        """Whether nothing of the session has come for the time-out, or there is no session."""
+        return self._heard_ns is None or now_ns - self._heard_ns > self._timeout_ns
 
     # -- what arrives ------------------------------------------------------------------------
 
@@ -211,6 +213,8 @@ class Failsafe:
             return
         if cause in LOCKING or cause is Reason.OPENED:
             self._good_ns = now_ns
+        if cause in CLOSING:
+            self._heard_ns = None
         before = self.mode, self.reason
         # Standing still is no reason of its own: what it braked for stays.
         self.mode, self.reason = after, self.reason if cause is Reason.STILL else cause

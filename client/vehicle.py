@@ -14,7 +14,7 @@ import numpy as np
 
 from client.clamp import clamped
 from client.compensator import Compensator
-from client.failsafe import DROPPING, HOLD, LATE_SHARE, TABLE, Failsafe
+from client.failsafe import CLOSING, DROPPING, HOLD, LATE_SHARE, TABLE, Failsafe
 from client.link import Link, Plain
 from client.plant import Plant
 from shared.config import Scenario
@@ -248,7 +248,7 @@ class Client(Endpoint):
 
     def _note_refusal(self, refusal: int, now_ns: int) -> None:
         """Note why there is no session, and say it once; a refusal that comes late is none."""
-        if not self._calls(now_ns) or refusal not in (FULL, TAKEN):
+        if not self._failsafe.is_lost(now_ns) or refusal not in (FULL, TAKEN):
             return
         host, port = self._server
         reason: Literal["full", "taken"] = "full" if refusal == FULL else "taken"
@@ -266,10 +266,6 @@ class Client(Endpoint):
         self._check_session(message)
         self._failsafe.heard(now_ns=now_ns)
         self._echo = (message.server_ns, now_ns)
-
-    def _calls(self, now_ns: int) -> bool:
-        """Whether the vehicle asks for a session: it has none, or nobody is heard."""
-        return not self._in_session or self._failsafe.is_lost(now_ns)
 
     def _step_at(self, stamp_ns: int) -> int:
         """Step of one of the vehicle's own stamps, or -1 where it is none."""
@@ -311,7 +307,7 @@ class Client(Endpoint):
             return
         else:
             self._fly(now_ns, self._epoch_ns)
-        wanted = self._calls(now_ns) or self._link.wants_hello(now_ns)
+        wanted = self._failsafe.is_lost(now_ns) or self._link.wants_hello(now_ns)
         if wanted and now_ns >= self._hello_ns:
             self._hello_ns = now_ns + HELLO_NS
             hello = encode(Hello(self.vehicle, self._boot_id, self._terms))
@@ -405,7 +401,7 @@ class Client(Endpoint):
             self._takes_from = None
         if cause in DROPPING:
             self._compensator.drop(self._step - 1, self._input)
-        if cause in (Reason.CLOSED, Reason.RESYNC):
+        if cause in CLOSING:
             self._in_session = False
         if Reason.OLD in (was, cause) and self._failsafe.mode in (Mode.TRACK, Mode.COAST):
             return
