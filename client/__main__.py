@@ -26,6 +26,7 @@ from shared.chance import stream
 from shared.config import Scenario
 from shared.events import NoSession, SessionRefused
 from shared.record import client_columns
+from shared.steady import Steady
 from shared.summary import summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -109,7 +110,7 @@ def fly(argv: Sequence[str]) -> None:
         endpoint = clients[0] if alone else Fleet(clients)
         command.drive(
             "client",
-            endpoint,
+            Steady(endpoint),
             bind=None,
             peers=[server],
             waiting_for=f"the server at {options.server}",

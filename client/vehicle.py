@@ -279,7 +279,15 @@ class Client(Endpoint):
             self.failure = self._refusal
             return
         host, port = self._server
-        self._fail(NoAnswer(vehicle=self.vehicle, host=host, port=port, waited_s=waited_s, secure=self._link.secure))
+        self._fail(
+            NoAnswer(
+                vehicle=self.vehicle,
+                host=host,
+                port=port,
+                waited_s=waited_s,
+                secure=self._link.secure,
+            )
+        )
 
     def _fail(self, failure: Failure) -> None:
         self.failure = failure

@@ -3,6 +3,10 @@
 Clients send to netem's bound socket. Each client address is a flow with a socket of its own towards
 the server, so that the server's answers find their way back. Uplink is server to client, downlink
 is client to server, as in the paper.
+
+A flow that the server has answered keeps its place while it is used. Where no place is free, any
+other gives way to a new client at once, the one first whose last packet is oldest: what strangers
+send takes no place from those who fly, and none for long from those who come.
 """
 
 from collections import OrderedDict
@@ -20,7 +24,7 @@ FLOWS_MAX = 512
 """Most clients at once, unless another number is asked for; packets of others are dropped and
 counted."""
 IDLE_NS = 60 * SECOND_NS
-"""Time without a packet after which a flow gives its place and its socket to a new client."""
+"""Time without a packet after which a flow that was answered gives way to a new client [ns]."""
 
 
 @dataclass(slots=True)
@@ -34,6 +38,8 @@ class Flow:
     downlink: Lane
     used_ns: int
     """Time of its newest packet, either way."""
+    order: "OrderedDict[Address, Flow]"
+    """Flows among which it stands, answered or unanswered, by client, oldest packet first."""
 
 
 class Proxy(Endpoint):
@@ -61,8 +67,10 @@ class Proxy(Endpoint):
         mtu = scenario.network.mtu
         self.uplink = Link(UPLINK, mtu, recorder)
         self.downlink = Link(DOWNLINK, mtu, recorder)
-        self._by_client: OrderedDict[Address, Flow] = OrderedDict()
-        """Flows by client, the one that has been idle longest first."""
+        self._answered: OrderedDict[Address, Flow] = OrderedDict()
+        """Flows through which a packet of the server's has come, by client, oldest packet first."""
+        self._unanswered: OrderedDict[Address, Flow] = OrderedDict()
+        """All other flows, likewise."""
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
         self.refused = 0
@@ -72,7 +80,8 @@ class Proxy(Endpoint):
         """Take a packet that enters the network."""
         payload, peer, socket = datagram
         if socket == 0:
-            flow = self._by_client.get(peer) or self._open(peer, now_ns)
+            flow = self._answered.get(peer) or self._unanswered.get(peer)
+            flow = flow or self._open(peer, now_ns)
             if flow is None:
                 self.refused += 1
                 return
@@ -84,8 +93,11 @@ class Proxy(Endpoint):
                 self.refused += 1
                 return
             self.uplink.take(Datagram(payload, flow.client), flow.uplink, now_ns=now_ns)
+            if flow.order is self._unanswered:
+                flow.order = self._answered
+                self._answered[flow.client] = self._unanswered.pop(flow.client)
         flow.used_ns = now_ns
-        self._by_client.move_to_end(flow.client)
+        flow.order.move_to_end(flow.client)
         self._forward(now_ns)
 
     def wake(self, *, now_ns: int) -> None:
@@ -108,11 +120,11 @@ class Proxy(Endpoint):
     def _open(self, client: Address, now_ns: int) -> Flow | None:
         socket = len(self._by_socket) + 1
         if socket > self._flows_max:
-            idle = next(iter(self._by_client.values()))
-            if now_ns - idle.used_ns < IDLE_NS:
+            oldest = self._oldest(now_ns)
+            if oldest is None:
                 return None
-            del self._by_client[idle.client]
-            socket = idle.socket
+            del oldest.order[oldest.client]
+            socket = oldest.socket
         number = self._opened
         self._opened += 1
         network, seed = self._scenario.network, self._scenario.seed
@@ -122,11 +134,22 @@ class Proxy(Endpoint):
             Lane(number, fates(network.uplink, seed, "uplink", number)),
             Lane(number, fates(network.downlink, seed, "downlink", number)),
             now_ns,
+            self._unanswered,
         )
-        self._by_client[client] = self._by_socket[socket] = flow
+        self._unanswered[client] = self._by_socket[socket] = flow
         host, port = client
         self._events.append(FlowOpened(flow=number, host=host, port=port))
         return flow
+
+    def _oldest(self, now_ns: int) -> Flow | None:
+        """Flow that gives way to a new client, if one does."""
+        unanswered = next(iter(self._unanswered.values()), None)
+        answered = next(iter(self._answered.values()), None)
+        if answered is None or now_ns - answered.used_ns < IDLE_NS:
+            return unanswered
+        if unanswered is None or answered.used_ns < unanswered.used_ns:
+            return answered
+        return unanswered
 
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""

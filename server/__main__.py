@@ -25,6 +25,7 @@ from shared import keys
 from shared.config import Scenario
 from shared.endpoint import Address
 from shared.record import server_columns
+from shared.steady import Steady
 from shared.stopwatch import Stopwatch
 from shell import command, workers
 from shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -57,7 +58,7 @@ class Options:
     """File of the keys of all vehicles that may fly, made by `skytether keygen`. Without it the
     link is plaintext, which is refused where other machines can reach it."""
     insecure: bool = False
-    """Do without keys even where other machines can reach it: anybody there can fly the vehicles."""
+    """Do without keys even where other machines can reach it: anybody there can fly vehicles."""
     config: ScenarioFlags = Scenario()
 
 
@@ -110,7 +111,7 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
         )
         command.drive(
             f"server{suffix}",
-            endpoint,
+            Steady(endpoint),
             bind=bind,
             waiting_for="vehicles",
             secure=gate.secure,

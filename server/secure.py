@@ -10,6 +10,7 @@ import hashlib
 import hmac
 from collections import deque
 from collections.abc import Callable
+from typing import NamedTuple
 
 from server.gate import Call
 from shared import channel, handshake
@@ -39,10 +40,18 @@ CHALLENGES_MAX = 1024
 """Number of challenges that wait to be sent; older ones give way."""
 
 
+class _Pending(NamedTuple):
+    """Channel that no packet has come in."""
+
+    channel: Channel
+    public: bytes
+    """Ephemeral key of the attempt that it came from."""
+
+
 class _Vehicle:
     """What is kept of one vehicle."""
 
-    __slots__ = ("handshakes_ns", "live", "pending", "previous")
+    __slots__ = ("done", "handshakes_ns", "live", "pending", "previous")
 
     def __init__(self, now_ns: int) -> None:
         self.handshakes_ns = now_ns - SECOND_NS
@@ -51,15 +60,18 @@ class _Vehicle:
         """Channel that the vehicle sends in."""
         self.previous: Channel | None = None
         """Channel that it has sent in before."""
-        self.pending: dict[int, Channel] = {}
+        self.pending: dict[int, _Pending] = {}
         """Channels by number that it may send in next, the oldest first."""
+        self.done = b""
+        """Ephemeral key of the attempt that has brought the live channel."""
 
     def find(self, number: int) -> Channel | None:
         """Channel with a number."""
         for each in (self.live, self.previous):
             if each is not None and each.number == number:
                 return each
-        return self.pending.get(number)
+        pending = self.pending.get(number)
+        return None if pending is None else pending.channel
 
     def grant(self, now_ns: int) -> bool:
         """Whether one more handshake is granted."""
@@ -69,21 +81,22 @@ class _Vehicle:
         self.handshakes_ns = begun_ns + SECOND_NS // HANDSHAKES
         return True
 
-    def add(self, opened: Channel) -> None:
+    def add(self, channel: Channel, public: bytes) -> None:
         """Keep a channel as pending; the oldest gives way where there are too many."""
-        self.pending[opened.number] = opened
+        self.pending[channel.number] = _Pending(channel, public)
         if len(self.pending) > PENDING_MAX:
             del self.pending[next(iter(self.pending))]
 
-    def promote(self, pending: Channel, now_ns: int) -> None:
+    def promote(self, number: int, now_ns: int) -> None:
         """Make a pending channel the live one; those that were pending before it go."""
-        for number in list(self.pending):
-            del self.pending[number]
-            if number == pending.number:
+        channel, self.done = self.pending[number]
+        for each in list(self.pending):
+            del self.pending[each]
+            if each == number:
                 break
         if self.live is not None:
             self.live.retire(now_ns=now_ns)
-        self.previous, self.live = self.live, pending
+        self.previous, self.live = self.live, channel
 
 
 class _Answer:
@@ -92,6 +105,7 @@ class _Answer:
     def __init__(self, gate: "Secure", key: Key, noise: Responder, now_ns: int) -> None:
         self._gate = gate
         self._noise = noise
+        self.public = noise.public
         self._now_ns = now_ns
         self.key = key
         self.channel: Channel | None = None
@@ -112,7 +126,7 @@ class _Answer:
         self.channel = Channel(
             vehicle, number, seal=keys.back, open_=keys.forth, born_ns=self._now_ns
         )
-        return write_response(self.key, number, message, self._noise.public)
+        return write_response(self.key, number, message, self.public)
 
 
 class Secure:
@@ -152,7 +166,7 @@ class Secure:
         answer = call.line
         assert isinstance(answer, _Answer)
         assert answer.channel is not None
-        self._vehicles[answer.key.vehicle].add(answer.channel)
+        self._vehicles[answer.key.vehicle].add(answer.channel, answer.public)
 
     def outbox(self) -> list[Datagram]:
         """Challenges to be sent; each is handed out once."""
@@ -176,7 +190,7 @@ class Secure:
             raise ProtocolError("unknown channel")
         payload, newest = used.open(packet, now_ns=now_ns)
         if number in known.pending:
-            known.promote(used, now_ns)
+            known.promote(number, now_ns)
         return Call(payload, vehicle, used, moves=newest and used is known.live)
 
     def _initiation(self, datagram: Datagram, now_ns: int) -> Call | None:
@@ -195,6 +209,8 @@ class Secure:
         known = self._vehicles.get(vehicle)
         if known is None:
             known = self._vehicles[vehicle] = _Vehicle(now_ns)
+        if message[:KEY_BYTES] == known.done:  # the vehicle has closed this attempt
+            raise ProtocolError("replayed")
         if not known.grant(now_ns):
             raise ProtocolError("too many handshakes")
         try:

@@ -244,7 +244,9 @@ class Run:
 def make_keys(seed: int, vehicles: int) -> Keyring:
     """A key for each of the vehicles from 1 on, the same for the same seed."""
     entropy = stream(seed, "keys").bytes
-    lines = [keys.write(vehicle, 1, entropy(keys.SECRET_BYTES)) for vehicle in range(1, vehicles + 1)]
+    lines = [
+        keys.write(vehicle, 1, entropy(keys.SECRET_BYTES)) for vehicle in range(1, vehicles + 1)
+    ]
     return keys.parse("keys", "".join(lines).encode())
 
 

@@ -4,19 +4,24 @@ Between endpoints a datagram takes no time (delays are netem's business, and net
 here as well). Every host has a clock of its own, with offset and drift, and may take time to
 compute when it is woken: what it then sends leaves, and it can be woken again, only once it is
 done. It hears all along, so that its computing for one peer does not delay another that only talks
-to it. Time is integer nanoseconds, and whatever happens at one instant happens in a fixed order:
+to it. A host can be stopped and begin another life, be frozen for a while, and have its clock set:
+what happens to hosts is done by actions that the world is given with their time (`World.at`). Time
+is integer nanoseconds, and whatever happens at one instant happens in a fixed order:
 the same inputs give the same outcome everywhere, and hosts that never meet do not change each
 other's.
 """
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 
 from shared.endpoint import Address, Datagram, Endpoint
 from shared.events import Event
 
 BILLION = 1_000_000_000
+FROZEN_MAX = 6_500
+"""Most datagrams that wait for a frozen host: as many of 600 B as the buffer of a socket holds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +45,45 @@ class Clock:
             return passed_ns
         return passed_ns - passed_ns * self.drift_ppb // (BILLION + self.drift_ppb)
 
+    def changed(self, time_ns: int, *, step_ns: int = 0, drift_ppb: int | None = None) -> "Clock":
+        """Clock that goes on from this one.
+
+        Args:
+            time_ns: time of the world from which it is read [ns].
+            step_ns: how much later it shows then than this one [ns].
+            drift_ppb: its own rate; None keeps this one's.
+        """
+        drift_ppb = self.drift_ppb if drift_ppb is None else drift_ppb
+        offset_ns = self.local(time_ns) + step_ns - Clock(0, drift_ppb).local(time_ns)
+        return Clock(offset_ns, drift_ppb)
+
+
+class _Still(Endpoint):
+    """What stands in for the endpoint of a host that is down or frozen: it does nothing.
+
+    Args:
+        inner: the endpoint.
+        room: most datagrams that wait for it; none do for a host that is down.
+    """
+
+    def __init__(self, inner: Endpoint, room: int) -> None:
+        super().__init__()
+        self.inner = inner
+        self.room = room
+        self.waiting: deque[Datagram] = deque()
+        """Datagrams that wait, in the order in which they came; there is no room for later ones."""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
+        """Keep the datagram where there is room."""
+        if len(self.waiting) < self.room:
+            self.waiting.append(datagram)
+
+    def wake(self, *, now_ns: int) -> None:
+        """Nothing happens: it has never asked for it."""
+
+    def next_wake_ns(self) -> None:
+        """None: it is never woken."""
+
 
 @dataclass(slots=True)
 class Host:
@@ -60,8 +104,9 @@ class Host:
     """Time of the world at which it is to be woken, or None."""
 
 
-ARRIVAL = 0
-"""Turn of a datagram: what has arrived is heard before anybody acts on the time."""
+ACTION, ARRIVAL = -1, 0
+"""Turns of an action and of a datagram: what happens to hosts comes first, and what has arrived is
+heard before anybody acts on the time."""
 
 
 class World:
@@ -77,9 +122,12 @@ class World:
         """Time of the world [ns]."""
         self._on_event = on_event
         self._hosts: dict[str, Host] = {}
-        self._agenda: list[tuple[int, int, int, Host, Datagram | None]] = []
+        self._agenda: list[
+            tuple[int, int, int, Host, Datagram | None]
+            | tuple[int, int, int, None, Callable[[], None]]
+        ] = []
         """Heap of what will happen: time, turn, order of entry, host, and the datagram that arrives
-        there, or None for a wake."""
+        there, or None for a wake; of an action no host and the action."""
         self._scheduled = 0
         """Number of entries so far."""
 
@@ -113,17 +161,89 @@ class World:
         self._arm(host)
         return (name, 0)
 
+    def at(self, time_ns: int, action: Callable[[], None]) -> None:
+        """Have an action done at a time of the world that has not passed."""
+        assert time_ns >= self.now_ns
+        self._scheduled += 1
+        heappush(self._agenda, (time_ns, ACTION, self._scheduled, None, action))
+
+    def stop(self, name: str) -> None:
+        """Take a host down: it hears nothing and sends nothing, nor what it has just computed."""
+        host = self._hosts[name]
+        host.endpoint, host.armed_ns = _Still(host.endpoint, 0), None
+        self._agenda[:] = [
+            entry
+            for entry in self._agenda
+            if not (isinstance(entry[4], Datagram) and entry[4].peer[0] == name)
+            or entry[0] == self.now_ns
+        ]
+        heapify(self._agenda)
+
+    def restart(self, name: str, endpoint: Endpoint) -> None:
+        """Let a host begin another life, at its address and with its clock, from now on.
+
+        Args:
+            name: name of the host, which may be down, frozen, or at work until now.
+            endpoint: what runs on it from now on; its end is told unless one was told before.
+        """
+        self.stop(name)
+        host = self._hosts[name]
+        host.endpoint, host.busy_until_ns = endpoint, self.now_ns
+        self._arm(host)
+
+    def freeze(self, name: str) -> None:
+        """Stop a host's time: datagrams wait for it, as many as there is room for.
+
+        One that is down or frozen already stays as it is.
+        """
+        host = self._hosts[name]
+        if not isinstance(host.endpoint, _Still):
+            host.endpoint, host.armed_ns = _Still(host.endpoint, FROZEN_MAX), None
+
+    def thaw(self, name: str) -> None:
+        """Let a frozen host go on: it hears what has waited, and then is woken, if it wants to.
+
+        One that is not frozen stays as it is.
+        """
+        host = self._hosts[name]
+        still = host.endpoint
+        if isinstance(still, _Still) and still.room:
+            host.endpoint = still.inner
+            for datagram in still.waiting:
+                self._receive(host, datagram)
+            self._arm(host)
+
+    def set_clock(self, name: str, *, step_ns: int = 0, drift_ppb: int | None = None) -> None:
+        """Step a host's clock now, or change its rate from now on.
+
+        The host is not told. What it waits for by its clock comes sooner or later by the step.
+
+        Args:
+            name: name of the host.
+            step_ns: time by which the clock goes ahead, or back [ns].
+            drift_ppb: rate by which it runs faster than the world's [10⁻⁹]; None leaves it.
+        """
+        host = self._hosts[name]
+        host.clock = host.clock.changed(self.now_ns, step_ns=step_ns, drift_ppb=drift_ppb)
+        self._arm(host)
+
+    def set_compute(self, name: str, compute_ns: int) -> None:
+        """Change the time that a host works whenever it is woken [ns]."""
+        self._hosts[name].compute_ns = compute_ns
+
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""
         while self._agenda and not until():
-            time_ns, _, _, host, datagram = heappop(self._agenda)
-            if time_ns > limit_ns:
+            entry = heappop(self._agenda)
+            if entry[0] > limit_ns:
                 return
-            self.now_ns = time_ns
-            if datagram is None:
-                self._wake(host)
+            self.now_ns = entry[0]
+            if entry[3] is None:
+                entry[4]()
+            elif entry[4] is None:
+                self._wake(entry[3])
             else:
-                self._receive(host, datagram)
+                self._receive(entry[3], entry[4])
 
     def _at(self, time_ns: int, turn: int, host: Host, datagram: Datagram | None) -> None:
         self._scheduled += 1

@@ -18,6 +18,7 @@ reorders and loses their packets.
   compare               schemes and triggers on the same seeds, each at its best weights
   calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
   scenarios             what can be flown
+  keygen FILE           keys for vehicles, so that nobody else can fly them
   server [SCENARIO]     one process by hand: plans for vehicles
   netem [SCENARIO]      one process by hand: the network
   client [SCENARIO]     one process by hand: a vehicle
@@ -47,6 +48,7 @@ COMMANDS = {
     "compare": "skytether.compare:compare",
     "calibrate": "skytether.calibrate:calibrate",
     "scenarios": "skytether.__main__:list_scenarios",
+    "keygen": "skytether.keygen:keygen",
     "server": "server.__main__:serve",
     "netem": "netem.__main__:emulate",
     "client": "client.__main__:fly",

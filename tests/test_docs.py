@@ -60,27 +60,50 @@ def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
     assert run.stdout.strip()
 
 
-def test_the_three_documented_terminals_fly_together() -> None:
+def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
     """The block of README with server, netem and client, each line in a process of its own."""
-    (lines,) = [
+    on_one, _ = terminals()
+    assert "PLAINTEXT" in fly_together(on_one, tmp_path)
+
+
+def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
+    """The block of README with keys, all of its hosts being this one."""
+    _, on_three = terminals()
+    keygen, *processes = on_three
+    made = subprocess.run(skytether(keygen), cwd=tmp_path, capture_output=True, check=False)
+    assert made.returncode == 0
+    processes = [re.sub(r"0\.0\.0\.0|ground|lab(?=:)", "127.0.0.1", line) for line in processes]
+    assert "PLAINTEXT" not in fly_together(processes, tmp_path)
+
+
+def terminals() -> list[list[str]]:
+    """Blocks of README with a client of their own."""
+    return [
         block
         for block in blocks(ROOT / "README.md")
         if any(line.startswith("skytether client") for line in block)
     ]
+
+
+def fly_together(lines: list[str], folder: Path) -> str:
+    """What the client says that flies with a server and a netem."""
     server, netem, client = (skytether(line) for line in lines)
-    client += ["--settle", "0", "--duration", "2"]
+    client += ["--settle", "0", "--duration", "3"]
     with (
-        subprocess.Popen(server, stdout=subprocess.DEVNULL) as one,
-        subprocess.Popen(netem, stdout=subprocess.DEVNULL) as two,
+        subprocess.Popen(server, cwd=folder, stdout=subprocess.DEVNULL) as one,
+        subprocess.Popen(netem, cwd=folder, stdout=subprocess.DEVNULL) as two,
     ):
         try:
-            run = subprocess.run(client, capture_output=True, text=True, timeout=60, check=False)
+            run = subprocess.run(
+                client, cwd=folder, capture_output=True, text=True, timeout=60, check=False
+            )
         finally:
             one.terminate()
             two.terminate()
     assert run.returncode == 0, run.stderr
     assert "session open, flying" in run.stdout
     assert (one.returncode, two.returncode) == (0, 0)
+    return run.stdout
 
 
 @pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
@@ -98,6 +121,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether scenarios", "skytether calibrate ", "skytether envelope ")
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py
+    known += ("skytether keygen ",)  # by test_keys.py
     known += ("docker compose up",)
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:
@@ -128,7 +152,7 @@ def test_the_protocols_table_states_the_limits() -> None:
     text = (ROOT / "docs" / "protocol.md").read_text()
     assert f"at most {PAYLOAD_BYTES_MAX} bytes" in text
     assert (
-        "has 355 bytes and\n8 more for each committed step, an OBSERVATION 79, a HEARTBEAT 19"
+        "has 355 bytes and\n8 more for each committed step, an OBSERVATION 99, a HEARTBEAT 20"
         in text
     )
     assert "rmse_xy" in Summary.__struct_fields__

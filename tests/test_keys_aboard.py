@@ -43,24 +43,25 @@ class Server:
         self.events: list[object] = []
         self._listens = threading.Event()
         self.port = 0
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
+        self.reader = threading.Thread(target=self._read)
+        self.reader.start()
         assert self._listens.wait(PATIENCE_S)
 
     def _read(self) -> None:
         assert self.popen.stdout is not None
-        for line in self.popen.stdout:
-            event = msgspec.json.decode(line, type=Line).event
-            self.events.append(event)
-            if isinstance(event, Listening):
-                self.port = event.port
-                self._listens.set()
+        with self.popen.stdout as said:
+            for line in said:
+                event = msgspec.json.decode(line, type=Line).event
+                self.events.append(event)
+                if isinstance(event, Listening):
+                    self.port = event.port
+                    self._listens.set()
 
     def end(self) -> list[object]:
         """All its events, once it has ended in order."""
         self.popen.send_signal(signal.SIGTERM)
         assert self.popen.wait(PATIENCE_S) == 0
-        self._reader.join()
+        self.reader.join()
         return self.events
 
     def address(self) -> str:
@@ -77,6 +78,7 @@ def serving(*argv: str) -> Iterator[Server]:
     finally:
         server.popen.kill()
         server.popen.wait()
+        server.reader.join()
 
 
 def key_file(folder: Path, secret: str = SECRET, *, mode: int = 0o600, name: str = "keys") -> Path:

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from netem import link as link_module
+from netem import proxy as proxy_module
 from netem.fate import fates
 from netem.link import Link
 from netem.proxy import FLOWS_MAX, IDLE_NS, Flow, Proxy
@@ -45,6 +46,14 @@ def pass_on(proxy: Proxy, payload: bytes, client: tuple[str, int], at: int = 0) 
     (sent,) = proxy.outbox()
     assert sent[:2] == (payload, SERVER)
     return sent.socket
+
+
+def fly(proxy: Proxy, client: tuple[str, int], at: int = 0) -> int:
+    """A client's packet crosses and is answered; the socket of its flow."""
+    socket = pass_on(proxy, b"?", client, at)
+    hear(proxy, b"!", SERVER, socket, at=at)
+    assert proxy.outbox() == [Datagram(b"!", client, 0)]
+    return socket
 
 
 def test_every_client_address_is_a_flow_with_a_socket_of_its_own() -> None:
@@ -91,9 +100,9 @@ def test_a_packet_at_a_socket_of_no_flow_is_refused() -> None:
 
 
 def test_a_client_too_many_is_refused() -> None:
-    """While those that are there stay served."""
+    """While those that are there, and were answered, stay served."""
     proxy = make_proxy(flows=2)
-    assert [pass_on(proxy, b"?", client) for client in (ALICE, BOB)] == [1, 2]
+    assert [fly(proxy, client) for client in (ALICE, BOB)] == [1, 2]
     hear(proxy, b"?", CAROL)
     assert (proxy.outbox(), proxy.refused) == ([], 1)
     assert pass_on(proxy, b"?", BOB) == 2
@@ -102,8 +111,8 @@ def test_a_client_too_many_is_refused() -> None:
 def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client() -> None:
     """The flow's socket then carries the new client's answers, and the old one has to wait."""
     proxy = make_proxy(flows=2)
-    pass_on(proxy, b"?", ALICE, at=0)
-    pass_on(proxy, b"?", BOB, at=1)
+    fly(proxy, ALICE, at=0)
+    fly(proxy, BOB, at=1)
     hear(proxy, b"?", CAROL, at=IDLE_NS - 1)
     assert (proxy.outbox(), proxy.refused) == ([], 1)
     assert pass_on(proxy, b"?", CAROL, at=IDLE_NS) == 1
@@ -116,8 +125,9 @@ def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client() -> None
 def test_flows_give_way_in_the_order_of_their_last_use() -> None:
     """Whether that was the client's packet or the server's."""
     proxy = make_proxy(flows=3)
-    for client in (ALICE, BOB, CAROL, ALICE):
-        pass_on(proxy, b"?", client)
+    for client in (ALICE, BOB, CAROL):
+        fly(proxy, client)
+    pass_on(proxy, b"?", ALICE)
     hear(proxy, b"!", SERVER, 2)
     proxy.outbox()
     newcomers = [("192.0.2.3", port) for port in range(3)]
@@ -130,7 +140,7 @@ def test_a_refusal_looks_at_one_flow_however_many_there_are(
     """A flood from strangers takes as long with 16 384 flows as with one."""
     proxy = make_proxy(flows=300)
     for port in range(300):
-        pass_on(proxy, b"?", ("192.0.2.1", port))
+        fly(proxy, ("192.0.2.1", port))
     looked = []
     monkeypatch.setattr(Flow, "used_ns", property(lambda flow: looked.append(flow.socket) or 0))
     for port in range(100):
@@ -139,10 +149,92 @@ def test_a_refusal_looks_at_one_flow_however_many_there_are(
     assert looked == [1] * 100
 
 
+def test_strangers_give_way_at_once_the_one_that_is_silent_longest_first() -> None:
+    """Nobody has answered them; a flow that was answered keeps its place."""
+    proxy = make_proxy(flows=3)
+    assert fly(proxy, ALICE) == 1
+    strangers = [("192.0.2.3", port) for port in range(4)]
+    assert [pass_on(proxy, b"x", stranger) for stranger in strangers[:2]] == [2, 3]
+    assert pass_on(proxy, b"x", strangers[0]) == 2
+    assert [pass_on(proxy, b"x", stranger) for stranger in strangers[2:]] == [3, 2]
+    assert pass_on(proxy, b"?", ALICE) == 1
+    assert (proxy.refused, proxy.figures()["flows"]) == (0, 3)
+
+
+@pytest.mark.parametrize(("begins", "expected"), [("client", 1), ("stranger", 2)])
+def test_of_a_stranger_and_a_flow_unused_for_long_the_older_gives_way(
+    begins: str, expected: int
+) -> None:
+    """An answer is worth IDLE_NS, and no more."""
+    proxy = make_proxy(flows=2)
+    fly(proxy, ALICE)
+    pass_on(proxy, b"x", BOB, at=1)
+    if begins == "stranger":
+        pass_on(proxy, b"?", ALICE, at=2)
+    assert pass_on(proxy, b"?", CAROL, at=IDLE_NS + 2) == expected
+
+
+def served_in_a_flood(proxy: Proxy) -> tuple[int, int]:
+    """Number of vehicles that are served beside strangers, each at a port of its own.
+
+    Each vehicle sends one packet, whose answer comes after packets of thirty strangers.
+
+    Returns:
+        Number of those of 8 vehicles that flew before the flood, and of 8 others.
+    """
+    old, new = ([(host, port) for port in range(8)] for host in ("192.0.2.1", "192.0.2.2"))
+    for client in old:
+        fly(proxy, client)
+    strangers, served = (("192.0.2.66", port) for port in range(1000)), [0, 0]
+    for _ in range(70):
+        hear(proxy, b"x", next(strangers))
+    proxy.outbox()
+    for client in (*old, *new):
+        hear(proxy, b"?", client)
+        sockets = [sent.socket for sent in proxy.outbox()]
+        for _ in range(30):
+            hear(proxy, b"x", next(strangers))
+        proxy.outbox()
+        for socket in sockets:
+            hear(proxy, b"!", SERVER, socket)
+        served[client in new] += Datagram(b"!", client, 0) in proxy.outbox()
+    return served[0], served[1]
+
+
+def test_a_flood_of_strangers_shuts_nobody_out() -> None:
+    """From 550 ports, with 64 places."""
+    assert served_in_a_flood(make_proxy(flows=64)) == (8, 8)
+
+
+def test_if_no_flow_gave_way_a_flood_would_shut_newcomers_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As it did while strangers were kept like anybody."""
+    proxy = make_proxy(flows=64)
+    monkeypatch.setattr(proxy, "_oldest", lambda _: None)
+    assert served_in_a_flood(proxy) == (8, 0)
+
+
+def test_if_no_flow_were_kept_a_flood_would_take_the_places_of_those_who_fly(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Their answers, which are on their way, would go to strangers."""
+    proxy = make_proxy(flows=64)
+    for client in [("192.0.2.1", port) for port in range(8)]:
+        fly(proxy, client)
+    monkeypatch.setattr(proxy_module, "IDLE_NS", 0)
+    for port in range(70):
+        hear(proxy, b"x", ("192.0.2.66", port), at=1)
+    proxy.outbox()
+    for socket in range(1, 9):
+        hear(proxy, b"!", SERVER, socket)
+    assert {sent.peer[0] for sent in proxy.outbox()} == {"192.0.2.66"}
+
+
 def test_the_servers_packets_keep_a_flow_in_use() -> None:
     """A client that only listens is not idle."""
     proxy = make_proxy(flows=1)
-    socket = pass_on(proxy, b"?", ALICE)
+    socket = fly(proxy, ALICE)
     hear(proxy, b"!", SERVER, socket, at=IDLE_NS - 1)
     proxy.outbox()
     hear(proxy, b"?", BOB, at=IDLE_NS)

@@ -1,11 +1,16 @@
 """Virtual time itself: clocks, order, computing time."""
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
 from shared.events import Event, Flying
+from sim import world as world_module
 from sim.world import Clock, World
 
 offsets = st.integers(-(10**15), 10**15)
@@ -201,3 +206,138 @@ def test_time_stops_at_its_limit(limit_ns: int) -> None:
     world.add("host", probe)
     world.run(never, limit_ns=limit_ns)
     assert len(probe.log) == (limit_ns == 50)
+
+
+def at(world: World, time_ns: int, action: Callable[..., None], *args: Any, **named: Any) -> None:
+    """Have something done to the world at a time."""
+    world.at(time_ns, partial(action, *args, **named))
+
+
+@given(offsets, drifts, times, offsets, drifts)
+def test_a_changed_clock_goes_on_from_the_time_it_shows(
+    offset_ns: int, drift_ppb: int, time_ns: int, step_ns: int, other_ppb: int
+) -> None:
+    """A step is seen at once, a rate only from then on."""
+    clock = Clock(offset_ns, drift_ppb)
+    changed = clock.changed(time_ns, step_ns=step_ns, drift_ppb=other_ppb)
+    assert changed.local(time_ns) == clock.local(time_ns) + step_ns
+    assert changed.drift_ppb == other_ppb
+    assert clock.changed(time_ns, step_ns=step_ns).drift_ppb == drift_ppb
+
+
+def test_actions_come_first_at_their_instant_and_in_the_order_they_were_asked_for() -> None:
+    """Before what arrives then, and what wakes."""
+    world, probe, order = World(), Probe([50]), []
+    world.add("host", probe)
+    for number in (1, 2):
+        at(world, 50, lambda number=number: order.append((number, len(probe.log))))
+    world.run(never, limit_ns=SECOND_NS)
+    assert order == [(1, 0), (2, 0)]
+
+
+def test_a_host_that_is_down_hears_nothing_and_sends_nothing() -> None:
+    """Not what it was woken for, nor what it was still computing; its next life begins anew."""
+    world, first, second, hearer = World(), Probe([50, 60]), Probe([0, 95]), Probe([])
+    there = world.add("there", hearer)
+    first.answer_to = second.answer_to = there
+    here = world.add("here", first, compute_ns=5)
+    world.add("caller", Probe([70, 90], answer_to=here))
+    at(world, 62, world.stop, "here")
+    at(world, 80, world.restart, "here", second)
+    world.run(never, limit_ns=SECOND_NS)
+    assert first.log == [("wake", 50), ("wake", 60)]
+    assert second.log == [("wake", 80), ("hi from caller 2", 90), ("wake", 95)]
+    assert hearer.log == [("hi from here 2", 55), ("hi from here 2", 85), ("hi from here 2", 100)]
+
+
+def test_a_host_at_work_can_be_restarted_at_once() -> None:
+    """The new life does not finish the work of the old one."""
+    world, second = World(), Probe([0])
+    world.add("here", Probe([50]), compute_ns=1000)
+    at(world, 60, world.restart, "here", second)
+    world.run(never, limit_ns=SECOND_NS)
+    assert second.log == [("wake", 60)]
+
+
+def test_the_end_of_a_later_life_is_told() -> None:
+    """Once, as that of the first would have been."""
+
+    class Finite(Probe):
+        @property
+        def finished(self) -> bool:
+            """After the last wake."""
+            return not self.wakes_ns
+
+    world, told_ns = World(), []
+    world.add("host", Finite([90]), on_finished=lambda: told_ns.append(world.now_ns))
+    at(world, 50, world.restart, "host", Finite([0, 70]))
+    world.run(never, limit_ns=SECOND_NS)
+    assert told_ns == [70]
+
+
+def test_datagrams_wait_for_a_frozen_host_and_it_wakes_late() -> None:
+    """In the order in which they came, and as many as there is room for."""
+    world, probe = World(), Probe([50, 200])
+    there = world.add("there", probe)
+    world.add("here", Probe([20, 60, 70, 80], answer_to=there))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(world_module, "FROZEN_MAX", 2)
+        at(world, 40, world.freeze, "there")
+        at(world, 45, world.freeze, "there")
+        at(world, 100, world.thaw, "there")
+        at(world, 110, world.thaw, "there")
+        world.run(never, limit_ns=SECOND_NS)
+    hi = "hi from here 2"
+    assert probe.log == [(hi, 20), (hi, 100), (hi, 100), ("wake", 100), ("wake", 200)]
+
+
+def test_a_frozen_host_can_be_taken_down_and_a_host_that_is_down_not_frozen() -> None:
+    """As a process can be killed that is stopped, and no process be stopped that is gone."""
+    world, old, new = World(), Probe([50]), Probe([60])
+    world.add("host", old)
+    for time_ns, action in ((10, world.freeze), (20, world.stop), (30, world.freeze)):
+        at(world, time_ns, action, "host")
+    at(world, 40, world.thaw, "host")
+    at(world, 55, world.restart, "host", new)
+    world.run(never, limit_ns=SECOND_NS)
+    assert (old.log, new.log) == ([], [("wake", 60)])
+
+
+def test_a_clock_that_goes_ahead_wakes_what_is_due_at_once() -> None:
+    """Later wakes come sooner by the step."""
+    world, probe = World(), Probe([50, 1060])
+    world.add("host", probe)
+    at(world, 30, world.set_clock, "host", step_ns=1000)
+    world.run(never, limit_ns=SECOND_NS)
+    assert probe.log == [("wake", 1030), ("wake", 1060)]
+    assert world.now_ns == 60
+
+
+def test_a_wake_that_a_clock_has_gone_back_from_waits_for_the_clock() -> None:
+    """But for a datagram, nothing tells the host."""
+    world, probe = World(), Probe([50])
+    there = world.add("there", probe)
+    world.add("here", Probe([100], answer_to=there))
+    at(world, 30, world.set_clock, "there", step_ns=-1000)
+    world.run(never, limit_ns=SECOND_NS)
+    assert probe.log == [("hi from here 2", -900), ("wake", 50)]
+    assert world.now_ns == 1050
+
+
+def test_another_rate_holds_from_now_on() -> None:
+    """A clock that runs twice as fast from 100 on has a wake at 300 come at 200."""
+    world, probe = World(), Probe([300])
+    world.add("host", probe)
+    at(world, 100, world.set_clock, "host", drift_ppb=1_000_000_000)
+    world.run(lambda: bool(probe.log), limit_ns=SECOND_NS)
+    assert (probe.log, world.now_ns) == ([("wake", 300)], 200)
+
+
+def test_a_host_can_be_given_more_to_compute() -> None:
+    """From its next wake on."""
+    world, hearer = World(), Probe([])
+    there = world.add("there", hearer)
+    world.add("here", Probe([50, 60], answer_to=there))
+    at(world, 55, world.set_compute, "here", 30)
+    world.run(never, limit_ns=SECOND_NS)
+    assert hearer.log == [("hi from here 2", 50), ("hi from here 2", 90)]

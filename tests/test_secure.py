@@ -1,0 +1,749 @@
+"""Both ends of a secured link, back to back, over good and terrible networks, and under attack."""
+
+import random
+from collections import Counter
+from collections.abc import Callable
+from heapq import heappop, heappush
+from itertools import count
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+
+from client.secure import ATTEMPT_NS, Secure
+from server import secure as server_secure
+from server.gate import Call
+from server.secure import CHALLENGES_MAX, COOKIE_NS, HANDSHAKES, PENDING_MAX
+from server.secure import Secure as Gate
+from shared import channel as channels
+from shared import handshake, noise
+from shared.channel import DATA, FRESH_NS, LIFE_NS, OVERLAP_NS, VERSION
+from shared.endpoint import SECOND_NS, Address, Datagram, seconds_to_ns
+from shared.handshake import (
+    CHALLENGE,
+    CHALLENGE_BYTES,
+    HELLO_BYTES_MAX,
+    INITIATION,
+    INITIATION_BYTES,
+    RESPONSE,
+    WELCOME_BYTES_MAX,
+)
+from shared.keys import Key, Keyring
+from shared.protocol import ProtocolError
+
+HERE, ELSEWHERE = ("vehicle", 1), ("elsewhere", 2)
+SECRETS = {1: bytes([1]) * 32, 2: bytes([2]) * 32}
+KEYS = {(vehicle, 5): Key.of(vehicle, 5, secret) for vehicle, secret in SECRETS.items()}
+HELLO, WELCOME = b"hello" * 60, b"welcome" * 48
+
+
+def gate(seed: int = 1) -> Gate:
+    """A server that has the keys of two vehicles; each seed is another life."""
+    return Gate(Keyring("keys", KEYS), entropy=random.Random(seed).randbytes)
+
+
+def link(seed: int = 2, key: Key = KEYS[1, 5]) -> Secure:
+    """A vehicle; each seed is another life."""
+    return Secure(key, entropy=random.Random(seed).randbytes)
+
+
+def called(server: Gate, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> Call:
+    """What a datagram that the server accepts says."""
+    call = server.open(Datagram(datagram, peer), now_ns=now_ns)
+    assert call is not None
+    return call
+
+
+def refusal(end: Gate | Secure, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> str:
+    """Reason for which an end drops a datagram."""
+    given = Datagram(datagram, peer) if isinstance(end, Gate) else datagram
+    with pytest.raises(ProtocolError) as error:
+        end.open(given, now_ns=now_ns)  # type: ignore[arg-type]
+    return error.value.reason
+
+
+def challenged(client: Secure, server: Gate, now_ns: int = 0) -> None:
+    """Give the client a cookie."""
+    asked = Datagram(client.hello(HELLO, now_ns=now_ns), HERE)
+    assert server.open(asked, now_ns=now_ns) is None
+    (challenge,) = server.outbox()
+    assert client.open(challenge.payload, now_ns=now_ns) is None
+
+
+def welcomed(client: Secure, server: Gate, now_ns: int = 0) -> bytes:
+    """RESPONSE to a client with a cookie, admitted and opened."""
+    call = called(server, client.hello(HELLO, now_ns=now_ns), now_ns)
+    assert (call.payload, call.vehicle, call.moves) == (HELLO, 1, False)
+    response = call.line.seal(WELCOME)
+    server.admit(call, now_ns=now_ns)
+    assert client.open(response, now_ns=now_ns) == WELCOME
+    return response
+
+
+def joined(now_ns: int = 0) -> tuple[Secure, Gate]:
+    """Both ends of an open link, before the first packet in the channel."""
+    client, server = link(), gate()
+    challenged(client, server, now_ns)
+    welcomed(client, server, now_ns)
+    client.adopt(now_ns=now_ns)
+    return client, server
+
+
+def live(server: Gate, vehicle: int = 1) -> int | None:
+    """Number of a vehicle's live channel."""
+    channel = server._vehicles[vehicle].live
+    return None if channel is None else channel.number
+
+
+# -- the handshake -----------------------------------------------------------------------------
+
+
+def test_a_handshake_takes_two_round_trips_and_opens_a_channel() -> None:
+    """INITIATION, CHALLENGE, INITIATION, RESPONSE; then messages both ways."""
+    client, server = joined()
+    call = called(server, client.seal(b"observation"))
+    assert (call.payload, call.vehicle, call.moves) == (b"observation", 1, True)
+    assert client.open(call.line.seal(b"horizon"), now_ns=0) == b"horizon"
+    assert client.secure
+    assert server.secure
+
+
+def test_the_bytes_of_a_handshake() -> None:
+    """As the table in docs/security.md has them; the header names vehicle and key."""
+    client, server = link(), gate()
+    first = client.hello(HELLO, now_ns=0)
+    assert first[:5].hex() == "0101010005"
+    assert first[5:21] == bytes(16)
+    server.open(Datagram(first, HERE), now_ns=0)
+    (challenge,) = server.outbox()
+    assert challenge.peer == HERE
+    assert challenge.payload[:5].hex() == "0102010005"
+    client.open(challenge.payload, now_ns=0)
+    second = client.hello(HELLO, now_ns=0)
+    assert second[5:21] == challenge.payload[5:21]
+    assert second[21:-16] == first[21:-16]  # the same attempt
+    call = called(server, second)
+    response = call.line.seal(WELCOME)
+    assert response[:5].hex() == "0103010005"
+    assert len(response) == 5 + 4 + 32 + len(WELCOME) + 16 + 16
+    assert (len(first), len(challenge.payload)) == (INITIATION_BYTES, CHALLENGE_BYTES) == (512, 37)
+    assert (INITIATION, CHALLENGE, RESPONSE, DATA) == (1, 2, 3, 4)
+    # No message in plaintext begins like a sealed packet: msgpack's arrays begin with 0x90 or more.
+    assert VERSION < 0x90
+
+
+def test_no_answer_is_longer_than_what_draws_it() -> None:
+    """Even the longest; and the longest HELLO fits."""
+    client, server = link(), gate()
+    for hello in (b"", b"\0" * HELLO_BYTES_MAX, b"\x80" * HELLO_BYTES_MAX, b"\x80\0"):
+        client, server = link(), gate()
+        server.open(Datagram(client.hello(hello, now_ns=0), HERE), now_ns=0)
+        client.open(server.outbox()[0].payload, now_ns=0)
+        call = called(server, client.hello(hello, now_ns=0))
+        assert call.payload == hello
+    assert len(call.line.seal(bytes(WELCOME_BYTES_MAX))) == INITIATION_BYTES
+    with pytest.raises(AssertionError):
+        call.line.seal(bytes(WELCOME_BYTES_MAX + 1))
+    with pytest.raises(AssertionError):
+        client.hello(bytes(HELLO_BYTES_MAX + 1), now_ns=0)
+
+
+def test_a_refused_client_goes_on_with_its_attempt() -> None:
+    """A WELCOME that is not adopted, and not admitted, opens nothing."""
+    client, server = link(), gate()
+    challenged(client, server)
+    before = client.hello(HELLO, now_ns=0)
+    call = called(server, before)
+    assert client.open(call.line.seal(b"refused"), now_ns=0) == b"refused"
+    assert client.hello(HELLO, now_ns=SECOND_NS) == before
+    assert server._vehicles[1].pending == {}
+    welcomed(client, server, SECOND_NS)
+    client.adopt(now_ns=SECOND_NS)
+    assert called(server, client.seal(b"o"), SECOND_NS).payload == b"o"
+
+
+def test_an_attempt_has_one_ephemeral_key() -> None:
+    """Another HELLO, or 60 s, begin another attempt; the cookie stays."""
+    client, server = link(), gate()
+    challenged(client, server)
+    first = client.hello(HELLO, now_ns=0)
+    assert client.hello(HELLO, now_ns=ATTEMPT_NS) == first
+    later = client.hello(HELLO, now_ns=ATTEMPT_NS + 1)
+    other = client.hello(HELLO + b"x", now_ns=ATTEMPT_NS + 1)
+    assert len({first[21:53], later[21:53], other[21:53]}) == 3
+    assert first[5:21] == later[5:21] == other[5:21] != bytes(16)
+
+
+def test_a_repeated_hello_is_answered_with_other_keys() -> None:
+    """No key seals two different answers; the vehicle may adopt either."""
+    client, server = link(), gate()
+    challenged(client, server)
+    hello = client.hello(HELLO, now_ns=0)
+    answers = []
+    for i in range(3):
+        call = called(server, hello)
+        answers.append(call.line.seal(b"welcome %d" % i))
+        server.admit(call, now_ns=0)
+    assert len({answer[5:9] for answer in answers}) == 3  # channel
+    assert len({answer[9:41] for answer in answers}) == 3  # ephemeral key
+    assert client.open(answers[2], now_ns=0) == b"welcome 2"
+    assert client.open(answers[1], now_ns=0) == b"welcome 1"
+    client.adopt(now_ns=0)
+    assert called(server, client.seal(b"o")).payload == b"o"
+    assert live(server) == int.from_bytes(answers[1][5:9], "little")
+    # The one that was pending before it is gone.
+    assert [*server._vehicles[1].pending] == [int.from_bytes(answers[2][5:9], "little")]
+
+
+def test_an_adopted_response_opens_no_channel_again() -> None:
+    """Its counters would begin anew, and what was recorded be opened a second time."""
+    client, server = link(), gate()
+    challenged(client, server)
+    response = welcomed(client, server)
+    client.adopt(now_ns=0)
+    sent = called(server, client.seal(b"o")).line.seal(b"fly left")
+    assert client.open(sent, now_ns=0) == b"fly left"
+    assert refusal(client, response) == "unasked"
+    client.hello(HELLO, now_ns=0)  # also during the next attempt
+    assert refusal(client, response) == "unasked"
+    assert refusal(client, sent) == "replayed"
+
+
+def test_where_adopting_leaves_the_attempt_open_a_command_is_flown_twice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ablation of the attempt's end."""
+    client, server = link(), gate()
+    challenged(client, server)
+    response = welcomed(client, server)
+    adopt = Secure.adopt
+
+    def without_end(self: Secure, *, now_ns: int) -> None:
+        attempt = self._attempt
+        adopt(self, now_ns=now_ns)
+        self._attempt = attempt
+
+    monkeypatch.setattr(Secure, "adopt", without_end)
+    client.adopt(now_ns=0)
+    sent = called(server, client.seal(b"o")).line.seal(b"fly left")
+    assert client.open(sent, now_ns=0) == b"fly left"
+    assert client.open(response, now_ns=0) == WELCOME
+    client.adopt(now_ns=0)
+    assert client.open(sent, now_ns=0) == b"fly left"
+
+
+# -- who is let in -----------------------------------------------------------------------------
+
+
+def test_who_has_no_key_is_met_with_silence() -> None:
+    """Plaintext, another key, an unknown vehicle or number of a key: nothing is sent or kept."""
+    server = gate()
+    strangers = {
+        "forged": Key.of(1, 5, b"x" * 32),
+        "unknown key": Key.of(3, 5, SECRETS[1]),
+    }
+    for reason, key in strangers.items():
+        assert refusal(server, link(key=key).hello(HELLO, now_ns=0)) == reason
+    assert refusal(server, link(key=Key.of(1, 6, SECRETS[1])).hello(b"", now_ns=0)) == "unknown key"
+    for end in (server, link()):
+        assert refusal(end, b"") == refusal(end, b"\x95\x04\x01") == "not sealed"
+        assert refusal(end, bytes([VERSION])) == "not sealed"
+        assert refusal(end, bytes([VERSION, DATA])) == "length"
+        assert refusal(end, bytes([VERSION, DATA]) + bytes(40)) == "unknown channel"
+    assert refusal(server, bytes([VERSION, RESPONSE]) + bytes(100)) == "not for a server"
+    assert refusal(link(), bytes([VERSION, INITIATION]) + bytes(510)) == "not for a client"
+    assert refusal(server, bytes([VERSION, INITIATION])) == "length"
+    assert server.outbox() == []
+    assert server._vehicles == {}
+
+
+def test_the_key_of_another_vehicle_opens_nothing() -> None:
+    """A vehicle that has a key is that vehicle, and no other."""
+    server = gate()
+    renamed = link(key=Key.of(1, 5, SECRETS[2]))
+    assert refusal(server, renamed.hello(HELLO, now_ns=0)) == "forged"
+    client, server = joined()
+    packet = bytearray(client.seal(b"o"))
+    packet[2] = 2
+    assert refusal(server, bytes(packet)) == "unknown channel"
+
+
+def changed(datagram: bytes, at: int) -> bytes:
+    """A datagram with one bit changed."""
+    found = bytearray(datagram)
+    found[at] ^= 1
+    return bytes(found)
+
+
+def exchanges(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """List that grows by an entry for each operation on the elliptic curve."""
+    exchange, found = noise._exchange, []
+
+    def counted(private: X25519PrivateKey, public: bytes) -> bytes:
+        found.append(1)
+        return exchange(private, public)
+
+    monkeypatch.setattr(noise, "_exchange", counted)
+    return found
+
+
+def test_the_mac_comes_before_any_costly_mathematics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A forged INITIATION draws nothing, and a forged RESPONSE costs no elliptic curve."""
+    client, server = link(), gate()
+    challenged(client, server)
+    initiation = client.hello(HELLO, now_ns=0)
+    response = called(server, initiation).line.seal(WELCOME)
+    costs = exchanges(monkeypatch)
+    for i in range(5, len(initiation)):
+        assert refusal(server, changed(initiation, i)) == "forged"
+    for i in range(4, len(response)):
+        assert refusal(client, changed(response, i)) == "unasked"
+    assert (server.outbox(), costs) == ([], [])
+
+
+def test_without_the_mac_strangers_cost_mathematics_and_draw_answers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ablation of the MAC."""
+    client, server = link(), gate()
+    challenged(client, server)
+    initiation = client.hello(HELLO, now_ns=0)
+    response = called(server, initiation).line.seal(WELCOME)
+    costs = exchanges(monkeypatch)
+    monkeypatch.setattr(handshake, "is_authentic", lambda *_: True)
+    assert refusal(client, changed(response, 60)) == "forged"
+    assert len(costs) == 1
+    assert server.open(Datagram(changed(initiation, 10), HERE), now_ns=0) is None
+    assert len(server.outbox()) == 1
+
+
+# -- cookies -----------------------------------------------------------------------------------
+
+
+def test_a_cookie_is_good_for_its_address_and_up_to_two_minutes() -> None:
+    """Elsewhere and later it draws a CHALLENGE; so it does in another life of the server."""
+    client, server = link(), gate()
+    challenged(client, server)
+    hello = client.hello(HELLO, now_ns=0)
+    assert server.open(Datagram(hello, ELSEWHERE), now_ns=0) is None
+    assert server.open(Datagram(hello, ("vehicle", 2)), now_ns=0) is None
+    assert server.open(Datagram(hello, HERE), now_ns=2 * COOKIE_NS) is None
+    assert [each.peer for each in server.outbox()] == [ELSEWHERE, ("vehicle", 2), HERE]
+    assert called(server, hello, 2 * COOKIE_NS - 1).payload == HELLO
+    assert gate(seed=9).open(Datagram(hello, HERE), now_ns=0) is None
+    assert COOKIE_NS == 60 * SECOND_NS
+
+
+def test_a_challenge_answers_one_attempt_once() -> None:
+    """Repeated, changed or of another attempt it draws no HELLO: nobody makes the client flood."""
+    client, server = link(), gate()
+    server.open(Datagram(client.hello(HELLO, now_ns=0), HERE), now_ns=0)
+    challenge = server.outbox()[0].payload
+    other = link(seed=3)
+    assert refusal(other, challenge) == "unasked"
+    other.hello(HELLO, now_ns=0)
+    assert refusal(other, challenge) == "unasked"
+    assert {refusal(client, changed(challenge, i)) for i in range(4, 37)} == {"unasked"}
+    assert client.open(challenge, now_ns=0) is None
+    assert refusal(client, challenge) == "replayed"
+    assert refusal(client, challenge[:-1]) == "length"
+
+
+def test_without_cookies_a_recorded_hello_draws_handshakes_from_anywhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ablation of the cookie: what a stranger repeats costs state and an elliptic curve."""
+    client, server = link(), gate()
+    hello = client.hello(HELLO, now_ns=0)
+    monkeypatch.setattr(Gate, "_is_valid", lambda *_: True)
+    assert called(server, hello, peer=ELSEWHERE).payload == HELLO
+    assert len(server._vehicles) == 1
+
+
+def test_a_vehicle_gets_five_handshakes_a_second() -> None:
+    """More are dropped; another vehicle is not concerned."""
+    client, server = link(), gate()
+    challenged(client, server)
+    hello = client.hello(HELLO, now_ns=0)
+    for start_ns in (0, 10 * SECOND_NS):
+        for _ in range(HANDSHAKES):
+            called(server, hello, start_ns)
+        assert refusal(server, hello, start_ns) == "too many handshakes"
+        assert refusal(server, hello, start_ns + SECOND_NS // 5 - 1) == "too many handshakes"
+        called(server, hello, start_ns + SECOND_NS // 5)
+    other = link(key=KEYS[2, 5])
+    server.open(Datagram(other.hello(HELLO, now_ns=0), HERE), now_ns=0)
+    other.open(server.outbox()[0].payload, now_ns=0)
+    called(server, other.hello(HELLO, now_ns=0))
+
+
+# -- a channel and its successor ---------------------------------------------------------------
+
+
+def test_an_address_moves_with_the_highest_counter_only() -> None:
+    """A packet that is late, or of the channel before, says nothing of where the vehicle is."""
+    client, server = joined()
+    packets = [client.seal(b"o") for _ in range(4)]
+    assert [called(server, packets[i]).moves for i in (0, 2, 1, 3)] == [True, True, False, True]
+    late = [client.seal(b"o") for _ in range(2)]
+    challenged_at = 200 * SECOND_NS  # the cookie has expired
+    challenged(client, server, challenged_at)
+    welcomed(client, server, challenged_at)
+    client.adopt(now_ns=challenged_at)
+    assert called(server, late[0], challenged_at).moves
+    assert called(server, client.seal(b"o"), challenged_at).moves
+    assert not called(server, late[1], challenged_at).moves
+
+
+def test_without_the_order_of_counters_a_late_packet_moves_the_address(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ablation: who holds a packet back, and sends it from elsewhere, gets what comes next."""
+    client, server = joined()
+    held, newer = client.seal(b"o"), client.seal(b"o")
+    called(server, newer)
+    monkeypatch.setattr(channels, "Opened", lambda payload, _: (payload, True))
+    assert called(server, held, peer=ELSEWHERE).moves
+
+
+def rekeyed(client: Secure, server: Gate, now_ns: int) -> None:
+    """A second handshake, up to its adoption."""
+    challenged(client, server, now_ns)
+    welcomed(client, server, now_ns)
+    client.adopt(now_ns=now_ns)
+
+
+def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
+    """What is under way in the old channel is opened at both ends, for 10 s."""
+    client, server = joined()
+    line = called(server, client.seal(b"o")).line
+    assert not client.wants_hello(FRESH_NS - 1)
+    assert client.wants_hello(FRESH_NS)
+    up = [client.seal(b"old") for _ in range(4)]
+    down = [line.seal(b"old") for _ in range(4)]
+    rekeyed(client, server, FRESH_NS)
+    assert not client.wants_hello(FRESH_NS)
+    assert called(server, up[0], FRESH_NS).moves  # the new channel is pending until it is used
+    assert client.open(down[0], now_ns=FRESH_NS) == b"old"
+    new = called(server, client.seal(b"new"), FRESH_NS)
+    assert client.open(new.line.seal(b"new"), now_ns=FRESH_NS) == b"new"
+    end_ns = FRESH_NS + OVERLAP_NS
+    assert called(server, up[1], end_ns).payload == b"old"
+    assert client.open(down[1], now_ns=end_ns) == b"old"
+    assert refusal(server, up[2], end_ns + 1) == "expired"
+    assert refusal(client, down[2], end_ns + 1) == "expired"
+    rekeyed(client, server, 2 * FRESH_NS)
+    called(server, client.seal(b"o"), 2 * FRESH_NS)
+    assert refusal(server, up[3], 2 * FRESH_NS) == "unknown channel"
+    assert refusal(client, down[3], 2 * FRESH_NS) == "unknown channel"
+
+
+def test_without_a_successor_a_channel_ends() -> None:
+    """After 600 s neither end opens anything."""
+    client, server = joined()
+    line = called(server, client.seal(b"o")).line
+    assert refusal(server, client.seal(b"o"), LIFE_NS + 1) == "expired"
+    assert refusal(client, line.seal(b"h"), LIFE_NS + 1) == "expired"
+
+
+def test_a_hello_that_is_repeated_ends_no_flight() -> None:
+    """The live channel stays, whatever is pending, until the vehicle uses another."""
+    client, server = joined()
+    called(server, client.seal(b"o"))
+    before = live(server)
+    other = link(seed=7)
+    challenged(other, server)
+    hello = other.hello(HELLO, now_ns=0)
+    for second in range(1, 3 * PENDING_MAX):
+        call = server.open(Datagram(hello, HERE), now_ns=second * SECOND_NS)
+        assert call is not None
+        call.line.seal(WELCOME)
+        server.admit(call, now_ns=second * SECOND_NS)
+        called(server, client.seal(b"o"), second * SECOND_NS)
+    assert live(server) == before
+    assert len(server._vehicles[1].pending) == PENDING_MAX
+
+
+def test_a_closed_attempt_is_not_answered() -> None:
+    """Its INITIATION, recorded and repeated, gives nobody a HELLO, cookie or not."""
+    client, server = link(), gate()
+    challenged(client, server)
+    hello = client.hello(HELLO, now_ns=0)
+    welcomed(client, server)
+    client.adopt(now_ns=0)
+    assert called(server, hello).payload == HELLO
+    called(server, client.seal(b"o"))
+    assert refusal(server, hello) == "replayed"
+
+
+# -- terrible networks -------------------------------------------------------------------------
+
+TICK_NS = SECOND_NS // 10
+HELLO_TICKS, SILENCE_TICKS = 10, 80
+"""Ticks between two HELLOs, and ticks without a word after which the client says HELLO again."""
+
+
+class Flight:
+    """A vehicle that says HELLO until it is welcomed, then sends at every tick, over a network."""
+
+    def __init__(self, seed: int, loss: float, delay_s: Callable[[random.Random], float]) -> None:
+        self.rng = random.Random(seed)
+        self.loss, self.delay_s = loss, delay_s
+        self.client, self.server = link(seed + 10**6), gate(seed + 2 * 10**6)
+        self.under_way: list[tuple[int, int, bool, bytes]] = []
+        self.numbers = count()
+        self.sent: list[tuple[bool, bytes]] = []
+        """Every datagram sent, and whether to the server."""
+        self.heard = Counter[bytes]()
+        self.dropped = Counter[str]()
+        self.flies = False
+        self.silent = 0
+        self.hello_due = 0
+        self.now_ns = 0
+
+    def send(self, to_server: bool, datagram: bytes) -> None:
+        """Send a datagram: lost, once or twice, after a delay each."""
+        self.sent.append((to_server, datagram))
+        for _ in range(1 + (self.rng.random() < 0.2)):
+            if self.rng.random() >= self.loss:
+                due_ns = self.now_ns + seconds_to_ns(self.delay_s(self.rng))
+                heappush(self.under_way, (due_ns, next(self.numbers), to_server, datagram))
+
+    def hello(self) -> None:
+        """Say HELLO."""
+        self.send(True, self.client.hello(HELLO, now_ns=self.now_ns))
+
+    def deliver(self, to_server: bool, datagram: bytes) -> None:
+        """Hand over a datagram, and send what it draws."""
+        try:
+            if to_server:
+                self.at_server(datagram)
+            else:
+                self.at_client(datagram)
+        except ProtocolError as error:
+            self.dropped[error.reason] += 1
+
+    def at_server(self, datagram: bytes) -> None:
+        """Let the server answer."""
+        call = self.server.open(Datagram(datagram, HERE), now_ns=self.now_ns)
+        for challenge in self.server.outbox():
+            self.send(False, challenge.payload)
+        if call is None:
+            return
+        self.heard[call.payload] += 1
+        if call.payload == HELLO:
+            self.send(False, call.line.seal(WELCOME))
+            self.server.admit(call, now_ns=self.now_ns)
+        else:
+            self.send(False, call.line.seal(b"horizon"))
+
+    def at_client(self, datagram: bytes) -> None:
+        """Let the client take note."""
+        payload = self.client.open(datagram, now_ns=self.now_ns)
+        if payload is None:
+            self.hello()
+            return
+        self.heard[payload] += 1
+        self.silent = 0
+        if payload == WELCOME:
+            self.client.adopt(now_ns=self.now_ns)
+            self.flies = True
+
+    def tick(self) -> None:
+        """Let a tenth of a second pass."""
+        self.now_ns += TICK_NS
+        while self.under_way and self.under_way[0][0] <= self.now_ns:
+            _, _, to_server, datagram = heappop(self.under_way)
+            self.deliver(to_server, datagram)
+        self.silent += 1
+        self.hello_due -= 1
+        if (not self.flies or self.silent > SILENCE_TICKS) and self.hello_due <= 0:
+            self.hello()
+            self.hello_due = HELLO_TICKS
+        if self.flies:
+            self.send(True, self.client.seal(b"observation"))
+
+    def until(self, horizons: int) -> None:
+        """Fly until so many horizons have come, at most three minutes."""
+        for _ in range(1800):
+            if self.heard[b"horizon"] >= horizons:
+                return
+            self.tick()
+        raise AssertionError(f"{self.heard} {self.dropped}")
+
+
+@pytest.mark.parametrize("seeds", [range(i, i + 25) for i in range(0, 100, 25)])
+def test_a_handshake_succeeds_over_a_terrible_network(seeds: range) -> None:
+    """Half of all packets lost, a fifth doubled, delays of 0 to 3 s, so everything out of order."""
+    for seed in seeds:
+        flight = Flight(seed, 0.5, lambda rng: rng.uniform(0.0, 3.0))
+        flight.until(horizons=30)
+        assert flight.client._current is not None
+        assert flight.client._current.number == live(flight.server)
+        assert set(flight.dropped) <= {"replayed", "unasked", "unknown channel"}
+
+
+def test_a_handshake_succeeds_where_a_round_trip_takes_seven_hellos() -> None:
+    """The vehicle uses the first channel that it hears of, which must still be pending."""
+    flight = Flight(1, 0.0, lambda _: 3.5)
+    flight.until(horizons=30)
+
+
+def test_with_fewer_pending_channels_it_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation of their number."""
+    monkeypatch.setattr(server_secure, "PENDING_MAX", 4)
+    flight = Flight(1, 0.0, lambda _: 3.5)
+    with pytest.raises(AssertionError, match="unknown channel"):
+        flight.until(horizons=30)
+
+
+# -- what was recorded, and is sent again ------------------------------------------------------
+
+
+def replayed(flight: Flight, peer: Address) -> tuple[Counter[bytes], list[int]]:
+    """What is accepted of all that was ever sent, and the sizes of answers less what drew them."""
+    accepted = Counter[bytes]()
+    excess = []
+    for to_server, datagram in flight.sent:
+        try:
+            if to_server:
+                call = flight.server.open(Datagram(datagram, peer), now_ns=flight.now_ns)
+                if call is not None:
+                    accepted[call.payload] += 1
+            else:
+                payload = flight.client.open(datagram, now_ns=flight.now_ns)
+                accepted[payload or b"cookie"] += 1
+        except ProtocolError:
+            pass
+        answers = flight.server.outbox()
+        assert len(answers) <= 1
+        excess += [len(answer.payload) - len(datagram) for answer in answers]
+    return accepted, excess
+
+
+def recorded(seed: int) -> Flight:
+    """A flight with a change of keys, all of whose packets have arrived."""
+    flight = Flight(seed, 0.0, lambda rng: rng.uniform(0.0, 0.3))
+    flight.until(horizons=200)
+    flight.now_ns += FRESH_NS
+    flight.hello()
+    flight.until(horizons=400)
+    flight.flies, flight.silent, flight.hello_due = False, 0, 10**9
+    for _ in range(20):
+        flight.tick()
+    assert not flight.under_way
+    return flight
+
+
+@pytest.mark.parametrize("later_ns", [0, 3 * COOKIE_NS])
+@pytest.mark.parametrize("peer", [HERE, ELSEWHERE])
+def test_nothing_of_a_recorded_session_is_accepted_again(peer: Address, later_ns: int) -> None:
+    """By neither end, from wherever it comes; it draws challenges at most, each shorter."""
+    flight = recorded(1)
+    before = live(flight.server)
+    flight.now_ns += later_ns
+    accepted, excess = replayed(flight, peer)
+    assert accepted == {}
+    assert set(excess) == {CHALLENGE_BYTES - INITIATION_BYTES}
+    assert len(excess) <= sum(to_server and len(d) == 512 for to_server, d in flight.sent)
+    assert live(flight.server) == before
+    assert not flight.server._vehicles[1].pending
+
+
+@pytest.mark.parametrize("restarted", ["client", "server", "both"])
+def test_nothing_is_accepted_after_a_restart(restarted: str) -> None:
+    """With the same keys, while a new handshake is under way."""
+    flight = recorded(2)
+    if restarted != "server":
+        flight.client = link(seed=5)
+        flight.client.hello(HELLO, now_ns=flight.now_ns)
+    if restarted != "client":
+        flight.server = gate(seed=6)
+    accepted, excess = replayed(flight, HERE)
+    assert accepted == {}
+    assert all(each < 0 for each in excess)
+
+
+# -- floods ------------------------------------------------------------------------------------
+
+
+def test_a_flood_of_initiations_takes_no_memory() -> None:
+    """10^5 of them, forged, of strangers and repeated: what is kept is bounded by the keys."""
+    rng, server = random.Random(3), gate()
+    clients = [link(seed, key) for seed in range(20) for key in KEYS.values()]
+    good = []
+    for client in clients:
+        server.open(Datagram(client.hello(HELLO, now_ns=0), HERE), now_ns=0)
+        client.open(server.outbox()[0].payload, now_ns=0)
+        good.append(client.hello(HELLO, now_ns=0))
+    reasons = Counter[str]()
+    for i in range(100_000):
+        now_ns = i * 10**6
+        datagram = rng.choice(good)
+        peer = HERE if rng.random() < 0.5 else (f"stranger {i}", i % 65_536)
+        if i % 4:
+            datagram = changed(datagram, rng.randrange(2, 512))
+        try:
+            call = server.open(Datagram(datagram, peer), now_ns=now_ns)
+        except ProtocolError as error:
+            reasons[error.reason] += 1
+            continue
+        if call is not None:
+            call.line.seal(WELCOME)
+            server.admit(call, now_ns=now_ns)
+    assert set(reasons) == {"forged", "unknown key", "too many handshakes"}
+    assert len(server._vehicles) == len(KEYS)
+    assert all(len(each.pending) == PENDING_MAX for each in server._vehicles.values())
+    assert len(server.outbox()) == CHALLENGES_MAX
+    assert server.outbox() == []
+
+
+def test_hostile_datagrams_give_protocol_errors_alone() -> None:
+    """Random bytes, and all packets of a flight with something changed, at either end."""
+    flight, rng = recorded(3), random.Random(4)
+    flight.client.hello(HELLO, now_ns=flight.now_ns)
+    reasons, accepted = Counter[str](), 0
+    datagrams = [datagram for _, datagram in flight.sent]
+    for _ in range(20_000):
+        if rng.random() < 0.3:
+            datagram = bytes([VERSION, rng.randrange(6)]) + rng.randbytes(rng.randrange(600))
+        else:
+            datagram = rng.choice(datagrams)
+            at = rng.randrange(len(datagram))
+            datagram = rng.choice(
+                [changed(datagram, at), datagram[:at], datagram + b"x", datagram[at:]]
+            )
+        for open_ in (
+            lambda d: flight.server.open(Datagram(d, HERE), now_ns=flight.now_ns),
+            lambda d: flight.client.open(d, now_ns=flight.now_ns),
+        ):
+            try:
+                accepted += open_(datagram) is not None
+            except ProtocolError as error:
+                reasons[error.reason] += 1
+    assert accepted == 0
+    assert set(reasons) <= {
+        "expired", "forged", "length", "not for a client", "not for a server", "not sealed",
+        "replayed", "too many handshakes", "unasked", "unknown channel", "unknown key",
+    }  # fmt: skip
+
+
+def test_no_secret_is_shown_by_an_end() -> None:
+    """Neither in a `repr`, nor in the message of an error."""
+    client, server = joined()
+    call = called(server, client.seal(b"o"))
+    shown = repr((client, server, call.line, server._vehicles, client._current))
+    for key in KEYS.values():
+        for secret in (key.psk, key.mac, SECRETS[1]):
+            assert secret.hex() not in shown
+            assert repr(secret)[2:-1] not in shown
+
+
+def test_a_hello_whose_ephemeral_key_is_none_is_dropped() -> None:
+    """Only who has the key can make one; the server drops it all the same."""
+    key, server = KEYS[1, 5], gate()
+    public = bytes(32)
+    state = noise._begin(key.psk, handshake.prologue(key)).mix_ephemeral(public)
+    message = public + state.seal(handshake.pad(HELLO))[1]
+    datagram = handshake.write_initiation(key, server._cookie(HERE, 0), message)
+    with pytest.raises(ProtocolError, match="forged"):
+        called(server, datagram).line.seal(WELCOME)
