@@ -149,7 +149,7 @@ def read_challenge(key: Key, packet: bytes, public: bytes) -> bytes:
     """
     if len(packet) != CHALLENGE_BYTES:
         raise ProtocolError("length")
-    if packet[: HEADER.size] != _header(key, CHALLENGE) or not is_authentic(key, packet, public):
+    if not is_authentic(key, packet, public):
         raise ProtocolError("unasked")
     return packet[HEADER.size : _COOKIE_END]
 
@@ -162,7 +162,7 @@ def read_response(key: Key, packet: bytes, public: bytes) -> Response:
     """
     if not RESPONSE_BYTES_MIN <= len(packet) <= INITIATION_BYTES:
         raise ProtocolError("length")
-    if packet[: HEADER.size] != _header(key, RESPONSE) or not is_authentic(key, packet, public):
+    if not is_authentic(key, packet, public):
         raise ProtocolError("unasked")
     (channel,) = CHANNEL.unpack_from(packet, HEADER.size)
     return Response(channel, packet[HEADER.size + CHANNEL.size : -MAC_BYTES])
