@@ -43,6 +43,8 @@ class Options:
     """HOST:PORT of netem, or of the server itself; an IPv6 host in brackets, as in [::1]:47000."""
     number: Annotated[int, tyro.conf.arg(name="id")] = 1
     """Number of this vehicle (0 to 65535); no two vehicles of a server may have the same."""
+    arm: bool = True
+    """Whether plans may be flown at all; --no-arm for a vehicle that is to stay where it is."""
     vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of vehicles to fly in this process, numbered from --id on."""
     keys: Path | None = None
@@ -98,6 +100,7 @@ def fly(argv: Sequence[str]) -> None:
                 server=server,
                 vehicle=number,
                 boot_id=secrets.randbits(64),
+                armed=options.arm,
                 link=link(number),
                 recorder=recording.recorder,
             )

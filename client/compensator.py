@@ -2,12 +2,14 @@
 
 The rule itself is `shared.rule`, which the server's replay flies by as well. Here is what it needs
 aboard: the newest horizon, where its first inputs have led so far, and the step it came into force.
-The horizon of the newest generation wins, in whatever order they arrive (E11).
+The horizon of the newest generation wins, in whatever order they arrive (E11). Without a horizon
+the input that was flown last is braked along, and from a standstill that is hovering.
 """
 
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.model import Array, advance
 from shared.protocol import NO_HORIZON, Horizon, ProtocolError
@@ -28,8 +30,11 @@ class Compensator:
         self._bounds = terms.u_max
         self._model = terms.model.axes()
         self._nothing = [0.0] * terms.axes
-        self._inputs = np.zeros((terms.axes, 1), dtype=np.float32)
-        """The horizon's inputs that may be flown [m/s]; shape (axes, at most d + H)."""
+        self._inputs: Array | NDArray[np.float32] = np.zeros((terms.axes, 1))
+        """The horizon's inputs that may be flown [m/s], shape (axes, at most d + H); without one
+        the input that was flown when it was dropped, shape (axes, 1)."""
+        self._dropped = 0
+        """Step that this input was flown at."""
         self._speed = 0.0
         """Magnitude of its last input [m/s]."""
         self._feedback: list[list[float]] = []
@@ -38,7 +43,9 @@ class Compensator:
         """State x̄ that the horizon leads to, of each axis at stage `_led_stage` [m, m/s]."""
         self._led_stage = 0
         self.in_force = NO_HORIZON
-        """Step that the horizon was made for, k_h, or NO_HORIZON: then the vehicle hovers."""
+        """Step that the horizon was made for, k_h, or NO_HORIZON."""
+        self.newest = NO_HORIZON
+        """Step that the newest horizon so far was made for, whether or not it is still held."""
         self.since = 0
         """First step that the horizon was chosen for."""
         self._new = False
@@ -50,13 +57,16 @@ class Compensator:
         self.stale = 0
         """Number of horizons that came after a newer one."""
 
-    def offer(self, horizon: Horizon, step: int, observed: int) -> None:
-        """Take a horizon that arrived before the input of a step is chosen, unless a newer is held.
+    def offer(self, horizon: Horizon, step: int, observed: int) -> bool:
+        """Take a horizon that arrived before the input of a step is chosen, unless a newer has come.
 
         Args:
             horizon: what arrived.
             step: k, the step whose input is chosen next.
             observed: step of the observation that the horizon was planned from.
+
+        Returns:
+            Whether it is held now.
 
         Raises:
             ProtocolError: it is made for a time so far ahead that nothing later could replace it,
@@ -65,9 +75,9 @@ class Compensator:
         """
         if horizon.step > step + self._H:
             raise ProtocolError("from the future")
-        if horizon.step <= self.in_force:
+        if horizon.step <= self.newest:
             self.stale += 1
-            return
+            return False
         given = horizon.inputs.shape[1] if self._indexed else self._age_max + self._H
         length = lasting(given, horizon.step, observed, self._age_max)
         if not 0 <= observed < step:
@@ -76,7 +86,8 @@ class Compensator:
             raise ProtocolError("too old")
         if self._comes_too_late(step - horizon.step, given - self._H, length):
             raise ProtocolError("too late")
-        self.in_force, self._new = horizon.step, True
+        self.in_force = self.newest = horizon.step
+        self._new = True
         self.observed_ns = horizon.observed_ns
         self._inputs = horizon.inputs[:, :length]
         if not self._indexed:
@@ -85,6 +96,20 @@ class Compensator:
         self._feedback = horizon.feedback.tolist() if horizon.feedback.size else []
         self._led = [(p, v) for p, v, *_ in self._feedback]
         self._led_stage = 0
+        return True
+
+    def drop(self, step: int, flown_last: Array) -> None:
+        """Drop the horizon; what was flown last is braked along, however often this is called.
+
+        Args:
+            step: the step that was flown last.
+            flown_last: its input [m/s]; shape (axes,).
+        """
+        self.in_force, self.observed_ns = NO_HORIZON, -1
+        self._new = self.covered = False
+        self._dropped, self._inputs = step, flown_last[:, None]
+        self._speed = math.sqrt(sum(u * u for u in flown_last.tolist()))
+        self._feedback = []
 
     def _comes_too_late(self, stage: int, committed: int, length: int) -> bool:
         """Whether a horizon that would come into force at a stage is of no use any more.
@@ -106,10 +131,10 @@ class Compensator:
         """
         if self._new:
             self.since, self._new = step, False
-        if self.in_force == NO_HORIZON:
-            return np.zeros(len(self._bounds))
-        stage, length = step - self.in_force, self._inputs.shape[1]
-        self.covered = stage < length
+        held = self.in_force != NO_HORIZON
+        stage = step - (self.in_force if held else self._dropped)
+        length = self._inputs.shape[1]
+        self.covered = held and stage < length
         told = self._told(entry(stage, length))
         back = self._led_back(stage, state) if self._feedback else self._nothing
         return np.array(

@@ -2,14 +2,19 @@
 
 The client's clock is the flight's clock: the epoch is the moment its session opened, step k begins
 at epoch + k Δt, and every stamp that control uses is read here. A lost server changes nothing in
-that: the vehicle flies on along its horizon, then as `vehicle.exhausted` says, and says HELLO
-meanwhile.
+that. What the vehicle does at all, `client.failsafe` decides; which input of a horizon it flies,
+`client.compensator`; and `client.clamp` lets nothing pass that the vehicle must never do.
 """
 
+import math
 from collections import Counter
 from typing import Any, Literal
 
+import numpy as np
+
+from client.clamp import clamped
 from client.compensator import Compensator
+from client.failsafe import CLOSING, DROPPING, HOLD, LATE_SHARE, TABLE, Failsafe
 from client.link import Link, Plain
 from client.plant import Plant
 from shared.config import Scenario
@@ -18,20 +23,17 @@ from shared.events import (
     Failure,
     Finished,
     Flying,
+    ModeChanged,
     NoAnswer,
     NoSession,
     NotFlown,
-    PlanEnded,
-    PlanResumed,
-    ServerHeard,
-    ServerRestarted,
-    ServerSilent,
     SessionRefused,
 )
 from shared.protocol import (
     ACCEPTED,
     CLOSES,
     FULL,
+    NO_HORIZON,
     REFUSALS,
     TAKEN,
     Close,
@@ -39,6 +41,7 @@ from shared.protocol import (
     Hello,
     Horizon,
     Idle,
+    Message,
     Mode,
     Observation,
     ProtocolError,
@@ -46,10 +49,21 @@ from shared.protocol import (
     decode,
     encode,
 )
-from shared.record import Recorder
+from shared.model import Array
+from shared.record import Reason, Recorder
 
 HELLO_NS = SECOND_NS
 """Time between two HELLOs while nobody answers."""
+LAND_MPS = 0.5
+"""Speed at which the vehicle descends to land [m/s]."""
+ALTITUDE = 2
+"""Axis of the altitude, where there is one."""
+PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
+"""Reasons that do not say why there is no newer horizon."""
+DEGRADED = "the server misses its deadlines"
+"""Why no newer horizon comes, as it seems, of a server that plans and says that it is degraded."""
+IMPOSSIBLE = frozenset({"from the future", "observation"})
+"""Reasons for which a horizon is dropped that is made for an impossible time."""
 
 
 class Client(Endpoint):
@@ -61,6 +75,7 @@ class Client(Endpoint):
         server: address of the server, or of the netem before it.
         vehicle: number of the vehicle, unlike that of any other vehicle of the server.
         boot_id: number that no other life of this vehicle has had.
+        armed: whether horizons may be flown.
         link: how messages become datagrams.
         recorder: takes one row a step.
     """
@@ -73,6 +88,7 @@ class Client(Endpoint):
         server: Address,
         vehicle: int,
         boot_id: int,
+        armed: bool = True,
         link: Link | None = None,
         recorder: Recorder | None = None,
     ) -> None:
@@ -90,10 +106,24 @@ class Client(Endpoint):
         self._link = link or Plain()
         self._recorder = recorder
 
-        self._hello_due_ns: int | None = 0
-        """Time of the next HELLO; None while the server is heard."""
+        holds = self._terms.exhausted == "hold"
+        self._failsafe = Failsafe(
+            HOLD if holds else TABLE,
+            armed=armed,
+            timeout_ns=self._timeout_ns,
+            land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
+            changed=self._mode_changed,
+        )
+        slew_mps2 = scenario.vehicle.slew_mps2
+        self._change_max = math.inf if holds else slew_mps2 * self._terms.dt_s
+        """Largest change of the input from step to step [m/s]."""
+
+        self._hello_ns = 0
+        """Time before which no HELLO is said again."""
         self._began_ns: int | None = None
         self._session: int | None = None
+        self._in_session = False
+        """Whether that session may go on; else nothing but a WELCOME is heard."""
         self._server_boot_id: int | None = None
         self._echo = (0, 0)
         """Newest `server_ns` [server's clock], and the time it came."""
@@ -102,14 +132,17 @@ class Client(Endpoint):
         """Step that comes next."""
         self._flown = 0
         """Step at whose start the plant's state is."""
-        self._input = self._compensator.choose(0, plant.state())
+        self._takes_from: int | None = None
+        """Step of the first observation that said that horizons are flown; None while they are
+        not."""
+        self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._covered = 0
         """Number of steps for which there was an input planned."""
         self._covered_last = 0
         """Step after the last of these."""
-        self._idle = Idle.PLANS
-        """Why the server makes no plan, as it said last."""
+        self._idle = str(Idle.PLANS)
+        """Why no newer horizon comes, as far as the server has said."""
         self._refusal: NoSession | None = None
         """Why the server opens no session, as far as it has said so since the last one."""
         self.failure: Failure | None = None
@@ -127,27 +160,67 @@ class Client(Endpoint):
     # -- datagrams ---------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Take WELCOME, HORIZON and HEARTBEAT of this session; drop and count anything else."""
+        """Take what is said in this session; drop and count anything else."""
         try:
             payload = self._link.open(datagram.payload, now_ns=now_ns)
             if payload is None:
-                self._hello_due_ns = now_ns if self._hello_due_ns is not None else None
+                self._hello_ns = now_ns
                 return
-            match decode(payload, self._terms):
+            match self._decode(payload, now_ns):
                 case Welcome() as welcome:
                     self._welcome(welcome, now_ns)
                 case Horizon() as horizon:
                     self._heard(horizon, now_ns)
-                    self._idle = Idle.PLANS
-                    self._compensator.offer(horizon, self._step, self._step_at(horizon.observed_ns))
+                    self._idle = str(Idle.PLANS)
+                    self._offer(horizon, now_ns)
                     self.counts["horizons"] += 1
                 case Heartbeat() as heartbeat:
                     self._heard(heartbeat, now_ns)
-                    self._idle = Idle(heartbeat.idle)
+                    planning = heartbeat.idle == Idle.PLANS
+                    missing = planning and heartbeat.degraded
+                    self._idle = DEGRADED if missing else str(Idle(heartbeat.idle))
+                case Close() as close:
+                    self._check_session(close)
+                    self._failsafe.meet(Reason.CLOSED, now_ns=now_ns)
                 case _:
                     raise ProtocolError("not for a client")
         except ProtocolError as error:
             self.counts[f"dropped: {error.reason}"] += 1
+
+    def _decode(self, payload: bytes, now_ns: int) -> Message:
+        """The message in a payload; one that is none is a mistake of the server, if it is its own.
+
+        In plaintext anybody could make the vehicle brake by such mistakes: there they count for
+        nothing.
+        """
+        try:
+            return decode(payload, self._terms)
+        except ProtocolError:
+            if self._link.secure:
+                self._failsafe.malformed(now_ns=now_ns)
+            raise
+
+    def _offer(self, horizon: Horizon, now_ns: int) -> None:
+        """Hold a horizon from now on, if it is the newest and may be flown.
+
+        One that was planned when the vehicle had not yet said that it would fly it begins where the
+        vehicle is not: the server reckoned with none.
+        """
+        H = self._terms.horizon
+        if horizon.step > self._compensator.newest:
+            passed = self._step - horizon.step - (horizon.inputs.shape[1] - H)
+            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * H, now_ns=now_ns)
+        observed = self._step_at(horizon.observed_ns)
+        if self._takes_from is None or 0 <= observed < self._takes_from:
+            raise ProtocolError("not taken")
+        try:
+            is_held = self._compensator.offer(horizon, self._step, observed)
+        except ProtocolError as error:
+            if error.reason in IMPOSSIBLE:
+                self._failsafe.future(now_ns=now_ns)
+            raise
+        if is_held:
+            self._failsafe.horizon_taken(now_ns=now_ns)
 
     def _welcome(self, welcome: Welcome, now_ns: int) -> None:
         if (welcome.vehicle, welcome.boot_id) != (self.vehicle, self._boot_id):
@@ -158,21 +231,24 @@ class Client(Endpoint):
                 self._fail(SessionRefused(vehicle=self.vehicle, differences=differences))
             raise ProtocolError("other terms")
         if welcome.refusal != ACCEPTED:
-            self._note_refusal(welcome.refusal)
+            self._note_refusal(welcome.refusal, now_ns)
             raise ProtocolError(REFUSALS[welcome.refusal])
         self._refusal = None
-        if self._server_boot_id not in (None, welcome.server_boot_id):
-            self._events.append(ServerRestarted(vehicle=self.vehicle))
+        restarted = self._server_boot_id not in (None, welcome.server_boot_id)
         self._session, self._server_boot_id = welcome.session, welcome.server_boot_id
+        self._in_session = True
         self._link.adopt(now_ns=now_ns)
         self._heard(welcome, now_ns)
+        if restarted:
+            self._failsafe.meet(Reason.RESTARTED, now_ns=now_ns)
         if self._epoch_ns is None:
             self._epoch_ns = now_ns
             self._events.append(Flying(vehicle=self.vehicle))
+            self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
 
-    def _note_refusal(self, refusal: int) -> None:
+    def _note_refusal(self, refusal: int, now_ns: int) -> None:
         """Note why there is no session, and say it once; a refusal that comes late is none."""
-        if self._hello_due_ns is None or refusal not in (FULL, TAKEN):
+        if not self._failsafe.is_lost(now_ns) or refusal not in (FULL, TAKEN):
             return
         host, port = self._server
         reason: Literal["full", "taken"] = "full" if refusal == FULL else "taken"
@@ -181,12 +257,14 @@ class Client(Endpoint):
             self._refusal = said
             self._events.append(said)
 
-    def _heard(self, message: Welcome | Horizon | Heartbeat, now_ns: int) -> None:
-        if (message.vehicle, message.session) != (self.vehicle, self._session):
+    def _check_session(self, message: Welcome | Horizon | Heartbeat | Close) -> None:
+        named = message.vehicle, message.session
+        if not self._in_session or named != (self.vehicle, self._session):
             raise ProtocolError("unknown session")
-        if self._hello_due_ns is not None and self._epoch_ns is not None:
-            self._events.append(ServerHeard(vehicle=self.vehicle))
-        self._hello_due_ns = None
+
+    def _heard(self, message: Welcome | Horizon | Heartbeat, now_ns: int) -> None:
+        self._check_session(message)
+        self._failsafe.heard(now_ns=now_ns)
         self._echo = (message.server_ns, now_ns)
 
     def _step_at(self, stamp_ns: int) -> int:
@@ -222,7 +300,7 @@ class Client(Endpoint):
         if self.finished:
             return None
         if self._epoch_ns is None:
-            return self._hello_due_ns
+            return self._hello_ns
         return self._epoch_ns + self._step * self._dt_ns
 
     def wake(self, *, now_ns: int) -> None:
@@ -237,11 +315,9 @@ class Client(Endpoint):
             return
         else:
             self._fly(now_ns, self._epoch_ns)
-            if self._hello_due_ns is None and now_ns - self._echo[1] > self._timeout_ns:
-                self._events.append(ServerSilent(vehicle=self.vehicle))
-                self._hello_due_ns = now_ns
-        if self._hello_due_ns is not None and now_ns >= self._hello_due_ns:
-            self._hello_due_ns = now_ns + HELLO_NS
+        wanted = self._failsafe.is_lost(now_ns) or self._link.wants_hello(now_ns)
+        if wanted and now_ns >= self._hello_ns:
+            self._hello_ns = now_ns + HELLO_NS
             hello = encode(Hello(self.vehicle, self._boot_id, self._terms))
             self._out.append(Datagram(self._link.hello(hello, now_ns=now_ns), self._server))
 
@@ -251,62 +327,119 @@ class Client(Endpoint):
         self.missed += present - self._step
         for _ in range(self._flown, present):
             self._plant.advance(self._input)
-        self._flown, self._step = present, present + 1
+        late_ns = now_ns - epoch_ns - self._step * self._dt_ns
+        self._flown = self._step = present
+        self._failsafe.step(late_ns=late_ns, now_ns=now_ns)
         state, stamp_ns = self._plant.state(), epoch_ns + present * self._dt_ns
-        had_plan = self._compensator.covered
-        self._input = self._compensator.choose(present, state)
-        self._tell_of_plan(had_plan, self._compensator.covered)
+        self._input = self._choose(state, now_ns)
+        if not self._failsafe.takes:
+            self._takes_from = None
+        elif self._takes_from is None:
+            self._takes_from = present
+        self._step = present + 1
+        self._note_end(now_ns)
+        self._report(state, stamp_ns)
+
+    def _choose(self, state: Array, now_ns: int) -> Array:
+        """Input of the present step [m/s], shape (axes,), and what follows from it."""
+        failsafe, compensator = self._failsafe, self._compensator
+        if not np.isfinite(state).all():
+            failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
+        wanted = compensator.choose(self._step, state).tolist()
+        if failsafe.mode is Mode.LAND:
+            wanted = [0.0] * self._terms.axes
+            if self._terms.axes > ALTITUDE and state[ALTITUDE, 0] > 0.0:
+                wanted[ALTITUDE] = -LAND_MPS
+        flown = clamped(wanted, self._input.tolist(), self._terms.u_max, self._change_max)
+        if flown is None:
+            failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
+        elif compensator.in_force != NO_HORIZON and not compensator.covered:
+            failsafe.meet(Reason.ENDED, now_ns=now_ns)
+        if flown is None or failsafe.mode is Mode.FAULT:
+            flown = [0.0] * self._terms.axes
+        if not any(flown):
+            failsafe.meet(Reason.STILL, now_ns=now_ns)
+        return np.array(flown)
+
+    def _report(self, state: Array, stamp_ns: int) -> None:
+        """Send and record the step that has just begun; a state that is none is only recorded."""
+        step, failsafe, compensator = self._flown, self._failsafe, self._compensator
         server_ns, received_ns = self._echo
         assert self._session is not None
-        self._send(
-            Observation(
-                self.vehicle,
-                self._session,
-                present,
-                stamp_ns,
-                self._compensator.in_force,
-                self._compensator.since,
-                server_ns,
-                received_ns,
-                Mode.TRACK if self._compensator.covered else Mode.HOVER,
-                1,
-                state,
-                self._input,
+        if np.isfinite(state).all():
+            self._send(
+                Observation(
+                    self.vehicle,
+                    self._session,
+                    step,
+                    stamp_ns,
+                    compensator.in_force,
+                    compensator.since,
+                    server_ns,
+                    received_ns,
+                    failsafe.mode,
+                    int(failsafe.takes),
+                    state,
+                    self._input,
+                )
             )
-        )
         if self._recorder is None:
             return
-        observed_ns = self._compensator.observed_ns
+        observed_ns = compensator.observed_ns
         self._recorder.append_row(
             self.vehicle,
-            present,
+            step,
             *state.ravel().tolist(),
             *self._input.tolist(),
-            self._compensator.covered,
-            self._compensator.in_force,
+            compensator.covered,
+            compensator.in_force,
             -1 if observed_ns < 0 else stamp_ns - observed_ns,
-            self._compensator.stale,
+            compensator.stale,
             self.missed,
+            failsafe.mode,
+            failsafe.reason,
         )
 
-    def _tell_of_plan(self, had: bool, has: bool) -> None:
-        """Say when a plan ends and when another begins, and how the flight ended."""
-        self._covered += has
-        self._covered_last = self._step if has else self._covered_last
-        why = "the server is silent" if self._hello_due_ns is not None else str(self._idle)
-        if self.finished:
-            without_ns = (self._step - self._covered_last) * self._dt_ns
-            if self._covered and without_ns <= self._timeout_ns:
-                finished = Finished(vehicle=self.vehicle, steps=self._steps, missed=self.missed)
-                self._events.append(finished)
-            else:
-                covered, steps = self._covered, self._steps
-                self._fail(NotFlown(vehicle=self.vehicle, covered=covered, steps=steps, why=why))
-        elif had and not has:
-            brakes = self._terms.exhausted == "brake"
-            self._events.append(PlanEnded(vehicle=self.vehicle, brakes=brakes, why=why))
-        elif has and not had and self._covered > 1:
-            self._events.append(PlanResumed(vehicle=self.vehicle))
+    def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
+        """Do and say what goes with another mode or reason.
+
+        That it coasts for a while is not said: where an event sends a horizon, that is as usual.
+        """
+        if not self._failsafe.takes:
+            self._takes_from = None
+        if cause in DROPPING:
+            self._compensator.drop(self._step - 1, self._input)
+        if cause in CLOSING:
+            self._in_session = False
+        if Reason.OLD in (was, cause) and self._failsafe.mode in (Mode.TRACK, Mode.COAST):
+            return
+        reason, after = self._failsafe.reason, str(self._failsafe.mode)
+        why = self._why_no_plan(now_ns) if reason is Reason.ENDED else str(reason)
+        changed = ModeChanged(vehicle=self.vehicle, before=str(before), after=after, reason=why)
+        self._events.append(changed)
+
+    def _why_no_plan(self, now_ns: int) -> str:
+        """Why there is no newer horizon, as far as the vehicle knows."""
+        reason = self._failsafe.reason
+        if reason not in PLANLESS:
+            return str(reason)
+        return str(Reason.LOST) if self._failsafe.is_lost(now_ns) else self._idle
+
+    def _note_end(self, now_ns: int) -> None:
+        """Note whether a plan is flown, and say how the flight ended."""
+        if self._compensator.covered:
+            self._covered += 1
+            self._covered_last = self._step
+        if not self.finished:
+            return
+        without_ns = (self._step - self._covered_last) * self._dt_ns
+        if self._covered and without_ns <= self._timeout_ns:
+            finished = Finished(vehicle=self.vehicle, steps=self._steps, missed=self.missed)
+            self._events.append(finished)
+        else:
+            covered, why = self._covered, self._why_no_plan(now_ns)
+            failure = NotFlown(vehicle=self.vehicle, covered=covered, steps=self._steps, why=why)
+            self._fail(failure)
 
     def _send(self, message: Observation | Close) -> None:
         self._out.append(Datagram(self._link.seal(encode(message)), self._server))
@@ -320,6 +453,7 @@ class Client(Endpoint):
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
         return {
+            "mode": str(self._failsafe.mode),
             "step": self._step,
             "steps": self._steps,
             "missed": self.missed,

@@ -94,6 +94,8 @@ class Controller:
         """Step of the newest observation of each vehicle, or -1; shape (room,)."""
         self.idle = np.zeros(room, dtype=np.int64)
         """Why there was no plan for each vehicle, or none sent, one of `Idle`; shape (room,)."""
+        self._takes = np.ones(room, dtype=np.bool_)
+        """Whether each vehicle flies horizons, as it said last; shape (room,)."""
         self._counts: Counter[str] = Counter()
 
     @property
@@ -105,13 +107,17 @@ class Controller:
         """Begin anew with a vehicle in this row, or with a new life of it."""
         self.last_step[row] = -1
         self.idle[row] = Idle.PLANS
+        self._takes[row] = True
         self._scheme.forget(row)
         self.planner.forget(row)
         self._trigger.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Keep an observation, unless a newer one is known (E11); whether it was kept."""
-        return self._scheme.observe(row, observation)
+        kept = self._scheme.observe(row, observation)
+        if kept:
+            self._takes[row] = bool(observation.takes)
+        return kept
 
     def able(self, rows: Indices, step: Indices) -> Flags:
         """Which vehicles can be decided on: their step is new, and `idle` names no reason."""
@@ -143,7 +149,8 @@ class Controller:
         self.planner.plan(rows, step, found)  # (14), (15)
         figures, planned = self.planner.figures[:n], self.planner.planned[:n]
         verdict = self._trigger.test(Situation(rows, figures, found.start[:n], planned))  # (16)
-        event = verdict.event.copy()
+        # A vehicle flies no horizon that was planned before it said that it would.
+        event = verdict.event & self._takes[rows]
         unsolved = _withhold(
             rows, step, found.ahead, self.observed_step, self._age_max, figures, self.idle, event
         )

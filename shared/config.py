@@ -148,6 +148,10 @@ class VehicleConfig(Section, frozen=True):
     """Answer to a horizon that has run out: hold its last input (the paper), or brake and hover."""
     brake_mps2: Factor = 2.0
     """Deceleration of the desired velocity when `brake` stops the vehicle [m/s²]."""
+    slew_mps2: Factor = 50.0
+    """Fastest change of the desired velocity on an axis [m/s²], unless `exhausted` is `hold`."""
+    land_after_s: Duration = 10.0
+    """Time of hovering with a silent server after which the vehicle lands [s]."""
     tau_s: tuple[Factor, ...] = ()
     """True time constant [s], one for all axes, or one each; left out: the model's."""
     gain: Factor = 1.0

@@ -47,6 +47,9 @@ def contradictions(scenario: "Scenario") -> Iterator[Contradiction]:
     link = scenario.link
     if link.timeout_s <= link.heartbeat_s:
         yield "link.timeout_s", link.timeout_s, f"more than link.heartbeat_s = {link.heartbeat_s:g}"
+    if vehicle.exhausted == "brake" and vehicle.slew_mps2 < vehicle.brake_mps2:
+        least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, for it to brake"
+        yield "vehicle.slew_mps2", vehicle.slew_mps2, least
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
     yield from _no_trigger(control)

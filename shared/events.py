@@ -242,25 +242,34 @@ class Flying(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: session open, flying"
 
 
-class ServerSilent(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle in flight has not heard the server for `link.timeout_s`."""
+class ModeChanged(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle does something else from now on, or the same for another reason.
+
+    That it coasts along a plan that still lasts is not told.
+    """
+
+    before: str
+    """Name of the mode that it was in, see `shared.protocol.Mode`."""
+    after: str
+    """Name of the mode that it is in; the same where its reason alone has changed."""
+    reason: str
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: the server is silent"
+        return f"vehicle {self.vehicle} {DOES[self.after]}: {self.reason}"
 
 
-class ServerHeard(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle hears the server again after a silence."""
-
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: the server is heard again"
-
-
-class ServerRestarted(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has got a session with another life of the server."""
-
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: the server has restarted"
+DOES = {
+    "init": "has no session",
+    "sync": "waits for a good link",
+    "ready": "waits for a plan",
+    "track": "flies a plan",
+    "coast": "holds its last input, as vehicle.exhausted says",
+    "brake": "brakes",
+    "hover": "hovers",
+    "land": "lands, and is not to be flown before somebody has seen to it",
+    "fault": "stands still, and is not to be flown before somebody has seen to it",
+}
+"""What a vehicle does in each mode, as far as it is told: along a plan it coasts in silence."""
 
 
 class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
@@ -277,26 +286,6 @@ class PlanningResumed(VehicleEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} is planned for again"
-
-
-class PlanEnded(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle in flight has come to the end of its newest horizon."""
-
-    brakes: bool
-    """Whether it brakes and hovers, or else holds the last input."""
-    why: str
-    """Reason for there being no newer one, as far as the vehicle knows."""
-
-    def __str__(self) -> str:
-        does = "brakes and hovers" if self.brakes else "holds its last input"
-        return f"vehicle {self.vehicle} {does}, its plan has ended: {self.why}"
-
-
-class PlanResumed(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle whose plan had ended flies another."""
-
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} flies a plan again"
 
 
 class NotFlown(VehicleEvent, frozen=True, kw_only=True):
@@ -349,13 +338,9 @@ Event = (
     | NoSession
     | NoAnswer
     | Flying
-    | ServerSilent
-    | ServerHeard
-    | ServerRestarted
+    | ModeChanged
     | PlanningStopped
     | PlanningResumed
-    | PlanEnded
-    | PlanResumed
     | NotFlown
     | Finished
 )

@@ -7,6 +7,7 @@ So a part may end anywhere, as that of a process that is killed does: half a row
 
 import json
 import math
+from enum import IntEnum
 from pathlib import Path
 from struct import Struct
 from typing import Any, Protocol
@@ -15,6 +16,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 Rows = NDArray[np.void]
+
+
+class Reason(IntEnum):
+    """Cause of what a vehicle does, see `client.failsafe`."""
+
+    BEGUN = 0
+    OPENED = 1
+    GOOD = 2
+    UNARMED = 3
+    HORIZON = 4
+    OLD = 5
+    ENDED = 6
+    LOST = 7
+    CLOSED = 8
+    RESTARTED = 9
+    LATE = 10
+    MALFORMED = 11
+    RESYNC = 12
+    STALLED = 13
+    STILL = 14
+    ALONE = 15
+    NOT_FINITE = 16
+
+    def __str__(self) -> str:
+        return REASON_TEXTS[self]
+
+
+REASON_TEXTS = {
+    Reason.BEGUN: "it has just begun",
+    Reason.OPENED: "its session is open",
+    Reason.GOOD: "the link has been good for a second",
+    Reason.UNARMED: "it is not armed",
+    Reason.HORIZON: "a horizon has come",
+    Reason.OLD: "no newer horizon has come",
+    Reason.ENDED: "its plan has ended",
+    Reason.LOST: "the server is silent",
+    Reason.CLOSED: "the server has closed the session",
+    Reason.RESTARTED: "the server has restarted",
+    Reason.LATE: "horizons come too late",
+    Reason.MALFORMED: "the server sends malformed messages",
+    Reason.RESYNC: "the server plans for impossible times",
+    Reason.STALLED: "its own computer was asleep",
+    Reason.STILL: "it stands still",
+    Reason.ALONE: "the server has been silent for long",
+    Reason.NOT_FINITE: "its state or its input is not finite",
+}
 
 
 def client_columns(axes: int) -> np.dtype[np.void]:
@@ -30,6 +77,8 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("age_ns", "<i8"),  # since the observation behind that horizon, -1 for none
             ("stale", "<i8"),  # horizons older than the one held, so far
             ("missed", "<i8"),  # steps slept through, so far
+            ("mode", "<u1"),  # what it does from here on, a `shared.protocol.Mode`
+            ("reason", "<u1"),  # and why, a `Reason`
         ]
     )
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from shared.config import Scenario
 from shared.model import Array
-from shared.record import DOWNLINK, UPLINK, Rows
+from shared.protocol import Mode
+from shared.record import DOWNLINK, UPLINK, Reason, Rows
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -29,6 +30,12 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     covered: float | None
     """Share of the steps for which the vehicle had an input planned; in the others it hovered,
     braked, or held the last."""
+    modes: dict[str, float]
+    """Time in each mode that occurred [s], see `shared.protocol.Mode`."""
+    mode: str | None
+    """Mode that the vehicle was in last."""
+    reason: str | None
+    """Why it was in it."""
     event_ratio: float | None
     """Share of the server's steps that sent a horizon."""
     uplink_packets: int | None
@@ -97,6 +104,13 @@ def summarise(
         rmse_xy=math.hypot(*rmse[:2]) if rmse else None,
         error_max=float(distances.max()) if len(distances) else None,
         covered=float(client["covered"].mean()) if len(client) else None,
+        modes={
+            str(mode): int((client["mode"] == mode).sum()) * scenario.control.dt
+            for mode in Mode
+            if (client["mode"] == mode).any()
+        },
+        mode=str(Mode(client["mode"][-1])) if len(client) else None,
+        reason=str(Reason(client["reason"][-1])) if len(client) else None,
         event_ratio=event_ratio,
         uplink_packets=_count(netem, UPLINK),
         uplink_bytes=_bytes(netem, UPLINK),

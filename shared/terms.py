@@ -140,6 +140,9 @@ _OWNERS = {
     "the vehicle's: what it truly is": """
         vehicle.tau_s vehicle.gain vehicle.dead_time_s
     """,
+    "the vehicle's: what it lets pass, and when it lands": """
+        vehicle.slew_mps2 vehicle.land_after_s
+    """,
     "the vehicle's: where it starts": "vehicle.start_m",
     "the vehicle's: the air it flies in": """
         vehicle.wind vehicle.steady_wind_mps vehicle.gust_mps2 vehicle.gust_every_s

@@ -13,27 +13,14 @@ import numpy as np
 from lab import figures
 from shared import config, record
 from shared.config import ConfigError, Scenario
-from shared.events import (
-    Event,
-    NotFlown,
-    PlanEnded,
-    PlanningStopped,
-    PlanResumed,
-    RecordIncomplete,
-    ServerHeard,
-    ServerRestarted,
-    ServerSilent,
-)
+from shared.events import Event, ModeChanged, NotFlown, PlanningStopped, RecordIncomplete
 from shared.summary import Summary, summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
 from skytether import processes
 
-TOLD = (
-    *(ServerSilent, ServerHeard, ServerRestarted),
-    *(PlanEnded, PlanResumed, PlanningStopped, RecordIncomplete),
-)
+TOLD = ModeChanged, PlanningStopped, RecordIncomplete
 """Events that are shown while it flies."""
 
 

@@ -117,7 +117,7 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
 
         summary = three.land(tmp_path)
         assert three.said("client").count("session open, flying") == 1
-        assert three.said("client").count("the server has restarted") == 2
+        assert three.said("client").count("the server has restarted") >= 2
         assert summary.steps + summary.deadline_misses == FAULTY_FLIGHT_S * STEPS_PER_S
         assert summary.rmse_xy is not None
         # However long the engine took: it waited on its path, at worst at the far end.
@@ -224,9 +224,9 @@ class Containers:
         say(what)
         yield
         began_s = time.monotonic()
-        for event in ("the server is silent", "the server is heard again"):
+        for event in ("brakes: the server is silent", "flies a plan"):
             until(event, partial(self.has_said, "client", event, since=before))
-        say(f"the server is heard again, {time.monotonic() - began_s:.1f} s after the repair")
+        say(f"a plan is flown again, {time.monotonic() - began_s:.1f} s after the repair")
         self.flies()
 
     @contextlib.contextmanager

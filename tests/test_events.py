@@ -22,21 +22,17 @@ from shared.events import (
     FlowOpened,
     Flying,
     Listening,
+    ModeChanged,
     NoAnswer,
     NoSession,
     NotFlown,
     NumberTaken,
     Omitted,
     Plaintext,
-    PlanEnded,
     PlanningResumed,
     PlanningStopped,
-    PlanResumed,
     RecordIncomplete,
     ServerFull,
-    ServerHeard,
-    ServerRestarted,
-    ServerSilent,
     SessionEnded,
     SessionOpened,
     SessionRefused,
@@ -103,23 +99,26 @@ SENTENCES = [
         "vehicle 1: no answer from server:5 in 16 s",
     ),
     (Flying(vehicle=1), "vehicle 1: session open, flying"),
-    (ServerSilent(vehicle=1), "vehicle 1: the server is silent"),
-    (ServerHeard(vehicle=1), "vehicle 1: the server is heard again"),
-    (ServerRestarted(vehicle=1), "vehicle 1: the server has restarted"),
+    (
+        ModeChanged(vehicle=1, before="track", after="brake", reason="the server is silent"),
+        "vehicle 1 brakes: the server is silent",
+    ),
+    (
+        ModeChanged(vehicle=1, before="hover", after="land", reason="the server is silent"),
+        (
+            "vehicle 1 lands, and is not to be flown before somebody has seen to it: "
+            "the server is silent"
+        ),
+    ),
+    (
+        ModeChanged(vehicle=1, before="track", after="coast", reason="no newer horizon has come"),
+        "vehicle 1 holds its last input, as vehicle.exhausted says: no newer horizon has come",
+    ),
     (
         PlanningStopped(vehicle=1, why="the solver has found none"),
         "vehicle 1 is sent no plan: the solver has found none",
     ),
     (PlanningResumed(vehicle=1), "vehicle 1 is planned for again"),
-    (
-        PlanEnded(vehicle=1, brakes=True, why="the server is silent"),
-        "vehicle 1 brakes and hovers, its plan has ended: the server is silent",
-    ),
-    (
-        PlanEnded(vehicle=1, brakes=False, why="the server is silent"),
-        "vehicle 1 holds its last input, its plan has ended: the server is silent",
-    ),
-    (PlanResumed(vehicle=1), "vehicle 1 flies a plan again"),
     (
         NotFlown(vehicle=1, covered=0, steps=200, why="no newer horizon has come"),
         "vehicle 1 was never flown: no newer horizon has come",

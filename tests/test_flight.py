@@ -10,7 +10,7 @@ import pytest
 
 from shared import config
 from shared.config import Scenario
-from shared.events import Finished, FlowOpened, Flying, SessionOpened
+from shared.events import Finished, FlowOpened, Flying, ModeChanged, SessionOpened
 from shared.model import Array
 from shared.record import DOWNLINK, UPLINK
 from shared.summary import Summary, summarise
@@ -198,8 +198,15 @@ def test_a_flight_keeps_what_everybody_said() -> None:
     said = {host: [event for _, name, event in events if name == host] for _, host, _ in events}
     assert said == {
         "netem 7": [FlowOpened(flow=n, host=f"client 7.{n + 1}", port=0) for n in (0, 1)],
-        "client 7.1": [Flying(vehicle=1), Finished(vehicle=1, steps=40, missed=0)],
-        "client 7.2": [Flying(vehicle=2), Finished(vehicle=2, steps=40, missed=0)],
+        **{
+            f"client 7.{n}": [
+                Flying(vehicle=n),
+                ModeChanged(vehicle=n, before="init", after="ready", reason="its session is open"),
+                ModeChanged(vehicle=n, before="ready", after="track", reason="a horizon has come"),
+                Finished(vehicle=n, steps=40, missed=0),
+            ]
+            for n in (1, 2)
+        },
         "server": [SessionOpened(vehicle=n, host="netem 7", port=n) for n in (1, 2)],
     }
 

@@ -15,11 +15,9 @@ from shared.events import (
     FlowOpened,
     Flying,
     Listening,
+    ModeChanged,
     Plaintext,
     RecordIncomplete,
-    ServerHeard,
-    ServerRestarted,
-    ServerSilent,
 )
 from shell.command import CommandError
 from shell.log import Line
@@ -93,9 +91,7 @@ def test_a_flight_shows_what_happens_to_its_server_and_nothing_else(
 ) -> None:
     """On stderr, where the progress bar is."""
     shown = [
-        ServerSilent(vehicle=1),
-        ServerHeard(vehicle=1),
-        ServerRestarted(vehicle=1),
+        ModeChanged(vehicle=1, before="track", after="brake", reason="the server is silent"),
         RecordIncomplete(file="netem", reason="No space left on device"),
     ]
     quiet = [

@@ -7,6 +7,7 @@ off one after the other to show that the flight leaves without them.
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,11 +22,10 @@ from shared.config import DirectionConfig, Scenario
 from shared.endpoint import SECOND_NS, Datagram
 from shared.events import (
     Finished,
+    ModeChanged,
     NotFlown,
-    PlanEnded,
     PlanningResumed,
     PlanningStopped,
-    PlanResumed,
 )
 from shared.protocol import IDLE_TEXTS, Idle
 from shared.summary import summarise
@@ -92,6 +92,8 @@ def test_a_round_trip_much_longer_than_the_horizon_is_flown(
     """1.55 s with a horizon of 0.4 s, one packet in ten lost, in wind: 42 m off without d > H."""
     control = {"dt": 0.02, "horizon": 20}
     flown = scenario(uplink_s, downlink_s, duration=40.0, control=control, vehicle={"wind": 0.05})
+    # It is flown after a second of good link, a heartbeat's trip later, and then a round trip.
+    flown = msgspec.structs.replace(flown, settle=10.0)
     flight = fly(flown)
     assert flight.failure is None
     error = summarise(flown, "test", flight.client).error_max
@@ -139,9 +141,9 @@ def test_a_delay_that_grows_in_flight_ends_in_hover_or_is_flown(
     assert isinstance(flight.failure, NotFlown)
     assert np.abs(flight.client["state"][-1, :, 1]).max() < 0.01
     said = [(host.split()[0], event) for _, host, event in flight.events]
-    here = [event for host, event in said if host == "client" and isinstance(event, PlanEnded)]
+    here = [event for host, event in said if host == "client" and isinstance(event, ModeChanged)]
     there = [event for host, event in said if host == "server"]
-    assert here
+    assert here[-1].after == "hover"
     assert flight.failure.why in (IDLE_TEXTS[Idle.DELAY], IDLE_TEXTS[Idle.OBSERVATION], SILENT)
     assert isinstance(there[-1], PlanningStopped)
     assert there[-1].why in (IDLE_TEXTS[Idle.DELAY], IDLE_TEXTS[Idle.OBSERVATION])
@@ -155,9 +157,11 @@ def test_a_delay_that_comes_and_goes_is_flown_again(monkeypatch: pytest.MonkeyPa
     flown = scenario(control={"dt": 0.02, "horizon": 20})
     flight = fly_over(monkeypatch, flown, short, lambda t: 6.0 if 15.0 < t < 25.0 else 0.05)
     assert flight.failure is None
-    said = [type(event) for _, _, event in flight.events]
-    for kind in (PlanningStopped, PlanEnded, PlanningResumed, PlanResumed):
-        assert kind in said
+    said = [event for _, _, event in flight.events]
+    changes = [event.after for event in said if isinstance(event, ModeChanged)]
+    assert changes[:5] == ["sync", "ready", "track", "brake", "hover"]
+    assert changes[-1] == "track"
+    assert {PlanningStopped, PlanningResumed} <= {type(event) for event in said}
     assert far_m(flight) < OUTSIDE_M
     assert summarise(flown, "test", flight.client).steps == 3000
     assert flight.client["covered"][-500:].all()
@@ -234,4 +238,4 @@ def test_the_age_bound_alone_ends_a_flight_that_would_leave(
         flown = scenario(control={"dt": 0.02, "horizon": 20}, link={"age_max_s": age_max_s})
         far.append(far_m(fly_over(monkeypatch, flown, *ways("both", GROWING["to 2.8 s"]))))
     assert far[0] < OUTSIDE_M
-    assert far[1] > 10 * OUTSIDE_M
+    assert far[1] > 5 * OUTSIDE_M

@@ -1,0 +1,27 @@
+"""The last clamp before the plant: whatever was chosen, no more than this is flown.
+
+It shares no code with what reads a packet or chooses an input, so that a mistake there ends here.
+"""
+
+import math
+from collections.abc import Sequence
+
+
+def clamped(
+    wanted: Sequence[float], before: Sequence[float], u_max: Sequence[float], change_max: float
+) -> list[float] | None:
+    """The input that may be flown [m/s], or None where it is not finite on some axis.
+
+    Args:
+        wanted: input that was chosen, of each axis [m/s].
+        before: input that was flown until now, of each axis, within `u_max` [m/s].
+        u_max: bound of each axis [m/s].
+        change_max: largest change from `before` on an axis [m/s]; may be infinite.
+    """
+    if not all(map(math.isfinite, wanted)):
+        return None
+    flown = []
+    for u, last, most in zip(wanted, before, u_max, strict=True):
+        near = min(max(u, last - change_max), last + change_max)
+        flown.append(min(max(near, -most), most))
+    return flown

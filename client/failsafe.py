@@ -1,0 +1,231 @@
+"""The failsafe: what the vehicle does at all, decided aboard by a table and a few timers.
+
+    INIT → SYNC → READY → TRACK ⇄ COAST → BRAKE → HOVER → LAND            and FAULT, for good
+
+`TABLE` is the machine: mode and cause give the next mode, and what is not in it changes nothing.
+`HOLD` is that of a vehicle which holds its last input for ever, as the paper's does: no failsafe.
+`Failsafe` finds the causes that take time: a good link, silence, late horizons, repeated mistakes.
+Time is an argument. What is flown in each mode is chosen in `client.vehicle`.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from shared.endpoint import MILLISECOND_NS, SECOND_NS
+from shared.protocol import Mode
+from shared.record import Reason
+
+GOOD_NS = SECOND_NS
+"""Time for which the link has to be good before horizons are taken [ns]."""
+STALL_NS = 100 * MILLISECOND_NS
+"""Lateness of a step above which the vehicle has been asleep [ns]."""
+LATE_NS = 500 * MILLISECOND_NS
+"""Time for which all horizons have to come late before the vehicle brakes [ns]."""
+LATE_SHARE = 0.75
+"""Share of a horizon that has passed when it comes, after its committed steps, if it is late."""
+WINDOW_NS = SECOND_NS
+"""Time within which mistakes of the server are counted [ns]."""
+MALFORMED_MAX = 5
+"""Malformed messages within `WINDOW_NS` that make the vehicle brake."""
+FUTURE_MAX = 10
+"""Horizons for impossible times within `WINDOW_NS` that make it ask for its session anew."""
+
+BROKEN = frozenset(
+    {Reason.LOST, Reason.CLOSED, Reason.RESTARTED, Reason.MALFORMED, Reason.RESYNC}
+)
+"""Causes after which the link has to be good for `GOOD_NS` anew, in every mode."""
+LOCKING = BROKEN | {Reason.LATE}
+"""Causes of braking after which no horizon is taken before the vehicle hovers on a good link."""
+CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
+"""Causes that end the session: another WELCOME is needed."""
+DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE}
+"""Causes for which the horizon held is dropped."""
+
+Table = Mapping[tuple[Mode, Reason], Mode]
+
+_FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not Mode.FAULT}
+_TO_BRAKE = BROKEN | {Reason.ENDED, Reason.LATE, Reason.STALLED}
+
+TABLE: Table = MappingProxyType(
+    {
+        (Mode.INIT, Reason.OPENED): Mode.SYNC,
+        (Mode.SYNC, Reason.GOOD): Mode.READY,
+        (Mode.READY, Reason.UNARMED): Mode.READY,
+        (Mode.READY, Reason.HORIZON): Mode.TRACK,
+        (Mode.TRACK, Reason.HORIZON): Mode.TRACK,
+        (Mode.TRACK, Reason.OLD): Mode.COAST,
+        (Mode.COAST, Reason.HORIZON): Mode.TRACK,
+        (Mode.BRAKE, Reason.HORIZON): Mode.TRACK,
+        (Mode.BRAKE, Reason.STILL): Mode.HOVER,
+        (Mode.HOVER, Reason.HORIZON): Mode.TRACK,
+        (Mode.HOVER, Reason.GOOD): Mode.HOVER,
+        (Mode.HOVER, Reason.ALONE): Mode.LAND,
+    }
+    | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
+    | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
+    | {(Mode.TRACK, cause): Mode.BRAKE for cause in _TO_BRAKE}
+    | {(Mode.COAST, cause): Mode.BRAKE for cause in _TO_BRAKE}
+    | {(Mode.BRAKE, cause): Mode.BRAKE for cause in BROKEN}
+    | {(Mode.HOVER, cause): Mode.HOVER for cause in BROKEN}
+    | _FAULTS
+)
+"""Next mode by mode and cause; a mode may stay and its reason change."""
+
+HOLD: Table = MappingProxyType(
+    {
+        (Mode.INIT, Reason.OPENED): Mode.READY,
+        (Mode.READY, Reason.UNARMED): Mode.READY,
+        (Mode.READY, Reason.HORIZON): Mode.TRACK,
+        (Mode.TRACK, Reason.HORIZON): Mode.TRACK,
+        (Mode.TRACK, Reason.OLD): Mode.COAST,
+        (Mode.TRACK, Reason.ENDED): Mode.COAST,
+        (Mode.COAST, Reason.ENDED): Mode.COAST,
+        (Mode.COAST, Reason.HORIZON): Mode.TRACK,
+    }
+    | _FAULTS
+)
+"""Next mode with `vehicle.exhausted = "hold"`: never does the vehicle brake or land by itself."""
+
+
+class Failsafe:
+    """Mode of one vehicle, and why it is in it.
+
+    Args:
+        table: `TABLE` or `HOLD`.
+        armed: whether horizons may be flown at all.
+        timeout_ns: time of silence after which the link is lost, and without a newer horizon after
+            which the vehicle coasts [ns].
+        land_after_ns: time of hovering with a lost link after which it lands [ns].
+        changed: called whenever mode or reason have changed, with those before, the cause, and the
+            time.
+    """
+
+    def __init__(
+        self,
+        table: Table,
+        *,
+        armed: bool,
+        timeout_ns: int,
+        land_after_ns: int,
+        changed: Callable[[Mode, Reason, Reason, int], None],
+    ) -> None:
+        self._table = table
+        self._armed = armed
+        self._timeout_ns = timeout_ns
+        self._land_after_ns = land_after_ns
+        self._changed = changed
+        self.mode = Mode.INIT
+        """What the vehicle does."""
+        self.reason = Reason.BEGUN
+        """Newest cause that it met; what it braked for, while it hovers."""
+        self._heard_ns: int | None = None
+        """Time of the newest packet of the session; None without a session."""
+        self._good_ns = 0
+        """Time since which the link has been good, as far as it is."""
+        self._horizon_ns = 0
+        """Time at which the newest horizon was taken."""
+        self._late_ns: int | None = None
+        """Time since which all horizons have come late; None where the newest has not."""
+        self._alone_ns = 0
+        """Time since which it has hovered with a lost link, as far as it has."""
+        self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
+        """Times of the newest malformed messages."""
+        self._future: deque[int] = deque(maxlen=FUTURE_MAX)
+        """Times of the newest horizons for impossible times."""
+
+    @property
+    def takes(self) -> bool:
+        """Whether a horizon that comes now is flown."""
+        may = (self.mode, Reason.HORIZON) in self._table
+        return may and self._armed and self.reason not in LOCKING
+
+    def is_lost(self, now_ns: int) -> bool:
+        """Whether nothing of the session has come for the time-out, or there is no session."""
+        return self._heard_ns is None or now_ns - self._heard_ns > self._timeout_ns
+
+    # -- what arrives ------------------------------------------------------------------------
+
+    def heard(self, *, now_ns: int) -> None:
+        """Note a packet of the session, authenticated where the link is."""
+        if self.is_lost(now_ns):
+            self._good_ns = now_ns
+        self._heard_ns = now_ns
+
+    def horizon_arrived(self, *, late: bool, now_ns: int) -> None:
+        """Note a horizon newer than those before, whether or not it is taken.
+
+        Args:
+            late: whether more than LATE_SHARE of it has passed.
+            now_ns: time at which it came.
+        """
+        if not late:
+            self._late_ns = None
+        elif self._late_ns is None:
+            self._late_ns = now_ns
+        elif now_ns - self._late_ns >= LATE_NS:
+            self.meet(Reason.LATE, now_ns=now_ns)
+
+    def horizon_taken(self, *, now_ns: int) -> None:
+        """Note a horizon that is held from now on."""
+        self._horizon_ns = now_ns
+        self.meet(Reason.HORIZON, now_ns=now_ns)
+
+    def malformed(self, *, now_ns: int) -> None:
+        """Note a message that is the server's own and yet is none of ours."""
+        if _full(self._malformed, now_ns):
+            self.meet(Reason.MALFORMED, now_ns=now_ns)
+
+    def future(self, *, now_ns: int) -> None:
+        """Note a horizon for a time, or from an observation, that there cannot be."""
+        if _full(self._future, now_ns):
+            self.meet(Reason.RESYNC, now_ns=now_ns)
+
+    # -- what time brings --------------------------------------------------------------------
+
+    def step(self, *, late_ns: int, now_ns: int) -> None:
+        """Meet what has become true by the start of a step.
+
+        Args:
+            late_ns: time by which the vehicle was woken late for it [ns].
+            now_ns: time now.
+        """
+        if late_ns > STALL_NS:
+            self.meet(Reason.STALLED, now_ns=now_ns)
+        locked, lost = self.reason in LOCKING, self.is_lost(now_ns)
+        if lost and not locked:
+            self.meet(Reason.LOST, now_ns=now_ns)
+        if not lost and now_ns - self._good_ns >= GOOD_NS and (locked or self.mode is Mode.SYNC):
+            self.meet(Reason.GOOD, now_ns=now_ns)
+        if not self._armed:
+            self.meet(Reason.UNARMED, now_ns=now_ns)
+        if now_ns - self._horizon_ns > self._timeout_ns:
+            self.meet(Reason.OLD, now_ns=now_ns)
+        if self.mode is not Mode.HOVER or not lost:
+            self._alone_ns = now_ns
+        elif now_ns - self._alone_ns >= self._land_after_ns:
+            self.meet(Reason.ALONE, now_ns=now_ns)
+
+    def meet(self, cause: Reason, *, now_ns: int) -> None:
+        """Go where the table leads from here, if anywhere."""
+        after = self._table.get((self.mode, cause))
+        if after is None:
+            return
+        if cause in LOCKING or cause is Reason.OPENED:
+            self._good_ns = now_ns
+        if cause in CLOSING:
+            self._heard_ns = None
+        before = self.mode, self.reason
+        # Standing still is no reason of its own: what it braked for stays.
+        self.mode, self.reason = after, self.reason if cause is Reason.STILL else cause
+        if (self.mode, self.reason) != before:
+            self._changed(*before, cause, now_ns)
+
+
+def _full(times_ns: deque[int], now_ns: int) -> bool:
+    """Whether, with one more now, as many as are remembered lie within the window; then none are."""
+    times_ns.append(now_ns)
+    full = len(times_ns) == times_ns.maxlen and now_ns - times_ns[0] <= WINDOW_NS
+    if full:
+        times_ns.clear()
+    return full

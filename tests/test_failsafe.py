@@ -1,0 +1,495 @@
+"""The failsafe aboard: what a vehicle does when the link, the server or itself fails.
+
+A hand makes the server's messages, at a step of 20 ms each; the vehicle is the real one.
+"""
+
+import io
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import client.vehicle
+from client import failsafe
+from client.clamp import clamped
+from client.failsafe import HOLD, TABLE, Failsafe
+from client.link import Plain
+from client.plant import FirstOrderPlant
+from client.vehicle import Client
+from shared import config
+from shared.chance import stream
+from shared.config import ConfigError, Scenario
+from shared.endpoint import SECOND_NS, Address, Datagram
+from shared.events import Event, ModeChanged
+from shared.model import Array
+from shared.protocol import (
+    ACCEPTED,
+    NO_HORIZON,
+    Close,
+    Heartbeat,
+    Hello,
+    Horizon,
+    Idle,
+    Message,
+    Mode,
+    Observation,
+    Welcome,
+    decode,
+    encode,
+)
+from shared.record import Reason, Recorder, Rows, client_columns, parse
+
+SERVER: Address = ("server", 0)
+STEPS_PER_S = 50
+H = 100
+D = 5
+"""Committed steps of the horizons."""
+SPEED = 1.0
+"""Input of all horizons, along x [m/s]."""
+
+
+class Sealed(Plain):
+    """A link that vouches for the server."""
+
+    secure = True
+
+
+class Hand:
+    """A vehicle, and a hand that plays its server: a heartbeat each 0.1 s, horizons on request."""
+
+    def __init__(self, *, secure: bool = False, armed: bool = True, **sections: Any) -> None:
+        self.scenario = scenario(**sections)
+        self.terms = self.scenario.terms()
+        self.sink = io.BytesIO()
+        self.plant = FirstOrderPlant(self.scenario, stream(1, "wind"))
+        self.client = Client(
+            self.scenario,
+            self.plant,
+            server=SERVER,
+            vehicle=4,
+            boot_id=99,
+            armed=armed,
+            link=Sealed() if secure else Plain(),
+            recorder=Recorder(client_columns(self.terms.axes), self.sink),
+        )
+        self.now_ns = self.epoch_ns = 5 * SECOND_NS
+        self.session = 7
+        self.events: list[Event] = []
+        self.client.wake(now_ns=self.now_ns)
+        self.client.outbox()
+        self.welcome()
+
+    def say(self, message: Message) -> None:
+        """One datagram to the vehicle."""
+        self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
+
+    def welcome(self, *, server_boot_id: int = 1) -> None:
+        """Open a session."""
+        self.say(Welcome(4, self.session, 99, server_boot_id, 1, ACCEPTED, self.terms))
+
+    def heartbeat(self) -> None:
+        """Say that the server lives."""
+        self.say(Heartbeat(4, self.session, 1, Idle.PLANS, 0))
+
+    def horizon(self, made_for: int | None = None, *, observed: int | None = None) -> None:
+        """A horizon, of the step that was flown last unless told."""
+        step = self.step if made_for is None else made_for
+        observed_ns = self.epoch_ns + (self.step if observed is None else observed) * 20_000_000
+        inputs = np.zeros((self.terms.axes, D + self.terms.horizon), np.float32)
+        inputs[0] = SPEED
+        self.say(Horizon(4, self.session, step, 1, observed_ns, inputs))
+
+    @property
+    def step(self) -> int:
+        """The step that was flown last."""
+        return self.said[-1].step
+
+    def fly(self, seconds: float, *, beats: bool = True, plans: bool = False) -> None:
+        """Let time pass, with heartbeats or without, and with a horizon at each step or none."""
+        for _ in range(round(seconds * STEPS_PER_S)):
+            due_ns = self.client.next_wake_ns()
+            assert due_ns is not None
+            self.now_ns = max(self.now_ns, due_ns)
+            self.client.wake(now_ns=self.now_ns)
+            self.out = [decode(each.payload, self.terms) for each in self.client.outbox()]
+            self.said = [each for each in self.out if isinstance(each, Observation)] or self.said
+            self.events += self.client.events()
+            if beats and self.step % 5 == 0:
+                self.heartbeat()
+            if plans:
+                self.horizon()
+
+    said: list[Observation]
+    out: list[Message]
+
+    @property
+    def mode(self) -> Mode:
+        """What the vehicle says that it does."""
+        return Mode(self.said[-1].mode)
+
+    @property
+    def takes(self) -> bool:
+        """Whether it says that it flies horizons."""
+        return bool(self.said[-1].takes)
+
+    @property
+    def speed(self) -> float:
+        """Magnitude of the input that it says it flies [m/s]."""
+        return float(np.linalg.norm(self.said[-1].input))
+
+    @property
+    def changes(self) -> list[tuple[str, str]]:
+        """Modes that it has told, and why."""
+        self.events += self.client.events()
+        told = [event for event in self.events if isinstance(event, ModeChanged)]
+        return [(event.after, event.reason) for event in told]
+
+    def rows(self) -> Rows:
+        """The record so far."""
+        return parse(self.sink.getvalue())
+
+
+def scenario(**sections: Any) -> Scenario:
+    """A long flight of the demo at 50 Hz in calm air; sections are laid over."""
+    table = config.to_table(config.load("demo")) | {"duration": 100.0}
+    table["control"] |= {"dt": 0.02, "horizon": H}
+    table["vehicle"] |= {"wind": 0.0}
+    for section, values in sections.items():
+        table[section] |= values
+    return config.check(table, "test")
+
+
+def tracking(**keys: Any) -> Hand:
+    """A vehicle that flies horizons."""
+    hand = Hand(**keys)
+    hand.fly(1.2)
+    assert hand.takes
+    hand.fly(2.0, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+    return hand
+
+
+def comes_to_hover_and_takes_no_horizon(hand: Hand, *, for_s: float = 0.8) -> None:
+    """Braked at 2 m/s² from 1 m/s, with the link good and horizons at every step meanwhile."""
+    hand.fly(0.02, plans=True)
+    assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, False, NO_HORIZON)
+    hand.fly(0.5, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.HOVER, 0.0)
+    hand.fly(for_s - 0.52, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
+    hand.fly(1.0)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, True)
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+
+
+# -- the way to the first horizon ------------------------------------------------------------------
+
+
+def test_a_vehicle_takes_a_horizon_after_a_second_of_good_link() -> None:
+    """One that comes before that is dropped, and counted."""
+    hand = Hand()
+    hand.fly(0.98, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.SYNC, False, 0.0)
+    assert hand.client.counts["dropped: not taken"] == 49
+    hand.fly(0.04)
+    assert (hand.mode, hand.takes) == (Mode.READY, True)
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+    modes = [(Mode(mode), Reason(reason)) for mode, reason in zip(*modes_of(hand), strict=True)]
+    assert list(dict.fromkeys(modes)) == [
+        (Mode.SYNC, Reason.OPENED),
+        (Mode.READY, Reason.GOOD),
+        (Mode.TRACK, Reason.HORIZON),
+    ]
+
+
+def modes_of(hand: Hand) -> tuple[list[int], list[int]]:
+    """Mode and reason of every step of the record."""
+    rows = hand.rows()
+    return rows["mode"].tolist(), rows["reason"].tolist()
+
+
+def test_a_link_that_stutters_is_not_good() -> None:
+    """A heartbeat every 1.1 s for ten seconds, where silence of 1 s is a loss."""
+    hand = Hand()
+    for _ in range(9):
+        hand.fly(1.1, beats=False)
+        hand.heartbeat()
+        assert hand.mode is Mode.SYNC
+
+
+def test_a_horizon_planned_before_the_vehicle_took_any_is_dropped() -> None:
+    """The server reckoned that it would stand still."""
+    hand = Hand()
+    hand.fly(1.2)
+    hand.horizon(observed=30)
+    hand.fly(0.02)
+    assert hand.mode is Mode.READY
+    assert hand.client.counts["dropped: not taken"] == 1
+
+
+def test_a_vehicle_that_is_not_armed_flies_nothing() -> None:
+    """It stays ready, says so, and tells the server that it takes no horizon."""
+    hand = Hand(armed=False)
+    hand.fly(3.0, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.READY, False, 0.0)
+    assert hand.changes[-1] == ("ready", "it is not armed")
+
+
+def test_a_client_that_was_restarted_begins_anew_and_disarmed_if_told() -> None:
+    """A new life of the vehicle has no session, no horizon, and no mode of the one before."""
+    before = tracking()
+    after = Hand(armed=False)
+    assert before.mode is Mode.TRACK
+    after.fly(0.02, plans=True)
+    assert (after.mode, after.said[-1].in_force, after.speed) == (Mode.SYNC, NO_HORIZON, 0.0)
+
+
+# -- what fails in flight --------------------------------------------------------------------------
+
+
+def test_without_a_newer_horizon_it_coasts_and_says_nothing() -> None:
+    """After a second; the heartbeats live, and the next horizon is flown at once."""
+    hand = tracking()
+    told = hand.changes
+    hand.fly(1.1)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.COAST, True, SPEED)
+    hand.horizon()
+    hand.fly(0.02)
+    assert hand.mode is Mode.TRACK
+    assert hand.changes == told
+
+
+def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() -> None:
+    """The link is good: nothing is locked."""
+    hand = tracking()
+    hand.fly((D + H) / STEPS_PER_S + 0.1)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, True)
+    assert hand.speed == pytest.approx(SPEED - 0.2, abs=0.05)
+    hand.fly(1.0)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, True, 0.0)
+    assert hand.changes[-2:] == [
+        ("brake", "no newer horizon has come"),
+        ("hover", "no newer horizon has come"),
+    ]
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+
+
+def test_a_silent_server_ends_in_brake_with_horizon_left() -> None:
+    """After a second without a packet, with one more second of horizon."""
+    hand = tracking()
+    hand.fly(0.96, beats=False)
+    assert hand.speed == SPEED
+    hand.fly(0.1, beats=False)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
+    hand.fly(0.6, beats=False)
+    assert (hand.mode, hand.speed) == (Mode.HOVER, 0.0)
+    assert hand.changes[-1] == ("hover", "the server is silent")
+    hand.fly(0.9, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
+    hand.fly(0.2)
+    assert hand.takes
+
+
+def test_ten_seconds_of_hovering_alone_end_in_landing_for_good() -> None:
+    """In space it descends to the ground; what the server says then changes nothing."""
+    space = {"model": {"axes": 3}, "reference": {"altitude_m": 2.0}}
+    hand = tracking(control={"horizon": 60}, **space)
+    hand.fly(0.5, plans=True)
+    hand.fly(1.0 + 0.6 + 9.7, beats=False)
+    assert hand.mode is Mode.HOVER
+    hand.fly(0.5, beats=False)
+    assert hand.mode is Mode.LAND
+    assert hand.said[-1].input.tolist() == [0.0, 0.0, -0.5]
+    hand.fly(5.0, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.LAND, False, 0.0)
+    assert hand.rows()["state"][-1, 2, 0] == pytest.approx(0.0, abs=0.5)
+    assert hand.changes[-1] == ("land", "the server has been silent for long")
+
+
+def test_in_the_plane_landing_is_staying() -> None:
+    """There is no down."""
+    hand = tracking()
+    hand.fly(12.0, beats=False)
+    assert (hand.mode, hand.speed) == (Mode.LAND, 0.0)
+
+
+def test_horizons_that_come_late_for_half_a_second_end_in_brake() -> None:
+    """Three quarters of a horizon after its committed steps, although each could be flown."""
+    hand = tracking(control={"scheme": "predictive", "trigger": "always"})
+    hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
+    begun = hand.step
+    while hand.mode is not Mode.BRAKE:
+        hand.horizon(hand.step - D - 76)
+        hand.fly(0.02)
+        assert hand.step <= begun + 30
+    assert hand.step == begun + 26
+    assert hand.changes[-1] == ("brake", "horizons come too late")
+    comes_to_hover_and_takes_no_horizon(hand)
+
+
+def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
+    """A single straggler says nothing."""
+    hand = tracking()
+    hand.fly((D + 0.75 * H) / STEPS_PER_S)
+    for _ in range(5):
+        hand.horizon(hand.step - D - 76)
+        hand.fly(0.4)
+        hand.horizon(hand.step - D - 74)
+        hand.fly(0.02)
+    assert ("brake", "horizons come too late") not in hand.changes
+
+
+def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
+    """What the former life planned is dropped."""
+    hand = tracking()
+    hand.session = 8
+    hand.welcome(server_boot_id=2)
+    comes_to_hover_and_takes_no_horizon(hand)
+    assert ("brake", "the server has restarted") in hand.changes
+
+
+def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
+    """Five within a second: one flipped bit is forgiven, a server gone mad is not."""
+    hand = tracking(secure=True)
+    for _ in range(4):
+        hand.client.receive(Datagram(b"?", SERVER), now_ns=hand.now_ns)
+    hand.fly(1.1, plans=True)
+    assert hand.mode is Mode.TRACK
+    for _ in range(5):
+        hand.say(with_input_out_of_range(hand))
+    comes_to_hover_and_takes_no_horizon(hand)
+    assert ("brake", "the server sends malformed messages") in hand.changes
+
+
+def with_input_out_of_range(hand: Hand) -> Horizon:
+    """A horizon that asks for more than u_max."""
+    inputs = np.full((2, H), 1.01 * hand.terms.u_max[0], np.float32)
+    return Horizon(4, hand.session, hand.step, 1, hand.epoch_ns, inputs)
+
+
+def test_in_plaintext_a_stranger_cannot_make_it_brake_by_malformed_messages() -> None:
+    """Nobody vouches for them."""
+    hand = tracking()
+    for _ in range(100):
+        hand.client.receive(Datagram(b"?", SERVER), now_ns=hand.now_ns)
+    hand.fly(0.1, plans=True)
+    assert hand.mode is Mode.TRACK
+
+
+def test_horizons_for_impossible_times_end_in_a_new_session() -> None:
+    """Ten within a second: braked, and HELLO said; only a WELCOME is heard from then on."""
+    hand = tracking()
+    for n in range(10):
+        if n % 2:
+            hand.horizon(hand.step + H + 10 + n)
+        else:
+            hand.horizon(hand.step + 1, observed=hand.step + 2)
+    hand.fly(0.02, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
+    assert any(isinstance(each, Hello) for each in hand.out)
+    assert hand.changes[-1] == ("brake", "the server plans for impossible times")
+    hand.welcome()
+    comes_to_hover_and_takes_no_horizon(hand)
+
+
+def test_a_server_that_closes_the_session_ends_in_brake_at_once() -> None:
+    """What it sent before and what comes late is not heard; the vehicle asks for a session."""
+    hand = tracking()
+    for _ in range(3):
+        hand.say(Close(4, hand.session))
+    hand.fly(0.02, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.BRAKE, pytest.approx(SPEED - 0.04))
+    assert any(isinstance(each, Hello) for each in hand.out)
+    hand.fly(3.0, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+    assert hand.changes[-1] == ("hover", "the server has closed the session")
+    hand.session = 8
+    hand.welcome(server_boot_id=2)
+    hand.fly(1.2)
+    assert hand.takes
+
+
+def test_a_close_of_another_session_is_dropped() -> None:
+    """It may be of the life before."""
+    hand = tracking()
+    hand.say(Close(4, 6))
+    hand.fly(0.02, plans=True)
+    assert hand.mode is Mode.TRACK
+
+
+def test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon() -> None:
+    """121 ms late: what it was flying had been planned for other places."""
+    hand = tracking()
+    hand.now_ns += 141_000_000
+    hand.heartbeat()
+    hand.fly(0.02)
+    assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, True, NO_HORIZON)
+    assert hand.changes[-1] == ("brake", "its own computer was asleep")
+    hand.horizon()
+    hand.fly(0.02)
+    assert hand.mode is Mode.TRACK
+
+
+def test_a_vehicle_that_oversleeps_by_less_flies_on() -> None:
+    """A busy machine is no reason."""
+    hand = tracking()
+    hand.now_ns += 100_000_000
+    hand.fly(0.02)
+    assert hand.mode is Mode.TRACK
+
+
+def test_a_solver_that_fails_or_a_server_that_is_degraded_is_told() -> None:
+    """The vehicle coasts, brakes, and says what the server said."""
+    for idle, degraded, why in (
+        (Idle.UNSOLVED, 0, "the solver has found none"),
+        (Idle.PLANS, 1, "the server misses its deadlines"),
+    ):
+        hand = tracking()
+        for _ in range(30):
+            hand.say(Heartbeat(4, hand.session, 1, idle, degraded))
+            hand.fly(0.1, beats=False)
+        assert hand.changes[-2:] == [("brake", why), ("hover", why)]
+
+
+class Mad(FirstOrderPlant):
+    """A plant whose state is no number from some time on."""
+
+    mad = False
+
+    def state(self) -> Array:
+        """See `Plant`."""
+        return super().state() * (np.nan if self.mad else 1.0)
+
+
+def test_what_is_not_finite_ends_in_fault_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A state or an input; nothing is flown after that."""
+    hand = tracking()
+    monkeypatch.setattr(
+        client.vehicle.Compensator, "choose", lambda *_: np.array([np.nan, 0.0])
+    )
+    hand.fly(0.02, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.FAULT, 0.0)
+    monkeypatch.undo()
+    monkeypatch.setattr(FirstOrderPlant, "state", lambda _: np.full((2, 2), np.inf))
+    other = tracking_with_a_mad_plant(monkeypatch)
+    for faulty in (hand, other):
+        faulty.fly(3.0, plans=True)
+        rows = faulty.rows()
+        assert rows["mode"][-1] == Mode.FAULT
+        assert not rows["input"][-1].any()
+        assert faulty.changes[-1] == ("fault", "its state or its input is not finite")
+
+
+def tracking_with_a_mad_plant(monkeypatch: pytest.MonkeyPatch) -> Hand:
+    """A vehicle in flight whose plant then goes mad."""
+    monkeypatch.undo()
+    hand = tracking()
+    monkeypatch.setattr(hand.plant, "state", lambda: np.full((2, 2), np.inf))
+    return hand
