@@ -13,19 +13,22 @@ from typing import Any, Literal
 
 import tyro
 
-from benchmarks import accuracy, netem, solvers, tick, wire
+from benchmarks import accuracy, flood, link, netem, restarts, solvers, tick, wire
 from benchmarks.harness import CONSOLE, Table, machine, refresh
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
 DOCUMENT = ROOT / "docs" / "performance.md"
-Section = Literal["netem", "solvers", "tick", "wire", "accuracy"]
+Section = Literal["netem", "solvers", "tick", "wire", "accuracy", "link", "flood", "restarts"]
 SECTIONS: dict[Section, ModuleType] = {
     "netem": netem,
     "solvers": solvers,
     "tick": tick,
     "wire": wire,
     "accuracy": accuracy,
+    "link": link,
+    "flood": flood,
+    "restarts": restarts,
 }
 
 
@@ -36,7 +39,7 @@ class Options:
     only: tuple[Section, ...] = tuple(SECTIONS)
     """Benchmarks to run."""
     quick: bool = False
-    """Measure all of them in under a minute, and write nothing."""
+    """Measure all of them in two minutes, and write nothing."""
 
 
 def main() -> int:
@@ -57,14 +60,25 @@ def write(
     results: Mapping[str, Any],
     file: Path = RESULTS,
     document: Path = DOCUMENT,
-    figure: Path = tick.FIGURE,
+    folder: Path = DOCUMENT.parent,
 ) -> None:
-    """Put new figures beside those of other sections, and all into the document."""
+    """Put new figures beside those of other sections, and all into the document.
+
+    Args:
+        results: what was measured, by section.
+        file: the figures.
+        document: where the tables are.
+        folder: for what is drawn.
+    """
+    if "tick" in results:
+        tick.draw(results["tick"], folder / tick.FIGURE.name)
+    if "restarts" in results:
+        restarts.draw(results["restarts"], folder / restarts.FIGURE.name)
+        traced = results["restarts"]
+        results = {**results, "restarts": {k: v for k, v in traced.items() if k != "traces"}}
     known = {**(json.loads(file.read_text()) if file.exists() else {}), **results}
     merged = {name: known[name] for name in SECTIONS if name in known}
     file.write_text(json.dumps(merged, indent=1) + "\n")
-    if "tick" in results:
-        tick.draw(results["tick"], figure)
     tables = {"machine": machines(merged), "packages": packages(merged)}
     for name, figures in merged.items():
         tables |= SECTIONS[name].tables(figures)

@@ -1,4 +1,4 @@
-"""Processes of a flight as children: started, heard, killed and stopped; none outlives its stack."""
+"""Processes of a flight as children: started, heard, killed and stopped; none outlives a stack."""
 
 import contextlib
 import os
@@ -16,7 +16,7 @@ import msgspec
 
 from shared import keys
 from shared.config import Scenario, to_toml
-from shared.endpoint import SECOND_NS, Address
+from shared.endpoint import Address
 from shared.events import Counted, Event, Listening, address_text
 from shell.log import Line
 from shell.workers import die_with_parent
@@ -41,7 +41,10 @@ class Child:
         # -P: a folder called like one of ours, where the user happens to be, is not ours.
         command = [sys.executable, "-P", "-m", name, *arguments, "--log", "json"]
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, preexec_fn=die_with_parent
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            preexec_fn=die_with_parent,  # noqa: PLW1509 - one call of the kernel, which takes no lock
         )
         stack.callback(self.kill)
         self.lines: list[Line] = []
@@ -54,15 +57,16 @@ class Child:
 
     def _read(self) -> None:
         assert self.process.stdout is not None
-        for text in self.process.stdout:
-            try:
-                line = _DECODER.decode(text)
-            except (msgspec.DecodeError, UnicodeDecodeError):
-                self.words.append(text.decode(errors="replace").rstrip())
-                continue
-            with self._heard:
-                self.lines.append(line)
-                self._heard.notify_all()
+        with self.process.stdout as said:
+            for text in said:
+                try:
+                    line = _DECODER.decode(text)
+                except (msgspec.DecodeError, UnicodeDecodeError):
+                    self.words.append(text.decode(errors="replace").rstrip())
+                    continue
+                with self._heard:
+                    self.lines.append(line)
+                    self._heard.notify_all()
 
     def wait_for(self, kind: type[Event], count: int = 1) -> Line:
         """The line of the event of a kind that comes as number `count`, waited for.
@@ -178,8 +182,3 @@ class Lab:
 
     def _start(self, name: str, *arguments: str) -> Child:
         return Child(self._stack, name, str(self._file), *arguments)
-
-
-def sleep_ns(duration_ns: int) -> None:
-    """Sleep for some time [ns]."""
-    time.sleep(max(0, duration_ns) / SECOND_NS)

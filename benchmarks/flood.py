@@ -40,8 +40,8 @@ from shell import driver
 VEHICLES = 5
 NEWCOMER = VEHICLES + 1
 """Number of the vehicle that starts during the flood."""
-LEAD_S = 6.0
-"""Time of flight before the flood [s], and a third of it after."""
+AFTER_S = 2.0
+"""Time of flight after the flood [s]."""
 POOL = 4096
 """Number of different packets that are sent, over and over."""
 PORTS_MAX = 500
@@ -60,6 +60,8 @@ class Counts:
     """Number of forged packets a second."""
     hellos: int
     """Number of HELLOs a second."""
+    lead_s: float = 6.0
+    """Time of flight before the flood [s]."""
 
 
 FULL, QUICK = Counts(30, 100_000, 10_000), Counts(3, 20_000, 2000)
@@ -74,8 +76,10 @@ class Flood:
     """Number of packets of the flood a second."""
     read: float
     """Number of them that the server read and dropped, a second."""
+    kept_out: float
+    """Number of them a second that the kernel kept from the server for their form."""
     unread: float
-    """Number of datagrams a second for which the server's receive buffer had no room."""
+    """Number of datagrams a second for which a receive buffer had no room, on the whole machine."""
     good: int
     """Number of observations sent."""
     lost: int
@@ -183,7 +187,9 @@ class _Piece(ctypes.Structure):
     _fields_ = (("base", ctypes.c_void_p), ("bytes", ctypes.c_size_t))
 
 
-def flood(pipe: Connection, port: int, packets: list[bytes], rate: int, seconds: int) -> tuple[int, int]:
+def flood(
+    pipe: Connection, port: int, packets: list[bytes], rate: int, seconds: int
+) -> tuple[int, int]:
     """Send packets, many in a call of the kernel; how many, and the CPU time it took [ns]."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.connect((HOST, port))
@@ -195,31 +201,30 @@ def flood(pipe: Connection, port: int, packets: list[bytes], rate: int, seconds:
         message.pieces = ctypes.addressof(pieces) + (i % count) * ctypes.sizeof(_Piece)
         message.pieces_count = 1
     send, width = ctypes.CDLL(None, use_errno=True).sendmmsg, ctypes.sizeof(_Message)
-    sent = 0
-
-    def batch(wanted: int) -> None:
-        nonlocal sent
-        at = ctypes.c_void_p(ctypes.addressof(messages) + sent % count * width)
-        sent += max(0, send(sock.fileno(), at, min(wanted, count), 0))
-
+    sent, used_ns = 0, 0
     for due in _batches(pipe, rate, seconds):
+        used_ns = used_ns or time.process_time_ns()
         while sent < due:
-            batch(due - sent)
-    return sent, time.process_time_ns()
+            at = ctypes.c_void_p(ctypes.addressof(messages) + sent % count * width)
+            sent += max(0, send(sock.fileno(), at, min(due - sent, count), 0))
+    return sent, time.process_time_ns() - used_ns
 
 
-def call(pipe: Connection, port: int, packets: list[bytes], rate: int, seconds: int) -> tuple[int, int]:
+def call(
+    pipe: Connection, port: int, packets: list[bytes], rate: int, seconds: int
+) -> tuple[int, int]:
     """Send each packet from a port of its own; how many, and the CPU time it took [ns]."""
     sockets: deque[socket.socket] = deque()
-    sent = 0
+    sent, used_ns = 0, 0
     for due in _batches(pipe, rate, seconds):
+        used_ns = used_ns or time.process_time_ns()
         while sent < due:
             if len(sockets) == PORTS_MAX:
                 sockets.popleft().close()
             sockets.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             sockets[-1].sendto(packets[sent % len(packets)], (HOST, port))
             sent += 1
-    return sent, time.process_time_ns()
+    return sent, time.process_time_ns() - used_ns
 
 
 def _batches(pipe: Connection, rate: int, seconds: int) -> Iterator[int]:
@@ -253,8 +258,10 @@ class _State:
     time_ns: int
     dropped: int
     """Number of datagrams that it has dropped."""
+    gone: int
+    """Number of those that the kernel has dropped."""
     unread: int
-    """Number of those for which there was no room."""
+    """Number of datagrams for which a receive buffer of this machine had no room."""
     missed: int
     bytes: int
     used_ns: int
@@ -272,15 +279,26 @@ class _State:
             time.monotonic_ns(),
             challenged + sum(n for name, n in counts.items() if name.startswith("dropped")),
             figures["kernel_drops"],
+            without_room(),
             figures["missed"],
             resident,
             *scheduled_ns(server.process.pid).tolist(),
         )
 
 
+def without_room() -> int:
+    """Number of UDP datagrams so far for which a receive buffer of this machine had no room."""
+    names, values = (
+        line.split()
+        for line in Path("/proc/net/snmp").read_text().splitlines()
+        if line.startswith("Udp:")
+    )
+    return int(values[names.index("RcvbufErrors")])
+
+
 def _fly(kind: str, counts: Counts, lateness: Lateness) -> Flood:
     """One flight, with one kind of flood or none."""
-    flown = derive("demo", duration=counts.seconds + 4.0 * LEAD_S / 3.0)
+    flown = derive("demo", duration=counts.lead_s + counts.seconds + AFTER_S, settle=0.0)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-")))
         lab = Lab(stack, folder, flown, range(1, NEWCOMER + 1))
@@ -289,7 +307,7 @@ def _fly(kind: str, counts: Counts, lateness: Lateness) -> Flood:
         way = start(stack, tap, port)
         fleet = lab.client((HOST, answer(way)), folder / "fleet", 1, "--vehicles", str(VEHICLES))
         fleet.wait_for(Flying, VEHICLES)
-        lateness.sleep(LEAD_S)
+        lateness.sleep(counts.lead_s)
         way.send("what has passed?")
         sender = _sender(stack, kind, counts, port, answer(way))
 
@@ -309,22 +327,24 @@ def _fly(kind: str, counts: Counts, lateness: Lateness) -> Flood:
         end = server.figures()
         rows = [record.read(folder / "fleet")]
         rows += [record.read(folder / "newcomer")] if flies else []
-        epoch_ns = fleet.all(Flying)[0].time_ns
-
-    passed_ns = after.time_ns - before.time_ns
-    good = sum(map(len, rows))
+        passed_ns = after.time_ns - before.time_ns
+    good, unread = sum(map(len, rows)), after.unread - before.unread
     lost = good - end["observations"]
-    step = (np.array([before.time_ns, after.time_ns]) - epoch_ns) // flown.dt_ns
-    flooded = [each[(each["step"] >= step[0]) & (each["step"] < step[1])] for each in rows]
-    error = position_error(flown, flooded[0])
+    times_s = [each["step"] * flown.control.dt for each in rows]
+    meanwhile = [
+        each[(t >= counts.lead_s) & (t < counts.lead_s + counts.seconds)]
+        for each, t in zip(rows, times_s, strict=True)
+    ]
+    error = position_error(flown, meanwhile[0])
     return Flood(
         kind=kind,
         sent=sent / counts.seconds,
-        read=(after.dropped - before.dropped) * SECOND_NS / passed_ns,
-        unread=(after.unread - before.unread) * SECOND_NS / passed_ns,
+        read=(after.dropped - before.dropped) / counts.seconds,
+        kept_out=(after.gone - before.gone - unread) / counts.seconds,
+        unread=unread / counts.seconds,
         good=good,
         lost=lost,
-        share=1.0 - lost / max(1, sum(map(len, flooded))),
+        share=1.0 - lost / max(1, sum(map(len, meanwhile))),
         missed=after.missed - before.missed,
         rmse_m=float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())),
         session_s=session_s,
@@ -362,6 +382,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, Table]:
     rows = {
         "packets of the flood sent [1/s]": [f"{each.sent:.0f}" for each in floods],
         "read and refused [1/s]": [f"{each.read:.0f}" for each in floods],
+        "kept out by the kernel [1/s]": [f"{each.kept_out:.0f}" for each in floods],
         "no room, never read [1/s]": [f"{each.unread:.0f}" for each in floods],
         "observations sent": [str(each.good) for each in floods],
         "never handled": [str(each.lost) for each in floods],

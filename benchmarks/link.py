@@ -238,9 +238,7 @@ def _fleet(counts: Counts) -> dict[str, Any]:
     flights = [kind for _ in range(counts.turns) for kind in KINDS]
     for kind in progress(flights, "fleet"):
         stopwatch = Stopwatch(perf_counter_ns)
-        flight.fly(
-            scenario, vehicles=counts.vehicles, secure=KINDS[kind], stopwatch=stopwatch
-        )
+        flight.fly(scenario, vehicles=counts.vehicles, secure=KINDS[kind], stopwatch=stopwatch)
         share = 1000.0 * counts.vehicles * scenario.steps
         spent = {stage: ns / share for stage, ns in stopwatch.spent_ns.items()}
         del spent["record"]

@@ -39,7 +39,7 @@ from benchmarks.problems import derive
 from shared import record
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS
-from shared.events import Flying
+from shared.events import Flying, ModeChanged
 from shared.protocol import Mode
 from shared.record import Rows
 
@@ -73,6 +73,8 @@ class Counts:
     """Number of times that it is stopped."""
     flight_s: float
     """Least time of flight between two of them [s]."""
+    subjects: tuple[Subject, ...] = SUBJECTS
+    """What is killed and stopped."""
 
 
 FULL, QUICK = Counts(kills=50, stops=10, flight_s=5.0), Counts(kills=1, stops=0, flight_s=4.0)
@@ -168,9 +170,10 @@ def schedule(counts: Counts) -> list[tuple[Subject, Way]]:
     kills = [
         (subject, CLOSED if number % 2 else KILLED)
         for number in range(counts.kills)
-        for subject in SUBJECTS
+        for subject in counts.subjects
     ]
-    return [*kills, *((subject, STOPPED) for _ in range(counts.stops) for subject in SUBJECTS)]
+    stops = [(subject, STOPPED) for _ in range(counts.stops) for subject in counts.subjects]
+    return [*kills, *stops]
 
 
 class Flight:
@@ -192,7 +195,7 @@ class Flight:
         self._children["netem"] = self._start("netem")
         self._addresses["netem"] = self._children["netem"].address
         self._children["client"] = self._start("client")
-        self._children["client"].wait_for(Flying)
+        self.wait_for_flight()
 
     def _start(self, subject: str) -> Child:
         """The process anew, at the address that it had."""
@@ -219,6 +222,15 @@ class Flight:
             time.sleep(DOWN_S)
         child = self._children[subject] = self._start(subject)
         return Outage(subject, way, began_ns, child.listening_ns())
+
+    def wait_for_flight(self) -> None:
+        """Wait until the vehicle says that it flies a plan, unless it does so already."""
+        client = self._children["client"]
+        while True:
+            told = [line.event for line in client.all(ModeChanged)]
+            if told and getattr(told[-1], "after", None) == str(Mode.TRACK):
+                return
+            client.wait_for(ModeChanged, len(told) + 1)
 
     def end(self) -> list[Life]:
         """All lives of the vehicle that flew, in order."""
@@ -313,14 +325,13 @@ def measure(counts: Counts) -> dict[str, Any]:
         for subject, way in progress(schedule(counts), "restarts"):
             lateness.sleep(counts.flight_s + float(rng.random()))
             outages.append(flight.suffer(subject, way))
+            flight.wait_for_flight()
         lateness.sleep(counts.flight_s)
         lives = flight.end()
     flown = scenario()
     return {
         "verdicts": [asdict(judge(outage, lives, flown)) for outage in outages],
-        "traces": [
-            trace(outage, lives) for outage in outages if outage.way in (KILLED, CLOSED)
-        ],
+        "traces": [trace(outage, lives) for outage in outages if outage.way in (KILLED, CLOSED)],
         "wake": lateness.figures(),
     }
 
@@ -398,19 +409,21 @@ def draw(result: Mapping[str, Any], path: Path = FIGURE) -> None:
     colours = {KILLED: "#0072b2", CLOSED: "#c1272d"}
     for subject, panel in zip(SUBJECTS, panels, strict=True):
         those = [each for each in result["traces"] if each["subject"] == subject]
-        fastest = [0.0, 0.0]
+        fastest = np.zeros(2)
         for each in those:
             style: Any = {"color": colours[each["way"]], "alpha": 0.35}
             for time_s, commanded, speed in each["runs"]:
                 panel.step(time_s, commanded, where="post", linewidth=0.4, linestyle=":", **style)
                 panel.plot(time_s, speed, linewidth=0.7, **style)
-                at = int(np.searchsorted(time_s, 0.0))
-                if subject != "client" and at < len(time_s):
-                    fastest = [max(fastest[0], commanded[at]), max(fastest[1], speed[at])]
+                flies = slice(*np.searchsorted(time_s, (0.0, BRAKES_S)).tolist())
+                for i, speeds in enumerate((commanded, speed)):
+                    fastest[i] = max(fastest[i], *speeds[flies], 0.0)
             panel.plot(each["down_s"], 0.0, "|", color=colours[each["way"]], markersize=12)
-        if fastest[0] > 0.0:
+        if subject != "client":  # which is at rest when it begins anew
             since_s = np.arange(0.0, AROUND_S[1] - BRAKES_S, flown.control.dt)
-            for curve, line in zip(curves(*fastest, since_s, flown), ("k--", "k-"), strict=True):
+            for curve, line in zip(
+                curves(*fastest.tolist(), since_s, flown), ("k--", "k-"), strict=True
+            ):
                 panel.plot(BRAKES_S + since_s, curve, line, linewidth=1.4)
         panel.axvline(0.0, color="0.4", linewidth=0.8)
         panel.set_title(f"{subject}, killed {len(those)} times", fontsize=10)

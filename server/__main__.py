@@ -20,7 +20,7 @@ import tyro
 
 from server.endpoint import VEHICLES_MAX, Server
 from server.gate import Plain
-from server.secure import Secure
+from server.secure import FORMS, Secure
 from shared import keys
 from shared.config import Scenario
 from shared.endpoint import Address
@@ -113,6 +113,7 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
             f"server{suffix}",
             Steady(endpoint),
             bind=bind,
+            forms=FORMS if keyring else (),
             waiting_for="vehicles",
             secure=gate.secure,
             insecure=options.insecure,

@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 from server.gate import Call
 from shared import channel, handshake
-from shared.channel import Channel, kind
-from shared.endpoint import SECOND_NS, Address, Datagram
+from shared.channel import OVERHEAD_BYTES, VERSION, Channel, kind
+from shared.endpoint import SECOND_NS, Address, Datagram, Form
 from shared.handshake import (
     CHANNEL,
     COOKIE_BYTES,
+    INITIATION_BYTES,
     check_place,
     prologue,
     read_initiation,
@@ -28,7 +29,7 @@ from shared.handshake import (
 )
 from shared.keys import Key, Keyring
 from shared.noise import KEY_BYTES, NoiseError, Responder
-from shared.protocol import ProtocolError
+from shared.protocol import PAYLOAD_BYTES_MAX, Hello, ProtocolError
 
 COOKIE_NS = 60 * SECOND_NS
 """Time for which cookies are alike; each is good for this time and the next [ns]."""
@@ -47,6 +48,15 @@ class _Pending(NamedTuple):
     channel: Channel
     public: bytes
     """Ephemeral key of the attempt that it came from."""
+
+
+FORMS = (
+    Form(bytes((VERSION, channel.DATA)), OVERHEAD_BYTES, PAYLOAD_BYTES_MAX + OVERHEAD_BYTES),
+    Form(bytes((VERSION, handshake.INITIATION)), INITIATION_BYTES, INITIATION_BYTES),
+    Form(bytes((0x92 + len(Hello._fields),)), 1, PAYLOAD_BYTES_MAX),
+)
+"""Forms of what vehicles send: packets of a channel, and INITIATIONs. A HELLO in plaintext (an
+array of msgpack) is dropped as well, but the operator is to be told of it."""
 
 
 class _Vehicle:

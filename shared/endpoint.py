@@ -43,6 +43,17 @@ class Datagram(NamedTuple):
     """Number of the endpoint's own socket that it uses; 0 is the one that is bound."""
 
 
+class Form(NamedTuple):
+    """What the packets of one kind have in common, as far as anybody can see it."""
+
+    head: bytes
+    """Bytes that they begin with."""
+    least: int
+    """Size of the shortest [B]."""
+    most: int
+    """Size of the longest [B]."""
+
+
 class _Events(deque[Event]):
     """Events that wait for the driver."""
 

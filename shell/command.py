@@ -30,7 +30,7 @@ from rich.text import Text
 
 from shared import config
 from shared.config import ConfigError, Scenario
-from shared.endpoint import Address, Endpoint
+from shared.endpoint import Address, Endpoint, Form
 from shared.events import Counted, Listening, Plaintext, address_text
 from shared.stopwatch import Stopwatch
 from shared.summary import Summary
@@ -221,6 +221,7 @@ def drive(
     *,
     bind: Address | socket | None,
     peers: Sequence[Address] = (),
+    forms: Sequence[Form] = (),
     waiting_for: str,
     secure: bool | None,
     insecure: bool = False,
@@ -234,7 +235,7 @@ def drive(
     Args:
         process: name of the process in its log.
         endpoint: what to run.
-        bind, peers, stopwatch: see `Shell`.
+        bind, peers, forms, stopwatch: see `Shell`.
         waiting_for: whose datagrams it waits for, for the operator.
         secure: whether it has keys; None of one that only passes on what others say.
         insecure: whether it may do without keys even where other machines are reached.
@@ -246,7 +247,7 @@ def drive(
         CommandError: it cannot start, must not without keys, or the file cannot be written.
     """
     try:
-        shell = Shell(endpoint, bind, peers, stopwatch)
+        shell = Shell(endpoint, bind, peers, stopwatch, forms)
     except AddressError as error:
         raise CommandError(str(error)) from None
     if secure is False and not (shell.is_local or insecure):

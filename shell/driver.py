@@ -16,12 +16,13 @@ from collections.abc import Callable, Sequence
 from socket import socket
 from typing import Any
 
-from shared.endpoint import Address, Datagram, Endpoint
+from shared.endpoint import Address, Datagram, Endpoint, Form
 from shared.events import Event, Fault
 from shared.stopwatch import Stopwatch
 from shell.timer import make_timer
 from shell.udp import (
     Names,
+    admit_only,
     from_kernel,
     is_loopback,
     kernel_drops,
@@ -57,6 +58,7 @@ class Shell:
         peers: addresses the endpoint will send to, names or numbers; the endpoint sees each as it
             is written here, in place of whatever the kernel calls it.
         stopwatch: measures receiving and sending.
+        forms: forms of the datagrams that may come to socket 0; without any, all may.
 
     Raises:
         AddressError: the address cannot be bound, or a name cannot be found.
@@ -68,6 +70,7 @@ class Shell:
         bind: Address | socket | None,
         peers: Sequence[Address] = (),
         stopwatch: Stopwatch | None = None,
+        forms: Sequence[Form] = (),
     ) -> None:
         self.endpoint = endpoint
         self._stopwatch = stopwatch or Stopwatch()
@@ -78,7 +81,11 @@ class Shell:
         self._names = Names(peers)
         self._elsewhere = within_reach_of(self._names.numbers())
         bound = bind if isinstance(bind, socket) else open_socket(bind or self._elsewhere)
+        if forms:
+            admit_only(bound, forms)
         self._sockets = {0: bound}
+        self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
+        """Where every datagram is received: making room for the longest costs more than to copy."""
         self.address = from_kernel(bound.getsockname())
         """Address of socket 0."""
 
@@ -113,27 +120,28 @@ class Shell:
             self._sockets.clear()
 
     def kernel_drops(self) -> int:
-        """Number of datagrams that the kernel dropped because a receive buffer was full."""
+        """Number of datagrams that the kernel dropped, see `shell.udp.kernel_drops`."""
         return self._drops + sum(map(kernel_drops, self._sockets.values()))
 
     def _listen(self, number: int) -> None:
         self._loop.add_reader(self._sockets[number], self._read, number)
 
     def _read(self, number: int) -> None:
-        receive, name = self._sockets[number].recvfrom, self._names.name
-        hear, clock_ns, stopwatch = self.endpoint.receive, time.monotonic_ns, self._stopwatch
+        receive, name = self._sockets[number].recvfrom_into, self._names.name
+        room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
+        stopwatch = self._stopwatch
         try:
             for _ in range(BURST_MAX):
                 stopwatch.start()
                 try:
-                    payload, sender = receive(DATAGRAM_BYTES_MAX)
+                    size, sender = receive(room)
                     peer = name(from_kernel(sender))
                 except BlockingIOError:
                     break
                 except OSError:  # an earlier packet of ours found the peer's port closed
                     continue
                 stopwatch.lap("receive")
-                hear(Datagram(payload, peer, number), now_ns=clock_ns())
+                hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
             self._after()
 

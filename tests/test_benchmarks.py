@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, netem, solvers, tick, versions, wire
+from benchmarks import accuracy, flood, link, netem, restarts, solvers, tick, versions, wire
 from benchmarks.__main__ import DOCUMENT, ROOT, SECTIONS, write
 from benchmarks.airspace import PlannedFleet
 from benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
@@ -30,6 +30,9 @@ TINY = MappingProxyType(
         "tick": tick.Counts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
         "wire": wire.Counts(each=10),
         "accuracy": accuracy.Counts(ticks=3, random=2, horizons=(1, 30)),
+        "link": link.Counts(packets=60, handshakes=60, vehicles=2, seconds=0.5, turns=1, seeds=1),
+        "flood": flood.Counts(seconds=1, forged=2000, hellos=200, lead_s=0.5),
+        "restarts": restarts.Counts(kills=1, stops=0, flight_s=0.5, subjects=("netem",)),
     }
 )
 
@@ -40,6 +43,7 @@ def results() -> Iterator[dict[str, Any]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tick, "SETTLE", 2)
         patch.setattr(solvers, "TUNINGS", TUNINGS[::8])
+        patch.setattr(flood, "KINDS", (flood.HELLOS,))  # tests/test_flood.py has the others
         yield _results()
 
 
@@ -59,12 +63,13 @@ def saturated() -> Recorded:
 def test_every_table_has_its_place_in_the_document(
     results: Mapping[str, Any], tmp_path: Path
 ) -> None:
-    """Tables, figures and figure are written; a section that is not run stays as it was."""
-    file, figure, document = (tmp_path / name for name in ("a.json", "b.png", "c.md"))
+    """Tables, figures and pictures are written; a section that is not run stays as it was."""
+    file, document = tmp_path / "a.json", tmp_path / "b.md"
     document.write_text(DOCUMENT.read_text())
-    write(results, file, document, figure)
+    write(results, file, document, tmp_path)
     assert set(json.loads(file.read_text())) == set(SECTIONS)
-    assert figure.read_bytes().startswith(b"\x89PNG")
+    for figure in (tick.FIGURE, restarts.FIGURE):
+        assert (tmp_path / figure.name).read_bytes().startswith(b"\x89PNG")
     for name, section in SECTIONS.items():
         for table in section.tables(results[name]).values():
             assert table.markdown() in document.read_text()
