@@ -30,6 +30,7 @@ from benchmarks.wire import NOTHING, messages
 from client import secure as client
 from server import secure as server
 from server.gate import Call
+from shared import channel
 from shared.chance import stream
 from shared.config import load
 from shared.endpoint import SECOND_NS, Address, Datagram
@@ -41,8 +42,6 @@ from sim import flight
 
 PEER: Address = ("127.0.0.1", 1024)
 NOW_NS = 86_400 * SECOND_NS
-REFUSED = ("forged", "replayed", "of a strange channel", "INITIATION with a wrong MAC")
-"""What a server refuses."""
 LARGER = 1.01
 """Target for the RMSE of sealed flights over that of flights in plaintext."""
 
@@ -157,22 +156,19 @@ def _packets(counts: Counts, lateness: Lateness) -> dict[str, Any]:
     sizes["WELCOME"] = len(welcome), len(ends.response)
 
     observation, horizon = known["OBSERVATION"], known["HORIZON"]
-    call = gate.open(Datagram(ends.link.seal(observation), PEER), now_ns=NOW_NS)
+    old = ends.link.seal(observation)
+    call = gate.open(Datagram(old, PEER), now_ns=NOW_NS)
     assert call is not None
     line = call.line
     up = [line.seal(horizon) for _ in range(counts.packets)]
     down = [ends.link.seal(observation) for _ in range(counts.packets)]
-    strange = bytearray(down[0])
-    strange[4:8] = bytes(4)
-    refused = dict(
-        zip(
-            REFUSED,
-            (_bent(ends.link.seal(observation)), ends.link.seal(observation), bytes(strange),
-             _bent(ends.second)),
-            strict=True,
-        )
-    )  # fmt: skip
-    gate.open(Datagram(refused["replayed"], PEER), now_ns=NOW_NS)
+    head, sealed = old[: channel.HEADER.size - 8], old[channel.HEADER.size :]
+    refused = {
+        "forged": head + (2**31).to_bytes(8, "little") + sealed,
+        "replayed": old,
+        "of a strange channel": old[:4] + bytes(4) + old[8:],
+        "INITIATION with a wrong MAC": ends.second[:-1] + bytes([ends.second[-1] ^ 1]),
+    }
 
     def refuse(packet: bytes) -> None:
         try:
@@ -194,11 +190,6 @@ def _packets(counts: Counts, lateness: Lateness) -> dict[str, Any]:
     }
     spent = interleave(contestants, counts.packets, HOT, lateness, "packets")
     return {"bytes": sizes, "packet": {name: figures_us(each) for name, each in spent.items()}}
-
-
-def _bent(packet: bytes) -> bytes:
-    """A packet whose last bit is another."""
-    return packet[:-1] + bytes([packet[-1] ^ 1])
 
 
 def _gate(vehicles: int) -> tuple[server.Secure, Keyring]:
