@@ -4,10 +4,11 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.ready
 BENCH_STAMP := .venv/.ready-to-bench
+FUZZ_STAMP := .venv/.ready-to-fuzz
 COMPILE := $(BIN)/pip-compile --quiet --strip-extras --generate-hashes --allow-unsafe --no-header \
 	--no-emit-index-url --no-emit-trusted-host --no-emit-find-links
 
-.PHONY: setup demo reproduce test check format lock docker-test bench clean
+.PHONY: setup demo reproduce test check format lock docker-test bench fuzz clean
 
 setup: $(STAMP)  ## the environment alone
 
@@ -49,6 +50,15 @@ $(BENCH_STAMP): $(STAMP) requirements-bench.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-bench.lock
 	touch $@
 
+SECONDS ?= 30
+fuzz: $(FUZZ_STAMP)  ## hostile datagrams, guided by what they reach, for SECONDS=30
+	$(BIN)/python -m fuzz --seconds $(SECONDS)
+
+$(FUZZ_STAMP): $(STAMP) requirements-fuzz.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-fuzz.lock || \
+		echo "atheris cannot be installed here: datagrams are random, and not guided"
+	touch $@
+
 lock:  ## pin what pyproject.toml asks for
 	$(BIN)/pip install --quiet pip-tools
 	$(COMPILE) --upgrade --output-file requirements.lock pyproject.toml
@@ -56,6 +66,8 @@ lock:  ## pin what pyproject.toml asks for
 		--output-file requirements-dev.lock pyproject.toml
 	$(COMPILE) --upgrade --extra bench --constraint requirements.lock \
 		--output-file requirements-bench.lock pyproject.toml
+	$(COMPILE) --upgrade --extra fuzz --constraint requirements.lock \
+		--output-file requirements-fuzz.lock pyproject.toml
 
 clean:
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -12,6 +12,7 @@ from shared.channel import Channel, kind
 from shared.endpoint import SECOND_NS
 from shared.handshake import (
     NO_COOKIE,
+    check_place,
     pad,
     prologue,
     read_challenge,
@@ -106,7 +107,9 @@ class Secure:
         _, number = channel.address(packet)
         for each in (self._current, self._previous):
             if each is not None and each.number == number:
-                return each.open(packet, now_ns=now_ns).payload
+                payload = each.open(packet, now_ns=now_ns).payload
+                check_place(payload, in_handshake=False)
+                return payload
         raise ProtocolError("unknown channel")
 
     def _challenge(self, packet: bytes) -> None:
@@ -126,6 +129,7 @@ class Secure:
             welcome, keys = attempt.noise.open(message)
         except NoiseError:
             raise ProtocolError("forged") from None
+        check_place(welcome, in_handshake=True)
         self._candidate = Channel(
             self._key.vehicle, number, seal=keys.forth, open_=keys.back, born_ns=now_ns
         )

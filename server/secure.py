@@ -19,6 +19,7 @@ from shared.endpoint import SECOND_NS, Address, Datagram
 from shared.handshake import (
     CHANNEL,
     COOKIE_BYTES,
+    check_place,
     prologue,
     read_initiation,
     unpad,
@@ -189,6 +190,7 @@ class Secure:
         if known is None or used is None:
             raise ProtocolError("unknown channel")
         payload, newest = used.open(packet, now_ns=now_ns)
+        check_place(payload, in_handshake=False)
         if number in known.pending:
             known.promote(number, now_ns)
         return Call(payload, vehicle, used, moves=newest and used is known.live)
@@ -217,8 +219,9 @@ class Secure:
             noise = Responder(key.psk, prologue(key), message)
         except NoiseError:
             raise ProtocolError("forged") from None
-        answer = _Answer(self, key, noise, now_ns)
-        return Call(unpad(noise.payload), vehicle, answer, moves=False)
+        hello = unpad(noise.payload)
+        check_place(hello, in_handshake=True)
+        return Call(hello, vehicle, _Answer(self, key, noise, now_ns), moves=False)
 
     def _is_valid(self, cookie: bytes, peer: Address, now_ns: int) -> bool:
         """Whether a cookie is this server's, for the sender, of this time or the last."""

@@ -39,6 +39,8 @@ RESPONSE_BYTES_MIN = HEADER.size + CHANNEL.size + MESSAGE_BYTES + MAC_BYTES
 NO_COOKIE = bytes(COOKIE_BYTES)
 """Cookie of a client that was given none."""
 
+_GREETINGS = (1, 2)
+"""Types of the messages HELLO and WELCOME."""
 _PROLOGUE = b"skytether 1"
 _COOKIE_END = HEADER.size + COOKIE_BYTES
 _PADDED_BYTES = INITIATION_BYTES - _COOKIE_END - MESSAGE_BYTES - MAC_BYTES
@@ -64,6 +66,21 @@ class Response(NamedTuple):
     """Number of the channel."""
     message: bytes
     """Second message of the handshake."""
+
+
+def check_place(message: bytes, *, in_handshake: bool) -> None:
+    """Refuse a HELLO or WELCOME in a channel, and any other message in a handshake.
+
+    A packet of the handshake may be repeated by others, and what is agreed upon in a channel is no
+    handshake. Each message must begin in msgpack's shortest form, so that it is what it looks like.
+
+    Raises:
+        ProtocolError: even the holder of the key must not send it there.
+    """
+    array, version, type_ = message[:3] if len(message) >= 3 else bytes(3)
+    is_short = array & 0xF0 == 0x90 and version < 0x80 and type_ < 0x80
+    if not is_short or (type_ in _GREETINGS) != in_handshake:
+        raise ProtocolError("out of place")
 
 
 def prologue(key: Key) -> bytes:
@@ -132,7 +149,7 @@ def read_challenge(key: Key, packet: bytes, public: bytes) -> bytes:
     """
     if len(packet) != CHALLENGE_BYTES:
         raise ProtocolError("length")
-    if packet[: HEADER.size] != _header(key, CHALLENGE) or not is_authentic(key, packet, public):
+    if not is_authentic(key, packet, public):
         raise ProtocolError("unasked")
     return packet[HEADER.size : _COOKIE_END]
 
@@ -145,7 +162,7 @@ def read_response(key: Key, packet: bytes, public: bytes) -> Response:
     """
     if not RESPONSE_BYTES_MIN <= len(packet) <= INITIATION_BYTES:
         raise ProtocolError("length")
-    if packet[: HEADER.size] != _header(key, RESPONSE) or not is_authentic(key, packet, public):
+    if not is_authentic(key, packet, public):
         raise ProtocolError("unasked")
     (channel,) = CHANNEL.unpack_from(packet, HEADER.size)
     return Response(channel, packet[HEADER.size + CHANNEL.size : -MAC_BYTES])

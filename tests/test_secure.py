@@ -33,7 +33,9 @@ from shared.protocol import ProtocolError
 HERE, ELSEWHERE = ("vehicle", 1), ("elsewhere", 2)
 SECRETS = {1: bytes([1]) * 32, 2: bytes([2]) * 32}
 KEYS = {(vehicle, 5): Key.of(vehicle, 5, secret) for vehicle, secret in SECRETS.items()}
-HELLO, WELCOME = b"hello" * 60, b"welcome" * 48
+HELLO, WELCOME = b"\x95\x04\x01" + b"hello" * 60, b"\x98\x04\x02" + b"welcome" * 48
+OBSERVATION, HORIZON = b"\x9b\x04\x03observation", b"\x99\x04\x04horizon"
+"""Messages that begin as they do on the wire."""
 
 
 def gate(seed: int = 1) -> Gate:
@@ -100,9 +102,9 @@ def live(server: Gate, vehicle: int = 1) -> int | None:
 def test_a_handshake_takes_two_round_trips_and_opens_a_channel() -> None:
     """INITIATION, CHALLENGE, INITIATION, RESPONSE; then messages both ways."""
     client, server = joined()
-    call = called(server, client.seal(b"observation"))
-    assert (call.payload, call.vehicle, call.moves) == (b"observation", 1, True)
-    assert client.open(call.line.seal(b"horizon"), now_ns=0) == b"horizon"
+    call = called(server, client.seal(OBSERVATION))
+    assert (call.payload, call.vehicle, call.moves) == (OBSERVATION, 1, True)
+    assert client.open(call.line.seal(HORIZON), now_ns=0) == HORIZON
     assert client.secure
     assert server.secure
 
@@ -134,7 +136,8 @@ def test_the_bytes_of_a_handshake() -> None:
 def test_no_answer_is_longer_than_what_draws_it() -> None:
     """Even the longest; and the longest HELLO fits."""
     client, server = link(), gate()
-    for hello in (b"", b"\0" * HELLO_BYTES_MAX, b"\x80" * HELLO_BYTES_MAX, b"\x80\0"):
+    room, head = HELLO_BYTES_MAX - 3, HELLO[:3]
+    for hello in (head, head + b"\0" * room, head + b"\x80" * room, head + b"\x80\0"):
         client, server = link(), gate()
         server.open(Datagram(client.hello(hello, now_ns=0), HERE), now_ns=0)
         client.open(server.outbox()[0].payload, now_ns=0)
@@ -153,12 +156,12 @@ def test_a_refused_client_goes_on_with_its_attempt() -> None:
     challenged(client, server)
     before = client.hello(HELLO, now_ns=0)
     call = called(server, before)
-    assert client.open(call.line.seal(b"refused"), now_ns=0) == b"refused"
+    assert client.open(call.line.seal(WELCOME), now_ns=0) == WELCOME
     assert client.hello(HELLO, now_ns=SECOND_NS) == before
     assert server._vehicles[1].pending == {}
     welcomed(client, server, SECOND_NS)
     client.adopt(now_ns=SECOND_NS)
-    assert called(server, client.seal(b"o"), SECOND_NS).payload == b"o"
+    assert called(server, client.seal(OBSERVATION), SECOND_NS).payload == OBSERVATION
 
 
 def test_an_attempt_has_one_ephemeral_key() -> None:
@@ -181,14 +184,14 @@ def test_a_repeated_hello_is_answered_with_other_keys() -> None:
     answers = []
     for i in range(3):
         call = called(server, hello)
-        answers.append(call.line.seal(b"welcome %d" % i))
+        answers.append(call.line.seal(WELCOME + b"%d" % i))
         server.admit(call, now_ns=0)
     assert len({answer[5:9] for answer in answers}) == 3  # channel
     assert len({answer[9:41] for answer in answers}) == 3  # ephemeral key
-    assert client.open(answers[2], now_ns=0) == b"welcome 2"
-    assert client.open(answers[1], now_ns=0) == b"welcome 1"
+    assert client.open(answers[2], now_ns=0) == WELCOME + b"2"
+    assert client.open(answers[1], now_ns=0) == WELCOME + b"1"
     client.adopt(now_ns=0)
-    assert called(server, client.seal(b"o")).payload == b"o"
+    assert called(server, client.seal(OBSERVATION)).payload == OBSERVATION
     assert live(server) == int.from_bytes(answers[1][5:9], "little")
     # The one that was pending before it is gone.
     assert [*server._vehicles[1].pending] == [int.from_bytes(answers[2][5:9], "little")]
@@ -200,8 +203,8 @@ def test_an_adopted_response_opens_no_channel_again() -> None:
     challenged(client, server)
     response = welcomed(client, server)
     client.adopt(now_ns=0)
-    sent = called(server, client.seal(b"o")).line.seal(b"fly left")
-    assert client.open(sent, now_ns=0) == b"fly left"
+    sent = called(server, client.seal(OBSERVATION)).line.seal(HORIZON)
+    assert client.open(sent, now_ns=0) == HORIZON
     assert refusal(client, response) == "unasked"
     client.hello(HELLO, now_ns=0)  # also during the next attempt
     assert refusal(client, response) == "unasked"
@@ -224,11 +227,11 @@ def test_where_adopting_leaves_the_attempt_open_a_command_is_flown_twice(
 
     monkeypatch.setattr(Secure, "adopt", without_end)
     client.adopt(now_ns=0)
-    sent = called(server, client.seal(b"o")).line.seal(b"fly left")
-    assert client.open(sent, now_ns=0) == b"fly left"
+    sent = called(server, client.seal(OBSERVATION)).line.seal(HORIZON)
+    assert client.open(sent, now_ns=0) == HORIZON
     assert client.open(response, now_ns=0) == WELCOME
     client.adopt(now_ns=0)
-    assert client.open(sent, now_ns=0) == b"fly left"
+    assert client.open(sent, now_ns=0) == HORIZON
 
 
 # -- who is let in -----------------------------------------------------------------------------
@@ -262,7 +265,7 @@ def test_the_key_of_another_vehicle_opens_nothing() -> None:
     renamed = link(key=Key.of(1, 5, SECRETS[2]))
     assert refusal(server, renamed.hello(HELLO, now_ns=0)) == "forged"
     client, server = joined()
-    packet = bytearray(client.seal(b"o"))
+    packet = bytearray(client.seal(OBSERVATION))
     packet[2] = 2
     assert refusal(server, bytes(packet)) == "unknown channel"
 
@@ -382,15 +385,15 @@ def test_a_vehicle_gets_five_handshakes_a_second() -> None:
 def test_an_address_moves_with_the_highest_counter_only() -> None:
     """A packet that is late, or of the channel before, says nothing of where the vehicle is."""
     client, server = joined()
-    packets = [client.seal(b"o") for _ in range(4)]
+    packets = [client.seal(OBSERVATION) for _ in range(4)]
     assert [called(server, packets[i]).moves for i in (0, 2, 1, 3)] == [True, True, False, True]
-    late = [client.seal(b"o") for _ in range(2)]
+    late = [client.seal(OBSERVATION) for _ in range(2)]
     challenged_at = 200 * SECOND_NS  # the cookie has expired
     challenged(client, server, challenged_at)
     welcomed(client, server, challenged_at)
     client.adopt(now_ns=challenged_at)
     assert called(server, late[0], challenged_at).moves
-    assert called(server, client.seal(b"o"), challenged_at).moves
+    assert called(server, client.seal(OBSERVATION), challenged_at).moves
     assert not called(server, late[1], challenged_at).moves
 
 
@@ -399,7 +402,7 @@ def test_without_the_order_of_counters_a_late_packet_moves_the_address(
 ) -> None:
     """Ablation: who holds a packet back, and sends it from elsewhere, gets what comes next."""
     client, server = joined()
-    held, newer = client.seal(b"o"), client.seal(b"o")
+    held, newer = client.seal(OBSERVATION), client.seal(OBSERVATION)
     called(server, newer)
     monkeypatch.setattr(channels, "Opened", lambda payload, _: (payload, True))
     assert called(server, held, peer=ELSEWHERE).moves
@@ -415,24 +418,24 @@ def rekeyed(client: Secure, server: Gate, now_ns: int) -> None:
 def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
     """What is under way in the old channel is opened at both ends, for 10 s."""
     client, server = joined()
-    line = called(server, client.seal(b"o")).line
+    line = called(server, client.seal(OBSERVATION)).line
     assert not client.wants_hello(FRESH_NS - 1)
     assert client.wants_hello(FRESH_NS)
-    up = [client.seal(b"old") for _ in range(4)]
-    down = [line.seal(b"old") for _ in range(4)]
+    up = [client.seal(OBSERVATION) for _ in range(4)]
+    down = [line.seal(OBSERVATION) for _ in range(4)]
     rekeyed(client, server, FRESH_NS)
     assert not client.wants_hello(FRESH_NS)
     assert called(server, up[0], FRESH_NS).moves  # the new channel is pending until it is used
-    assert client.open(down[0], now_ns=FRESH_NS) == b"old"
-    new = called(server, client.seal(b"new"), FRESH_NS)
-    assert client.open(new.line.seal(b"new"), now_ns=FRESH_NS) == b"new"
+    assert client.open(down[0], now_ns=FRESH_NS) == OBSERVATION
+    new = called(server, client.seal(HORIZON), FRESH_NS)
+    assert client.open(new.line.seal(HORIZON), now_ns=FRESH_NS) == HORIZON
     end_ns = FRESH_NS + OVERLAP_NS
-    assert called(server, up[1], end_ns).payload == b"old"
-    assert client.open(down[1], now_ns=end_ns) == b"old"
+    assert called(server, up[1], end_ns).payload == OBSERVATION
+    assert client.open(down[1], now_ns=end_ns) == OBSERVATION
     assert refusal(server, up[2], end_ns + 1) == "expired"
     assert refusal(client, down[2], end_ns + 1) == "expired"
     rekeyed(client, server, 2 * FRESH_NS)
-    called(server, client.seal(b"o"), 2 * FRESH_NS)
+    called(server, client.seal(OBSERVATION), 2 * FRESH_NS)
     assert refusal(server, up[3], 2 * FRESH_NS) == "unknown channel"
     assert refusal(client, down[3], 2 * FRESH_NS) == "unknown channel"
 
@@ -440,15 +443,15 @@ def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
 def test_without_a_successor_a_channel_ends() -> None:
     """After 600 s neither end opens anything."""
     client, server = joined()
-    line = called(server, client.seal(b"o")).line
-    assert refusal(server, client.seal(b"o"), LIFE_NS + 1) == "expired"
-    assert refusal(client, line.seal(b"h"), LIFE_NS + 1) == "expired"
+    line = called(server, client.seal(OBSERVATION)).line
+    assert refusal(server, client.seal(OBSERVATION), LIFE_NS + 1) == "expired"
+    assert refusal(client, line.seal(HORIZON), LIFE_NS + 1) == "expired"
 
 
 def test_a_hello_that_is_repeated_ends_no_flight() -> None:
     """The live channel stays, whatever is pending, until the vehicle uses another."""
     client, server = joined()
-    called(server, client.seal(b"o"))
+    called(server, client.seal(OBSERVATION))
     before = live(server)
     other = link(seed=7)
     challenged(other, server)
@@ -458,7 +461,7 @@ def test_a_hello_that_is_repeated_ends_no_flight() -> None:
         assert call is not None
         call.line.seal(WELCOME)
         server.admit(call, now_ns=second * SECOND_NS)
-        called(server, client.seal(b"o"), second * SECOND_NS)
+        called(server, client.seal(OBSERVATION), second * SECOND_NS)
     assert live(server) == before
     assert len(server._vehicles[1].pending) == PENDING_MAX
 
@@ -471,7 +474,7 @@ def test_a_closed_attempt_is_not_answered() -> None:
     welcomed(client, server)
     client.adopt(now_ns=0)
     assert called(server, hello).payload == HELLO
-    called(server, client.seal(b"o"))
+    called(server, client.seal(OBSERVATION))
     assert refusal(server, hello) == "replayed"
 
 
@@ -534,7 +537,7 @@ class Flight:
             self.send(False, call.line.seal(WELCOME))
             self.server.admit(call, now_ns=self.now_ns)
         else:
-            self.send(False, call.line.seal(b"horizon"))
+            self.send(False, call.line.seal(HORIZON))
 
     def at_client(self, datagram: bytes) -> None:
         """Let the client take note."""
@@ -560,12 +563,12 @@ class Flight:
             self.hello()
             self.hello_due = HELLO_TICKS
         if self.flies:
-            self.send(True, self.client.seal(b"observation"))
+            self.send(True, self.client.seal(OBSERVATION))
 
     def until(self, horizons: int) -> None:
         """Fly until so many horizons have come, at most three minutes."""
         for _ in range(1800):
-            if self.heard[b"horizon"] >= horizons:
+            if self.heard[HORIZON] >= horizons:
                 return
             self.tick()
         raise AssertionError(f"{self.heard} {self.dropped}")
@@ -663,6 +666,41 @@ def test_nothing_is_accepted_after_a_restart(restarted: str) -> None:
     assert all(each < 0 for each in excess)
 
 
+# -- who has a key, and abuses it --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "message", [OBSERVATION, WELCOME[:2] + b"\xcc\x01", b"\xdc\x00\x05\x04\x01", b"", b"\x95"]
+)
+def test_only_a_hello_travels_in_an_initiation(message: bytes) -> None:
+    """Anything else, whose packet others could repeat, is dropped."""
+    server, client = gate(), link()
+    server.open(Datagram(client.hello(message, now_ns=0), HERE), now_ns=0)
+    client.open(server.outbox()[0].payload, now_ns=0)
+    assert refusal(server, client.hello(message, now_ns=0)) == "out of place"
+
+
+@pytest.mark.parametrize(
+    "message", [HELLO, WELCOME, b"\x95\xcc\x04\x01", b"\xdc\x00\x05\x04\x01", b""]
+)
+def test_no_greeting_travels_in_a_channel(message: bytes) -> None:
+    """Neither as it is, nor in a longer form of msgpack that looks like another message."""
+    client, server = joined()
+    line = called(server, client.seal(OBSERVATION)).line
+    assert refusal(server, client.seal(message)) == "out of place"
+    assert refusal(client, line.seal(message)) == "out of place"
+
+
+def test_a_response_with_another_message_opens_no_channel() -> None:
+    """The vehicle has nothing to adopt, and goes on with its attempt."""
+    client, server = link(), gate()
+    challenged(client, server)
+    call = called(server, client.hello(HELLO, now_ns=0))
+    assert refusal(client, call.line.seal(HORIZON)) == "out of place"
+    assert client._candidate is None
+    welcomed(client, server)
+
+
 # -- floods ------------------------------------------------------------------------------------
 
 
@@ -730,7 +768,7 @@ def test_hostile_datagrams_give_protocol_errors_alone() -> None:
 def test_no_secret_is_shown_by_an_end() -> None:
     """Neither in a `repr`, nor in the message of an error."""
     client, server = joined()
-    call = called(server, client.seal(b"o"))
+    call = called(server, client.seal(OBSERVATION))
     shown = repr((client, server, call.line, server._vehicles, client._current))
     for key in KEYS.values():
         for secret in (key.psk, key.mac, SECRETS[1]):

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("shared", "shell", "server", "client", "netem", "sim", "lab", "skytether")
 FILES = [
     file.relative_to(ROOT).as_posix()
-    for package in (*PACKAGES, "benchmarks", "tests")
+    for package in (*PACKAGES, "fuzz", "benchmarks", "tests")
     for file in sorted((ROOT / package).rglob("*.py"))
 ]
 DEFINITIONS = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
