@@ -293,7 +293,7 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
     summary = json.loads(files[0].read_text())
     assert list(summary) == [
         *("scenario", "seed", "duration_s", "steps", "rmse_x", "rmse_y", "rmse_z", "rmse_xy"),
-        *("error_max", "covered"),
+        *("error_max", "covered", "modes", "mode", "reason"),
         *("event_ratio", "uplink_packets", "uplink_bytes", "downlink_packets", "downlink_bytes"),
         *("lost", "reordered", "stale", "age_ms_p50", "age_ms_p99", "solve_ms_p50"),
         *("solve_ms_p99", "deadline_misses", "secure"),
