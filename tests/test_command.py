@@ -27,8 +27,8 @@ from shared.events import (
     Flying,
     Listening,
     ModeChanged,
-    Plaintext,
     Omitted,
+    Plaintext,
     SessionRefused,
     address_text,
 )
