@@ -58,7 +58,7 @@ class Compensator:
         """Number of horizons that came after a newer one."""
 
     def offer(self, horizon: Horizon, step: int, observed: int) -> bool:
-        """Take a horizon that arrived before the input of a step is chosen, unless a newer has come.
+        """Take a horizon that came before the input of a step is chosen, unless a newer has come.
 
         Args:
             horizon: what arrived.

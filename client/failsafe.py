@@ -31,9 +31,7 @@ MALFORMED_MAX = 5
 FUTURE_MAX = 10
 """Horizons for impossible times within `WINDOW_NS` that make it ask for its session anew."""
 
-BROKEN = frozenset(
-    {Reason.LOST, Reason.CLOSED, Reason.RESTARTED, Reason.MALFORMED, Reason.RESYNC}
-)
+BROKEN = frozenset({Reason.LOST, Reason.CLOSED, Reason.RESTARTED, Reason.MALFORMED, Reason.RESYNC})
 """Causes after which the link has to be good for `GOOD_NS` anew, in every mode."""
 LOCKING = BROKEN | {Reason.LATE}
 """Causes of braking after which no horizon is taken before the vehicle hovers on a good link."""
@@ -223,7 +221,7 @@ class Failsafe:
 
 
 def _full(times_ns: deque[int], now_ns: int) -> bool:
-    """Whether, with one more now, as many as are remembered lie within the window; then none are."""
+    """Whether so many lie within the window, with one more now; if so, all are forgotten."""
     times_ns.append(now_ns)
     full = len(times_ns) == times_ns.maxlen and now_ns - times_ns[0] <= WINDOW_NS
     if full:

@@ -29,6 +29,7 @@ from shared.events import (
     NotFlown,
     SessionRefused,
 )
+from shared.model import Array
 from shared.protocol import (
     ACCEPTED,
     CLOSES,
@@ -49,7 +50,6 @@ from shared.protocol import (
     decode,
     encode,
 )
-from shared.model import Array
 from shared.record import Reason, Recorder
 
 HELLO_NS = SECOND_NS
@@ -411,7 +411,7 @@ class Client(Endpoint):
             self._compensator.drop(self._step - 1, self._input)
         if cause in CLOSING:
             self._in_session = False
-        if Reason.OLD in (was, cause) and self._failsafe.mode in (Mode.TRACK, Mode.COAST):
+        if cause is Reason.OLD or (was, cause) == (Reason.OLD, Reason.HORIZON):
             return
         reason, after = self._failsafe.reason, str(self._failsafe.mode)
         why = self._why_no_plan(now_ns) if reason is Reason.ENDED else str(reason)

@@ -26,7 +26,9 @@ from shared.events import (
     Finished,
     Flying,
     Listening,
+    ModeChanged,
     Omitted,
+    Plaintext,
     SessionRefused,
     address_text,
 )
@@ -293,7 +295,7 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
     summary = json.loads(files[0].read_text())
     assert list(summary) == [
         *("scenario", "seed", "duration_s", "steps", "rmse_x", "rmse_y", "rmse_z", "rmse_xy"),
-        *("error_max", "covered"),
+        *("error_max", "covered", "modes", "mode", "reason"),
         *("event_ratio", "uplink_packets", "uplink_bytes", "downlink_packets", "downlink_bytes"),
         *("lost", "reordered", "stale", "age_ms_p50", "age_ms_p99", "solve_ms_p50"),
         *("solve_ms_p99", "deadline_misses", "secure"),
@@ -444,11 +446,12 @@ def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> Non
     assert run.returncode == 0, run.stderr
     lines = [msgspec.json.decode(line, type=Line) for line in run.stdout.splitlines()]
     kinds = [type(line.event) for line in lines]
-    assert kinds == [Listening, Flying, Finished, Counted]
+    changes = [ModeChanged] * 3  # sync, ready, track
+    assert kinds == [Listening, Plaintext, Flying, *changes, Finished, Counted]
     assert {line.process for line in lines} == {"client"}
     times_ns = [began_ns, *(line.time_ns for line in lines), time.monotonic_ns()]
     assert times_ns == sorted(times_ns)
-    assert json.loads(run.stdout.splitlines()[1])["event"] == {"type": "Flying", "vehicle": 1}
+    assert json.loads(run.stdout.splitlines()[2])["event"] == {"type": "Flying", "vehicle": 1}
     assert server.end() == 0
 
 
@@ -626,7 +629,7 @@ def test_the_other_two_survive_a_kill_and_restart(
     argv["netem"] = ["netem", "demo", "--bind", address, *argv["netem"][4:]]
     argv["client"] = ["client", "demo", "--server", address, *flags]
     running["client"] = start(*argv["client"])
-    running["client"].wait_for("session open, flying")
+    running["client"].wait_for("flies a plan")
 
     assert running[victim].end(signal.SIGKILL) == -signal.SIGKILL
     if victim != "client":

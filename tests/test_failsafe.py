@@ -4,7 +4,8 @@ A hand makes the server's messages, at a step of 20 ms each; the vehicle is the 
 """
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,17 @@ import pytest
 import client.vehicle
 from client import failsafe
 from client.clamp import clamped
+from client.compensator import Compensator
 from client.failsafe import HOLD, TABLE, Failsafe
 from client.link import Plain
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
+from lab.states import svg
 from shared import config
 from shared.chance import stream
 from shared.config import ConfigError, Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram
 from shared.events import Event, ModeChanged
-from shared.model import Array
 from shared.protocol import (
     ACCEPTED,
     NO_HORIZON,
@@ -41,6 +43,7 @@ from shared.protocol import (
 from shared.record import Reason, Recorder, Rows, client_columns, parse
 
 SERVER: Address = ("server", 0)
+DIAGRAM = Path(__file__).parent.parent / "docs/failsafe.svg"
 STEPS_PER_S = 50
 H = 100
 D = 5
@@ -335,12 +338,14 @@ def test_horizons_that_come_late_for_half_a_second_end_in_brake() -> None:
 
 
 def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
-    """A single straggler says nothing."""
+    """A few stragglers say nothing."""
     hand = tracking()
-    hand.fly((D + 0.75 * H) / STEPS_PER_S)
+    hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
     for _ in range(5):
         hand.horizon(hand.step - D - 76)
-        hand.fly(0.4)
+        hand.fly(0.1)
+        hand.horizon(hand.step - D - 76)
+        hand.fly(0.3)
         hand.horizon(hand.step - D - 74)
         hand.fly(0.02)
     assert ("brake", "horizons come too late") not in hand.changes
@@ -360,8 +365,9 @@ def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
     hand = tracking(secure=True)
     for _ in range(4):
         hand.client.receive(Datagram(b"?", SERVER), now_ns=hand.now_ns)
-    hand.fly(1.1, plans=True)
+    hand.fly(0.5, plans=True)
     assert hand.mode is Mode.TRACK
+    hand.fly(0.6, plans=True)
     for _ in range(5):
         hand.say(with_input_out_of_range(hand))
     comes_to_hover_and_takes_no_horizon(hand)
@@ -458,38 +464,198 @@ def test_a_solver_that_fails_or_a_server_that_is_degraded_is_told() -> None:
         assert hand.changes[-2:] == [("brake", why), ("hover", why)]
 
 
-class Mad(FirstOrderPlant):
-    """A plant whose state is no number from some time on."""
+def test_what_is_not_finite_ends_in_fault_for_good() -> None:
+    """A state or an input: zero is flown, and nothing after that."""
+    for seen in (FirstOrderPlant, Compensator):
+        hand = tracking()
+        with pytest.MonkeyPatch.context() as mad:
+            if seen is Compensator:
+                mad.setattr(Compensator, "choose", lambda *_: np.array([np.nan, 0.0]))
+            else:
+                mad.setattr(hand.plant, "state", lambda: np.full((2, 2), np.inf))
+            hand.fly(0.02, plans=True)
+        hand.fly(3.0, plans=True)
+        rows = hand.rows()[160:]
+        assert (rows["mode"] == Mode.FAULT).all()
+        assert not rows["input"].any()
+        assert hand.changes[-1] == ("fault", "its state or its input is not finite")
 
-    mad = False
 
-    def state(self) -> Array:
-        """See `Plant`."""
-        return super().state() * (np.nan if self.mad else 1.0)
+# -- the paper's own rule --------------------------------------------------------------------------
 
 
-def test_what_is_not_finite_ends_in_fault_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A state or an input; nothing is flown after that."""
-    hand = tracking()
-    monkeypatch.setattr(
-        client.vehicle.Compensator, "choose", lambda *_: np.array([np.nan, 0.0])
+def test_a_vehicle_that_holds_has_no_failsafe() -> None:
+    """The first horizon that comes is flown, and its last input for ever, whatever happens."""
+    hand = Hand(vehicle={"exhausted": "hold"})
+    hand.fly(0.02)
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+    hand.fly((D + H) / STEPS_PER_S + 0.1)
+    assert hand.changes[-1] == ("coast", "no newer horizon has come")
+    hand.session = 8
+    hand.welcome(server_boot_id=2)
+    hand.say(Close(4, hand.session))
+    hand.fly(20.0, beats=False)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.COAST, True, SPEED)
+    assert not {Mode.SYNC, Mode.BRAKE, Mode.HOVER, Mode.LAND} & {*HOLD.values()}
+
+
+# -- the last clamp --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wanted", "flown"),
+    [
+        ([0.5, -0.5], [0.5, -0.5]),
+        ([9.0, -9.0], [1.6, -0.8]),
+        ([1.6, -9.0], [1.6, -0.8]),
+        ([np.nan, 0.0], None),
+        ([0.0, np.inf], None),
+    ],
+)
+def test_the_last_clamp_bounds_value_and_change(
+    wanted: list[float], flown: list[float] | None
+) -> None:
+    """From 0.8 and 0.2 m/s, at most 1.6 m/s, and 1 m/s a step; nothing of what is not finite."""
+    assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0) == flown
+
+
+@pytest.mark.parametrize("clamps", [True, False])
+def test_no_mistake_of_the_compensator_reaches_the_plant(
+    monkeypatch: pytest.MonkeyPatch, *, clamps: bool
+) -> None:
+    """100 m/s on both axes, from one step to the next; without the clamp it is flown."""
+    hand = tracking(vehicle={"slew_mps2": 5.0})
+    if not clamps:
+        monkeypatch.setattr(client.vehicle, "clamped", lambda wanted, *_: wanted)
+    monkeypatch.setattr(Compensator, "choose", lambda *_: np.array([100.0, -100.0]))
+    # What is over u_max is no message: the record tells.
+    monkeypatch.setattr(client.vehicle.Client, "_send", lambda *_: None)
+    hand.fly(0.4, plans=True)
+    flown = hand.rows()["input"]
+    bounded = np.abs(flown).max() <= hand.terms.u_max[0]
+    slow = np.abs(np.diff(flown[70:], axis=0)).max() <= 5.0 * 0.02 + 1e-12
+    assert (bounded, slow) == (clamps, clamps)
+
+
+def test_a_slew_that_would_not_let_it_brake_is_refused() -> None:
+    """Braking is always allowed."""
+    with pytest.raises(ConfigError, match=r"^test: vehicle.slew_mps2: got 1.5, expected at least"):
+        scenario(vehicle={"slew_mps2": 1.5})
+
+
+# -- the table -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("table", [TABLE, HOLD])
+def test_nothing_leads_out_of_fault_and_only_fault_out_of_land(table: failsafe.Table) -> None:
+    """Somebody has to see to the vehicle first."""
+    out = [(before, after) for (before, _), after in table.items()]
+    assert {after for before, after in out if before is Mode.LAND} <= {Mode.FAULT}
+    assert not [before for before, _ in out if before is Mode.FAULT]
+    assert all((mode, Reason.NOT_FINITE) in table for mode in Mode if mode is not Mode.FAULT)
+
+
+def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
+    """Ten thousand causes by chance: no horizon leads out of a forced brake without a good link."""
+    rng = stream(1, "causes")
+    told: list[Reason] = []
+    aboard = Failsafe(
+        TABLE,
+        armed=True,
+        timeout_ns=SECOND_NS,
+        land_after_ns=SECOND_NS,
+        changed=lambda _, __, cause, ___: told.append(cause),
     )
-    hand.fly(0.02, plans=True)
-    assert (hand.mode, hand.speed) == (Mode.FAULT, 0.0)
-    monkeypatch.undo()
-    monkeypatch.setattr(FirstOrderPlant, "state", lambda _: np.full((2, 2), np.inf))
-    other = tracking_with_a_mad_plant(monkeypatch)
-    for faulty in (hand, other):
-        faulty.fly(3.0, plans=True)
-        rows = faulty.rows()
-        assert rows["mode"][-1] == Mode.FAULT
-        assert not rows["input"][-1].any()
-        assert faulty.changes[-1] == ("fault", "its state or its input is not finite")
+    calm = [each for each in Reason if each not in (Reason.ALONE, Reason.NOT_FINITE)]
+    locked = False
+    for now_ns in range(10_000):
+        cause = calm[int(rng.integers(len(calm)))]
+        before = aboard.mode, aboard.takes
+        if cause is not Reason.HORIZON or aboard.takes:
+            aboard.meet(cause, now_ns=now_ns)
+        locked &= not (cause is Reason.GOOD and before[0] in (Mode.SYNC, Mode.HOVER))
+        locked |= told[-1:] == [cause] and cause in failsafe.LOCKING
+        assert not (locked and aboard.takes)
 
 
-def tracking_with_a_mad_plant(monkeypatch: pytest.MonkeyPatch) -> Hand:
-    """A vehicle in flight whose plant then goes mad."""
-    monkeypatch.undo()
-    hand = tracking()
-    monkeypatch.setattr(hand.plant, "state", lambda: np.full((2, 2), np.inf))
-    return hand
+def test_the_diagram_in_the_documents_is_that_of_the_table() -> None:
+    """Drawn by `lab.states`, which says how to draw it anew."""
+    assert DIAGRAM.read_text() == svg()
+
+
+# -- without its guards ----------------------------------------------------------------------------
+
+ROWS: dict[Reason, Callable[[], None]] = {
+    Reason.GOOD: test_a_vehicle_takes_a_horizon_after_a_second_of_good_link,
+    Reason.UNARMED: test_a_vehicle_that_is_not_armed_flies_nothing,
+    Reason.OLD: test_without_a_newer_horizon_it_coasts_and_says_nothing,
+    Reason.ENDED: test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once,
+    Reason.STILL: test_a_silent_server_ends_in_brake_with_horizon_left,
+    Reason.LOST: test_a_silent_server_ends_in_brake_with_horizon_left,
+    Reason.ALONE: test_ten_seconds_of_hovering_alone_end_in_landing_for_good,
+    Reason.LATE: test_horizons_that_come_late_for_half_a_second_end_in_brake,
+    Reason.RESTARTED: test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link,
+    Reason.MALFORMED: test_malformed_messages_of_the_server_itself_end_in_brake,
+    Reason.RESYNC: test_horizons_for_impossible_times_end_in_a_new_session,
+    Reason.CLOSED: test_a_server_that_closes_the_session_ends_in_brake_at_once,
+    Reason.STALLED: test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon,
+    Reason.NOT_FINITE: test_what_is_not_finite_ends_in_fault_for_good,
+}
+"""Scenario that needs the table's rows of a cause."""
+
+
+@pytest.mark.parametrize("cause", ROWS)
+def test_without_the_rows_of_a_cause_its_scenario_goes_wrong(
+    cause: Reason, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every row is needed."""
+    rows = {key: after for key, after in TABLE.items() if key[1] is not cause}
+    monkeypatch.setattr(client.vehicle, "TABLE", rows)
+    with pytest.raises(AssertionError):
+        ROWS[cause]()
+
+
+GUARDS: dict[str, tuple[object, str, object, Callable[[], None]]] = {
+    "a second of good link": (
+        *(failsafe, "GOOD_NS", 0),
+        test_a_vehicle_takes_a_horizon_after_a_second_of_good_link,
+    ),
+    "locking": (
+        *(failsafe, "LOCKING", frozenset()),
+        test_a_silent_server_ends_in_brake_with_horizon_left,
+    ),
+    "dropping": (
+        *(client.vehicle, "DROPPING", frozenset()),
+        test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link,
+    ),
+    "closing": (
+        *(client.vehicle, "CLOSING", frozenset()),
+        test_a_server_that_closes_the_session_ends_in_brake_at_once,
+    ),
+    "who is malformed": (
+        *(Plain, "secure", True),
+        test_in_plaintext_a_stranger_cannot_make_it_brake_by_malformed_messages,
+    ),
+    "late in a row": (
+        *(failsafe, "LATE_NS", 0),
+        test_one_horizon_in_time_among_late_ones_is_enough,
+    ),
+    "malformed in a row": (
+        *(failsafe, "MALFORMED_MAX", 1),
+        test_malformed_messages_of_the_server_itself_end_in_brake,
+    ),
+}
+"""Guard that is switched off, how, and the scenario that needs it."""
+
+
+@pytest.mark.parametrize("guard", GUARDS)
+def test_without_a_guard_its_scenario_goes_wrong(
+    guard: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every guard is needed."""
+    where, name, off, goes_wrong = GUARDS[guard]
+    monkeypatch.setattr(where, name, off)
+    with pytest.raises(AssertionError):
+        goes_wrong()

@@ -105,10 +105,8 @@ def test_a_wrong_key_is_one_line_at_each_end(tmp_path: Path) -> None:
     ours = key_file(tmp_path)
     other = key_file(tmp_path, "70" * 32, name="other")
     with serving("--keys", str(ours)) as server:
-        ended = skytether_(
-            *("client", "demo", "--server", server.address(), "--keys", str(other)),
-            *("--link.connect-s", "1"),
-        )
+        argv = ["client", "demo", "--server", server.address(), "--link.connect-s", "1"]
+        ended = skytether_(*argv, "--keys", str(other))
         events = server.end()
     assert ended.returncode == 1
     (line,) = ended.stderr.splitlines()

@@ -28,13 +28,13 @@ from skytether.processes import Child, _read, started
 async def test_a_child_is_known_by_its_events() -> None:
     """It listens where its first event says, and counts at its end, which is no last word."""
     heard: list[Event] = []
-    argv = ("demo", "--bind", "0.0.0.0:0", "--server", "127.0.0.1:9")
-    async with started("netem", *argv, on_event=heard.append) as netem:
-        host, port = netem.address
+    argv = ("demo", "--bind", "0.0.0.0:0", "--insecure")
+    async with started("server", *argv, on_event=heard.append) as server:
+        host, port = server.address
         assert (host, port > 0) == ("0.0.0.0", True)
     assert [type(event) for event in heard] == [Listening, Plaintext, Counted]
-    assert netem.process.returncode == 0
-    assert netem.last_words().startswith("netem: plaintext and unauthenticated")
+    assert server.process.returncode == 0
+    assert server.last_words().startswith("server: PLAINTEXT, no keys: anybody on the network")
 
 
 @pytest.mark.ipv6
