@@ -121,7 +121,7 @@ def test_only_admitted_forms_come_through() -> None:
 
 @linux
 def test_all_that_a_vehicle_sends_comes_through_and_random_bytes_do_not(linked: Linked) -> None:
-    """A HELLO in plaintext does as well, for the operator is to be told; nothing else in it does."""
+    """A HELLO in plaintext does as well, as the operator is to be told; nothing else in it does."""
     ends, plain = linked.ends, linked.plain
     assert passes(FORMS, [ends.first, ends.second, linked.observation, plain[Hello]]) == [True] * 4
     rng = np.random.default_rng(1)
