@@ -432,7 +432,7 @@ def draw(result: Mapping[str, Any], path: Path = FIGURE) -> None:
     panels[-1].set_xlabel("time since the kill [s]; a tick at the bottom: it listens again")
     panels[-1].set_xlim(*AROUND_S)
     panels[0].legend(handles=_legend(colours), loc="upper right", fontsize=8, ncols=2)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=90)
 
 
 def _legend(colours: Mapping[str, str]) -> list[Any]:
@@ -442,6 +442,6 @@ def _legend(colours: Mapping[str, str]) -> list[Any]:
     return [
         *(Line2D([], [], color=colours[way], label=name) for way, name in names.items()),
         Line2D([], [], color="0.4", linestyle=":", label="commanded speed"),
-        Line2D([], [], color="k", linestyle="--", label="braking curve, commanded"),
-        Line2D([], [], color="k", label="braking curve, true"),
+        Line2D([], [], color="k", linestyle="--", label="braking curve of the fastest, commanded"),
+        Line2D([], [], color="k", label="and true"),
     ]
