@@ -30,6 +30,7 @@ from benchmarks.harness import Lateness, Table, progress, sleep_until
 from benchmarks.netem import answer, scheduled_ns, start
 from benchmarks.problems import derive
 from netem.proxy import Proxy
+from server.secure import FORMS
 from shared import channel, handshake, record
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS, Datagram
@@ -79,7 +80,7 @@ class Flood:
     kept_out: float
     """Number of them a second that the kernel kept from the server for their form."""
     unread: float
-    """Number of datagrams a second for which a receive buffer had no room, on the whole machine."""
+    """Number of datagrams a second that the kernel dropped beside these: there was no room."""
     good: int
     """Number of observations sent."""
     lost: int
@@ -167,7 +168,7 @@ def hellos(good: bytes) -> list[bytes]:
 
 
 class _Message(ctypes.Structure):
-    """`struct mmsghdr`."""
+    """`struct msghdr`, which is padded at its end."""
 
     _fields_ = (
         ("name", ctypes.c_void_p),
@@ -177,8 +178,13 @@ class _Message(ctypes.Structure):
         ("control", ctypes.c_void_p),
         ("control_bytes", ctypes.c_size_t),
         ("flags", ctypes.c_int),
-        ("sent_bytes", ctypes.c_uint32),
     )
+
+
+class _Sending(ctypes.Structure):
+    """`struct mmsghdr`."""
+
+    _fields_ = (("message", _Message), ("sent_bytes", ctypes.c_uint32))
 
 
 class _Piece(ctypes.Structure):
@@ -196,16 +202,16 @@ def flood(
     buffers = [ctypes.create_string_buffer(packet, len(packet)) for packet in packets]
     count = len(packets)
     pieces = (_Piece * count)(*(_Piece(ctypes.addressof(b), len(b)) for b in buffers))
-    messages = (_Message * (2 * count))()  # twice, so that a batch never wraps
-    for i, message in enumerate(messages):
-        message.pieces = ctypes.addressof(pieces) + (i % count) * ctypes.sizeof(_Piece)
-        message.pieces_count = 1
-    send, width = ctypes.CDLL(None, use_errno=True).sendmmsg, ctypes.sizeof(_Message)
+    sendings = (_Sending * (2 * count))()  # twice, so that a batch never wraps
+    for i, sending in enumerate(sendings):
+        sending.message.pieces = ctypes.addressof(pieces) + (i % count) * ctypes.sizeof(_Piece)
+        sending.message.pieces_count = 1
+    send, width = ctypes.CDLL(None).sendmmsg, ctypes.sizeof(_Sending)
     sent, used_ns = 0, 0
     for due in _batches(pipe, rate, seconds):
         used_ns = used_ns or time.process_time_ns()
         while sent < due:
-            at = ctypes.c_void_p(ctypes.addressof(messages) + sent % count * width)
+            at = ctypes.c_void_p(ctypes.addressof(sendings) + sent % count * width)
             sent += max(0, send(sock.fileno(), at, min(due - sent, count), 0))
     return sent, time.process_time_ns() - used_ns
 
@@ -260,8 +266,6 @@ class _State:
     """Number of datagrams that it has dropped."""
     gone: int
     """Number of those that the kernel has dropped."""
-    unread: int
-    """Number of datagrams for which a receive buffer of this machine had no room."""
     missed: int
     bytes: int
     used_ns: int
@@ -279,21 +283,10 @@ class _State:
             time.monotonic_ns(),
             challenged + sum(n for name, n in counts.items() if name.startswith("dropped")),
             figures["kernel_drops"],
-            without_room(),
             figures["missed"],
             resident,
             *scheduled_ns(server.process.pid).tolist(),
         )
-
-
-def without_room() -> int:
-    """Number of UDP datagrams so far for which a receive buffer of this machine had no room."""
-    names, values = (
-        line.split()
-        for line in Path("/proc/net/snmp").read_text().splitlines()
-        if line.startswith("Udp:")
-    )
-    return int(values[names.index("RcvbufErrors")])
 
 
 def _fly(kind: str, counts: Counts, lateness: Lateness) -> Flood:
@@ -309,7 +302,8 @@ def _fly(kind: str, counts: Counts, lateness: Lateness) -> Flood:
         fleet.wait_for(Flying, VEHICLES)
         lateness.sleep(counts.lead_s)
         way.send("what has passed?")
-        sender = _sender(stack, kind, counts, port, answer(way))
+        packets = _packets(kind, answer(way))
+        sender = _sender(stack, kind, counts, port, packets)
 
         before = _State.of(server)
         if sender:
@@ -328,7 +322,9 @@ def _fly(kind: str, counts: Counts, lateness: Lateness) -> Flood:
         rows = [record.read(folder / "fleet")]
         rows += [record.read(folder / "newcomer")] if flies else []
         passed_ns = after.time_ns - before.time_ns
-    good, unread = sum(map(len, rows)), after.unread - before.unread
+    good, gone = sum(map(len, rows)), after.gone - before.gone
+    strange = sum(not is_admitted(packet) for packet in packets)
+    kept_out = min(gone, sent * strange // POOL)
     lost = good - end["observations"]
     times_s = [each["step"] * flown.control.dt for each in rows]
     meanwhile = [
@@ -340,8 +336,8 @@ def _fly(kind: str, counts: Counts, lateness: Lateness) -> Flood:
         kind=kind,
         sent=sent / counts.seconds,
         read=(after.dropped - before.dropped) / counts.seconds,
-        kept_out=(after.gone - before.gone - unread) / counts.seconds,
-        unread=unread / counts.seconds,
+        kept_out=kept_out / counts.seconds,
+        unread=(gone - kept_out) / counts.seconds,
         good=good,
         lost=lost,
         share=1.0 - lost / max(1, sum(map(len, meanwhile))),
@@ -355,18 +351,31 @@ def _fly(kind: str, counts: Counts, lateness: Lateness) -> Flood:
     )
 
 
+def is_admitted(packet: bytes) -> bool:
+    """Whether the kernel of a server with keys lets a packet come through."""
+    return any(
+        packet.startswith(form.head) and form.least <= len(packet) <= form.most for form in FORMS
+    )
+
+
+def _packets(kind: str, recorded: Mapping[int, bytes]) -> list[bytes]:
+    """Packets of a flood, made of what was recorded."""
+    if kind == FORGED:
+        return forgeries(recorded[channel.DATA])
+    return hellos(recorded[handshake.INITIATION]) if kind == HELLOS else []
+
+
 def _sender(
-    stack: ExitStack, kind: str, counts: Counts, port: int, recorded: Mapping[int, bytes]
+    stack: ExitStack, kind: str, counts: Counts, port: int, packets: list[bytes]
 ) -> Connection | None:
     """A process that is ready to flood, if there is to be a flood."""
-    if kind == NONE:
-        return None
-    if kind == FORGED:
-        packets = forgeries(recorded[channel.DATA])
-        sender = start(stack, flood, port, packets, counts.forged, counts.seconds)
-    else:
-        packets = hellos(recorded[handshake.INITIATION])
-        sender = start(stack, call, port, packets, counts.hellos, counts.seconds)
+    match kind:
+        case "forged packets":
+            sender = start(stack, flood, port, packets, counts.forged, counts.seconds)
+        case "HELLOs":
+            sender = start(stack, call, port, packets, counts.hellos, counts.seconds)
+        case _:
+            return None
     answer(sender)
     return sender
 
