@@ -21,6 +21,10 @@ from shared.events import address_text
 BUFFER_BYTES = 4 * 1024 * 1024
 """Size of a socket's buffers [B]: the default receive buffer holds 166 datagrams of 600 B."""
 
+FLOODED_BYTES = 16 * 1024 * 1024
+"""Size of the receive buffer of a socket that may be flooded [B]: at 50 000 packets a second that
+come through, what a process can read that waits for a core for half a second."""
+
 SPARE_FILES = 32
 """Number of open files that a process may need beside its sockets."""
 
@@ -85,10 +89,14 @@ def _prepare(sock: socket.socket, *, shared: bool) -> None:
         sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
     if shared:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-    for plain, forced in ((socket.SO_RCVBUF, _SO_RCVBUFFORCE), (socket.SO_SNDBUF, _SO_SNDBUFFORCE)):
-        sock.setsockopt(socket.SOL_SOCKET, plain, BUFFER_BYTES)
-        with contextlib.suppress(OSError):  # over the system's limit, for those who may
-            sock.setsockopt(socket.SOL_SOCKET, forced, BUFFER_BYTES)
+    _make_room(sock, socket.SO_RCVBUF, _SO_RCVBUFFORCE, BUFFER_BYTES)
+    _make_room(sock, socket.SO_SNDBUF, _SO_SNDBUFFORCE, BUFFER_BYTES)
+
+
+def _make_room(sock: socket.socket, plain: int, forced: int, size: int) -> None:
+    sock.setsockopt(socket.SOL_SOCKET, plain, size)
+    with contextlib.suppress(OSError):  # over the system's limit, for those who may
+        sock.setsockopt(socket.SOL_SOCKET, forced, size)
 
 
 def from_kernel(address: tuple[Any, ...]) -> Address:
@@ -131,13 +139,15 @@ def allow_sockets(count: int) -> None:
 def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
     """Let the kernel drop datagrams of other forms; elsewhere than on Linux all come through.
 
-    What is dropped takes no room in the receive buffer and no time of the process.
+    What is dropped takes no room in the receive buffer and no time of the process. For what comes
+    through there is more room than usual.
 
     Args:
         sock: a UDP socket.
         forms: those that pass, the most frequent first; one that is shorter than a head before its
             own is dropped.
     """
+    _make_room(sock, socket.SO_RCVBUF, _SO_RCVBUFFORCE, FLOODED_BYTES)
     if sys.platform != "linux":
         return
     instruction = struct.Struct("=HBBI")
