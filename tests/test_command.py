@@ -532,7 +532,7 @@ def test_workers_that_are_told_to_end_twice_end_in_order(number: signal.Signals)
     ) as server:
         try:
             assert server.stdout is not None
-            said = [server.stdout.readline() for _ in range(2)]
+            said = [server.stdout.readline() for _ in range(4)]
             os.killpg(server.pid, number)
             rest, mistakes = server.communicate(timeout=PATIENCE_S)
         finally:
