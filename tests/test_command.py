@@ -389,8 +389,8 @@ def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_p
     assert client.ended() == 0
     assert netem.end() == 0
     assert server.end(signal.SIGINT) == 0
-    for process in (server, netem, client):
-        assert not any("plaintext" in line for line in process.said)
+    loud = [any("PLAINTEXT" in line for line in each.said) for each in (server, netem, client)]
+    assert loud == [True, False, True]
     assert any("error_ms_p99" in line for line in netem.said[-20:])
     summary = json.loads(file.read_text())
     assert summary["steps"] + summary["deadline_misses"] == 60
