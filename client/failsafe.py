@@ -142,11 +142,15 @@ class Failsafe:
         """Whether nothing of the session has come for the time-out, or there is no session."""
         return self._heard_ns is None or now_ns - self._heard_ns > self._timeout_ns
 
+    def _is_good(self, now_ns: int) -> bool:
+        """Whether something of the session has come within half of the time-out."""
+        return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns // 2
+
     # -- what arrives ------------------------------------------------------------------------
 
     def heard(self, *, now_ns: int) -> None:
         """Note a packet of the session, authenticated where the link is."""
-        if self.is_lost(now_ns):
+        if not self._is_good(now_ns):
             self._good_ns = now_ns
         self._heard_ns = now_ns
 
@@ -193,7 +197,8 @@ class Failsafe:
         locked, lost = self.reason in LOCKING, self.is_lost(now_ns)
         if lost and not locked:
             self.meet(Reason.LOST, now_ns=now_ns)
-        if not lost and now_ns - self._good_ns >= GOOD_NS and (locked or self.mode is Mode.SYNC):
+        good = self._is_good(now_ns) and now_ns - self._good_ns >= GOOD_NS
+        if good and (locked or self.mode is Mode.SYNC):
             self.meet(Reason.GOOD, now_ns=now_ns)
         if not self._armed:
             self.meet(Reason.UNARMED, now_ns=now_ns)

@@ -436,6 +436,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ("RMSE z [m]", _values(".4f", s.rmse_z)),
         ("largest error [m]", _values(".4f", s.error_max)),
         ("steps with a planned input", _values(".3f", s.covered)),
+        ("modes [s]", ", ".join(f"{mode} {seconds:g}" for mode, seconds in s.modes.items())),
         ("event ratio", _values(".3f", s.event_ratio)),
         ("uplink packets, bytes", _values("d", s.uplink_packets, s.uplink_bytes)),
         ("downlink packets, bytes", _values("d", s.downlink_packets, s.downlink_bytes)),

@@ -14,6 +14,7 @@ from lab import figures
 from shared import config, record
 from shared.config import ConfigError, Scenario
 from shared.events import Event, ModeChanged, NotFlown, PlanningStopped, RecordIncomplete
+from shared.protocol import Mode
 from shared.summary import Summary, summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -22,6 +23,8 @@ from skytether import processes
 
 TOLD = ModeChanged, PlanningStopped, RecordIncomplete
 """Events that are shown while it flies."""
+ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
+"""Names of the modes before the first plan is flown, which are not worth a word."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,7 @@ def _missing(scenario: Scenario, flown: flight.Flight) -> str | None:
 
 def _tell(event: Event) -> None:
     """Show what may happen to the link and the record in flight, above the progress bar."""
-    if isinstance(event, TOLD):
+    begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
+    if isinstance(event, TOLD) and not begins:
         with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
             print(event, file=sys.stderr)

@@ -389,8 +389,8 @@ def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_p
     assert client.ended() == 0
     assert netem.end() == 0
     assert server.end(signal.SIGINT) == 0
-    for process in (server, netem, client):
-        assert not any("plaintext" in line for line in process.said)
+    loud = [any("PLAINTEXT" in line for line in each.said) for each in (server, netem, client)]
+    assert loud == [True, False, True]
     assert any("error_ms_p99" in line for line in netem.said[-20:])
     summary = json.loads(file.read_text())
     assert summary["steps"] + summary["deadline_misses"] == 60
@@ -532,7 +532,7 @@ def test_workers_that_are_told_to_end_twice_end_in_order(number: signal.Signals)
     ) as server:
         try:
             assert server.stdout is not None
-            said = [server.stdout.readline() for _ in range(2)]
+            said = [server.stdout.readline() for _ in range(4)]
             os.killpg(server.pid, number)
             rest, mistakes = server.communicate(timeout=PATIENCE_S)
         finally:

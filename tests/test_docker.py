@@ -35,11 +35,11 @@ SERVICES = ("server", "netem", "client")
 STEPS_PER_S = round(1 / config.load("demo").control.dt)
 
 FLIGHT_S = 60
-FAULTY_FLIGHT_S = 75
+FAULTY_FLIGHT_S = 110
 """Duration of the flight with faults [s]; faults and what proves their end take 45 s of it."""
 FAULT_S = 3.0
 """Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client notices."""
-HORIZONS = 10
+HORIZONS = 6
 """Number of new horizons that shows that orders flow."""
 HOVER_M = 1.58
 """Error `rmse_xy` of the demo for a vehicle that stays at its start [m]."""

@@ -22,7 +22,7 @@ SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
 """Bit of SIGUSR1 in the mask of ignored signals."""
 
 VIRTUAL = ["--virtual", "--vehicles", "2", "--duration", "1", "--settle", "0"]
-SHORT = ["--duration", "1", "--settle", "0"]
+SHORT = ["--duration", "2", "--settle", "0"]
 for _direction in ("uplink", "downlink"):  # a plan comes at once
     SHORT += [f"--network.{_direction}.delay", "none"]
 

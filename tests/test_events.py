@@ -46,7 +46,10 @@ SENTENCES = [
         Listening(host="::1", port=47001, waiting_for="vehicles"),
         "listening on [::1]:47001, waiting for vehicles",
     ),
-    (Plaintext(), "plaintext and unauthenticated: only for a network that you trust"),
+    (
+        Plaintext(local=True),
+        "PLAINTEXT, no keys: anybody on this machine can fly the vehicle; see skytether keygen",
+    ),
     (Counted(figures={"missed": 3, "spent_ns": {"plan": 7}}), "counted so far:"),
     (Omitted(kind="SessionRefused", count=4312), "… and 4 312 more SessionRefused"),
     (
@@ -283,7 +286,7 @@ def test_an_endpoints_events_are_told_as_far_as_they_can_be_read(
         log.hear(Flying(vehicle=vehicle))
     log.each_second(last=True)
     for _ in range(9):
-        log.say(Plaintext())
+        log.say(Plaintext(local=True))
     log.close()
     lines = capfd.readouterr().out.splitlines()
     told = [line for line in lines if "flying" in line]
@@ -291,7 +294,7 @@ def test_an_endpoints_events_are_told_as_far_as_they_can_be_read(
     left_out = [int(found[1].replace(" ", "")) for found in re.finditer(OMITTED, "\n".join(lines))]
     assert len(told) + sum(left_out) == 4318
     assert len(told) < 500  # five in each second that this takes
-    assert sum("plaintext" in line for line in lines) == 9
+    assert sum("PLAINTEXT" in line for line in lines) == 9
 
 
 OMITTED = re.compile("^client: … and ([0-9 ]+) more Flying$", re.MULTILINE)

@@ -57,7 +57,7 @@ def test_folders_with_our_names_are_not_taken_for_ours(tmp_path: Path) -> None:
         for name in ("__init__.py", "__main__.py"):
             (tmp_path / package / name).write_text("raise SystemExit('somebody else')")
     skytether = str(Path(sys.executable).with_name("skytether"))
-    flags = ["--duration", "1", "--settle", "0"]
+    flags = ["--duration", "3", "--settle", "0"]
     flags += ["--network.uplink.delay", "none", "--network.downlink.delay", "none"]
     for argv in (
         [skytether, "fly", "demo", *flags],

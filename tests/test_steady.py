@@ -3,8 +3,8 @@
 import io
 from collections.abc import Callable, Sequence
 from functools import cache
-from math import inf
-from statistics import mean
+from math import inf, sqrt
+from statistics import mean, variance
 from typing import Any
 
 import pytest
@@ -173,9 +173,9 @@ SCENARIOS = [replace(config.load("demo"), seed=seed) for seed in range(1, 7)]
 
 
 @cache
-def usual_rmse() -> float:
-    """Mean error with equal clocks [m]."""
-    return mean(map(rmse, SCENARIOS))
+def usual_rmse() -> tuple[float, ...]:
+    """Error with equal clocks of each seed [m]."""
+    return tuple(map(rmse, SCENARIOS))
 
 
 STEPS = {
@@ -205,13 +205,20 @@ CLOCKS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", CLOCKS)
 def test_the_error_is_the_same_whatever_the_clocks_do(name: str) -> None:
-    """It is within 5 % of that with equal clocks, as a mean of six seeds."""
+    """It is within 5 % of that with equal clocks, as far as six seeds can tell.
+
+    Whatever the clocks do changes which packets are lost, and that alone scatters the mean of six
+    by some 5 %: it counts only beyond twice its standard error.
+    """
     errors = [rmse(scenario, **CLOCKS[name]) for scenario in SCENARIOS]
-    assert mean(errors) == pytest.approx(usual_rmse(), rel=0.05)
+    usual = usual_rmse()
+    chance = sqrt((variance(errors) + variance(usual)) / len(usual))
+    assert abs(mean(errors) - mean(usual)) <= 0.05 * mean(usual) + 2.0 * chance
+    assert max(errors) < 1.5 * max(usual)
 
 
 @pytest.mark.parametrize("name", STEPS)
 def test_without_steady_time_a_step_loses_the_flight(name: str) -> None:
     """The error doubles at least, or the vehicle stands still until its clock has come back."""
     error = rmse(SCENARIOS[0], wrap=lambda endpoint: endpoint, steps=STEPS[name])
-    assert error > 2.0 * usual_rmse()
+    assert error > 2.0 * mean(usual_rmse())
