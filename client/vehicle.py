@@ -18,7 +18,7 @@ from client.failsafe import CLOSING, DROPPING, HOLD, LATE_SHARE, TABLE, Failsafe
 from client.link import Link, Plain
 from client.plant import Plant
 from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
+from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
 from shared.events import (
     Failure,
     Finished,
@@ -53,7 +53,10 @@ from shared.protocol import (
 from shared.record import Reason, Recorder
 
 HELLO_NS = SECOND_NS
-"""Time between two HELLOs while nobody answers."""
+"""Time between two HELLOs while nobody has ever answered [ns]."""
+AGAIN_NS = 400 * MILLISECOND_NS
+"""Time between two HELLOs for a session that was lost, or is refused [ns]: less than the five
+handshakes a second that a server grants."""
 LAND_MPS = 0.5
 """Speed at which the vehicle descends to land [m/s]."""
 ALTITUDE = 2
@@ -317,7 +320,8 @@ class Client(Endpoint):
             self._fly(now_ns, self._epoch_ns)
         wanted = self._failsafe.is_lost(now_ns) or self._link.wants_hello(now_ns)
         if wanted and now_ns >= self._hello_ns:
-            self._hello_ns = now_ns + HELLO_NS
+            unheard = self._epoch_ns is None and self._refusal is None
+            self._hello_ns = now_ns + (HELLO_NS if unheard else AGAIN_NS)
             hello = encode(Hello(self.vehicle, self._boot_id, self._terms))
             self._out.append(Datagram(self._link.hello(hello, now_ns=now_ns), self._server))
 
