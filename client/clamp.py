@@ -6,9 +6,17 @@ It shares no code with what reads a packet or chooses an input, so that a mistak
 import math
 from collections.abc import Sequence
 
+ROUNDING = 1e-9
+"""Excess of speed that is rounding alone [m/s]."""
+
 
 def clamped(
-    wanted: Sequence[float], before: Sequence[float], u_max: Sequence[float], change_max: float
+    wanted: Sequence[float],
+    before: Sequence[float],
+    u_max: Sequence[float],
+    change_max: float,
+    *,
+    speed_max: float = math.inf,
 ) -> list[float] | None:
     """The input that may be flown [m/s], or None where it is not finite on some axis.
 
@@ -17,11 +25,13 @@ def clamped(
         before: input that was flown until now, of each axis, within `u_max` [m/s].
         u_max: bound of each axis [m/s].
         change_max: largest change from `before` on an axis [m/s]; may be infinite.
+        speed_max: bound of the magnitude over all axes, within `ROUNDING` [m/s].
     """
     if not all(map(math.isfinite, wanted)):
         return None
-    flown = []
-    for u, last, most in zip(wanted, before, u_max, strict=True):
+    flown, speed = [], math.hypot(*wanted)
+    share = speed_max / speed if speed > speed_max + ROUNDING else 1.0
+    for u, last, most in zip([share * u for u in wanted], before, u_max, strict=True):
         near = min(max(u, last - change_max), last + change_max)
         flown.append(min(max(near, -most), most))
     return flown

@@ -138,6 +138,11 @@ class Failsafe:
         may = (self.mode, Reason.HORIZON) in self._table
         return may and self._armed and self.reason not in LOCKING
 
+    @property
+    def brakes(self) -> bool:
+        """Whether the vehicle brakes where it has no plan, and does not hold its last input."""
+        return self._table is TABLE
+
     def is_lost(self, now_ns: int) -> bool:
         """Whether nothing of the session has come for the time-out, or there is no session."""
         return self._heard_ns is None or now_ns - self._heard_ns > self._timeout_ns

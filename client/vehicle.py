@@ -349,12 +349,19 @@ class Client(Endpoint):
         failsafe, compensator = self._failsafe, self._compensator
         if not np.isfinite(state).all():
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
+        had_plan = compensator.covered
         wanted = compensator.choose(self._step, state).tolist()
         if failsafe.mode is Mode.LAND:
             wanted = [0.0] * self._terms.axes
             if self._terms.axes > ALTITUDE and state[ALTITUDE, 0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
-        flown = clamped(wanted, self._input.tolist(), self._terms.u_max, self._change_max)
+        flown = clamped(
+            wanted,
+            before := self._input.tolist(),
+            self._terms.u_max,
+            self._change_max,
+            speed_max=self._speed_max(had_plan, before),
+        )
         if flown is None:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         elif compensator.in_force != NO_HORIZON and not compensator.covered:
@@ -364,6 +371,13 @@ class Client(Endpoint):
         if not any(flown):
             failsafe.meet(Reason.STILL, now_ns=now_ns)
         return np.array(flown)
+
+    def _speed_max(self, had_plan: bool, before: list[float]) -> float:
+        """Largest speed of the input [m/s]: without a plan what was flown is braked along."""
+        brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
+        if self._compensator.covered or not brakes:
+            return math.inf
+        return max(0.0, math.hypot(*before) - (0.0 if had_plan else self._terms.brake))
 
     def _report(self, state: Array, stamp_ns: int) -> None:
         """Send and record the step that has just begun; a state that is none is only recorded."""

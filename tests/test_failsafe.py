@@ -521,6 +521,14 @@ def test_the_last_clamp_bounds_value_and_change(
     assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0) == flown
 
 
+def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
+    """Along the way that was chosen; what is over by rounding alone stays as it is."""
+    loose = [9.0, 9.0], 9.0
+    assert clamped([3.0, 4.0], [0.0, 0.0], *loose, speed_max=2.5) == pytest.approx([1.5, 2.0])
+    assert clamped([3.0, 4.0], [0.0, 0.0], *loose, speed_max=5.0 - 1e-12) == [3.0, 4.0]
+    assert clamped([3.0, 4.0], [0.0, 0.0], *loose, speed_max=0.0) == [0.0, 0.0]
+
+
 @pytest.mark.parametrize("clamps", [True, False])
 def test_no_mistake_of_the_compensator_reaches_the_plant(
     monkeypatch: pytest.MonkeyPatch, *, clamps: bool
@@ -528,7 +536,7 @@ def test_no_mistake_of_the_compensator_reaches_the_plant(
     """100 m/s on both axes, from one step to the next; without the clamp it is flown."""
     hand = tracking(vehicle={"slew_mps2": 5.0})
     if not clamps:
-        monkeypatch.setattr(client.vehicle, "clamped", lambda wanted, *_: wanted)
+        monkeypatch.setattr(client.vehicle, "clamped", lambda wanted, *_, **__: wanted)
     monkeypatch.setattr(Compensator, "choose", lambda *_: np.array([100.0, -100.0]))
     # What is over u_max is no message: the record tells.
     monkeypatch.setattr(client.vehicle.Client, "_send", lambda *_: None)
