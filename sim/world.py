@@ -231,6 +231,10 @@ class World:
         """Change the time that a host works whenever it is woken [ns]."""
         self._hosts[name].compute_ns = compute_ns
 
+    def rearm(self, name: str) -> None:
+        """Ask a host when it wants to be woken, after an action has given it something to do."""
+        self._arm(self._hosts[name])
+
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""
         while self._agenda and not until():
