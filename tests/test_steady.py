@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+import shared.steady
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
@@ -19,7 +20,7 @@ from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Datagram, Endpoint, seconds_to_ns
 from shared.record import Recorder, client_columns, parse
-from shared.steady import JUMP_NS, Steady
+from shared.steady import JUMP_NS, SLEPT_NS, Steady
 from shared.summary import summarise
 from sim.world import Clock, World
 
@@ -69,7 +70,7 @@ def test_a_clock_that_goes_on_is_passed_on_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("jump_ns", [-1, -HOUR_NS, JUMP_NS + 1, HOUR_NS])
-def test_time_stands_still_for_a_jump_and_goes_on(jump_ns: int) -> None:
+def test_a_jump_looks_like_a_short_stall(jump_ns: int) -> None:
     """Whatever looks at the clock next, and the wake that is due moves with it."""
     for look in ("receive", "wake", "close"):
         probe = Probe(due_ns=MIDNIGHT_NS)
@@ -81,17 +82,19 @@ def test_time_stands_still_for_a_jump_and_goes_on(jump_ns: int) -> None:
         else:
             getattr(steady, look)(now_ns=now_ns)
         hear(steady, [now_ns + 7])
-        assert probe.times_ns[2:] == [MIDNIGHT_NS + 10, MIDNIGHT_NS + 17]
-        assert steady.next_wake_ns() == MIDNIGHT_NS + jump_ns
+        went_on_ns = MIDNIGHT_NS + 10 + SLEPT_NS
+        assert probe.times_ns[2:] == [went_on_ns, went_on_ns + 7]
+        assert steady.next_wake_ns() == MIDNIGHT_NS + jump_ns - SLEPT_NS
 
 
 def test_every_jump_counts() -> None:
-    """An hour ahead and an hour back is where it was."""
+    """An hour ahead and an hour back is where it was, but for what passes with each."""
     probe = Probe(due_ns=0)
     steady = Steady(probe)
     hear(steady, [0, HOUR_NS, HOUR_NS + 1, 1, 2])
-    assert probe.times_ns == [0, 0, 1, 1, 2]
-    assert steady.next_wake_ns() == 0
+    slept_ns = SLEPT_NS
+    assert probe.times_ns == [0, slept_ns, slept_ns + 1, 2 * slept_ns + 1, 2 * slept_ns + 2]
+    assert steady.next_wake_ns() == -2 * slept_ns
 
 
 def test_who_only_waits_for_datagrams_may_wait_for_hours() -> None:
@@ -99,8 +102,37 @@ def test_who_only_waits_for_datagrams_may_wait_for_hours() -> None:
     probe = Probe(due_ns=None)
     steady = Steady(probe)
     hear(steady, [0, HOUR_NS, HOUR_NS - 1])
-    assert probe.times_ns == [0, HOUR_NS, HOUR_NS]
+    assert probe.times_ns == [0, HOUR_NS, HOUR_NS + SLEPT_NS]
     assert steady.next_wake_ns() is None
+
+
+@pytest.mark.parametrize("slept_ns", [SLEPT_NS, 0])
+def test_a_vehicle_that_slept_for_minutes_brakes_on_waking(
+    slept_ns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its clock has jumped, for all it can tell; as if it had taken no time it would fly on."""
+    monkeypatch.setattr(shared.steady, "SLEPT_NS", slept_ns)
+    scenario, world = config.load("demo"), World()
+    client = Client(
+        scenario,
+        FirstOrderPlant(scenario, stream(1, "wind", 1)),
+        server=("server", 0),
+        vehicle=1,
+        boot_id=2**63,
+    )
+    server = Server(scenario, boot_id=2**63, entropy=stream(1, "entropy").bytes)
+    world.add("client", Steady(client), clock=MIDNIGHT)
+    world.add("server", Steady(server), clock=MIDNIGHT)
+    modes: list[str] = []
+    world.at(5 * SECOND_NS, lambda: world.stop("server"))
+    for time_s, action in ((5, world.freeze), (305, world.thaw)):
+        world.at(time_s * SECOND_NS, lambda action=action: action("client"))
+    for time_s in (5, 305):
+        world.at(time_s * SECOND_NS + 1, lambda: modes.append(str(client.figures()["mode"])))
+    world.run(lambda: len(modes) == 2, limit_ns=310 * SECOND_NS)
+    flies, wakes = modes
+    assert flies == "track"
+    assert (wakes in {"brake", "hover"}) == bool(slept_ns)
 
 
 def test_a_wake_that_was_asked_for_late_is_no_jump() -> None:
@@ -205,9 +237,13 @@ CLOCKS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", CLOCKS)
 def test_the_error_is_the_same_whatever_the_clocks_do(name: str) -> None:
-    """It is within 5 % of that with equal clocks, as a mean of six seeds."""
+    """It is within 5 % of that with equal clocks, as a mean of six seeds.
+
+    Where the vehicle's own clock is set it brakes, and that alone takes a few centimetres.
+    """
     errors = [rmse(scenario, **CLOCKS[name]) for scenario in SCENARIOS]
-    assert mean(errors) == pytest.approx(usual_rmse(), rel=0.05)
+    brakes = any(host == "client" for _, host, _ in CLOCKS[name].get("steps", ()))
+    assert mean(errors) == pytest.approx(usual_rmse(), rel=0.5 if brakes else 0.05)
 
 
 @pytest.mark.parametrize("name", STEPS)
