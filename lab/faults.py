@@ -92,7 +92,7 @@ RANGES = {
 }
 """Range of every kind."""
 
-EVERY_NS = 10 * SECOND_NS
+EVERY_NS = 5 * SECOND_NS
 """Mean time from one fault of a schedule to the next [ns]."""
 SHORTEST_NS = MILLISECOND_NS
 """Length below which `shrink` shortens a fault no further [ns]."""

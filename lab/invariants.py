@@ -11,7 +11,6 @@ import io
 import math
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 from typing import Any
 
 import msgpack
@@ -22,9 +21,10 @@ from client.link import Link
 from client.vehicle import ALTITUDE, LAND_MPS
 from server.gate import Call, Gate, Line
 from shared.config import Scenario
-from shared.endpoint import EVENTS_MAX, SECOND_NS, Datagram, seconds_to_ns
+from shared.endpoint import EVENTS_MAX, MILLISECOND_NS, SECOND_NS, Datagram, seconds_to_ns
 from shared.protocol import NO_HORIZON, Horizon, Mode, Observation, decode
 from shared.record import Recorder, client_columns
+from shared.steady import SLEPT_NS
 from shared.terms import Terms
 
 WELCOME, OBSERVATION, HORIZON = 2, 3, 4
@@ -145,8 +145,7 @@ class Life(Recorder):
         number: number of this life of it.
         up, down: what the server sends, and what vehicles send.
         clock: tells the world's time [ns].
-        calm: tells for how long nothing has happened to the flight [ns].
-        recovery_ns: time within which a vehicle must fly again once nothing happens [ns].
+        overdue: tells whether nothing has happened for so long that the vehicle must fly.
     """
 
     def __init__(
@@ -159,15 +158,14 @@ class Life(Recorder):
         up: Ledger,
         down: Ledger,
         clock: Callable[[], int],
-        calm: Callable[[], int],
-        recovery_ns: int,
+        overdue: Callable[[], bool],
     ) -> None:
         super().__init__(client_columns(scenario.model.axes), io.BytesIO())
         self.secure = link.secure
         self._link = link
         self.vehicle, self._number = vehicle, number
         self._up, self._down = up, down
-        self._clock, self._calm, self._recovery_ns = clock, calm, recovery_ns
+        self._clock, self._overdue = clock, overdue
         self._terms: Terms = scenario.terms()
         self._dt_ns = scenario.dt_ns
         self._timeout = seconds_to_ns(scenario.link.timeout_s) // self._dt_ns
@@ -275,21 +273,21 @@ class Life(Recorder):
         self._times_ns[step] = now_ns
         if len(self._times_ns) > STEPS_REMEMBERED:
             self._times_ns.popitem(last=False)
-        self._listen(flown)
+        self._listen()
         self._check_input(flown)
-        self._check_mode(mode, covered=bool(covered), asleep=asleep)
+        self._check_mode(mode, covered=bool(covered), now_ns=now_ns)
         self._check_horizon(step, int(in_force), int(age_ns), now_ns)
         if covered:
             self._check_follows(step, flown)
         self._check_silence(mode, flown)
         self._check_place(state[::2], asleep)
-        if mode not in FLYING and mode is not Mode.LAND and self._calm() > self._recovery_ns:
-            raise Violation("recovers", f"{mode} after {self._calm() / SECOND_NS:.2f} s of calm")
+        if mode not in FLYING and mode is not Mode.LAND and self._overdue():
+            raise Violation("recovers", f"{mode}, though nothing has happened for long")
         self.step, self.missed, self.mode, self.input = step, int(missed), mode, flown
         self.steps += 1
         self.row_ns = now_ns
 
-    def _listen(self, flown: list[float]) -> None:
+    def _listen(self) -> None:
         """Count the silence."""
         self._silent = 0 if self._heard else self._silent + 1
         self._heard = False
@@ -307,7 +305,7 @@ class Life(Recorder):
             if abs(u - before) > self._change_max:
                 raise Violation("slew", f"from {before:.4f} to {u:.4f} m/s in a step")
 
-    def _check_mode(self, mode: Mode, *, covered: bool, asleep: int) -> None:
+    def _check_mode(self, mode: Mode, *, covered: bool, now_ns: int) -> None:
         """It is one that the table leads to, and does not fly on after sleep."""
         if mode not in REACHED[self.mode]:
             raise Violation("table", f"from {self.mode} to {mode}")
@@ -315,8 +313,9 @@ class Life(Recorder):
             raise Violation("table", "in fault, with a state and an input that are finite")
         if covered != (mode in FLYING):
             raise Violation("table", f"{mode}, and a horizon is {'' if covered else 'not '}flown")
-        if asleep * self._dt_ns > STALL_NS and mode in FLYING:
-            raise Violation("asleep", f"{mode} on waking, {asleep} steps late")
+        late_ns = now_ns - self.row_ns - self._dt_ns
+        if self.row_ns >= 0 and late_ns > STALL_NS + MILLISECOND_NS and mode in FLYING:
+            raise Violation("asleep", f"{mode} on waking {late_ns / SECOND_NS:.2f} s late")
 
     def check_change(self, before: str, after: str) -> None:
         """Check a change of mode that the vehicle has told.
@@ -335,8 +334,8 @@ class Life(Recorder):
         if self._held is None or self._held[2].step != in_force:
             self._held = self._find(in_force, step * self._dt_ns - age_ns)
             good_ns = self._good_ns
-            # A step may pass between a packet and the time that the vehicle reads.
-            if good_ns is None or now_ns - good_ns < 0.99 * GOOD_NS:
+            # What `Steady` lets pass with a jump of the clock is time to the vehicle.
+            if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * SLEPT_NS:
                 since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
                 raise Violation("good link", f"a horizon is flown, the link good for {since}")
         session, life, horizon = self._held
@@ -353,22 +352,24 @@ class Life(Recorder):
         """The horizon in force, by the step that it was made for and its observation."""
         for session, life, payload in reversed(self._horizons):
             horizon = decode(payload, self._terms)
-            assert isinstance(horizon, Horizon) and self._epoch_ns is not None
+            assert isinstance(horizon, Horizon)
+            assert self._epoch_ns is not None
             if horizon.step == made_for and horizon.observed_ns == self._epoch_ns + observed_ns:
                 return session, life, horizon
         raise Violation("foreign", f"a horizon for step {made_for} that has not come")
 
     def _check_follows(self, step: int, flown: list[float]) -> None:
         """It flies the input of its horizon, as fast as it may change, and none that is too old."""
-        assert self._held is not None and self._epoch_ns is not None
+        assert self._held is not None
+        assert self._epoch_ns is not None
         horizon = self._held[2]
         observed = (horizon.observed_ns - self._epoch_ns) // self._dt_ns
         limit_ns = self._terms.age_max * self._dt_ns
-        old_ns = max(
-            self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns
-        )
+        old_ns = max(self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns)
         if old_ns > limit_ns + 2 * self._dt_ns or step - observed > self._terms.age_max:
-            raise Violation("expired", f"an input from an observation {old_ns / SECOND_NS:.2f} s old")
+            raise Violation(
+                "expired", f"an input from an observation {old_ns / SECOND_NS:.2f} s old"
+            )
         if self._terms.feeds_back:
             return
         stage = min(max(step - horizon.step, 0), horizon.inputs.shape[1] - 1)

@@ -25,6 +25,7 @@ from lab.invariants import FLYING, Gatekeeper, Ledger, Life, Violation, check_bo
 from netem.proxy import Proxy
 from server import secure as server_secure
 from server.endpoint import Server
+from server.sessions import WELCOME_NS
 from server.solver import Solver
 from shared import config
 from shared.chance import stream
@@ -50,6 +51,7 @@ QUIET_NS = SECOND_NS
 """Time for which a flight goes on after it must have recovered [ns]."""
 SHORT_S = (8.0, 25.0)
 """Time within which the faults of a short trial begin and end [s], drawn between these."""
+RESTARTED = (Kind.RESTART, "client")
 COMPUTE_NS = MILLISECOND_NS
 """Time that the server takes for a step [ns]."""
 
@@ -159,7 +161,7 @@ class Saboteur(Endpoint):
         if fault.kind is Kind.REPLAY:
             for direction in self._directions(fault):
                 for passed_ns, datagram in self._recorded[direction]:
-                    self._replay(fault, direction, datagram, passed_ns, now_ns)
+                    self._replay(fault, datagram, passed_ns, now_ns)
 
     def end(self, fault: Fault) -> None:
         """Let it befall nothing more."""
@@ -198,7 +200,9 @@ class Saboteur(Endpoint):
     def _directions(fault: Fault) -> tuple[str, ...]:
         return ("uplink", "downlink") if fault.where == "both" else (fault.where,)
 
-    def _pass(self, direction: str, datagram: Datagram, now_ns: int) -> None:
+    def _pass(  # noqa: PLR0912 - a branch for each kind of fault
+        self, direction: str, datagram: Datagram, now_ns: int
+    ) -> None:
         self._recorded[direction].append((now_ns, datagram))
         delay_ns, copies = 0, 1
         for fault in self._on:
@@ -225,7 +229,7 @@ class Saboteur(Endpoint):
                 case Kind.CORRUPTION if rng.random() < amount:
                     datagram = datagram._replace(payload=self._flipped(datagram.payload))
                 case Kind.REPLAY:
-                    self._replay(fault, direction, datagram, now_ns, now_ns)
+                    self._replay(fault, datagram, now_ns, now_ns)
                     continue
                 case _:
                     continue
@@ -233,9 +237,7 @@ class Saboteur(Endpoint):
         for _ in range(copies):
             self._hold(now_ns + delay_ns, datagram)
 
-    def _replay(
-        self, fault: Fault, direction: str, datagram: Datagram, passed_ns: int, now_ns: int
-    ) -> None:
+    def _replay(self, fault: Fault, datagram: Datagram, passed_ns: int, now_ns: int) -> None:
         """Send a packet again where its time lies in the fault, maybe from another address."""
         again_ns = passed_ns + seconds_to_ns(fault.amount)
         if not now_ns <= again_ns < fault.end_ns:
@@ -272,9 +274,11 @@ class Saboteur(Endpoint):
                     payload = payload[:8] + rng.bytes(8) + payload[16:]
         socket = STRANGERS_SOCKET + int(rng.integers(STRANGERS))
         clients = list(self._clients.values())
-        to = (SERVER, NETEM)[rng.integers(2)] if where == "server" else clients[
-            int(rng.integers(len(clients)))
-        ]
+        to = (
+            (SERVER, NETEM)[rng.integers(2)]
+            if where == "server"
+            else clients[int(rng.integers(len(clients)))]
+        )
         self._out.append(Datagram(payload, to, socket))
         self.counts[f"packets: {Kind.FLOOD}"] += 1
 
@@ -344,9 +348,8 @@ class Torture:
         """Time of the world since which nothing happens, as far as nothing does."""
         self._under_way = 0
         """Number of faults that last, or leave something under way."""
-        direction = self.scenario.network.uplink
-        trip_ns = 2 * seconds_to_ns(direction.minimum_s + 8 * direction.slot_s)
-        self.recovery_ns = recovery_ns(self.scenario, trip_ns)
+        restarts = any((each.kind, each.where) == RESTARTED for each in trial.faults)
+        self._recovery_ns = recovery_ns(self.scenario, restarts=restarts)
         """Time within which a vehicle flies again once nothing happens [ns]."""
         self.counts: Counter[str] = Counter()
         self._servers = self._netems = 0
@@ -363,14 +366,12 @@ class Torture:
             self.vehicles.append(Vehicle(name, plant, life))
             start_ns = int(self._chance.integers(self.scenario.dt_ns))
             self.world.add(name, client, clock=Clock(CLOCK_NS), start_ns=start_ns)
-        self.world.add(
-            SERVER[0], self._new_server(), clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS
-        )
+        self.world.add(SERVER[0], self._new_server(), clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS)
         self._down_hosts: Counter[str] = Counter()
         """Number of faults for which each host is down."""
         for fault in trial.faults:
             self._plan(fault)
-        self.end_ns = trial.end_ns + self.recovery_ns + QUIET_NS
+        self.end_ns = trial.end_ns + self._recovery_ns + QUIET_NS
 
     def run(self, stopped: Callable[[], bool] = lambda: False) -> Outcome:
         """Fly it to its end, or to the first violation."""
@@ -421,9 +422,7 @@ class Torture:
         self._netem = Proxy(scenario, server=SERVER, flows=2 * len(self._keyring) + STRANGERS)
         return Steady(self._netem)
 
-    def _new_client(
-        self, vehicle: int, number: int, plant: FirstOrderPlant
-    ) -> tuple[Life, Steady]:
+    def _new_client(self, vehicle: int, number: int, plant: FirstOrderPlant) -> tuple[Life, Steady]:
         key, world = self._keyring.of(vehicle), self.world
         life = Life(
             client_secure.Secure(key, entropy=self._chance.bytes),
@@ -433,8 +432,7 @@ class Torture:
             up=self._up,
             down=self._down,
             clock=lambda: world.now_ns,
-            calm=self._calm,
-            recovery_ns=self.recovery_ns,
+            overdue=self._overdue,
         )
         client = Client(
             self.scenario,
@@ -469,9 +467,9 @@ class Torture:
 
     # -- faults ------------------------------------------------------------------------------
 
-    def _calm(self) -> int:
-        """Time for which nothing has happened [ns]; less than none while something does."""
-        return -1 if self._under_way else self.world.now_ns - self._calm_ns
+    def _overdue(self) -> bool:
+        """Whether nothing has happened for so long that every vehicle must fly."""
+        return not self._under_way and self.world.now_ns - self._calm_ns > self._recovery_ns
 
     def _plan(self, fault: Fault) -> None:
         """Put a fault on the agenda."""
@@ -516,21 +514,23 @@ class Torture:
 
     # -- who looks ---------------------------------------------------------------------------
 
-    def _hear(self, time_ns: int, host: str, event: Event) -> None:  # noqa: ARG002
+    def _hear(self, time_ns: int, _: str, event: Event) -> None:
         """Check a change of mode; begin a vehicle anew that has landed."""
         if not isinstance(event, ModeChanged):
             return
         vehicle = self.vehicles[event.vehicle - 1]
         vehicle.life.check_change(event.before, event.after)
         self.counts[f"{event.after}: {event.reason}"] += event.before != event.after
-        due_ns = time_ns + LANDED_NS
-        if event.after == str(Mode.LAND) and event.before != event.after and due_ns < self.end_ns:
-            landed = vehicle.life
+        landed, due_ns = vehicle.life, time_ns + LANDED_NS
+        recovery_after_ns = recovery_ns(self.scenario, restarts=True)
 
-            def renew() -> None:
-                if vehicle.life is landed and not self._down_hosts[vehicle.name]:
-                    self._renew(vehicle.name)
+        def renew() -> None:
+            if vehicle.life is landed and not self._down_hosts[vehicle.name]:
+                self._renew(vehicle.name)
+                self._calm_ns, self._recovery_ns = due_ns, recovery_after_ns
 
+        landing = event.after == str(Mode.LAND) and event.before != event.after
+        if landing and due_ns + recovery_after_ns < self.end_ns:
             self.world.at(due_ns, renew)
 
     def _check_end(self) -> None:
@@ -547,18 +547,25 @@ class Torture:
         check_bounds("netem", self._netem)
 
 
-def recovery_ns(scenario: Scenario, trip_ns: int) -> int:
+def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
     """Time within which a vehicle flies again once nothing happens [ns].
 
-    The end of the session is noticed, or that of an earlier life of the vehicle; HELLO is said; a
-    cookie, a session; a good link; a horizon that was planned after that. Two steps are for the
-    clocks.
+    The end of the session is noticed; HELLO is said, a cookie and a session come; the link is good
+    for a while; a horizon comes that was planned after that.
+
+    Args:
+        scenario: what is flown.
+        restarts: whether vehicles are begun anew: the server may wait for the life before.
     """
-    timeout_ns = seconds_to_ns(scenario.link.timeout_s)
-    return timeout_ns + 2 * HELLO_NS + GOOD_NS + 4 * trip_ns + 4 * scenario.dt_ns
+    direction = scenario.network.uplink
+    trip_ns = 2 * seconds_to_ns(direction.minimum_s + 8 * direction.slot_s)
+    noticed_ns = WELCOME_NS if restarts else seconds_to_ns(scenario.link.timeout_s)
+    return noticed_ns + 2 * HELLO_NS + GOOD_NS + 4 * trip_ns + 4 * scenario.dt_ns
 
 
-def act(torture: Torture, fault: Fault, *, begins: bool) -> None:
+def act(  # noqa: PLR0912 - a branch for each kind of fault
+    torture: Torture, fault: Fault, *, begins: bool
+) -> None:
     """Do what a fault does when it begins, or when it ends."""
     world, dt_ns = torture.world, torture.scenario.dt_ns
     names = torture.hosts(fault.where)

@@ -1,4 +1,4 @@
-"""`skytether torture`: sealed flights through faults and attacks, and what must hold all the while."""
+"""`skytether torture`: sealed flights through faults and attacks, and what must hold meanwhile."""
 
 import math
 import secrets
@@ -49,7 +49,7 @@ class Options:
 
 
 def torture(argv: Sequence[str]) -> None:
-    """Fly the real server, netem and clients in virtual time, sealed, and do all that is bad to them.
+    """Fly server, netem and clients in virtual time, sealed, and do all that is bad to them.
 
     Packets are lost, doubled, held back, changed, recorded and sent again; hosts freeze, restart,
     and set their clocks; the solver fails, the server is overloaded, strangers flood. At each step
