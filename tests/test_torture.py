@@ -252,7 +252,7 @@ def test_two_hours_go_well() -> None:
 
 
 def test_a_failure_shrinks_to_the_fault_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of five, the one that the guard is there for; and it fails again from its line of JSON."""
+    """Five faults shrink to the one that the guard is there for; it fails again from its JSON."""
     no_stall(monkeypatch)
     culprit = fault(Kind.FREEZE, "client", 6, 1.0)
     others = (
