@@ -228,7 +228,7 @@ def test_a_guard_that_is_switched_off_is_caught(
     switch_off: Patch, invariant: str, faults: tuple[Fault, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By its invariant; with the guard the same flight goes well."""
-    trial = Trial(1, faults)
+    trial = Trial(3, faults)
     assert not fly(trial).failure
     switch_off(monkeypatch)
     assert fly(trial).invariant == invariant
