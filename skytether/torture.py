@@ -82,7 +82,8 @@ def torture(argv: Sequence[str]) -> None:
         failed = [each for each in done if each.failure]
     _finish(options, title, done, failed)
     if failed:
-        raise CommandError(f"{len(failed)} of {len(done)} flights failed")
+        said = f"{len(failed)} of {len(done)} flights failed"
+        raise CommandError(f"{interrupted}, and {said}" if interrupted else said)
     if interrupted:
         raise CommandError(interrupted, command.INTERRUPTED)
 
