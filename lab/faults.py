@@ -2,7 +2,7 @@
 
 A schedule is data: what is done to which host or direction, from when to when, and how badly. The
 same generator draws the same schedule. One after which a flight fails is shrunk to the shortest
-that still fails, and kept as a line of JSON.
+that still fails, and kept as a line of JSON with the seed of the flight.
 """
 
 from collections.abc import Callable, Sequence
@@ -88,11 +88,11 @@ RANGES = {
     Kind.REPLAY: Range(NETWORK, (1.0, 30.0), (0.1, 30.0)),
     Kind.DELAY: Range(NETWORK, (0.5, 10.0), (0.1, 10.0)),
     Kind.CORRUPTION: Range(NETWORK, (1.0, 30.0), SHARE),
-    Kind.FLOOD: Range(HOSTS, (0.1, 5.0), (100.0, 10_000.0)),
+    Kind.FLOOD: Range(HOSTS, (0.1, 5.0), (100.0, 2_000.0)),
 }
 """Range of every kind."""
 
-EVERY_NS = 10 * SECOND_NS
+EVERY_NS = 5 * SECOND_NS
 """Mean time from one fault of a schedule to the next [ns]."""
 SHORTEST_NS = MILLISECOND_NS
 """Length below which `shrink` shortens a fault no further [ns]."""
@@ -112,13 +112,24 @@ class Fault:
     amount: float
     """How badly, in the unit of its kind."""
 
+    @property
+    def end_ns(self) -> int:
+        """Time of the world at which it ends."""
+        return self.start_ns + self.length_ns
+
+    @property
+    def over_ns(self) -> int:
+        """Time of the world at which the last packet comes that it has held back."""
+        held = self.kind in (Kind.REORDERING, Kind.DELAY)
+        return self.end_ns + (seconds_to_ns(self.amount) if held else 0)
+
 
 def schedule(rng: np.random.Generator, duration_ns: int) -> tuple[Fault, ...]:
     """Draw the faults of a flight, one at least, by the time at which they begin.
 
     Args:
         rng: source of chance.
-        duration_ns: time within which they begin [ns].
+        duration_ns: time within which they begin and end [ns].
     """
     count = 1 + rng.poisson(duration_ns / EVERY_NS)
     kinds = list(Kind)
@@ -130,7 +141,7 @@ def _draw(rng: np.random.Generator, kind: Kind, duration_ns: int) -> Fault:
     bounds = RANGES[kind]
     where = bounds.where[rng.integers(len(bounds.where))]
     start_ns = int(rng.integers(duration_ns))
-    length_ns = seconds_to_ns(_between(rng, bounds.length_s))
+    length_ns = min(seconds_to_ns(_between(rng, bounds.length_s)), duration_ns - start_ns)
     amount = _between(rng, bounds.amount)
     negative = bounds.signed and rng.random() < 0.5
     return Fault(kind, where, start_ns, length_ns, -amount if negative else amount)
@@ -173,24 +184,39 @@ def shrink(
     return kept
 
 
-def dumps(faults: Sequence[Fault]) -> str:
-    """Line of JSON for a schedule."""
-    return msgspec.json.encode(faults).decode()
+@dataclass(frozen=True)
+class Trial:
+    """A flight under torture."""
+
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**32 - 1)]
+    """Seed of everything else that is drawn."""
+    faults: tuple[Fault, ...]
+    """What happens to it."""
+
+    @property
+    def end_ns(self) -> int:
+        """Time of the world from which on nothing that is left of a fault happens any more."""
+        return max((fault.over_ns for fault in self.faults), default=0)
 
 
-def loads(line: str) -> tuple[Fault, ...]:
-    """Schedule in a line of JSON.
+def dumps(trial: Trial) -> str:
+    """Line of JSON for a trial."""
+    return msgspec.json.encode(trial).decode()
+
+
+def loads(line: str) -> Trial:
+    """Trial in a line of JSON.
 
     Raises:
         ConfigError: it is none.
     """
     try:
-        faults = msgspec.json.decode(line, type=tuple[Fault, ...])
+        trial = msgspec.json.decode(line, type=Trial)
     except msgspec.DecodeError as error:
         raise ConfigError(f"schedule of faults: {error}") from None
-    for fault in faults:
+    for fault in trial.faults:
         where = RANGES[fault.kind].where
         if fault.where not in where:
             expected = " or ".join(where)
             raise ConfigError(f"schedule: {fault.kind}: got {fault.where!r}, expected {expected}")
-    return faults
+    return trial

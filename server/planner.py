@@ -189,9 +189,10 @@ class Planner:
         self._mpc = mpc
         self._terminal_weight = np.array(control.terminal_weight)
         self._compares = terms.commits
-        self._solvers = [
+        self.solvers = [
             make_solver(control, pose(terms.model, mpc, which)) for which in (FIRST, LATER)
         ]
+        """Solvers of a vehicle's first plan, and of later ones; others may take their places."""
         self._stopwatch = stopwatch
         self._memory = Memory(
             inputs=np.zeros((2, capacity, axes, H)),
@@ -239,7 +240,7 @@ class Planner:
             figures=self.figures,
         )
         left = np.arange(len(rows))
-        solver = self._solvers[LATER]
+        solver = self.solvers[LATER]
         if type(solver) is ExactSolver:
             undone = _plan(batch, rows, step, solver.work)
             left = np.flatnonzero(~self.figures["solved"][: len(rows)]) if undone else left[:0]
@@ -255,7 +256,7 @@ class Planner:
         """Solve the problems posed in the draft for some vehicles of the block, by index."""
         draft = self._draft
         fresh = self.figures["fresh"][left]
-        for some, solver in zip((left[fresh], left[~fresh]), self._solvers, strict=True):
+        for some, solver in zip((left[fresh], left[~fresh]), self.solvers, strict=True):
             if len(some):
                 inputs, solved = solver.solve(draft.gradient[some], draft.guess[some])
                 draft.inputs[which, some] = inputs

@@ -416,9 +416,18 @@ def _observe_disturbance(
 
 
 @part
-def _listen(settings: Settings, memory: Memory, bound: DelayBound, clock: Seen, row: int) -> None:
-    """Take what the newest observation says of the delay of horizons."""
+def _listen(
+    settings: Settings, memory: Memory, bound: DelayBound, clock: Seen, row: int, k: int
+) -> None:
+    """Take what the newest observation says of the delay of horizons.
+
+    A bound so large that no plan could be flown is forgotten: nothing would be sent, and nothing
+    that was sent could show that the delay is smaller by now.
+    """
     seen, room = memory.seen[row], memory.sent.shape[1]
+    age = k - memory.observed[row]
+    if bound.steps[row] > age and age + bound.steps[row] > settings.age_max:
+        bound.steps[row], bound.seen[row] = 0, 0
     if bound.steps[row] == 0:
         begin(bound, row, -(-half_trip_ns(clock, row) // settings.dt_ns) + MARGIN)
     at_least(bound, row, -(-shortest_ns(clock, row) // settings.dt_ns))
@@ -447,7 +456,7 @@ def _foresee(
     track, lost = Track(np.empty(longest), np.empty((longest, 2))), 0
     for i in range(len(rows)):
         row, k = rows[i], steps[i]
-        _listen(settings, memory, bound, clock, row)
+        _listen(settings, memory, bound, clock, row, k)
         d = bound.steps[row]
         if settings.decay < 1.0:
             trip = k + d - memory.observed[row]

@@ -64,10 +64,12 @@ class _Still(Endpoint):
     Args:
         inner: the endpoint.
         room: most datagrams that wait for it; none do for a host that is down.
+        armed_ns: time of the world at which its timer ends, or None.
     """
 
-    def __init__(self, inner: Endpoint, room: int) -> None:
+    def __init__(self, inner: Endpoint, room: int, armed_ns: int | None = None) -> None:
         super().__init__()
+        self.armed_ns = armed_ns
         self.inner = inner
         self.room = room
         self.waiting: deque[Datagram] = deque()
@@ -198,7 +200,8 @@ class World:
         """
         host = self._hosts[name]
         if not isinstance(host.endpoint, _Still):
-            host.endpoint, host.armed_ns = _Still(host.endpoint, FROZEN_MAX), None
+            host.endpoint = _Still(host.endpoint, FROZEN_MAX, host.armed_ns)
+            host.armed_ns = None
 
     def thaw(self, name: str) -> None:
         """Let a frozen host go on: it hears what has waited, and then is woken, if it wants to.
@@ -211,12 +214,15 @@ class World:
             host.endpoint = still.inner
             for datagram in still.waiting:
                 self._receive(host, datagram)
-            self._arm(host)
+            if not still.waiting and still.armed_ns is not None:
+                host.armed_ns = max(self.now_ns, still.armed_ns)
+                self._at(host.armed_ns, host.turn, host, None)
 
     def set_clock(self, name: str, *, step_ns: int = 0, drift_ppb: int | None = None) -> None:
         """Step a host's clock now, or change its rate from now on.
 
-        The host is not told. What it waits for by its clock comes sooner or later by the step.
+        The host is not told. What it waits for is on a timer, which counts on: it comes when it
+        would have come.
 
         Args:
             name: name of the host.
@@ -225,11 +231,14 @@ class World:
         """
         host = self._hosts[name]
         host.clock = host.clock.changed(self.now_ns, step_ns=step_ns, drift_ppb=drift_ppb)
-        self._arm(host)
 
     def set_compute(self, name: str, compute_ns: int) -> None:
         """Change the time that a host works whenever it is woken [ns]."""
         self._hosts[name].compute_ns = compute_ns
+
+    def rearm(self, name: str) -> None:
+        """Ask a host when it wants to be woken, after an action has given it something to do."""
+        self._arm(self._hosts[name])
 
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""

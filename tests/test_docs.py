@@ -122,6 +122,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py
     known += ("skytether keygen ",)  # by test_keys.py
+    known += ("skytether torture",)  # by test_torture.py
     known += ("docker compose up",)
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:

@@ -1,0 +1,612 @@
+"""Torture: the real endpoints, sealed, through a schedule of faults, with somebody who looks.
+
+    clients ── saboteur ── netem ── server          on hosts that stop, freeze, and set their clocks
+
+What is flown follows from the seed of a trial, the faults are given with it, and so it goes the
+same each time. All that fails is a `Violation` of an invariant (`lab.invariants`), or an exception
+of an endpoint. A vehicle that has landed is begun anew after a while, as an operator would.
+"""
+
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
+
+import msgspec
+import numpy as np
+
+from client import secure as client_secure
+from client.failsafe import GOOD_NS
+from client.plant import FirstOrderPlant
+from client.vehicle import HELLO_NS, Client
+from lab.faults import Fault, Kind, Trial, schedule, shrink
+from lab.invariants import FLYING, Gatekeeper, Ledger, Life, Violation, check_bounds
+from netem.proxy import Proxy
+from server import secure as server_secure
+from server.endpoint import Server
+from server.sessions import WELCOME_NS
+from server.solver import Solver
+from shared import config
+from shared.chance import stream
+from shared.config import Scenario
+from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
+from shared.events import Event, ModeChanged
+from shared.keys import Keyring
+from shared.model import Array, Flags
+from shared.protocol import Mode
+from shared.steady import Steady
+from sim.flight import make_keys
+from sim.world import Clock, World
+
+SERVER: Address = ("server", 0)
+NETEM: Address = ("netem", 0)
+SABOTEUR: Address = ("saboteur", 0)
+
+CLOCK_NS = 10**7 * SECOND_NS
+"""Time that all clocks show at first [ns]: no step back leads below zero."""
+LANDED_NS = 5 * SECOND_NS
+"""Time after which a vehicle that has landed is begun anew [ns]."""
+QUIET_NS = SECOND_NS
+"""Time for which a flight goes on after it must have recovered [ns]."""
+SHORT_S = (8.0, 25.0)
+"""Time within which the faults of a short trial begin and end [s], drawn between these."""
+RESTARTED = (Kind.RESTART, "client")
+COMPUTE_NS = MILLISECOND_NS
+"""Time that the server takes for a step [ns]."""
+
+RECORDED = 2048
+"""Number of newest packets of a direction that an attacker has recorded."""
+HELD_MAX = 65536
+"""Largest number of packets that an attacker holds back."""
+FLOOD_NS = 10 * MILLISECOND_NS
+"""Time between two volleys of forged packets [ns]."""
+OTHER_SOCKET, STRANGERS_SOCKET, STRANGERS = 100, 200, 8
+"""First number of the sockets from which packets of vehicles are replayed, of those from which
+forged ones are sent, and number of the latter."""
+
+
+def make_scenario(seed: int) -> tuple[Scenario, int]:
+    """Scenario of a trial, and how many vehicles fly it; both are drawn from the seed."""
+    rng = stream(seed, "torture", "scenario")
+    scheme = ("committed", "feedback", "predictive")[rng.choice(3, p=(0.6, 0.2, 0.2))]
+    dt_s, axes = (0.05, 0.1)[rng.choice(2, p=(0.25, 0.75))], (2, 3)[rng.integers(2)]
+    delay_s = round(float(np.exp(rng.uniform(np.log(0.005), np.log(0.4)))), 3)
+    direction = {"delay": "poisson", "minimum_s": delay_s, "slot_s": delay_s / 20.0, "loss": 0.0}
+    table = {
+        "seed": seed,
+        "duration": 86_400.0,
+        "settle": 0.0,
+        "model": {"axes": axes, "tau_s": [0.84], "u_max": [1.6]},
+        "control": {
+            "dt": dt_s,
+            "horizon": round(2.0 / dt_s),
+            "scheme": scheme,
+            "trigger": f"{'state_gap' if scheme == 'predictive' else 'cost_gap'} | silence(1)",
+        },
+        "reference": {
+            "shape": "figure-eight",
+            "radius_m": 2.0,
+            "period_s": 30.0,
+            "altitude_m": 3.0 if axes == 3 else 0.0,
+        },
+        "vehicle": {"exhausted": "brake", "wind": 0.05, "slew_mps2": 5.0},
+        "network": {"uplink": direction, "downlink": direction},
+        "link": {"heartbeat_s": 0.1, "timeout_s": 1.0, "age_max_s": 3.0, "connect_s": 3600.0},
+    }
+    return config.check(table, "torture"), 1 + int(rng.random() < 0.3)
+
+
+def short_trial(seed: int) -> Trial:
+    """Trial of some 25 s."""
+    rng = stream(seed, "torture", "faults")
+    return Trial(seed, schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S))))
+
+
+def long_trial(seed: int, hours: float = 1.0) -> Trial:
+    """Trial of so many hours, with faults all along."""
+    return Trial(seed, schedule(stream(seed, "torture", "faults"), seconds_to_ns(3600.0 * hours)))
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What came of a trial."""
+
+    trial: Trial
+    failure: str = ""
+    """Violation or exception that ended it; empty where there was none."""
+    invariant: str = ""
+    """Name of the invariant, or `raises`."""
+    flown_s: float
+    """Time of the world [s]."""
+    counts: dict[str, int]
+    """Number of steps, lives, packets and the like, by name."""
+
+
+class Saboteur(Endpoint):
+    """Who sits on the way between vehicles and netem, and reads nothing.
+
+    Vehicle number n is a client of netem's by its socket n. Packets pass unless a fault is on.
+
+    Args:
+        rng: source of chance.
+        clients: addresses of vehicles 1, 2, ….
+    """
+
+    def __init__(self, rng: np.random.Generator, clients: Sequence[Address]) -> None:
+        super().__init__()
+        self._rng = rng
+        self._clients = dict(enumerate(clients, start=1))
+        self._numbers = {client: number for number, client in self._clients.items()}
+        self._on: list[Fault] = []
+        """Faults that last."""
+        self._left: dict[Fault, int] = {}
+        """Number of packets that are still lost of a burst."""
+        self._recorded: dict[str, deque[tuple[int, Datagram]]] = {
+            direction: deque(maxlen=RECORDED) for direction in ("uplink", "downlink")
+        }
+        """Newest packets of each direction, and the times at which they passed."""
+        self._held: list[tuple[int, int, Datagram]] = []
+        """Heap of time at which a packet goes on, order, and packet."""
+        self._order = 0
+        self._volley_ns: int | None = None
+        """Time of the next volley of forged packets."""
+        self.counts: Counter[str] = Counter()
+        """Number of packets that each kind of fault has befallen."""
+
+    def begin(self, fault: Fault, now_ns: int) -> None:
+        """Let a fault befall what passes from now on."""
+        self._on.append(fault)
+        if fault.kind is Kind.FLOOD:
+            self._volley_ns = now_ns
+        if fault.kind is Kind.REPLAY:
+            for direction in self._directions(fault):
+                for passed_ns, datagram in self._recorded[direction]:
+                    self._replay(fault, datagram, passed_ns, now_ns)
+
+    def end(self, fault: Fault) -> None:
+        """Let it befall nothing more."""
+        self._on.remove(fault)
+        self._left.pop(fault, None)
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Let a packet pass, or not."""
+        payload, peer, socket = datagram
+        if socket == 0:
+            number = self._numbers.get(peer)
+            if number is not None:
+                self._pass("downlink", Datagram(payload, NETEM, number), now_ns)
+        elif socket in self._clients:
+            self._pass("uplink", Datagram(payload, self._clients[socket]), now_ns)
+        self._release(now_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        """Let go on what was held back, and flood."""
+        if self._volley_ns is not None and now_ns >= self._volley_ns:
+            floods = [fault for fault in self._on if fault.kind is Kind.FLOOD]
+            for fault in floods:
+                for _ in range(self._rng.poisson(fault.amount * FLOOD_NS / SECOND_NS)):
+                    self._forge(fault.where)
+            self._volley_ns = now_ns + FLOOD_NS if floods else None
+        self._release(now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """Time at which the next packet goes on."""
+        due_ns = self._held[0][0] if self._held else None
+        if due_ns is None or (self._volley_ns is not None and self._volley_ns < due_ns):
+            return self._volley_ns
+        return due_ns
+
+    @staticmethod
+    def _directions(fault: Fault) -> tuple[str, ...]:
+        return ("uplink", "downlink") if fault.where == "both" else (fault.where,)
+
+    def _pass(  # noqa: PLR0912 - a branch for each kind of fault
+        self, direction: str, datagram: Datagram, now_ns: int
+    ) -> None:
+        self._recorded[direction].append((now_ns, datagram))
+        delay_ns, copies = 0, 1
+        for fault in self._on:
+            if fault.where not in (direction, "both"):
+                continue
+            rng, amount = self._rng, fault.amount
+            match fault.kind:
+                case Kind.PARTITION:
+                    copies = 0
+                case Kind.LOSS if rng.random() < amount:
+                    copies = 0
+                case Kind.BURST:
+                    left = self._left.get(fault, 0)
+                    if not left and rng.random() < 1.0 / amount:
+                        left = round(amount)
+                    self._left[fault] = max(0, left - 1)
+                    copies = 0 if left else copies
+                case Kind.DUPLICATES if rng.random() < amount:
+                    copies *= 2
+                case Kind.REORDERING:
+                    delay_ns += seconds_to_ns(amount * rng.random())
+                case Kind.DELAY:
+                    delay_ns += seconds_to_ns(amount)
+                case Kind.CORRUPTION if rng.random() < amount:
+                    datagram = datagram._replace(payload=self._flipped(datagram.payload))
+                case Kind.REPLAY:
+                    self._replay(fault, datagram, now_ns, now_ns)
+                    continue
+                case _:
+                    continue
+            self.counts[f"packets: {fault.kind}"] += 1
+        for _ in range(copies):
+            self._hold(now_ns + delay_ns, datagram)
+
+    def _replay(self, fault: Fault, datagram: Datagram, passed_ns: int, now_ns: int) -> None:
+        """Send a packet again where its time lies in the fault, maybe from another address."""
+        again_ns = passed_ns + seconds_to_ns(fault.amount)
+        if not now_ns <= again_ns < fault.end_ns:
+            return
+        if self._rng.random() < 0.5:
+            other = datagram.socket + OTHER_SOCKET
+            datagram = datagram._replace(socket=other)
+        self.counts[f"packets: {fault.kind}"] += 1
+        self._hold(again_ns, datagram)
+
+    def _flipped(self, payload: bytes) -> bytes:
+        """Payload with one bit flipped."""
+        bit = int(self._rng.integers(8 * len(payload)))
+        flipped = bytearray(payload)
+        flipped[bit // 8] ^= 1 << bit % 8
+        return bytes(flipped)
+
+    def _forge(self, where: str) -> None:
+        """Send what a stranger can make: noise, or what was recorded with something changed."""
+        rng = self._rng
+        recorded = self._recorded["downlink" if where == "server" else "uplink"]
+        payload = rng.bytes(int(rng.integers(1, 600)))
+        if recorded and rng.random() < 0.8:
+            payload = recorded[int(rng.integers(len(recorded)))][1].payload
+            size, at = len(payload), int(rng.integers(len(payload)))
+            match rng.integers(4):
+                case 0:
+                    payload = self._flipped(payload)
+                case 1:
+                    payload = payload[:at]
+                case 2:
+                    payload = payload[:at] + rng.bytes(size - at)
+                case _:  # another counter, as if it were newer
+                    payload = payload[:8] + rng.bytes(8) + payload[16:]
+        socket = STRANGERS_SOCKET + int(rng.integers(STRANGERS))
+        clients = list(self._clients.values())
+        to = (
+            (SERVER, NETEM)[rng.integers(2)]
+            if where == "server"
+            else clients[int(rng.integers(len(clients)))]
+        )
+        self._out.append(Datagram(payload, to, socket))
+        self.counts[f"packets: {Kind.FLOOD}"] += 1
+
+    def _hold(self, due_ns: int, datagram: Datagram) -> None:
+        if len(self._held) < HELD_MAX:
+            self._order += 1
+            heappush(self._held, (due_ns, self._order, datagram))
+
+    def _release(self, now_ns: int) -> None:
+        while self._held and self._held[0][0] <= now_ns:
+            self._out.append(heappop(self._held)[2])
+
+
+class Failing:
+    """Solver that says of a share of its problems that it has found nothing.
+
+    Args:
+        inner: what solves the others.
+        share: that share.
+        rng: source of chance.
+    """
+
+    def __init__(self, inner: Solver, share: float, rng: np.random.Generator) -> None:
+        self.inner = inner
+        self._share = share
+        self._rng = rng
+
+    def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
+        """See `Solver`."""
+        inputs, solved = self.inner.solve(gradient, guess)
+        failed = self._rng.random(len(solved)) < self._share
+        inputs[failed] = guess[failed]
+        return inputs, solved & ~failed
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """A vehicle through its lives."""
+
+    name: str
+    """Name of its host."""
+    plant: FirstOrderPlant
+    """What flies, in all of them."""
+    life: Life
+    """The present one."""
+    lives: int = 1
+    """Number of lives so far."""
+    down: int = 0
+    """Number of faults for which its host is down."""
+
+
+class Torture:
+    """A trial under way.
+
+    Args:
+        trial: what is to happen.
+    """
+
+    def __init__(self, trial: Trial) -> None:
+        self.trial = trial
+        self.scenario, count = make_scenario(trial.seed)
+        self._keyring: Keyring = make_keys(trial.seed, count)
+        self._chance = stream(trial.seed, "torture", "flight")
+        self.world = World(self._hear)
+        self._up, self._down = Ledger(), Ledger()
+        self._calm_ns = 0
+        """Time of the world since which nothing happens, as far as nothing does."""
+        self._under_way = 0
+        """Number of faults that last, or leave something under way."""
+        restarts = any((each.kind, each.where) == RESTARTED for each in trial.faults)
+        self._recovery_ns = recovery_ns(self.scenario, restarts=restarts)
+        """Time within which a vehicle flies again once nothing happens [ns]."""
+        self.counts: Counter[str] = Counter()
+        self._servers = self._netems = 0
+        names = [f"client {number}" for number in range(1, count + 1)]
+        self.saboteur = Saboteur(
+            stream(trial.seed, "torture", "saboteur"), [(name, 0) for name in names]
+        )
+        self.world.add(SABOTEUR[0], self.saboteur)
+        self.world.add(NETEM[0], self._new_netem(), clock=Clock(CLOCK_NS))
+        self.vehicles: list[Vehicle] = []
+        for number, name in enumerate(names, start=1):
+            plant = FirstOrderPlant(self.scenario, stream(trial.seed, "wind", number))
+            life, client = self._new_client(number, 1, plant)
+            self.vehicles.append(Vehicle(name, plant, life))
+            start_ns = int(self._chance.integers(self.scenario.dt_ns))
+            self.world.add(name, client, clock=Clock(CLOCK_NS), start_ns=start_ns)
+        self.world.add(SERVER[0], self._new_server(), clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS)
+        self._down_hosts: Counter[str] = Counter()
+        """Number of faults for which each host is down."""
+        for fault in trial.faults:
+            self._plan(fault)
+        self.end_ns = trial.end_ns + self._recovery_ns + QUIET_NS
+
+    def run(self, stopped: Callable[[], bool] = lambda: False) -> Outcome:
+        """Fly it to its end, or to the first violation."""
+        failure = invariant = ""
+        try:
+            self.world.run(stopped, limit_ns=self.end_ns)
+            if not stopped():
+                self._check_end()
+        except Violation as violation:
+            failure, invariant = str(violation), violation.invariant
+        except Exception as error:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            said = f"{type(error).__name__} {error} ({where.filename}:{where.lineno})"
+            failure, invariant = f"raises: {said}", "raises"
+        for vehicle in self.vehicles:
+            self._count(vehicle.life)
+        self.counts += self.saboteur.counts
+        return Outcome(
+            trial=self.trial,
+            failure=f"{self.world.now_ns / SECOND_NS:.3f} s: {failure}" if failure else "",
+            invariant=invariant,
+            flown_s=self.world.now_ns / SECOND_NS,
+            counts=dict(self.counts),
+        )
+
+    # -- lives -------------------------------------------------------------------------------
+
+    def _boot_id(self) -> int:
+        return int(self._chance.integers(2**63)) | 2**62
+
+    def _new_server(self) -> Steady:
+        self._servers += 1
+        entropy = self._chance.bytes
+        gate = server_secure.Secure(self._keyring, entropy=entropy)
+        self._gate = Gatekeeper(gate, self._servers, self._up, self._down)
+        self._server = Server(
+            self.scenario,
+            boot_id=self._boot_id(),
+            entropy=entropy,
+            gate=self._gate,
+            room=len(self._keyring),
+        )
+        return Steady(self._server)
+
+    def _new_netem(self) -> Steady:
+        scenario = msgspec.structs.replace(self.scenario, seed=self.trial.seed + self._netems)
+        self._netems += 1
+        self._netem = Proxy(scenario, server=SERVER, flows=2 * len(self._keyring) + STRANGERS)
+        return Steady(self._netem)
+
+    def _new_client(self, vehicle: int, number: int, plant: FirstOrderPlant) -> tuple[Life, Steady]:
+        key, world = self._keyring.of(vehicle), self.world
+        life = Life(
+            client_secure.Secure(key, entropy=self._chance.bytes),
+            self.scenario,
+            vehicle=vehicle,
+            number=number,
+            up=self._up,
+            down=self._down,
+            clock=lambda: world.now_ns,
+            overdue=self._overdue,
+        )
+        client = Client(
+            self.scenario,
+            plant,
+            server=SABOTEUR,
+            vehicle=vehicle,
+            boot_id=self._boot_id(),
+            link=life,
+            recorder=life,
+        )
+        return life, Steady(client)
+
+    def _renew(self, name: str) -> None:
+        """Begin another life of whatever runs on a host."""
+        self.counts[f"lives of {name.partition(' ')[0]}"] += 1
+        if name == SERVER[0]:
+            self.world.restart(name, self._new_server())
+        elif name == NETEM[0]:
+            self.world.restart(name, self._new_netem())
+        else:
+            vehicle = next(each for each in self.vehicles if each.name == name)
+            self._count(vehicle.life)
+            vehicle.lives += 1
+            number = vehicle.life.vehicle
+            vehicle.life, client = self._new_client(number, vehicle.lives, vehicle.plant)
+            self.world.restart(name, client)
+
+    def _count(self, life: Life) -> None:
+        self.counts["steps"] += life.steps
+        self.counts["steps slept through"] += life.missed
+        self.counts["landed"] += life.mode is Mode.LAND
+
+    # -- faults ------------------------------------------------------------------------------
+
+    def _overdue(self) -> bool:
+        """Whether nothing has happened for so long that every vehicle must fly."""
+        return not self._under_way and self.world.now_ns - self._calm_ns > self._recovery_ns
+
+    def _plan(self, fault: Fault) -> None:
+        """Put a fault on the agenda."""
+        world = self.world
+
+        def begin() -> None:
+            self._under_way += 1
+            self.counts[f"faults: {fault.kind}"] += 1
+            act(self, fault, begins=True)
+            world.at(max(world.now_ns, fault.end_ns), end)
+
+        def end() -> None:
+            act(self, fault, begins=False)
+            world.at(fault.over_ns, over)
+
+        def over() -> None:
+            self._under_way -= 1
+            self._calm_ns = world.now_ns
+
+        world.at(fault.start_ns, begin)
+
+    def hosts(self, where: str) -> list[str]:
+        """Names of the hosts that a fault befalls."""
+        return [each.name for each in self.vehicles] if where == "client" else [where]
+
+    def set_down(self, name: str, *, down: bool) -> None:
+        """Take a host down, or begin another life there once no fault keeps it down any more."""
+        self._down_hosts[name] += 1 if down else -1
+        if down:
+            self.world.stop(name)
+        elif not self._down_hosts[name]:
+            self._renew(name)
+
+    def set_solver(self, share: float, *, failing: bool) -> None:
+        """Let a share of solves of the present life of the server fail, or none any more."""
+        planner = self._server.controller.planner
+        solvers = [getattr(solver, "inner", solver) for solver in planner.solvers]
+        if failing:
+            rng = self._chance
+            solvers = [Failing(solver, share, rng) for solver in solvers]
+        planner.solvers = solvers
+
+    # -- who looks ---------------------------------------------------------------------------
+
+    def _hear(self, time_ns: int, _: str, event: Event) -> None:
+        """Check a change of mode; begin a vehicle anew that has landed."""
+        if not isinstance(event, ModeChanged):
+            return
+        vehicle = self.vehicles[event.vehicle - 1]
+        vehicle.life.check_change(event.before, event.after)
+        self.counts[f"{event.after}: {event.reason}"] += event.before != event.after
+        landed, due_ns = vehicle.life, time_ns + LANDED_NS
+        recovery_after_ns = recovery_ns(self.scenario, restarts=True)
+
+        def renew() -> None:
+            if vehicle.life is landed and not self._down_hosts[vehicle.name]:
+                self._renew(vehicle.name)
+                self._calm_ns, self._recovery_ns = due_ns, recovery_after_ns
+
+        landing = event.after == str(Mode.LAND) and event.before != event.after
+        if landing and due_ns + recovery_after_ns < self.end_ns:
+            self.world.at(due_ns, renew)
+
+    def _check_end(self) -> None:
+        """Every vehicle flies, and nothing has grown beyond its bounds."""
+        for vehicle in self.vehicles:
+            life = vehicle.life
+            silent_ns = self.end_ns - life.row_ns
+            if life.row_ns < 0 or silent_ns > 3 * self.scenario.dt_ns:
+                raise Violation("recovers", f"vehicle {life.vehicle} does not fly at the end")
+            if life.mode not in FLYING and life.mode is not Mode.LAND:
+                raise Violation("recovers", f"vehicle {life.vehicle} in {life.mode} at the end")
+        check_bounds("server", self._server)
+        check_bounds("gate", self._gate.gate)
+        check_bounds("netem", self._netem)
+
+
+def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
+    """Time within which a vehicle flies again once nothing happens [ns].
+
+    The end of the session is noticed; HELLO is said, a cookie and a session come; the link is good
+    for a while; a horizon comes that was planned after that.
+
+    Args:
+        scenario: what is flown.
+        restarts: whether vehicles are begun anew: the server may wait for the life before.
+    """
+    direction = scenario.network.uplink
+    trip_ns = 2 * seconds_to_ns(direction.minimum_s + 8 * direction.slot_s)
+    noticed_ns = WELCOME_NS if restarts else seconds_to_ns(scenario.link.timeout_s)
+    return noticed_ns + 2 * HELLO_NS + GOOD_NS + 4 * trip_ns + 4 * scenario.dt_ns
+
+
+def act(  # noqa: PLR0912 - a branch for each kind of fault
+    torture: Torture, fault: Fault, *, begins: bool
+) -> None:
+    """Do what a fault does when it begins, or when it ends."""
+    world, dt_ns = torture.world, torture.scenario.dt_ns
+    names = torture.hosts(fault.where)
+    match fault.kind:
+        case Kind.STEP if begins:
+            for name in names:
+                world.set_clock(name, step_ns=seconds_to_ns(fault.amount))
+        case Kind.STEP:
+            pass
+        case Kind.SKEW:
+            for name in names:
+                world.set_clock(name, drift_ppb=round(1000 * fault.amount) if begins else 0)
+        case Kind.RESTART:
+            for name in names:
+                torture.set_down(name, down=begins)
+        case Kind.FREEZE:
+            for name in names:
+                (world.freeze if begins else world.thaw)(name)
+        case Kind.SOLVER:
+            torture.set_solver(fault.amount, failing=begins)
+        case Kind.OVERLOAD:
+            world.set_compute(SERVER[0], round(fault.amount * dt_ns) if begins else COMPUTE_NS)
+        case _ if begins:
+            torture.saboteur.begin(fault, world.now_ns)
+            world.rearm(SABOTEUR[0])
+        case _:
+            torture.saboteur.end(fault)
+
+
+def fly(trial: Trial, stopped: Callable[[], bool] = lambda: False) -> Outcome:
+    """Fly a trial to its end, or to the first violation."""
+    return Torture(trial).run(stopped)
+
+
+def shrunk(outcome: Outcome) -> Outcome:
+    """The outcome of the shortest schedule of a failed trial that violates the same invariant."""
+
+    def fails(faults: tuple[Fault, ...]) -> bool:
+        return fly(replace(outcome.trial, faults=faults)).invariant == outcome.invariant
+
+    faults, until_ns = outcome.trial.faults, seconds_to_ns(outcome.flown_s)
+    begun = tuple(fault for fault in faults if fault.start_ns <= until_ns)
+    faults = shrink(begun if fails(begun) else faults, fails)
+    return fly(replace(outcome.trial, faults=faults))

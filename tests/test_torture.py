@@ -1,0 +1,378 @@
+"""Torture: what it flies, what it finds once a guard is switched off, and that it comes again."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.ciphers import Cipher, algorithms
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+
+import client.compensator
+import client.failsafe
+import client.vehicle
+import lab.torture
+import server.plausibility
+import shared.channel
+import skytether.torture
+from client.failsafe import LOCKING, TABLE
+from lab.faults import RANGES, Fault, Kind, Trial, dumps, loads
+from lab.invariants import Violation, check_bounds
+from lab.torture import CLOCK_NS, fly, long_trial, make_scenario, short_trial, shrunk
+from netem.proxy import Proxy
+from server.endpoint import Server
+from shared.endpoint import SECOND_NS, Datagram, Endpoint
+from shared.protocol import Mode
+from shared.record import Reason
+from shell.command import CommandError
+from skytether.__main__ import main
+
+SEEDS = Path(__file__).with_name("torture_seeds.txt")
+FAILED = [line for line in SEEDS.read_text().splitlines() if not line.startswith("#")]
+LONG = pytest.mark.skipif("SKYTETHER_LONG" not in os.environ, reason="long: set SKYTETHER_LONG=1")
+
+Patch = Callable[[pytest.MonkeyPatch], None]
+
+
+def fault(kind: Kind, where: str, start_s: float, length_s: float, amount: float = 1.0) -> Fault:
+    """A fault, in seconds."""
+    return Fault(kind, where, round(start_s * SECOND_NS), round(length_s * SECOND_NS), amount)
+
+
+# -- what is flown ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_a_trial_goes_well_and_the_same_each_time(seed: int) -> None:
+    """To the last count."""
+    outcome = fly(short_trial(seed))
+    assert not outcome.failure
+    assert outcome == fly(short_trial(seed))
+
+
+def test_trials_differ_in_scheme_step_axes_and_vehicles() -> None:
+    """All of them are drawn."""
+    drawn = [make_scenario(seed) for seed in range(100)]
+    assert {scenario.control.scheme for scenario, _ in drawn} == {
+        "committed",
+        "feedback",
+        "predictive",
+    }
+    assert {scenario.control.dt for scenario, _ in drawn} == {0.05, 0.1}
+    assert {scenario.model.axes for scenario, _ in drawn} == {2, 3}
+    assert {vehicles for _, vehicles in drawn} == {1, 2}
+
+
+@pytest.mark.parametrize("line", FAILED)
+def test_what_has_failed_once_fails_no_more(line: str) -> None:
+    """Schedules that torture has found, each shrunk."""
+    outcome = fly(loads(line))
+    assert not outcome.failure
+
+
+EFFECTS = [
+    (fault(Kind.LOSS, "both", 5, 4, 0.9), "packets: loss"),
+    (fault(Kind.BURST, "uplink", 5, 4, 10.0), "packets: burst"),
+    (fault(Kind.DUPLICATES, "both", 5, 4, 0.9), "packets: duplicates"),
+    (fault(Kind.REORDERING, "both", 5, 4, 2.0), "packets: reordering"),
+    (fault(Kind.PARTITION, "both", 5, 4), "brake: the server is silent"),
+    (fault(Kind.PARTITION, "both", 5, 14), "land: the server has been silent for long"),
+    (fault(Kind.RESTART, "server", 5, 0.05), "brake: the server is silent"),
+    (fault(Kind.RESTART, "client", 5, 1.0), "lives of client"),
+    (fault(Kind.RESTART, "netem", 5, 1.5), "brake: the server is silent"),
+    (fault(Kind.FREEZE, "client", 5, 1.0), "brake: its own computer was asleep"),
+    (fault(Kind.FREEZE, "server", 5, 2.0), "brake: the server is silent"),
+    (fault(Kind.SOLVER, "server", 5, 4), "brake: the solver has found none"),
+    (fault(Kind.OVERLOAD, "server", 5, 6, 20.0), "brake: the server is silent"),
+    (fault(Kind.REPLAY, "both", 5, 4, 1.0), "packets: replay"),
+    (fault(Kind.DELAY, "uplink", 5, 6, 3.0), "brake: the server is silent"),
+    (fault(Kind.CORRUPTION, "both", 5, 4, 0.9), "brake: the server is silent"),
+    (fault(Kind.FLOOD, "server", 5, 2, 500.0), "packets: flood"),
+    (fault(Kind.FLOOD, "client", 5, 2, 500.0), "packets: flood"),
+]
+
+
+@pytest.mark.parametrize(("one", "effect"), EFFECTS)
+def test_each_fault_has_its_effect_and_is_survived(one: Fault, effect: str) -> None:
+    """The effect is something that was counted, and is not without the fault."""
+    assert not fly(Trial(1, ())).counts.get(effect)
+    outcome = fly(Trial(1, (one,)))
+    assert not outcome.failure
+    assert outcome.counts[effect] > 0
+
+
+@pytest.mark.parametrize("amount", [3600.0, -3600.0])
+def test_a_clock_that_is_set_costs_a_moment(amount: float) -> None:
+    """A vehicle whose own clock is set brakes, once; what the server's shows it does not notice."""
+    braked = "brake: its own computer was asleep"
+    for where, times in (("client", 1), ("server", 0)):
+        outcome = fly(Trial(1, (fault(Kind.STEP, where, 5, 0, amount),)))
+        assert not outcome.failure
+        assert outcome.counts.get(braked, 0) == times
+
+
+def test_every_kind_of_fault_is_tried() -> None:
+    """In the tests above."""
+    assert {one.kind for one, _ in EFFECTS} | {Kind.STEP, Kind.SKEW} == set(RANGES)
+
+
+# -- what is found ---------------------------------------------------------------------------
+
+
+class Unchecked:
+    """ChaCha20-Poly1305 that opens whatever comes."""
+
+    def __init__(self, key: bytes) -> None:
+        self._key = key
+        self.encrypt = ChaCha20Poly1305(key).encrypt
+
+    def decrypt(self, nonce: bytes, data: bytes, _: bytes) -> bytes:
+        """Plaintext, whether or not the tag is right."""
+        algorithm = algorithms.ChaCha20(self._key, (1).to_bytes(4, "little") + nonce)
+        return Cipher(algorithm, mode=None).decryptor().update(data[:-16])
+
+
+def no_clamp(patch: pytest.MonkeyPatch) -> None:
+    """No last clamp aboard."""
+    patch.setattr(client.vehicle, "clamped", lambda wanted, *_: list(wanted))
+
+
+def no_window(patch: pytest.MonkeyPatch) -> None:
+    """No replay window."""
+    patch.setattr(shared.channel.Window, "is_new", lambda *_: True)
+
+
+def no_tag(patch: pytest.MonkeyPatch) -> None:
+    """No check of the tag of a packet."""
+    patch.setattr(shared.channel, "ChaCha20Poly1305", Unchecked)
+
+
+def no_age(patch: pytest.MonkeyPatch) -> None:
+    """No bound on the age of the observation behind an input, aboard."""
+    patch.setattr(client.compensator, "lasting", lambda length, *_: length)
+
+
+def no_brake_without_link(patch: pytest.MonkeyPatch) -> None:
+    """No braking where the link is lost."""
+    table = {(mode, cause): after for (mode, cause), after in TABLE.items() if cause != Reason.LOST}
+    patch.setattr(client.vehicle, "TABLE", table)
+
+
+def no_lock_at_restart(patch: pytest.MonkeyPatch) -> None:
+    """No dropping of horizons, and no waiting, when the server has restarted."""
+    dropping = client.vehicle.DROPPING - {Reason.RESTARTED}
+    patch.setattr(client.vehicle, "DROPPING", dropping)
+    patch.setattr(client.failsafe, "LOCKING", LOCKING - {Reason.RESTARTED})
+
+
+def no_stall(patch: pytest.MonkeyPatch) -> None:
+    """No braking after sleep."""
+    patch.setattr(client.failsafe, "STALL_NS", 2**62)
+
+
+def no_lock(patch: pytest.MonkeyPatch) -> None:
+    """No waiting for a good link once it was broken."""
+    patch.setattr(client.failsafe, "LOCKING", frozenset())
+
+
+def no_good_link(patch: pytest.MonkeyPatch) -> None:
+    """No waiting for a good link at all."""
+    patch.setattr(client.failsafe, "GOOD_NS", 0)
+
+
+def no_steady(patch: pytest.MonkeyPatch) -> None:
+    """No steady time."""
+
+    def as_it_is(endpoint: Endpoint) -> Endpoint:
+        return endpoint
+
+    patch.setattr(lab.torture, "Steady", as_it_is)
+
+
+def no_latch(patch: pytest.MonkeyPatch) -> None:
+    """No latch in LAND."""
+    patch.setattr(client.vehicle, "TABLE", {**TABLE, (Mode.LAND, Reason.HORIZON): Mode.TRACK})
+
+
+def no_plausibility(patch: pytest.MonkeyPatch) -> None:
+    """No doubt of observations at the server."""
+    judge = lambda *_: server.plausibility.BELIEVED  # noqa: E731
+    patch.setattr(server.plausibility.Plausibility, "judge", judge)
+
+
+ABLATIONS: list[tuple[Patch, str, tuple[Fault, ...]]] = [
+    (no_clamp, "slew", ()),
+    (no_window, "once", (fault(Kind.REPLAY, "downlink", 5, 2, 0.5),)),
+    (no_window, "once", (fault(Kind.DUPLICATES, "uplink", 5, 2, 0.9),)),
+    (no_tag, "authentic", (fault(Kind.CORRUPTION, "both", 5, 2, 0.9),)),
+    (no_tag, "authentic", (fault(Kind.FLOOD, "server", 5, 2, 500.0),)),
+    (no_age, "expired", (fault(Kind.LOSS, "downlink", 5, 5),)),
+    (no_brake_without_link, "brakes", (fault(Kind.PARTITION, "both", 5, 3),)),
+    (no_lock_at_restart, "good link", (fault(Kind.RESTART, "server", 5, 0.05),)),
+    (no_stall, "asleep", (fault(Kind.FREEZE, "client", 5, 0.6),)),
+    (no_lock, "good link", (fault(Kind.PARTITION, "both", 5, 3),)),
+    (no_good_link, "good link", ()),
+    (no_steady, "recovers", (fault(Kind.STEP, "client", 5, 0, -3600.0),)),
+    (no_steady, "recovers", (fault(Kind.STEP, "server", 5, 0, -3600.0),)),
+    (no_latch, "table", (fault(Kind.PARTITION, "both", 5, 14),)),
+]
+
+
+@pytest.mark.parametrize(("switch_off", "invariant", "faults"), ABLATIONS)
+def test_a_guard_that_is_switched_off_is_caught(
+    switch_off: Patch, invariant: str, faults: tuple[Fault, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its invariant; with the guard the same flight goes well."""
+    trial = Trial(3, faults)
+    assert not fly(trial).failure
+    switch_off(monkeypatch)
+    assert fly(trial).invariant == invariant
+
+
+@LONG
+@pytest.mark.parametrize("switch_off", dict.fromkeys(patch for patch, _, _ in ABLATIONS))
+def test_schedules_that_are_drawn_catch_each_guard(
+    switch_off: Patch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of the first 400."""
+    switch_off(monkeypatch)
+    assert any(fly(short_trial(seed)).failure for seed in range(1, 401))
+
+
+@LONG
+def test_two_hours_go_well() -> None:
+    """With faults all along, and keys that are replaced on the way."""
+    outcome = fly(long_trial(1, 2.0))
+    assert not outcome.failure
+
+
+def test_a_failure_shrinks_to_the_fault_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five faults shrink to the one that the guard is there for; it fails again from its JSON."""
+    no_stall(monkeypatch)
+    culprit = fault(Kind.FREEZE, "client", 6, 1.0)
+    others = (
+        fault(Kind.DUPLICATES, "both", 3, 2, 0.5),
+        fault(Kind.SKEW, "server", 3, 9, 200.0),
+        fault(Kind.REPLAY, "both", 4, 4, 1.0),
+        culprit,
+        fault(Kind.FLOOD, "client", 9, 1, 100.0),
+    )
+    failed = fly(Trial(1, others))
+    assert failed.invariant == "asleep"
+    short = shrunk(failed)
+    assert short.failure
+    (left,) = short.trial.faults
+    assert (left.kind, left.start_ns) == (Kind.FREEZE, culprit.start_ns)
+    assert left.length_ns < culprit.length_ns
+    assert fly(loads(dumps(short.trial))) == short
+
+
+def test_an_endpoint_that_raises_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With what it raised, and where."""
+
+    def raise_(*_: Any, **__: Any) -> None:
+        raise ValueError("no such thing")
+
+    monkeypatch.setattr(Server, "_tick", raise_)
+    outcome = fly(Trial(1, ()))
+    assert outcome.invariant == "raises"
+    assert "ValueError no such thing" in outcome.failure
+
+
+def test_a_container_without_a_bound_is_found() -> None:
+    """However deep in an endpoint it is."""
+    scenario, _ = make_scenario(1)
+    netem = Proxy(scenario, server=("server", 0), flows=10**6)
+    for port in range(2100):
+        netem.receive(Datagram(b"", ("host", port)), now_ns=CLOCK_NS)
+    with pytest.raises(Violation, match=r"bounded memory: netem\.\w+ holds 2100"):
+        check_bounds("netem", netem)
+
+
+# -- the command -----------------------------------------------------------------------------
+
+
+def run(*argv: str) -> "subprocess.CompletedProcess[str]":
+    """The command in a process of its own."""
+    line = [sys.executable, "-P", "-m", "skytether", "torture", *argv]
+    return subprocess.run(line, capture_output=True, text=True, check=False)
+
+
+def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: Path) -> None:
+    """As a table, and as JSON."""
+    path = tmp_path / "counts.json"
+    done = run("--seed", "1", "--count", "3", "--jobs", "2", "--json", str(path))
+    assert done.returncode == 0, done.stderr
+    assert "torture from seed 1" in done.stdout
+    said = json.loads(path.read_text())
+    outcomes = [fly(short_trial(seed)) for seed in (1, 2, 3)]
+    assert (said["flights"], said["failed"], said["failures"]) == (3, 0, [])
+    assert said["counts"]["steps"] == sum(outcome.counts["steps"] for outcome in outcomes)
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--schedule", "{"], "schedule of faults: "),
+        (["--schedule", "{}", "--seed", "1"], "got --seed and --schedule, expected one of them"),
+        (["--hours", "-1"], "--hours: got -1, expected more than 0, at most 10000"),
+        (["--seed", "-1"], "--seed: got -1, expected 0 to 4294967295"),
+        (["--replay", "/nowhere"], "--replay: /nowhere: "),
+    ],
+)
+def test_what_cannot_be_flown_is_refused(
+    argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line."""
+    assert main(["torture", *argv]) == 2
+    assert said in capsys.readouterr().err
+
+
+class Alone:
+    """A crew of this process alone."""
+
+    def advance(self, amount: float, text: str = "") -> None:
+        """Count nothing."""
+
+    def map(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+        """See `Crew`."""
+        return [function(item) for item in items]
+
+    def share(
+        self,
+        function: Callable[[Any], Any],
+        items: Sequence[Any],
+        on_done: Callable[[int, Any], None],
+    ) -> None:
+        """See `Crew`."""
+        for number, result in enumerate(self.map(function, items)):
+            on_done(number, result)
+
+
+@contextmanager
+def alone(*_: Any) -> Iterator[Alone]:
+    """A crew that knows what is patched here."""
+    yield Alone()
+
+
+def test_a_failure_is_printed_with_its_schedule_and_flies_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Exit code 1, a command line to fly it again, and a file of schedules does as well."""
+    monkeypatch.setattr(skytether.torture, "crew", alone)
+    no_stall(monkeypatch)
+    file = tmp_path / "seeds.txt"
+    frozen = Trial(1, (fault(Kind.FREEZE, "client", 5, 0.6),))
+    file.write_text(f"# two\n{dumps(Trial(1, ()))}\n{dumps(frozen)}\n")
+    for argv in (["--replay", str(file)], ["--schedule", dumps(frozen)]):
+        with pytest.raises(CommandError, match=r"1 of [12] flights failed") as refused:
+            skytether.torture.torture(argv)
+        assert refused.value.code == 1
+        printed = capsys.readouterr().out
+        assert "asleep: " in printed
+        assert 'skytether torture --schedule \'{"seed":1,' in printed
