@@ -51,12 +51,18 @@ from shared.protocol import (
     encode,
 )
 from shared.record import Reason, Recorder
+from shared.steady import JUMP_NS
 
 HELLO_NS = SECOND_NS
 """Time between two HELLOs while nobody has ever answered [ns]."""
 AGAIN_NS = 400 * MILLISECOND_NS
 """Time between two HELLOs for a session that was lost, or is refused [ns]: less than the five
 handshakes a second that a server grants."""
+NEVER = (0, 0)
+"""Echo of a server that was not heard yet."""
+SLEPT_NS = JUMP_NS // 2
+"""Time by which the server's clock goes on further than ours while we sleep [ns]; far more than
+what delays that change make of it."""
 LAND_MPS = 0.5
 """Speed at which the vehicle descends to land [m/s]."""
 ALTITUDE = 2
@@ -128,7 +134,7 @@ class Client(Endpoint):
         self._in_session = False
         """Whether that session may go on; else nothing but a WELCOME is heard."""
         self._server_boot_id: int | None = None
-        self._echo = (0, 0)
+        self._echo = NEVER
         """Newest `server_ns` [server's clock], and the time it came."""
         self._epoch_ns: int | None = None
         self._step = 0
@@ -238,6 +244,8 @@ class Client(Endpoint):
             raise ProtocolError(REFUSALS[welcome.refusal])
         self._refusal = None
         restarted = self._server_boot_id not in (None, welcome.server_boot_id)
+        if restarted:
+            self._echo = NEVER
         self._session, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._in_session = True
         self._link.adopt(now_ns=now_ns)
@@ -266,7 +274,16 @@ class Client(Endpoint):
             raise ProtocolError("unknown session")
 
     def _heard(self, message: Welcome | Horizon | Heartbeat, now_ns: int) -> None:
+        """Note a packet of the session, and a sleep that our own clock has not told of.
+
+        A leap of it may be a clock that was set, or real time that was slept through
+        (`shared.steady`): the server's clock has gone on as well then.
+        """
         self._check_session(message)
+        server_ns, received_ns = self._echo
+        ahead_ns = (message.server_ns - server_ns) - (now_ns - received_ns)
+        if ahead_ns > SLEPT_NS and self._echo != NEVER:
+            self._failsafe.meet(Reason.STALLED, now_ns=now_ns)
         self._failsafe.heard(now_ns=now_ns)
         self._echo = (message.server_ns, now_ns)
 

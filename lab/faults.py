@@ -134,7 +134,21 @@ def schedule(rng: np.random.Generator, duration_ns: int) -> tuple[Fault, ...]:
     count = 1 + rng.poisson(duration_ns / EVERY_NS)
     kinds = list(Kind)
     drawn = [_draw(rng, kinds[rng.integers(len(kinds))], duration_ns) for _ in range(count)]
-    return tuple(sorted(drawn, key=lambda fault: fault.start_ns))
+    kept = [fault for fault in drawn if not _hides(fault, drawn)]
+    return tuple(sorted(kept or drawn[:1], key=lambda fault: fault.start_ns))
+
+
+def _hides(step: Fault, drawn: Sequence[Fault]) -> bool:
+    """Whether a clock is set back while its host is frozen: then nobody can know for how long.
+
+    The clock that hosts live by, CLOCK_MONOTONIC, cannot be set by anybody.
+    """
+    return step.kind is Kind.STEP and any(
+        each.kind is Kind.FREEZE
+        and each.where == step.where
+        and each.start_ns <= step.start_ns <= each.end_ns
+        for each in drawn
+    )
 
 
 def _draw(rng: np.random.Generator, kind: Kind, duration_ns: int) -> Fault:

@@ -24,7 +24,6 @@ from shared.config import Scenario
 from shared.endpoint import EVENTS_MAX, MILLISECOND_NS, SECOND_NS, Datagram, seconds_to_ns
 from shared.protocol import NO_HORIZON, Horizon, Mode, Observation, decode
 from shared.record import Recorder, client_columns
-from shared.steady import SLEPT_NS
 from shared.terms import Terms
 
 WELCOME, OBSERVATION, HORIZON = 2, 3, 4
@@ -334,8 +333,7 @@ class Life(Recorder):
         if self._held is None or self._held[2].step != in_force:
             self._held = self._find(in_force, step * self._dt_ns - age_ns)
             good_ns = self._good_ns
-            # What `Steady` lets pass with a jump of the clock is time to the vehicle.
-            if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * SLEPT_NS:
+            if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * self._dt_ns:
                 since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
                 raise Violation("good link", f"a horizon is flown, the link good for {since}")
         session, life, horizon = self._held

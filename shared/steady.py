@@ -2,27 +2,23 @@
 
 An endpoint counts on a clock that goes forward, and no faster than life. Where the clock goes back,
 or leaps ahead, what it does by its clock would be an hour early or late, and stamps of before and
-after would not be of one time. Seen through `Steady` the clock goes on a little for such a jump,
-and then from there:
+after would not be of one time. Seen through `Steady` the clock stands still for such a jump and
+goes on from there:
 
     steady = clock - (all jumps so far)
 
-A stall of the host, in which real time passes, is no jump: it is passed on as it is. How long a
-jump has taken nobody knows; so it looks like a short stall, and who must not go on as if awake
-after sleep does not.
+A stall of the host, in which real time passes, is no jump: it is passed on as it is.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
-from shared.endpoint import MILLISECOND_NS, SECOND_NS, Datagram, Endpoint
+from shared.endpoint import SECOND_NS, Datagram, Endpoint
 from shared.events import Event
 
 JUMP_NS = 60 * SECOND_NS
 """Time by which a clock may go on between two looks at it, or past a wake that is due [ns]; more is
 a jump."""
-SLEPT_NS = 200 * MILLISECOND_NS
-"""Time that passes with a jump, at least as it is shown, after what was due by then [ns]."""
 
 
 class Steady(Endpoint):
@@ -47,13 +43,15 @@ class Steady(Endpoint):
         """Time to be shown."""
         seen_ns = now_ns if self._seen_ns is None else self._seen_ns
         self._seen_ns = now_ns
-        if not 0 <= now_ns - seen_ns <= JUMP_NS:
-            due_ns = self.next_wake_ns()
-            ahead = due_ns is not None and now_ns - max(seen_ns, due_ns) > JUMP_NS
-            if ahead or now_ns < seen_ns:
-                least_ns = max(seen_ns, seen_ns if due_ns is None else due_ns) + SLEPT_NS
-                self._jumps_ns += now_ns - least_ns
+        if not 0 <= now_ns - seen_ns <= JUMP_NS and self._is_jump(seen_ns, now_ns):
+            self._jumps_ns += now_ns - seen_ns
         return now_ns - self._jumps_ns
+
+    def _is_jump(self, seen_ns: int, now_ns: int) -> bool:
+        if now_ns < seen_ns:
+            return True
+        due_ns = self.next_wake_ns()
+        return due_ns is not None and now_ns - max(seen_ns, due_ns) > JUMP_NS
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Endpoint`."""

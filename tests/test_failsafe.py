@@ -23,7 +23,7 @@ from lab.states import svg
 from shared import config
 from shared.chance import stream
 from shared.config import ConfigError, Scenario
-from shared.endpoint import SECOND_NS, Address, Datagram
+from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
 from shared.events import Event, ModeChanged
 from shared.protocol import (
     ACCEPTED,
@@ -479,6 +479,20 @@ def test_what_is_not_finite_ends_in_fault_for_good() -> None:
         assert (rows["mode"] == Mode.FAULT).all()
         assert not rows["input"].any()
         assert hand.changes[-1] == ("fault", "its state or its input is not finite")
+
+
+@pytest.mark.parametrize("slept", [True, False])
+def test_a_sleep_of_minutes_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
+    *, slept: bool
+) -> None:
+    """Seen through `Steady` no time has passed; the server's clock has gone on, or has not."""
+    hand = tracking()
+    hand.say(Heartbeat(4, hand.session, SECOND_NS, Idle.PLANS, 0))
+    hand.fly(0.1, beats=False)
+    passed_ns = 100 * MILLISECOND_NS + (120 * SECOND_NS if slept else 0)
+    hand.say(Heartbeat(4, hand.session, SECOND_NS + passed_ns, Idle.PLANS, 0))
+    hand.fly(0.1, beats=False)
+    assert hand.mode == (Mode.BRAKE if slept else Mode.TRACK)
 
 
 # -- the paper's own rule --------------------------------------------------------------------------

@@ -107,13 +107,13 @@ def test_each_fault_has_its_effect_and_is_survived(one: Fault, effect: str) -> N
 
 
 @pytest.mark.parametrize("amount", [3600.0, -3600.0])
-def test_a_clock_that_is_set_costs_a_moment(amount: float) -> None:
-    """A vehicle whose own clock is set brakes, once; what the server's shows it does not notice."""
+def test_a_clock_that_is_set_costs_nothing(amount: float) -> None:
+    """Nobody brakes for it, whichever clock it is."""
     braked = "brake: its own computer was asleep"
-    for where, times in (("client", 1), ("server", 0)):
+    for where in ("client", "server"):
         outcome = fly(Trial(1, (fault(Kind.STEP, where, 5, 0, amount),)))
         assert not outcome.failure
-        assert outcome.counts.get(braked, 0) == times
+        assert braked not in outcome.counts
 
 
 def test_every_kind_of_fault_is_tried() -> None:
@@ -139,7 +139,7 @@ class Unchecked:
 
 def no_clamp(patch: pytest.MonkeyPatch) -> None:
     """No last clamp aboard."""
-    patch.setattr(client.vehicle, "clamped", lambda wanted, *_: list(wanted))
+    patch.setattr(client.vehicle, "clamped", lambda wanted, *_, **__: list(wanted))
 
 
 def no_window(patch: pytest.MonkeyPatch) -> None:
