@@ -187,9 +187,7 @@ def forget_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ClockMap, "observe", deaf)
 
 
-@pytest.mark.parametrize(
-    ("growing", "side"), [("slowly", "uplink"), ("slowly", "both"), ("fast", "uplink")]
-)
+@pytest.mark.parametrize(("growing", "side"), [("slowly", "uplink"), ("slowly", "both")])
 def test_without_a_bound_on_lateness_it_flies_away(
     growing: str, side: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -216,26 +214,12 @@ def test_without_echoes_a_longer_delay_is_never_flown_again(
     assert flight.failure is not None
 
 
-@pytest.mark.parametrize(("growing", "side"), [("slowly", "downlink"), ("to 2.8 s", "uplink")])
+@pytest.mark.parametrize(("growing", "side"), [("slowly", "downlink"), ("slowly", "both")])
 def test_without_echoes_and_bound_on_lateness_it_flies_away(
     growing: str, side: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where the delay stops growing, or only observations are delayed."""
+    """Also where only observations are delayed."""
     forget_late(monkeypatch)
     forget_echoes(monkeypatch)
     flown = scenario(control={"dt": 0.02, "horizon": 20})
     assert far_m(fly_over(monkeypatch, flown, *ways(side, GROWING[growing]))) > 2 * OUTSIDE_M
-
-
-def test_the_age_bound_alone_ends_a_flight_that_would_leave(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Without the other safeguards: within 5 s it hovers, with a bound of 60 s it flies away."""
-    forget_late(monkeypatch)
-    forget_echoes(monkeypatch)
-    far = []
-    for age_max_s in (5.0, 60.0):
-        flown = scenario(control={"dt": 0.02, "horizon": 20}, link={"age_max_s": age_max_s})
-        far.append(far_m(fly_over(monkeypatch, flown, *ways("both", GROWING["to 2.8 s"]))))
-    assert far[0] < OUTSIDE_M
-    assert far[1] > 5 * OUTSIDE_M
