@@ -1,16 +1,19 @@
-"""What is fuzzed: the decoder, and a server and a client in the midst of a flight."""
+"""What is fuzzed: the decoder, and a server and a client in a flight, with keys and without."""
 
 from collections.abc import Callable
 from math import isfinite
 
+from client import secure as client_secure
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
+from server import secure as server_secure
 from server.endpoint import Server
 from shared import config
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import EVENTS_MAX, MILLISECOND_NS, SECOND_NS, Datagram, Endpoint
 from shared.protocol import ProtocolError, decode, encode
+from sim.flight import make_keys
 
 Target = Callable[[bytes], None]
 """Takes a payload, and raises where something is wrong with what happens to it."""
@@ -54,10 +57,13 @@ class InFlight:
 
     Args:
         scenario: what to fly.
+        sealed: whether they have keys; then each payload is sealed by the other end, as a faulty
+            peer would, and stands behind all that keeps strangers out.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, *, sealed: bool = False) -> None:
         self._scenario = scenario
+        self._keyring = make_keys(1, 1) if sealed else None
         self._begin()
 
     def _begin(self) -> None:
@@ -68,9 +74,13 @@ class InFlight:
         self.newest: dict[int, bytes] = {}
         """Newest of their own datagrams of each type."""
         plant = FirstOrderPlant(scenario, stream(1, "wind"))
-        self.client = Client(scenario, plant, server=("server", 0), vehicle=1, boot_id=2**50)
-        entropy = stream(1, "entropy").bytes
-        self.server = Server(scenario, boot_id=2**40, entropy=entropy, room=4)
+        entropy, keyring = stream(1, "entropy").bytes, self._keyring
+        link = client_secure.Secure(keyring.of(1), entropy=entropy) if keyring else None
+        gate = server_secure.Secure(keyring, entropy=entropy) if keyring else None
+        self.client = Client(
+            scenario, plant, server=("server", 0), vehicle=1, boot_id=2**50, link=link
+        )
+        self.server = Server(scenario, boot_id=2**40, entropy=entropy, gate=gate, room=4)
         for _ in range(200):
             self._pass()
 
@@ -83,7 +93,7 @@ class InFlight:
             if due_ns is not None and due_ns <= self._now_ns:
                 sender.wake(now_ns=self._now_ns)
             for datagram in sender.outbox():
-                self.newest[datagram.payload[2]] = datagram.payload
+                self._note(datagram)
                 told = Datagram(datagram.payload, (name, 0))
                 receiver.receive(told, now_ns=self._now_ns)
             assert len(sender.events()) <= EVENTS_MAX + 20
@@ -97,19 +107,31 @@ class InFlight:
             self._hear(end, payload)
         self._pass()
 
+    def _note(self, datagram: Datagram) -> None:
+        if self._keyring is None:
+            self.newest[datagram.payload[2]] = datagram.payload
+
+    def _seal(self, end: Endpoint, payload: bytes) -> bytes:
+        """Datagram that brings a payload to an end, from the other one where they have keys."""
+        session = next(iter(self.server.sessions), None)
+        if self._keyring is None or session is None:
+            return payload
+        return (self.client._link if end is self.server else session.line).seal(payload)
+
     def _hear(self, end: Endpoint, payload: bytes) -> None:
         peer = ("client" if end is self.server else "server", 0)
-        end.receive(Datagram(payload, peer), now_ns=self._now_ns)
+        end.receive(Datagram(self._seal(end, payload), peer), now_ns=self._now_ns)
         answers = end.outbox()
         assert len(answers) <= 1, payload.hex()
         state = self.client._plant.state()
         assert all(map(isfinite, state.ravel().tolist())), payload.hex()
         for answer in answers:
-            self.newest[answer.payload[2]] = answer.payload
+            self._note(answer)
 
 
 def targets() -> dict[str, Target]:
     """All targets, by name."""
     decoders = {f"decode {s.model.axes}-D": decoder(s) for s in SCENARIOS}
     flights = {f"flight {s.model.axes}-D": InFlight(s) for s in SCENARIOS}
-    return {**decoders, **flights}
+    sealed = {f"sealed {s.model.axes}-D": InFlight(s, sealed=True) for s in SCENARIOS}
+    return {**decoders, **flights, **sealed}
