@@ -5,12 +5,22 @@
 
 from typing import Protocol
 
+from shared.endpoint import MILLISECOND_NS, SECOND_NS
+
+HELLO_NS = SECOND_NS
+"""Time between two HELLOs in plaintext while nobody has ever answered [ns]."""
+AGAIN_NS = 400 * MILLISECOND_NS
+"""Time between two HELLOs otherwise [ns]: fewer than the five handshakes a second that a server
+grants."""
+
 
 class Link(Protocol):
     """Turns messages into datagrams for the server, and its datagrams into messages."""
 
     secure: bool
     """Whether what comes out of `open` is known to come from the server."""
+    hello_ns: int
+    """Time between two HELLOs while nobody has ever answered [ns]."""
 
     def hello(self, payload: bytes, *, now_ns: int) -> bytes:
         """Datagram that carries a HELLO."""
@@ -36,6 +46,7 @@ class Plain:
     """Link without keys: anybody may read and write what passes."""
 
     secure = False
+    hello_ns = HELLO_NS
 
     def hello(self, payload: bytes, *, now_ns: int) -> bytes:  # noqa: ARG002 - as of any `Link`
         """See `Link`."""

@@ -7,6 +7,7 @@ so that nobody can open a channel a second time, whose counters would begin anew
 
 from collections.abc import Callable
 
+from client.link import AGAIN_NS
 from shared import channel, handshake
 from shared.channel import Channel, kind
 from shared.endpoint import SECOND_NS
@@ -48,6 +49,7 @@ class Secure:
     """
 
     secure = True
+    hello_ns = AGAIN_NS
 
     def __init__(self, key: Key, *, entropy: Callable[[int], bytes]) -> None:
         self._key = key

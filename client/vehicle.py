@@ -15,10 +15,10 @@ import numpy as np
 from client.clamp import clamped
 from client.compensator import Compensator
 from client.failsafe import CLOSING, DROPPING, HOLD, LATE_SHARE, TABLE, Failsafe
-from client.link import Link, Plain
+from client.link import AGAIN_NS, Link, Plain
 from client.plant import Plant
 from shared.config import Scenario
-from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
+from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
 from shared.events import (
     Failure,
     Finished,
@@ -53,11 +53,6 @@ from shared.protocol import (
 from shared.record import Reason, Recorder
 from shared.steady import JUMP_NS
 
-HELLO_NS = SECOND_NS
-"""Time between two HELLOs while nobody has ever answered [ns]."""
-AGAIN_NS = 400 * MILLISECOND_NS
-"""Time between two HELLOs for a session that was lost, or is refused [ns]: less than the five
-handshakes a second that a server grants."""
 NEVER = (0, 0)
 """Echo of a server that was not heard yet."""
 SLEPT_NS = JUMP_NS // 2
@@ -338,7 +333,7 @@ class Client(Endpoint):
         wanted = self._failsafe.is_lost(now_ns) or self._link.wants_hello(now_ns)
         if wanted and now_ns >= self._hello_ns:
             unheard = self._epoch_ns is None and self._refusal is None
-            self._hello_ns = now_ns + (HELLO_NS if unheard else AGAIN_NS)
+            self._hello_ns = now_ns + (self._link.hello_ns if unheard else AGAIN_NS)
             hello = encode(Hello(self.vehicle, self._boot_id, self._terms))
             self._out.append(Datagram(self._link.hello(hello, now_ns=now_ns), self._server))
 

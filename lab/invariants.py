@@ -160,7 +160,7 @@ class Life(Recorder):
         overdue: Callable[[], bool],
     ) -> None:
         super().__init__(client_columns(scenario.model.axes), io.BytesIO())
-        self.secure = link.secure
+        self.secure, self.hello_ns = link.secure, link.hello_ns
         self._link = link
         self.vehicle, self._number = vehicle, number
         self._up, self._down = up, down

@@ -17,8 +17,9 @@ import numpy as np
 
 from client import secure as client_secure
 from client.failsafe import GOOD_NS
+from client.link import AGAIN_NS
 from client.plant import FirstOrderPlant
-from client.vehicle import HELLO_NS, Client
+from client.vehicle import Client
 from lab.faults import Fault, Kind, Trial, schedule, shrink
 from lab.invariants import FLYING, Gatekeeper, Ledger, Life, Violation, check_bounds
 from lab.saboteur import NETEM, SERVER, STRANGERS, Saboteur
@@ -378,7 +379,7 @@ def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
     direction = scenario.network.uplink
     trip_ns = 2 * seconds_to_ns(direction.minimum_s + 8 * direction.slot_s)
     noticed_ns = WELCOME_NS if restarts else seconds_to_ns(scenario.link.timeout_s)
-    return noticed_ns + 2 * HELLO_NS + GOOD_NS + 4 * trip_ns + 4 * scenario.dt_ns
+    return noticed_ns + 2 * AGAIN_NS + GOOD_NS + 4 * trip_ns + 4 * scenario.dt_ns
 
 
 def act(  # noqa: PLR0912 - a branch for each kind of fault

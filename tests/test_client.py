@@ -6,8 +6,9 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from client.link import HELLO_NS
 from client.plant import FirstOrderPlant
-from client.vehicle import HELLO_NS, Client
+from client.vehicle import Client
 from shared import config
 from shared.chance import stream
 from shared.config import Scenario
