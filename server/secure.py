@@ -35,9 +35,9 @@ COOKIE_NS = 60 * SECOND_NS
 """Time for which cookies are alike; each is good for this time and the next [ns]."""
 HANDSHAKES = 5
 """Number of handshakes of a vehicle in a second."""
-PENDING_MAX = 16
-"""Number of pending channels of a vehicle. A HELLO that is repeated once a second gets as many
-within a round trip of so many seconds, and the vehicle uses the first of them that it hears of."""
+PENDING_MAX = 64
+"""Number of pending channels of a vehicle. It uses the first that it hears of, and within a round
+trip of 12 s no more are made, even of HELLOs that somebody repeats: five a second."""
 CHALLENGES_MAX = 1024
 """Number of challenges that wait to be sent; older ones give way."""
 
