@@ -456,12 +456,13 @@ def test_a_hello_that_is_repeated_ends_no_flight() -> None:
     other = link(seed=7)
     challenged(other, server)
     hello = other.hello(HELLO, now_ns=0)
-    for second in range(1, 3 * PENDING_MAX):
-        call = server.open(Datagram(hello, HERE), now_ns=second * SECOND_NS)
+    for time in range(1, 3 * PENDING_MAX):
+        now_ns = time * SECOND_NS // 2
+        call = server.open(Datagram(hello, HERE), now_ns=now_ns)
         assert call is not None
         call.line.seal(WELCOME)
-        server.admit(call, now_ns=second * SECOND_NS)
-        called(server, client.seal(OBSERVATION), second * SECOND_NS)
+        server.admit(call, now_ns=now_ns)
+        called(server, client.seal(OBSERVATION), now_ns)
     assert live(server) == before
     assert len(server._vehicles[1].pending) == PENDING_MAX
 
