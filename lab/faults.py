@@ -139,16 +139,23 @@ def schedule(rng: np.random.Generator, duration_ns: int) -> tuple[Fault, ...]:
 
 
 def _hides(step: Fault, drawn: Sequence[Fault]) -> bool:
-    """Whether a clock is set back while its host is frozen: then nobody can know for how long.
+    """Whether a clock is set while its host is frozen, or a moment after it was set before.
 
-    The clock that hosts live by, CLOCK_MONOTONIC, cannot be set by anybody.
+    Then nobody aboard can know for how long it stood still. The clock that hosts live by,
+    CLOCK_MONOTONIC, cannot be set by anybody.
     """
-    return step.kind is Kind.STEP and any(
-        each.kind is Kind.FREEZE
-        and each.where == step.where
-        and each.start_ns <= step.start_ns <= each.end_ns
-        for each in drawn
+    if step.kind is not Kind.STEP:
+        return False
+    of_host = [each for each in drawn if each.where == step.where and each is not step]
+    frozen = any(
+        each.kind is Kind.FREEZE and each.start_ns <= step.start_ns <= each.end_ns
+        for each in of_host
     )
+    before = any(
+        each.kind is Kind.STEP and 0 <= step.start_ns - each.start_ns < SECOND_NS
+        for each in of_host
+    )
+    return frozen or before
 
 
 def _draw(rng: np.random.Generator, kind: Kind, duration_ns: int) -> Fault:
