@@ -327,8 +327,7 @@ def _roll(
             the magnitude of that over all axes [m/s].
     """
     rule, room, begin = settings.rule[axis], memory.sent.shape[1], course.begins[0]
-    (p, v, u, speed_told), w = x, memory.state[row, axis].w
-    told_first = u
+    (p, v, told_first, speed_told), w = x, memory.state[row, axis].w
     for leg in range(legs):
         first = course.begins[leg]
         last = min(end, course.begins[leg + 1] if leg + 1 < legs else end)
