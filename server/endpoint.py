@@ -128,7 +128,7 @@ class Server(Endpoint):
         self._told: deque[tuple[int, int, int]] = deque(maxlen=REFUSALS_TOLD_MAX)
         """Vehicle, boot id and refusal of the newest refusals that the operator was told."""
         self._strangers = 0
-        """Number of datagrams that no vehicle with a key has sent."""
+        """Number of datagrams that the gate has not let pass."""
         self._tell_ns = 0
         """When the operator may be told of these again."""
         self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)

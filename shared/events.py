@@ -106,7 +106,7 @@ class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A server with keys has dropped datagrams that no vehicle with one of them has sent."""
+    """A server with keys has dropped datagrams: strangers made them, or they came twice or late."""
 
     count: int
     """Number of them so far."""
@@ -118,7 +118,7 @@ class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     def __str__(self) -> str:
         newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"
-        return f"{self.count} datagrams so far are of no vehicle with a key, {newest}"
+        return f"{self.count} datagrams so far are not taken for a vehicle's, {newest}"
 
 
 class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):

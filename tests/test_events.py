@@ -63,7 +63,7 @@ SENTENCES = [
     (FlowOpened(flow=2, host="192.0.2.1", port=5), "flow 2 for 192.0.2.1:5"),
     (
         Unauthenticated(count=3, host="::1", port=5, reason="forged"),
-        "3 datagrams so far are of no vehicle with a key, the newest from [::1]:5: forged",
+        "3 datagrams so far are not taken for a vehicle's, the newest from [::1]:5: forged",
     ),
     (Degraded(degraded=True), "degraded: it misses ticks"),
     (Degraded(degraded=False), "it is in time again"),
