@@ -23,7 +23,7 @@ SCENARIOS = (
     config.check(
         {
             "model": {"axes": 3, "tau_s": [0.5, 0.5, 0.4], "u_max": [3.0, 3.0, 2.0]},
-            "control": {"scheme": "feedback", "horizon": 20},
+            "control": {"scheme": "committed", "feedback": True, "horizon": 20},
         },
         "fuzz",
     ),

@@ -65,7 +65,7 @@ COMMITTED = {"scheme": "committed", "observer_s": 2.0} | TIGHT
 """Committed inputs; the observer's time constant is searched for and may come out very long."""
 GAP = COMMITTED | {"trigger": "cost_gap", "cost_gap": 2.0}
 BUDGET = GAP | {"trigger": "cost_gap & budget(5, 2)"}
-FEEDBACK = GAP | {"scheme": "feedback"}
+FEEDBACK = GAP | {"feedback": True}
 
 CONTENDERS = (
     Contender("paper-every-step", "paper, every step", LOOSE | {"trigger": "always"}),

@@ -42,8 +42,6 @@ DT_MIN_S, DT_MAX_S = 0.005, 0.5
 """Shortest and longest step that is drawn [s]."""
 HORIZON_MAX = 120
 """Longest horizon that is drawn; the shortest is 1."""
-SCHEMES = ("committed", "feedback")
-"""Schemes that are drawn."""
 NEAR_M = 1.0
 """Distance from the reference within which a vehicle flies it [m]."""
 SIGMAS = 6.0
@@ -72,7 +70,7 @@ def draw(seed: int, number: int) -> dict[str, Any]:
         keys[f"network.{direction}.loss"] = _short(rng.uniform(0.0, loss_max))
     keys["control.dt"] = _short(DT_MIN_S * (DT_MAX_S / DT_MIN_S) ** rng.random())
     keys["control.horizon"] = int((HORIZON_MAX + 1) ** rng.random())
-    keys["control.scheme"] = str(rng.choice(SCHEMES))
+    keys["control.feedback"] = bool(rng.integers(2))
     keys["vehicle.exhausted"] = "brake"
     keys["seed"] = int(rng.integers(2**32))
     return keys

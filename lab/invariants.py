@@ -368,7 +368,7 @@ class Life(Recorder):
             raise Violation(
                 "expired", f"an input from an observation {old_ns / SECOND_NS:.2f} s old"
             )
-        if self._terms.feeds_back:
+        if self._terms.feedback:
             return
         stage = min(max(step - horizon.step, 0), horizon.inputs.shape[1] - 1)
         told = horizon.inputs[:, stage].tolist()

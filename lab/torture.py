@@ -58,7 +58,8 @@ COMPUTE_NS = MILLISECOND_NS
 def make_scenario(seed: int) -> tuple[Scenario, int]:
     """Scenario of a trial, and how many vehicles fly it; both are drawn from the seed."""
     rng = stream(seed, "torture", "scenario")
-    scheme = ("committed", "feedback", "predictive")[rng.choice(3, p=(0.6, 0.2, 0.2))]
+    kind = rng.choice(3, p=(0.6, 0.2, 0.2))
+    scheme = ("committed", "committed", "predictive")[kind]
     dt_s, axes = (0.05, 0.1)[rng.choice(2, p=(0.25, 0.75))], (2, 3)[rng.integers(2)]
     delay_s = round(float(np.exp(rng.uniform(np.log(0.005), np.log(0.4)))), 3)
     direction = {"delay": "poisson", "minimum_s": delay_s, "slot_s": delay_s / 20.0, "loss": 0.0}
@@ -71,6 +72,7 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
             "dt": dt_s,
             "horizon": round(2.0 / dt_s),
             "scheme": scheme,
+            "feedback": bool(kind == 1),
             "trigger": f"{'state_gap' if scheme == 'predictive' else 'cost_gap'} | silence(1)",
         },
         "reference": {

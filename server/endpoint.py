@@ -337,7 +337,7 @@ class Server(Endpoint):
         # Bytes of one input on all axes, and of what goes with a horizon.
         width = 4 * self._terms.axes
         feedback, told = found.feedback.data.cast("B"), 0
-        if self._terms.feeds_back:
+        if self._terms.feedback:
             told = width * FEEDBACK
         inputs, begin = in_a_row(found, sent), 0
         columns = (sent, decisions.rows[sent], decisions.step[sent], found.ahead[sent])

@@ -141,7 +141,7 @@ class Replay:
         for name, numbers in terms.model._asdict().items():
             rule[name] = numbers
         rule["bound"] = terms.u_max
-        if terms.feeds_back:  # as the vehicle will be told it, in float32
+        if terms.feedback:  # as the vehicle will be told it, in float32
             rule["gain_p"], rule["gain_v"] = stationary_gain(terms.model, control).T.astype("f4")
         self._settings = Settings(
             rule=rule,
@@ -150,7 +150,7 @@ class Replay:
             dt_ns=terms.dt_ns,
             brake=terms.brake,
             decay=float(np.exp(-terms.dt_s / control.observer_s)) if control.observer_s else 1.0,
-            feeds_back=terms.feeds_back,
+            feeds_back=terms.feedback,
         )
         room = terms.age_max + H
         self._memory = Memory(

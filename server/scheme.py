@@ -1,6 +1,6 @@
 """What the schemes of delay compensation have in common: what is foreseen, and asked of each.
 
-`server.replay` is "committed" and "feedback", `server.estimator` "predictive" and "none".
+`server.replay` is "committed", `server.estimator` "predictive" and "none".
 """
 
 from collections import Counter

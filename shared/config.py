@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from shared import files, policy
 from shared import reference as shapes
+from shared.chance import stream
 from shared.contradictions import contradictions
 from shared.endpoint import seconds_to_ns
 from shared.hint import hint
@@ -73,6 +74,8 @@ class ModelConfig(Section, frozen=True):
     """Time constant of the velocity loop [s]: one for all axes, or one each."""
     u_max: tuple[Factor, ...] = (1.6,)
     """Largest desired velocity [m/s]: one for all axes, or one each."""
+    dead_time_s: Annotated[float, Meta(ge=0, le=2)] = 0.0
+    """Dead time of the vehicle that the gain of feedback is designed for [s]."""
 
 
 class ControlConfig(Section, frozen=True):
@@ -82,8 +85,12 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
     """Number of steps planned ahead, H."""
-    scheme: Literal["committed", "feedback", "predictive", "none"] = "committed"
-    """Delay compensation: committed inputs, these with feedback, eq. (11) and (13), or none."""
+    scheme: Literal["committed", "predictive", "dead_reckoning", "none"] = "committed"
+    """Delay compensation: committed inputs, eq. (11) and (13), or none; with dead reckoning the
+    server sends no plan, but the state of the desired trajectory, along which the vehicle goes
+    on."""
+    feedback: bool = False
+    """Whether horizons say also where they lead, and how the vehicle comes back to there."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """Longest time from making a horizon to its being in force [s]; auto: as was seen."""
     observer_s: Duration = 4.0
@@ -117,24 +124,32 @@ class ControlConfig(Section, frozen=True):
     @property
     def commits(self) -> bool:
         """Whether horizons begin with committed inputs."""
-        return self.scheme in ("committed", "feedback")
+        return self.scheme == "committed"
 
 
 class ReferenceConfig(Section, frozen=True):
     """The desired trajectory."""
 
-    shape: Literal["circle", "figure-eight", "square", "waypoints", "hover", "csv"] = "circle"
-    """Shape of the desired trajectory."""
+    shape: Literal[
+        "circle", "figure-eight", "square", "waypoints", "hover", "csv", "target", "live"
+    ] = "circle"
+    """Shape of the desired trajectory; target: a random walk that only the server sees; live: a
+    point that is moved while it flies."""
+    preview: Duration | Literal["all", "none"] = "all"
+    """How far ahead the server may look [s]; beyond that it predicts. Of a live point it never sees
+    more than the present."""
+    agility: Strength = 0.3
+    """Strength of the white acceleration that moves a target [m/s per √s]."""
     radius_m: Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)] = 1.55
-    """Half the width of circle, figure-eight and square [m]."""
+    """Half the width of circle, figure-eight and square, and of where a target moves [m]."""
     period_s: Annotated[float, Meta(ge=0.1, le=86400)] = 27.5
     """Time for one round of circle, figure-eight or square [s]."""
     altitude_m: Position = 0.0
     """Altitude of circle, figure-eight and square in space [m]."""
     points_m: tuple[tuple[Position, ...], ...] = ()
-    """Waypoints [m], at least two, or the one point to hover at."""
+    """Waypoints [m], at least two; the one point to hover at; where a live point begins."""
     speed_mps: Factor = 1.0
-    """Speed between waypoints [m/s]."""
+    """Speed between waypoints, and the largest of a target along an axis [m/s]."""
     loop: bool = False
     """Whether the waypoints are flown round and round."""
     file: str = ""
@@ -172,6 +187,28 @@ class VehicleConfig(Section, frozen=True):
     """Mean length of a gust [s]."""
 
 
+class SensorConfig(Section, frozen=True):
+    """What the vehicle measures of itself, and what it makes of that."""
+
+    filter: Literal["kalman", "none"] = "kalman"
+    """What makes the state that is reported and flown by: a Kalman filter, or each measurement as
+    it is. Where measurements are perfect it makes no difference."""
+    position_noise_m: Strength = 0.0
+    """Standard deviation of the noise of a position [m]."""
+    velocity_noise_mps: Strength = 0.0
+    """Standard deviation of the noise of a velocity [m/s]."""
+    position_bias_m: tuple[Position, ...] = ()
+    """Constant error of each position, for each axis [m]; left out: none."""
+    velocity_bias_mps: tuple[Speed, ...] = ()
+    """Constant error of each velocity, for each axis [m/s]; left out: none."""
+    position_every_s: Duration = 0.0
+    """Time from one position to the next [s]; 0: one at every step."""
+    velocity_every_s: Duration | Literal["never"] = 0.0
+    """Time from one velocity to the next [s]; 0: one at every step; never: positions alone."""
+    delay_s: Annotated[float, Meta(ge=0, le=2)] = 0.0
+    """Time from measuring to having the measurement [s]."""
+
+
 class DirectionConfig(Section, frozen=True):
     """One direction of the network."""
 
@@ -185,6 +222,8 @@ class DirectionConfig(Section, frozen=True):
     """Mean number of slots on top of the smallest delay."""
     loss: Annotated[float, Meta(ge=0, le=1)] = 0.1
     """Share of packets that are lost."""
+    burst_s: Duration = 0.0
+    """Mean length of the bursts in which packets are lost [s]; 0: each is lost by itself."""
 
     @property
     def least_s(self) -> float:
@@ -249,6 +288,7 @@ class Scenario(Section, frozen=True):
     control: ControlConfig = ControlConfig()
     reference: ReferenceConfig = ReferenceConfig()
     vehicle: VehicleConfig = VehicleConfig()
+    sensor: SensorConfig = SensorConfig()
     network: NetworkConfig = NetworkConfig()
     link: LinkConfig = LinkConfig()
     simulation: SimulationConfig = SimulationConfig()
@@ -292,6 +332,7 @@ class Scenario(Section, frozen=True):
             tau_s=tuple(self.tau_s.tolist()),
             u_max=tuple(self.u_max.tolist()),
             scheme=control.scheme,
+            feedback=control.feedback,
             exhausted=vehicle.exhausted,
             brake_mps2=vehicle.brake_mps2,
             heartbeat_s=self.link.heartbeat_s,
@@ -306,7 +347,7 @@ class Scenario(Section, frozen=True):
             table=_digest(table),
         )
 
-    def make_reference(self) -> shapes.Reference:
+    def make_reference(self) -> shapes.Reference:  # noqa: PLR0911 - one for each shape
         """The desired trajectory."""
         config, axes = self.reference, self.model.axes
         points = np.array(config.points_m, dtype=np.float64)
@@ -325,6 +366,16 @@ class Scenario(Section, frozen=True):
                 return shapes.hover(points[0])
             case "csv":
                 return shapes.from_csv(Path(config.file), axes)
+            case "target":
+                return shapes.target(
+                    stream(self.seed, "target"),
+                    axes,
+                    agility=config.agility,
+                    speed_mps=config.speed_mps,
+                    radius_m=config.radius_m,
+                )
+            case "live":
+                return shapes.hover(points[0] if len(points) else np.zeros(axes))
 
 
 def _digest(content: bytes) -> str:

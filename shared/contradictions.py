@@ -36,6 +36,8 @@ def contradictions(scenario: "Scenario") -> Iterator[Contradiction]:
     for key, values in (
         ("vehicle.start_m", vehicle.start_m),
         ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
+        ("sensor.position_bias_m", scenario.sensor.position_bias_m),
+        ("sensor.velocity_bias_mps", scenario.sensor.velocity_bias_mps),
     ):
         if len(values) not in (0, axes):
             yield key, list(values), f"{axes} numbers with model.axes = {axes}"
@@ -107,8 +109,7 @@ def _no_trigger(control: "ControlConfig") -> Iterator[Contradiction]:
         return
     for name in (part.name for part in policy.policies(trigger)):
         if policy.SIGNATURES[name].committed and not control.commits:
-            schemes = "'committed' or 'feedback'"
-            yield "control.scheme", repr(control.scheme), f"{schemes} with the trigger {name}"
+            yield "control.scheme", repr(control.scheme), f"'committed' with the trigger {name}"
 
 
 def _no_reference(scenario: "Scenario") -> Iterator[Contradiction]:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from shared.terms import Terms
 
-VERSION = 4
+VERSION = 5
 PAYLOAD_BYTES_MAX = 1200
 """So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
 

@@ -19,6 +19,11 @@ FAR_M = 1e6
 """Largest coordinate of a trajectory [m]."""
 FAST_MPS = 1e6
 """Largest velocity along an axis of a trajectory that is given by its points [m/s]."""
+GRID_S = 0.05
+"""Time between two points at which the velocity of a target is drawn [s]; in between it is
+interpolated."""
+GRID_BLOCK = 1024
+"""Number of points that are drawn at a time."""
 FILE_BYTES_MAX = 16_000_000
 """Largest size of a table [B]."""
 
@@ -130,6 +135,66 @@ def hover(point_m: Array) -> Reference:
         return state
 
     return sample
+
+
+def target(
+    rng: np.random.Generator, axes: int, *, agility: float, speed_mps: float, radius_m: float
+) -> Reference:
+    """Random walk from the origin: white acceleration, which nobody can foresee.
+
+    The velocity is reflected where it would become too large, and the position where it would leave
+    its bounds. Before time 0 the target rests at the origin.
+
+    Args:
+        rng: chance of this walk alone; it is asked for more as later times are.
+        agility: strength of the acceleration [m/s per √s].
+        speed_mps: largest velocity along an axis [m/s].
+        radius_m: largest coordinate [m].
+    """
+    walk = _Walk(rng, axes)
+
+    def sample(t: Array) -> Array:
+        t = np.maximum(np.asarray(t, dtype=np.float64), 0.0)
+        velocities, positions = walk.upto(
+            int(t.max(initial=0.0) / GRID_S) + 1, agility=agility, speed_mps=speed_mps
+        )
+        at = (t / GRID_S).astype(np.int64)
+        after = (t - at * GRID_S)[..., None]
+        v, rise = velocities[at], (velocities[at + 1] - velocities[at]) / GRID_S
+        p = positions[at] + after * (v + 0.5 * after * rise)
+        position, way = _folded(p, radius_m)
+        return np.stack([position, way * (v + after * rise)], axis=-1)
+
+    return sample
+
+
+class _Walk:
+    """Velocity and position of a target on a grid of GRID_S, drawn as far as they are asked for."""
+
+    def __init__(self, rng: np.random.Generator, axes: int) -> None:
+        self._rng = rng
+        self._free = np.zeros((1, axes))
+        self._velocities = np.zeros((1, axes))
+        self._positions = np.zeros((1, axes))
+
+    def upto(self, last: int, *, agility: float, speed_mps: float) -> tuple[Array, Array]:
+        """Velocities [m/s] and positions [m] up to a point of the grid; each (points, axes)."""
+        while len(self._free) <= last:
+            kicks = self._rng.standard_normal((GRID_BLOCK, self._free.shape[1]))
+            free = self._free[-1] + np.cumsum(agility * np.sqrt(GRID_S) * kicks, axis=0)
+            v, _ = _folded(np.concatenate([self._free[-1:], free]), speed_mps)
+            p = self._positions[-1] + np.cumsum(0.5 * GRID_S * (v[:-1] + v[1:]), axis=0)
+            self._free = np.concatenate([self._free, free])
+            self._velocities = np.concatenate([self._velocities, v[1:]])
+            self._positions = np.concatenate([self._positions, p])
+        return self._velocities, self._positions
+
+
+def _folded(free: Array, bound: float) -> tuple[Array, Array]:
+    """What walls at ±bound make of a free motion: where it is, and which way it goes (1 or -1)."""
+    rounds = np.floor((free + bound) / (2.0 * bound))
+    way = 1.0 - 2.0 * np.mod(rounds, 2.0)
+    return way * (free - 2.0 * bound * rounds), way
 
 
 def read(path: Path) -> bytes:

@@ -29,6 +29,8 @@ class Terms(NamedTuple):
     """Bound (6) of the input on each axis [m/s]."""
     scheme: str
     """Delay compensation at both ends, as in `control.scheme`."""
+    feedback: bool
+    """Whether horizons bring feedback."""
     exhausted: str
     """What the vehicle does after a horizon's last input, "hold" or "brake"."""
     brake_mps2: float
@@ -72,12 +74,7 @@ class Terms(NamedTuple):
     @property
     def commits(self) -> bool:
         """Whether horizons begin with committed inputs."""
-        return self.scheme in ("committed", "feedback")
-
-    @property
-    def feeds_back(self) -> bool:
-        """Whether horizons bring feedback."""
-        return self.scheme == "feedback"
+        return self.scheme == "committed"
 
     @property
     def age_max(self) -> int:
@@ -106,6 +103,7 @@ KEYS: Mapping[str, str] = MappingProxyType(
         "tau_s": "model.tau_s",
         "u_max": "model.u_max",
         "scheme": "control.scheme",
+        "feedback": "control.feedback",
         "exhausted": "vehicle.exhausted",
         "brake_mps2": "vehicle.brake_mps2",
         "heartbeat_s": "link.heartbeat_s",
@@ -133,9 +131,12 @@ _OWNERS = {
         control.trigger control.period control.epsilon control.decay_rate control.cost_gap
         control.deviation_m
     """,
+    "the server's: what only it knows": """
+        reference.preview reference.agility
+    """,
     "the server's: how it plans": """
-        control.solver control.state_weight control.terminal_weight control.input_weight
-        control.change_weight control.input_reference
+        model.dead_time_s control.solver control.state_weight control.terminal_weight
+        control.input_weight control.change_weight control.input_reference
     """,
     "the vehicle's: what it truly is": """
         vehicle.tau_s vehicle.gain vehicle.dead_time_s
@@ -144,15 +145,19 @@ _OWNERS = {
         vehicle.slew_mps2 vehicle.land_after_s
     """,
     "the vehicle's: where it starts": "vehicle.start_m",
+    "the vehicle's: what it measures": """
+        sensor.filter sensor.position_noise_m sensor.velocity_noise_mps sensor.position_bias_m
+        sensor.velocity_bias_mps sensor.position_every_s sensor.velocity_every_s sensor.delay_s
+    """,
     "the vehicle's: the air it flies in": """
         vehicle.wind vehicle.steady_wind_mps vehicle.gust_mps2 vehicle.gust_every_s
         vehicle.gust_s
     """,
     "netem's": """
         network.uplink.delay network.uplink.minimum_s network.uplink.slot_s
-        network.uplink.slots_mean network.uplink.loss network.downlink.delay
+        network.uplink.slots_mean network.uplink.loss network.uplink.burst_s network.downlink.delay
         network.downlink.minimum_s network.downlink.slot_s network.downlink.slots_mean
-        network.downlink.loss network.mtu
+        network.downlink.loss network.downlink.burst_s network.mtu
     """,
     "each end's own: when it takes the other for silent": "link.timeout_s",
     "the vehicle's: when it gives up": "link.connect_s",

@@ -53,7 +53,8 @@ scenarios = st.fixed_dictionaries(
         "control": st.fixed_dictionaries(
             {
                 "dt": st.sampled_from([0.05, 0.03]),
-                "scheme": st.sampled_from(["predictive", "none", "committed", "feedback"]),
+                "scheme": st.sampled_from(["predictive", "none", "committed"]),
+                "feedback": st.booleans(),
                 "trigger": st.sampled_from(
                     ["state_gap", "always", "periodic", "state_gap & budget(5, 2) | silence(0.3)"]
                 ),
@@ -82,7 +83,8 @@ committing = st.builds(
     scenarios,
     st.fixed_dictionaries(
         {
-            "scheme": st.sampled_from(["committed", "feedback"]),
+            "scheme": st.just("committed"),
+            "feedback": st.booleans(),
             "trigger": st.sampled_from(["cost_gap", "deviation & budget(5, 2) | cost_gap(1)"]),
             "cost_gap": st.sampled_from([0.01, 1.0]),
         }

@@ -57,7 +57,7 @@ def test_points_lie_within_their_bounds_and_fill_them() -> None:
     assert 0.48 < column["control.dt"].max() <= 0.5
     assert np.median(column["control.dt"]) == pytest.approx(0.05, rel=0.15)
     assert (column["control.horizon"].min(), column["control.horizon"].max()) == (1, 120)
-    assert {*column["control.scheme"]} == {"committed", "feedback"}
+    assert {*column["control.feedback"]} == {"False", "True"}
     assert len({*column["seed"]}) == 2000
     delays = [column[f"network.{direction}.minimum_s"] for direction in ("uplink", "downlink")]
     assert abs(np.corrcoef(delays)[0, 1]) < 0.1

@@ -242,7 +242,7 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
 # -- how long an observation counts --------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=["none", "predictive", "committed", "feedback"])
+@pytest.fixture(scope="module", params=["none", "predictive", "committed"])
 def controller(request: pytest.FixtureRequest) -> Controller:
     """The controller of a vehicle under each scheme, in steps of 0.05 s."""
     table = config.to_table(config.load("paper"))

@@ -404,7 +404,13 @@ def differences(real: Flight, virtual: Flight) -> list[str]:
     "control",
     [
         {"epsilon": 0.05},
-        {"scheme": "feedback", "trigger": "cost_gap", "cost_gap": 1.0, "delay_bound": 0.4},
+        {
+            "scheme": "committed",
+            "feedback": True,
+            "trigger": "cost_gap",
+            "cost_gap": 1.0,
+            "delay_bound": 0.4,
+        },
     ],
     ids=["paper", "feedback"],
 )

@@ -112,7 +112,7 @@ FIRST = 100
 """Step that the horizon in force is made for."""
 
 
-def scenario(scheme: str, exhausted: str, age_max: int) -> Scenario:
+def scenario(exhausted: str, age_max: int, *, feedback: bool) -> Scenario:
     """Six stages of 0.1 s, and a delay of up to four; the age bound is in steps."""
     raw = {
         "model": {"tau_s": [0.81, 0.3], "u_max": [1.8, 0.9]},
@@ -120,7 +120,7 @@ def scenario(scheme: str, exhausted: str, age_max: int) -> Scenario:
             "dt": 0.1,
             "horizon": H,
             "delay_bound": 0.1 * BOUND,
-            "scheme": scheme,
+            "feedback": feedback,
             "trigger": "always",
             "observer_s": 2.0,
         },
@@ -164,7 +164,7 @@ def foresee(replay: Replay, step: int) -> Foresight:
 @quick
 @given(
     seed=st.integers(0, 2**32 - 1),
-    scheme=st.sampled_from(["committed", "feedback"]),
+    feedback=st.booleans(),
     exhausted=st.sampled_from(["hold", "brake"]),
     age=st.integers(-H, 30),
     in_flight=st.sets(st.integers(1 - BOUND, 4), max_size=3),
@@ -175,7 +175,7 @@ def foresee(replay: Replay, step: int) -> Foresight:
 def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
     *,
     seed: int,
-    scheme: str,
+    feedback: bool,
     exhausted: str,
     age: int,
     in_flight: set[int],
@@ -199,10 +199,10 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
         made[step] = due - step
     now = max([seen, *made]) + later
     age_max = max(BOUND + 2, now - seen, FIRST + first - begin + observed) + spare
-    setting = scenario(scheme, exhausted, age_max)
+    setting = scenario(exhausted, age_max, feedback=feedback)
     terms = setting.terms()
     assert terms.age_max == age_max
-    gain = stationary_gain(terms.model, setting.control) if terms.feeds_back else np.zeros((2, 0))
+    gain = stationary_gain(terms.model, setting.control) if terms.feedback else np.zeros((2, 0))
     vehicle = Compensator(terms)
     replay = Replay(terms, setting.control, 1, ClockMap(1, terms.dt_ns))
 

@@ -127,12 +127,18 @@ def ways(side: str, delay: Delay) -> tuple[Delay, Delay]:
 @pytest.mark.parametrize("side", ["uplink", "downlink", "both"])
 @pytest.mark.parametrize("growing", GROWING)
 @pytest.mark.parametrize(("dt", "horizon"), [(0.02, 20), (0.05, 40)])
-@pytest.mark.parametrize("scheme", ["committed", "feedback"])
+@pytest.mark.parametrize("feedback", [False, True])
 def test_a_delay_that_grows_in_flight_ends_in_hover_or_is_flown(
-    scheme: str, dt: float, horizon: int, growing: str, side: str, monkeypatch: pytest.MonkeyPatch
+    dt: float,
+    horizon: int,
+    growing: str,
+    side: str,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    feedback: bool,
 ) -> None:
     """Nothing flies away; where a flight ends without a plan, both ends have said why."""
-    flown = scenario(control={"scheme": scheme, "dt": dt, "horizon": horizon})
+    flown = scenario(control={"feedback": feedback, "dt": dt, "horizon": horizon})
     flight = fly_over(monkeypatch, flown, *ways(side, GROWING[growing]))
     assert far_m(flight) < OUTSIDE_M
     if flight.failure is None:

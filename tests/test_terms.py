@@ -31,7 +31,13 @@ HERE = config.check(
 """What the server flies, with as little as possible that forbids a single change."""
 OTHER: dict[str, Any] = {
     "model.axes": 3,
-    "control.scheme": "feedback",
+    "control.scheme": "none",
+    "control.feedback": True,
+    "reference.preview": 1.0,
+    "sensor.filter": "none",
+    "sensor.position_bias_m": [0.1, 0.1],
+    "sensor.velocity_bias_mps": [0.1, 0.1],
+    "sensor.velocity_every_s": 1.0,
     "control.delay_bound": 0.5,
     "control.trigger": "always",
     "control.solver": "osqp",
