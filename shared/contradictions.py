@@ -52,6 +52,13 @@ def contradictions(scenario: "Scenario") -> Iterator[Contradiction]:
     if vehicle.exhausted == "brake" and vehicle.slew_mps2 < vehicle.brake_mps2:
         least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, for it to brake"
         yield "vehicle.slew_mps2", vehicle.slew_mps2, least
+    sensor = scenario.sensor
+    if sensor.velocity_every_s == "never" and sensor.filter == "none":
+        yield (
+            "sensor.filter",
+            repr(sensor.filter),
+            "'kalman' with sensor.velocity_every_s = 'never'",
+        )
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
     yield from _no_trigger(control)
