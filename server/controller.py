@@ -9,11 +9,13 @@ for planning is a small part of what a step costs.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from server.clock import UNSEEN, ClockMap, Seen, shortest_ns
+from server.desired import Desired
 from server.estimator import Estimator
 from server.planner import Figures, Planner
 from server.reckoning import Reckoning
@@ -24,6 +26,7 @@ from shared.config import Scenario
 from shared.kernel import B1, I1, kernel
 from shared.model import Array, Flags, Indices
 from shared.protocol import Idle, Observation, committed_max
+from shared.reference import Reference
 from shared.stopwatch import Stopwatch
 from shared.terms import Terms
 
@@ -66,10 +69,17 @@ class Controller:
         terms: the same, as far as both ends agree on it.
         clock: knows half of the smallest round trip of each vehicle.
         stopwatch: measures the parts; the core has no clock of its own.
+        references: see `Desired`.
     """
 
     def __init__(
-        self, scenario: Scenario, terms: Terms, room: int, clock: ClockMap, stopwatch: Stopwatch
+        self,
+        scenario: Scenario,
+        terms: Terms,
+        room: int,
+        clock: ClockMap,
+        stopwatch: Stopwatch,
+        references: Callable[[int], Reference] | None = None,
     ) -> None:
         control = scenario.control
         block = min(room, BLOCK)
@@ -80,21 +90,20 @@ class Controller:
         """Longest delay to a vehicle that a horizon has room for [ns]."""
         if not terms.indexed:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
+        self.desired = Desired(scenario, terms, room, block, references)
+        """What is known of the desired trajectories."""
         self._scheme: Scheme
         self.planner: Planner | Reckoning
         """Plans of every vehicle, or what is sent in place of a plan."""
         if terms.reckons:
-            sample = scenario.make_reference()
-            self._scheme = self.planner = Reckoning(
-                terms, control, room, block, lambda _, steps: sample(steps * terms.dt_s)
-            )
+            self._scheme = self.planner = Reckoning(control, terms, self.desired, room, block)
         else:
             self._scheme = (
                 Replay(terms, control, room, clock)
                 if terms.commits
                 else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
             )
-            self.planner = Planner(scenario, terms, room, block, stopwatch)
+            self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
         self._trigger = make_trigger(control, room)
         self._found = foresight(block, terms.axes, terms.planned, most)
         self._stopwatch = stopwatch

@@ -15,10 +15,10 @@ of a vehicle is its newest observation, as it is.
 """
 
 from collections import Counter
-from collections.abc import Callable
 
 import numpy as np
 
+from server.desired import Desired
 from server.mpc import stationary_gain
 from server.planner import FIGURES, Figures
 from server.scheme import Foresight
@@ -32,11 +32,10 @@ class Reckoning:
     """The `Scheme` of dead reckoning for up to `capacity` vehicles, and its horizons.
 
     Args:
-        terms: the rule of flight.
         control: the weights that make the gain of feedback aboard.
+        terms: the rule of flight.
+        desired: what the server knows of the targets.
         block: number of vehicles that are decided on at a time.
-        desired: gives the desired states of some rows, at a step of each [m, m/s], as far as the
-            server knows them; shape (n, axes, 2).
     """
 
     solve_ns = -1
@@ -44,11 +43,11 @@ class Reckoning:
 
     def __init__(
         self,
-        terms: Terms,
         control: ControlConfig,
+        terms: Terms,
+        desired: Desired,
         capacity: int,
         block: int,
-        desired: Callable[[Indices, Indices], Array],
     ) -> None:
         axes = terms.axes
         self.counts: Counter[str] = Counter()
@@ -100,7 +99,7 @@ class Reckoning:
         """
         n = len(rows)
         told, figures, planned = found.feedback[:n], self.figures[:n], self.planned[:n]
-        desired = self._desired(rows, step)
+        desired = self._desired.now(rows, step)
         told[:, :, 0] = desired[:, :, 0]
         told[:, :, 1] = np.clip(desired[:, :, 1], -self._bounds, self._bounds)
         told[:, :, 3:] = self._gain
