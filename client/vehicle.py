@@ -230,10 +230,10 @@ class Client(Endpoint):
         One that was planned when the vehicle had not yet said that it would fly it begins where the
         vehicle is not: the server reckoned with none.
         """
-        H = self._terms.horizon
+        terms = self._terms
         if horizon.step > self._compensator.newest:
-            passed = self._step - horizon.step - (horizon.inputs.shape[1] - H)
-            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * H, now_ns=now_ns)
+            passed = self._step - horizon.step - (horizon.inputs.shape[1] - terms.planned)
+            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
         observed = self._step_at(horizon.observed_ns)
         if self._takes_from is None or 0 <= observed < self._takes_from:
             raise ProtocolError("not taken")

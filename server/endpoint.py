@@ -349,7 +349,7 @@ class Server(Endpoint):
         inputs, begin = in_a_row(found, sent), 0
         columns = (sent, decisions.rows[sent], decisions.step[sent], found.ahead[sent])
         for i, row, step, d in zip(*(column.tolist() for column in columns), strict=True):
-            session, end = self.sessions.at(row), begin + width * (d + self._terms.horizon)
+            session, end = self.sessions.at(row), begin + width * (d + self._terms.planned)
             payload = encode_horizon(
                 session.vehicle,
                 session.number,

@@ -110,6 +110,9 @@ class ControlConfig(Section, frozen=True):
     """Extra cost of flying on with what was sent, above which the policy `cost_gap` sends."""
     deviation_m: Amount = 0.05
     """Distance from the plan, above which the policy `deviation` sends [m]."""
+    tolerance_m: Amount = 0.1
+    """Distance of the desired position from where it was expected, above which the policy
+    `tolerance` sends, and from where it was sent, above which `delta` does [m]."""
     state_weight: tuple[Amount, Amount] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: tuple[Amount, Amount] = (50.0, 20.0)
