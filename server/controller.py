@@ -8,11 +8,13 @@ planning is a small part of what a step costs.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from server.clock import UNSEEN, ClockMap, Seen, shortest_ns
+from server.desired import Desired
 from server.estimator import Estimator
 from server.planner import Figures, Planner
 from server.replay import Replay
@@ -22,6 +24,7 @@ from shared.config import ControlConfig, Scenario
 from shared.kernel import B1, I1, kernel
 from shared.model import Array, Flags, Indices
 from shared.protocol import Idle, Observation, committed_max
+from shared.reference import Reference
 from shared.stopwatch import Stopwatch
 from shared.terms import Terms
 
@@ -64,10 +67,17 @@ class Controller:
         terms: the same, as far as both ends agree on it.
         clock: knows half of the smallest round trip of each vehicle.
         stopwatch: measures the parts; the core has no clock of its own.
+        references: see `Desired`.
     """
 
     def __init__(
-        self, scenario: Scenario, terms: Terms, room: int, clock: ClockMap, stopwatch: Stopwatch
+        self,
+        scenario: Scenario,
+        terms: Terms,
+        room: int,
+        clock: ClockMap,
+        stopwatch: Stopwatch,
+        references: Callable[[int], Reference] | None = None,
     ) -> None:
         control = scenario.control
         block = min(room, BLOCK)
@@ -83,7 +93,9 @@ class Controller:
             if terms.commits
             else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
         )
-        self.planner = Planner(scenario, terms, room, block, stopwatch)
+        self.desired = Desired(scenario, terms, room, block, references)
+        """What is known of the desired trajectories."""
+        self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
         """Plans of every vehicle."""
         self._trigger = make_trigger(control, room)
         self._found = foresight(block, terms.axes, terms.horizon, most)

@@ -62,6 +62,7 @@ from shared.protocol import (
     encode_horizon,
 )
 from shared.record import Recorder
+from shared.reference import Reference
 from shared.stopwatch import Stopwatch
 
 VEHICLES_MAX = 64
@@ -96,6 +97,8 @@ class Server(Endpoint):
         room: for how many vehicles at once.
         recorder: takes one row a tick and vehicle.
         stopwatch: measures the parts of a tick; the core has no clock of its own.
+        references: desired trajectory of each vehicle, by its number, where they differ; left out:
+            the scenario's for all.
     """
 
     def __init__(
@@ -108,6 +111,7 @@ class Server(Endpoint):
         room: int = VEHICLES_MAX,
         recorder: Recorder | None = None,
         stopwatch: Stopwatch | None = None,
+        references: Callable[[int], Reference] | None = None,
     ) -> None:
         super().__init__()
         self.changeable = TRIGGER | POINT if scenario.reference.shape == "live" else TRIGGER
@@ -119,7 +123,9 @@ class Server(Endpoint):
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, self._terms.dt_ns)
         self._plausibility = Plausibility(self._terms, room)
-        self.controller = Controller(scenario, self._terms, room, self._clock, self.stopwatch)
+        self.controller = Controller(
+            scenario, self._terms, room, self._clock, self.stopwatch, references
+        )
         self.sessions = Sessions(room, entropy, seconds_to_ns(scenario.link.timeout_s))
         """Who flies."""
         self._idle = np.zeros(room, dtype=np.int64)
@@ -265,6 +271,7 @@ class Server(Endpoint):
         session.line = call.line
         self._plausibility.forget(session.row)
         self._anew(session.row)
+        self.controller.desired.assign(session.row, session.vehicle)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))
         return session
@@ -393,6 +400,7 @@ class Server(Endpoint):
             n,
             vehicle=self.sessions.vehicle[rows],
             step=decisions.step,
+            reference=self.controller.desired.now(rows, decisions.step),
             estimate=found.estimate[:n],
             ahead=found.ahead[:n],
             planned=decisions.planned,

@@ -286,6 +286,8 @@ def _fly(
 
     world, sink = World(on_event), io.BytesIO()
     entropy = stream(scenario.seed, "entropy").bytes
+    each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]
+    targets = [run.make_reference() for run in each if run.reference.shape == "target"]
     server = Server(
         scenario,
         boot_id=BOOT_ID,
@@ -294,11 +296,9 @@ def _fly(
         room=len(seeds) * vehicles,
         recorder=Recorder(server_columns(scenario.model.axes), sink),
         stopwatch=stopwatch,
+        references=(lambda vehicle: targets[(vehicle - 1) // vehicles]) if targets else None,
     )
-    runs = [
-        Run(world, msgspec.structs.replace(scenario, seed=seed), server, number, vehicles, keyring)
-        for number, seed in enumerate(seeds)
-    ]
+    runs = [Run(world, run, server, number, vehicles, keyring) for number, run in enumerate(each)]
     run_of = {host: run for run in runs for host in run.hosts}
     # Added last, it is woken last: it has heard all there is to hear at that instant.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
