@@ -138,6 +138,7 @@ KEYS: Mapping[str, str] = MappingProxyType(
 _OWNERS = {
     "a word for people": "title",
     "the vehicle's: how long it flies": "duration",
+    "the vehicle's: whether it flies plans": "armed",
     "the vehicle's: what its summary leaves out": "settle",
     "of chance, at each end its own": "seed",
     "the server's: where it plans from": "control.delay_bound",
