@@ -325,6 +325,7 @@ class Server(Endpoint):
         before_ns = self.stopwatch.spent_ns.total()
         rows = self.sessions.rows
         step = self._clock.steps(rows, tick_ns)
+        self.controller.desired.tick(tick_ns)
         able = self.controller.able(rows, step)
         if not able.all():
             rows, step = rows[able], step[able]

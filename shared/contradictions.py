@@ -41,6 +41,7 @@ def contradictions(
             yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
     for key, values in (
         ("vehicle.start_m", vehicle.start_m),
+        ("reference.velocity_mps", scenario.reference.velocity_mps),
         ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
         ("sensor.position_bias_m", scenario.sensor.position_bias_m),
         ("sensor.velocity_bias_mps", scenario.sensor.velocity_bias_mps),

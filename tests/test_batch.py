@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from server import sessions
+from server.desired import Desired
 from shared import chance, config
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
@@ -134,6 +135,22 @@ def test_runs_are_the_same_in_another_order_and_in_larger_company() -> None:
     many = fly_batch(flown, range(9, 1, -1))
     assert [run.trace_hash() for run in few] == [run.trace_hash() for run in many[2:7]][::-1]
     assert len({run.trace_hash() for run in many}) == 8
+
+
+@pytest.mark.parametrize("preview", ["none", 0.5, "all"])
+def test_each_run_follows_the_target_of_its_own_seed(
+    preview: float | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if alone; ablation: with the first run's target for all, the others are not."""
+    flown = scenario(reference={"shape": "target", "preview": preview})
+    runs = assert_as_alone(flown, (3, 1, 2))
+    monkeypatch.setattr(Desired, "assign", lambda self, row, _: self._number.put(row, 1))
+    same = [run.trace_hash() for run in fly_batch(flown, (3, 1, 2))]
+    assert [run.trace_hash() == other for run, other in zip(runs, same, strict=True)] == [
+        True,
+        False,
+        False,
+    ]
 
 
 def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:
