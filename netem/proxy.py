@@ -13,7 +13,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
 
-from netem.fate import fates
+from netem.fate import Fates
 from netem.link import Lane, Link
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
@@ -131,8 +131,8 @@ class Proxy(Endpoint):
         flow = Flow(
             client,
             socket,
-            Lane(number, fates(network.uplink, seed, "uplink", number)),
-            Lane(number, fates(network.downlink, seed, "downlink", number)),
+            Lane(number, Fates(network.uplink, seed, "uplink", number), now_ns),
+            Lane(number, Fates(network.downlink, seed, "downlink", number), now_ns),
             now_ns,
             self._unanswered,
         )
