@@ -82,11 +82,12 @@ def by_rule(replay: Replay, step: int, in_force: int) -> Array:
         made_for, _, length, speed = memory.sent[0, slot].tolist()
         if made_for == in_force:
             stage = step - made_for
-            told = memory.inputs[0, slot, :, rule.entry(stage, length)].tolist()
+            inputs = memory.inputs[0, slot, :, rule.entry(stage, length)].tolist()
+            share = rule.remaining(stage, length, speed, brake)
             return np.array(
                 [
-                    rule.flown(stage, length, rule.bounded(u, bound), 0.0, speed, brake, bound)
-                    for u, bound in zip(told, bounds, strict=True)
+                    rule.flown(stage, share * rule.bounded(u, bound), 0.0, bound)
+                    for u, bound in zip(inputs, bounds, strict=True)
                 ]
             )
     return np.zeros(2)
