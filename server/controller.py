@@ -14,6 +14,7 @@ import numpy as np
 
 from server.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from server.estimator import Estimator
+from server.gain import feedback_gain
 from server.planner import Figures, Planner
 from server.replay import Replay
 from server.scheme import Foresight, Scheme, foresight
@@ -78,10 +79,11 @@ class Controller:
         """Longest delay to a vehicle that a horizon has room for [ns]."""
         if not terms.indexed:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
+        gain = feedback_gain(scenario)
         self._scheme: Scheme = (
-            Replay(terms, control, room, clock)
+            Replay(terms, control, gain, room, clock)
             if terms.commits
-            else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
+            else Estimator(terms, control, gain, room)
         )
         self.planner = Planner(scenario, terms, room, block, stopwatch)
         """Plans of every vehicle."""

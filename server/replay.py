@@ -44,19 +44,16 @@ from server.model import (
     led_back,
     remaining,
 )
-from server.mpc import stationary_gain
+from server.observer import decay_of, learned
 from server.scheme import Foresight
 from shared.config import ControlConfig
 from shared.kernel import B1, F1, F2, I1, R1, R2, S4, kernel, part, record, records
-from shared.model import Flags, Indices
+from shared.model import Array, Flags, Indices
 from shared.protocol import NO_HORIZON, Observation, committed_max
 from shared.terms import Terms
 
 MARGIN = 2
 """Steps on top of half a round trip, until a horizon has been acknowledged."""
-TRIP_NS = 1_500_000_000
-"""Longest trip, from an observation to the plan made from it, that `control.observer_s` is meant
-for [ns]; over a longer one an observer as fast as that makes the plans swing."""
 HOVERS, UNKNOWN = -1, -2
 """In place of the number of a horizon: none, so that it brakes and stands still; one that was sent
 in an earlier life of ours."""
@@ -139,12 +136,13 @@ class Replay:
 
     Args:
         terms: the rule of flight.
-        control: `observer_s`, `delay_bound`, and the weights that make the gain of feedback aboard.
+        control: `observer_s` and `delay_bound`.
+        gain: K of feedback aboard, 0 without; shape (axes, 2).
         clock: knows half of the smallest round trip, which is a first guess at the delay bound.
     """
 
     def __init__(
-        self, terms: Terms, control: ControlConfig, capacity: int, clock: ClockMap
+        self, terms: Terms, control: ControlConfig, gain: Array, capacity: int, clock: ClockMap
     ) -> None:
         axes, H, most = terms.axes, terms.horizon, committed_max(terms)
         self.counts: Counter[str] = Counter()
@@ -152,15 +150,14 @@ class Replay:
         for name, numbers in terms.model._asdict().items():
             rule[name] = numbers
         rule["bound"] = terms.u_max
-        if terms.feedback:  # as the vehicle will be told it, in float32
-            rule["gain_p"], rule["gain_v"] = stationary_gain(terms.model, control).T.astype("f4")
+        rule["gain_p"], rule["gain_v"] = gain.T.astype("f4")  # as the vehicle will be told it
         self._settings = Settings(
             rule=rule,
             H=H,
             age_max=terms.age_max,
             dt_ns=terms.dt_ns,
             brake=terms.brake,
-            decay=float(np.exp(-terms.dt_s / control.observer_s)) if control.observer_s else 1.0,
+            decay=decay_of(terms, control),
             feeds_back=terms.feedback,
         )
         room = terms.age_max + H
@@ -416,11 +413,10 @@ def _observe_disturbance(
             state, rule = memory.state[row, axis], settings.rule[axis]
             x = (state.base_p, state.base_v, state.base_u, speed)
             _roll(settings, memory, row, axis, course, legs, end, x, track)
-            # A change of w changes the velocity after m steps by 1 - a11^m of it.
-            off = (state.v - track.states[m, 1]) / (1.0 - rule.a11**m)
-            slower = max(1.0, trip * settings.dt_ns / TRIP_NS)
-            w = state.w + (1.0 - settings.decay ** (m / slower)) * off
-            memory.state[row, axis].w = min(max(w, -rule.bound), rule.bound)
+            off, trip_ns = state.v - track.states[m, 1], trip * settings.dt_ns
+            memory.state[row, axis].w = learned(
+                state.w, off, m, rule.a11, settings.decay, trip_ns, rule.bound
+            )
     for axis in range(len(settings.rule)):
         state = memory.state[row, axis]
         memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v

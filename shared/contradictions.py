@@ -52,6 +52,8 @@ def contradictions(scenario: "Scenario") -> Iterator[Contradiction]:
     if vehicle.exhausted == "brake" and vehicle.slew_mps2 < vehicle.brake_mps2:
         least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, for it to brake"
         yield "vehicle.slew_mps2", vehicle.slew_mps2, least
+    if control.scheme == "none" and control.feedback:
+        yield "control.feedback", "true", "false with control.scheme = 'none'"
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
     yield from _no_trigger(control)

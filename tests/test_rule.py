@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from client.compensator import Compensator
 from server import model as compiled
 from server.clock import ClockMap
-from server.mpc import stationary_gain
+from server.gain import feedback_gain
 from server.replay import Replay
 from server.scheme import Foresight, foresight
 from shared import rule
@@ -220,9 +220,10 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
     setting = scenario(exhausted, age_max, feedback=feedback)
     terms = setting.terms()
     assert terms.age_max == age_max
-    gain = stationary_gain(terms.model, setting.control) if terms.feedback else np.zeros((2, 0))
+    K = feedback_gain(setting)
+    gain = K if feedback else np.zeros((2, 0))
     vehicle = Compensator(terms)
-    replay = Replay(terms, setting.control, 1, ClockMap(1, terms.dt_ns))
+    replay = Replay(terms, setting.control, K, 1, ClockMap(1, terms.dt_ns))
 
     x, states, inputs = rng.normal(size=(2, 2)), [], []
     arriving = {begin: (make_horizon(rng, FIRST, first, x, gain), begin - observed)}
