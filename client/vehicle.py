@@ -70,6 +70,16 @@ DEGRADED = "the server misses its deadlines"
 """Why no newer horizon comes, as it seems, of a server that plans and says that it is degraded."""
 IMPOSSIBLE = frozenset({"from the future", "observation"})
 """Reasons for which a horizon is dropped that is made for an impossible time."""
+AIR = frozenset(
+    {
+        "vehicle.wind",
+        "vehicle.steady_wind_mps",
+        "vehicle.gust_mps2",
+        "vehicle.gust_every_s",
+        "vehicle.gust_s",
+    }
+)
+"""Keys of the air that a simulated vehicle flies in."""
 
 
 class Known(NamedTuple):
@@ -97,11 +107,12 @@ class Client(Endpoint):
         server: address of the server, or of the netem before it.
         vehicle: number of the vehicle, unlike that of any other vehicle of the server.
         boot_id: number that no other life of this vehicle has had.
-        armed: whether horizons may be flown.
         link: how messages become datagrams.
         navigation: what the vehicle knows of its state; left out: the plant's state as it is.
         recorder: takes one row a step.
     """
+
+    changeable = AIR | {"armed"}
 
     def __init__(
         self,
@@ -111,7 +122,6 @@ class Client(Endpoint):
         server: Address,
         vehicle: int,
         boot_id: int,
-        armed: bool = True,
         link: Link | None = None,
         navigation: Navigation | None = None,
         recorder: Recorder | None = None,
@@ -133,7 +143,7 @@ class Client(Endpoint):
         holds = self._terms.exhausted == "hold"
         self._failsafe = Failsafe(
             HOLD if holds else TABLE,
-            armed=armed,
+            armed=scenario.armed,
             timeout_ns=self._timeout_ns,
             land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
             changed=self._mode_changed,
@@ -230,10 +240,10 @@ class Client(Endpoint):
         One that was planned when the vehicle had not yet said that it would fly it begins where the
         vehicle is not: the server reckoned with none.
         """
-        H = self._terms.horizon
+        terms = self._terms
         if horizon.step > self._compensator.newest:
-            passed = self._step - horizon.step - (horizon.inputs.shape[1] - H)
-            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * H, now_ns=now_ns)
+            passed = self._step - horizon.step - (horizon.inputs.shape[1] - terms.planned)
+            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
         observed = self._step_at(horizon.observed_ns)
         if self._takes_from is None or 0 <= observed < self._takes_from:
             raise ProtocolError("not taken")
@@ -328,6 +338,12 @@ class Client(Endpoint):
     def _fail(self, failure: Failure) -> None:
         self.failure = failure
         self._events.append(failure)
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+        """See `Endpoint`."""
+        self._failsafe.armed = scenario.armed
+        if keys & AIR:
+            self._plant.change(scenario.vehicle)
 
     # -- time --------------------------------------------------------------------------------
 

@@ -91,6 +91,7 @@ def server_columns(axes: int) -> np.dtype[np.void]:
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),
+            ("reference", "<f8", (axes, 2)),  # x_d(k), as the server knew it then
             ("estimate", "<f8", (axes, 2)),  # x̂(k)
             ("ahead", "<i8"),  # d: planning starts at k + d
             ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
