@@ -13,7 +13,9 @@ had d steps and was not in force is lost, and left out.
 
 w is what else acts on the vehicle, as an input of its own: constant wind, a wrong gain. Each
 observation shows how far the velocity has come away from where the one before it, replayed, says;
-the disturbance observer follows that with a time constant of `control.observer_s`.
+the disturbance observer follows that with a time constant of `control.observer_s`. Vehicles report
+what they take their velocity for. So the observer has a velocity of its own, which follows what is
+reported within FOLLOW_S: else it would learn the noise that a filter aboard has left.
 
 With feedback aboard, a horizon tells the vehicle also where its inputs lead, x̄ from x̂(k) on, and
 how to come back to there: it flies u(i) + K (x̄(i) - x(i)). That is replayed in the same way. What
@@ -54,6 +56,8 @@ from shared.terms import Terms
 
 MARGIN = 2
 """Steps on top of half a round trip, until a horizon has been acknowledged."""
+FOLLOW_S = 0.25
+"""Time constant with which the disturbance observer follows the velocity that is reported [s]."""
 HOVERS, UNKNOWN = -1, -2
 """In place of the number of a horizon: none, so that it brakes and stands still; one that was sent
 in an earlier life of ours."""
@@ -86,7 +90,8 @@ STATE = record(
     ("w", "f8"),
 )
 """On one axis of a vehicle: position [m], velocity [m/s] and input [m/s] of its newest observation
-and of the one before, and the disturbance [m/s]."""
+and of the one before, with the velocity that the observer takes it for; and the disturbance
+[m/s]."""
 SENT = record(("step", "i8"), ("due", "i8"), ("length", "i8"), ("speed", "f8"))
 """A horizon that was sent: the step it was made for; that at which it is in force, or lost; how
 many inputs it has; and the magnitude of the last [m/s]."""
@@ -110,6 +115,8 @@ class Settings(NamedTuple):
     """Speed that braking takes away in a step [m/s]."""
     decay: float
     """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
+    follow: float
+    """Share of what is new of the velocity that the observer has not followed after a step."""
     feeds_back: bool
     """Whether horizons bring feedback."""
 
@@ -158,6 +165,7 @@ class Replay:
             dt_ns=terms.dt_ns,
             brake=terms.brake,
             decay=decay_of(terms, control),
+            follow=float(np.exp(-terms.dt_s / FOLLOW_S)),
             feeds_back=terms.feedback,
         )
         room = terms.age_max + H
@@ -397,7 +405,9 @@ def _observe_disturbance(
         return
     before, after = _number(memory, row, seen.base_in_force), _number(memory, row, seen.in_force)
     by_rule = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
-    if by_rule and begin >= 0 and end - begin <= settings.age_max:
+    follows = by_rule and begin >= 0 and end - begin <= settings.age_max
+    m, legs, speed = end - begin, 0, _speed(memory.state[row].base_u)
+    if follows:
         first = _first_under_way(memory, row, seen.base_in_force, begin)
         legs = _chart(course, memory, row, begin, before, range(first, after))
         # What came into force, and when, is known.
@@ -408,18 +418,23 @@ def _observe_disturbance(
         elif seen.since < end:
             course.begins[legs], course.numbers[legs] = seen.since, after
             legs += 1
-        m, speed = end - begin, _speed(memory.state[row].base_u)
-        for axis in range(len(settings.rule)):
-            state, rule = memory.state[row, axis], settings.rule[axis]
+    for axis in range(len(settings.rule)):
+        state, rule, lag = memory.state[row, axis], settings.rule[axis], 0.0
+        if follows:
             x = (state.base_p, state.base_v, state.base_u, speed)
             _roll(settings, memory, row, axis, course, legs, end, x, track)
-            off, trip_ns = state.v - track.states[m, 1], trip * settings.dt_ns
+            off, left = state.v - track.states[m, 1], settings.follow**m
             memory.state[row, axis].w = learned(
-                state.w, off, m, rule.a11, settings.decay, trip_ns, rule.bound
+                state.w,
+                (1.0 - left) * off,
+                m,
+                rule.a11,
+                settings.decay,
+                trip * settings.dt_ns,
+                rule.bound,
             )
-    for axis in range(len(settings.rule)):
-        state = memory.state[row, axis]
-        memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v
+            lag = left * off
+        memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v - lag
         memory.state[row, axis].base_u = state.u
     memory.seen[row].base_step, memory.seen[row].base_in_force = end, seen.in_force
     memory.seen[row].base_takes = seen.takes
