@@ -22,7 +22,7 @@ from server.reckoning import Reckoning
 from server.replay import Replay
 from server.scheme import Foresight, Scheme, foresight
 from server.trigger import Situation, Verdict, make_trigger
-from shared.config import Scenario
+from shared.config import ControlConfig, Scenario
 from shared.kernel import B1, I1, kernel
 from shared.model import Array, Flags, Indices
 from shared.protocol import Idle, Observation, committed_max
@@ -121,6 +121,10 @@ class Controller:
     def counts(self) -> Counter[str]:
         """Events that were counted, by name."""
         return Counter({**self._counts, **self._scheme.counts})
+
+    def change_trigger(self, control: ControlConfig) -> None:
+        """Ask another trigger from the next step on; it knows of nothing that was sent before."""
+        self._trigger = make_trigger(control, len(self.last_step))
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""

@@ -77,6 +77,15 @@ TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
 
+TRIGGER = frozenset(
+    f"control.{key}"
+    for key in ("trigger", "period", "epsilon", "decay_rate", "cost_gap", "deviation_m")
+)
+"""Keys of when horizons are sent."""
+POINT = frozenset({"reference.points_m", "reference.velocity_mps"})
+"""Keys of a point that is led by hand."""
+
+
 class Server(Endpoint):
     """Plans for every vehicle that asks.
 
@@ -105,6 +114,7 @@ class Server(Endpoint):
         references: Callable[[int], Reference] | None = None,
     ) -> None:
         super().__init__()
+        self.changeable = TRIGGER | POINT if scenario.reference.shape == "live" else TRIGGER
         self._terms = scenario.terms()
         self._heartbeat_ns = seconds_to_ns(self._terms.heartbeat_s)
         self._boot_id = boot_id
@@ -265,6 +275,16 @@ class Server(Endpoint):
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))
         return session
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        """See `Endpoint`; the terms of the flight stay as they were agreed upon."""
+        if keys & TRIGGER:
+            self.controller.change_trigger(scenario.control)
+        if keys & POINT:
+            self._lead(scenario, now_ns)
+
+    def _lead(self, scenario: Scenario, now_ns: int) -> None:
+        """Move the point that is led."""
 
     # -- time --------------------------------------------------------------------------------
 

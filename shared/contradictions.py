@@ -22,8 +22,14 @@ LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
 
-def contradictions(scenario: "Scenario") -> Iterator[Contradiction]:
-    """All that is wrong with a scenario whose values are right one by one."""
+def contradictions(
+    scenario: "Scenario", known: "Scenario | None" = None
+) -> Iterator[Contradiction]:
+    """All that is wrong with a scenario whose values are right one by one.
+
+    Args:
+        known: a scenario with which nothing is wrong; a trajectory that it has is not made again.
+    """
     model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
     axes = model.axes
     for key, values in (
@@ -52,12 +58,20 @@ def contradictions(scenario: "Scenario") -> Iterator[Contradiction]:
     if vehicle.exhausted == "brake" and vehicle.slew_mps2 < vehicle.brake_mps2:
         least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, for it to brake"
         yield "vehicle.slew_mps2", vehicle.slew_mps2, least
+    sensor = scenario.sensor
+    if sensor.velocity_every_s == "never" and sensor.filter == "none":
+        yield (
+            "sensor.filter",
+            repr(sensor.filter),
+            "'kalman' with sensor.velocity_every_s = 'never'",
+        )
     if control.scheme == "dead_reckoning" and not control.feedback:
         yield "control.feedback", "false", "true with control.scheme = 'dead_reckoning'"
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
     yield from _no_trigger(control)
-    yield from _no_reference(scenario)
+    if known is None or scenario.reference != known.reference or axes != known.model.axes:
+        yield from _no_reference(scenario)
 
 
 def _too_slow(scenario: "Scenario") -> Iterator[Contradiction]:

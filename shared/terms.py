@@ -138,6 +138,7 @@ KEYS: Mapping[str, str] = MappingProxyType(
 _OWNERS = {
     "a word for people": "title",
     "the vehicle's: how long it flies": "duration",
+    "the vehicle's: whether it flies plans": "armed",
     "the vehicle's: what its summary leaves out": "settle",
     "of chance, at each end its own": "seed",
     "the server's: where it plans from": "control.delay_bound",
@@ -163,6 +164,7 @@ _OWNERS = {
     "the vehicle's: what it measures": """
         sensor.filter sensor.position_noise_m sensor.velocity_noise_mps sensor.position_bias_m
         sensor.velocity_bias_mps sensor.position_every_s sensor.velocity_every_s sensor.delay_s
+        sensor.process_noise
     """,
     "the vehicle's: the air it flies in": """
         vehicle.wind vehicle.steady_wind_mps vehicle.gust_mps2 vehicle.gust_every_s
