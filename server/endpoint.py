@@ -79,7 +79,15 @@ TICK_BIN_NS = MILLISECOND_NS // 20
 
 TRIGGER = frozenset(
     f"control.{key}"
-    for key in ("trigger", "period", "epsilon", "decay_rate", "cost_gap", "deviation_m")
+    for key in [
+        "trigger",
+        "period",
+        "epsilon",
+        "decay_rate",
+        "cost_gap",
+        "deviation_m",
+        "tolerance_m",
+    ]
 )
 """Keys of when horizons are sent."""
 POINT = frozenset({"reference.points_m", "reference.velocity_mps"})

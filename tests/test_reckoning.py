@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from client.compensator import Compensator
 from server.desired import Desired
@@ -16,7 +17,7 @@ from server.reckoning import Reckoning
 from server.scheme import Foresight, foresight
 from shared import config
 from shared.config import ConfigError, Scenario
-from shared.model import Array
+from shared.model import Array, Indices
 from shared.protocol import (
     FEEDBACK,
     VERSION,
@@ -31,6 +32,8 @@ from shared.record import UPLINK
 from shared.summary import position_error
 from shared.terms import Terms
 from sim.flight import Flight, fly, fly_batch
+
+Floats = NDArray[np.float32]
 
 SECONDS = 20.0
 LINE = {"shape": "waypoints", "points_m": [[0.0, 0.0], [80.0, 60.0]], "speed_mps": 1.0}
@@ -77,15 +80,23 @@ def rmse_m(flown: Scenario, flight: Flight) -> float:
 # -- what is sent, and when ------------------------------------------------------------------
 
 
+class Moved(Desired):
+    """What is known of targets that are moved by hand."""
+
+    states = np.zeros((2, 2, 2))
+
+    def now(self, rows: Indices, steps: Indices) -> Array:  # noqa: ARG002
+        """Where they are."""
+        return self.states[rows]
+
+
 class Server:
-    """A server's part of dead reckoning, with a target that is moved by hand."""
+    """A server's part of dead reckoning."""
 
     def __init__(self, flown: Scenario, capacity: int = 1) -> None:
         self.terms = flown.terms()
-        self.states = np.zeros((capacity, 2, 2))
-        desired = Desired(flown, self.terms, capacity, capacity)
-        desired.now = lambda rows, _: self.states[rows]  # type: ignore[method-assign]
-        self.scheme = Reckoning(flown.control, self.terms, desired, capacity, capacity)
+        self.desired = Moved(flown, self.terms, capacity, capacity)
+        self.scheme = Reckoning(flown.control, self.terms, self.desired, capacity, capacity)
         self.found: Foresight = foresight(capacity, 2, self.terms.planned, 1)
 
     def observe(self, step: int, *, row: int = 0, takes: int = 1) -> None:
@@ -96,7 +107,7 @@ class Server:
     def at(self, step: int, *states: Sequence[float], send: bool = False) -> tuple[Any, ...]:
         """Fresh, left_m, moved_m of one vehicle whose target has come to a state, of each axis."""
         if states:
-            self.states[0] = states
+            self.desired.states = np.array([states, states])
         rows, steps = np.array([0]), np.array([step])
         self.scheme.foresee(rows, steps, self.found)
         self.scheme.plan(rows, steps, self.found)
@@ -216,7 +227,7 @@ def test_both_ends_expect_the_target_in_the_same_place(
 # -- the wire --------------------------------------------------------------------------------
 
 
-def horizon(step: int, inputs: Array, feedback: Array) -> Horizon:
+def horizon(step: int, inputs: Floats, feedback: Floats) -> Horizon:
     """What the server sends at a step."""
     return Horizon(1, 2**32 - 1, step, 2**47, 2**47, inputs, feedback)
 
