@@ -22,7 +22,7 @@ import numpy as np
 from client.clamp import clamped
 from client.navigation import navigation
 from client.plant import FirstOrderPlant, white_acceleration
-from server.mpc import stationary_gain
+from server.gain import stationary_gain
 from shared.chance import stream
 from shared.config import Scenario
 from shared.model import Array

@@ -78,8 +78,10 @@ TICK_BIN_NS = MILLISECOND_NS // 20
 
 
 TRIGGER = frozenset(
-    f"control.{key}"
-    for key in ("trigger", "period", "epsilon", "decay_rate", "cost_gap", "deviation_m")
+    {
+        *("control.trigger", "control.period", "control.epsilon", "control.decay_rate"),
+        *("control.cost_gap", "control.deviation_m", "control.tolerance_m"),
+    }
 )
 """Keys of when horizons are sent."""
 POINT = frozenset({"reference.points_m", "reference.velocity_mps"})
