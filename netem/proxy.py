@@ -10,11 +10,10 @@ send takes no place from those who fly, and none for long from those who come.
 """
 
 from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from netem.fate import Fate, fates
+from netem.fate import Fates
 from netem.link import Lane, Link
 from shared.config import DirectionConfig, Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
@@ -137,8 +136,8 @@ class Proxy(Endpoint):
         flow = Flow(
             client,
             socket,
-            Lane(number, self._fates("uplink", number)),
-            Lane(number, self._fates("downlink", number)),
+            Lane(number, self._fates("uplink", number), now_ns),
+            Lane(number, self._fates("downlink", number), now_ns),
             now_ns,
             self._unanswered,
         )
@@ -147,10 +146,10 @@ class Proxy(Endpoint):
         self._events.append(FlowOpened(flow=number, host=host, port=port))
         return flow
 
-    def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Iterator[Fate]:
+    def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Fates:
         """Fates of the packets of a flow in one direction."""
         direction: DirectionConfig = getattr(self._scenario.network, name)
-        return fates(direction, self._scenario.seed, name, flow)
+        return Fates(direction, self._scenario.seed, name, flow)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
         """See `Endpoint`; packets that are under way keep their fate."""

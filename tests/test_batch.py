@@ -154,7 +154,7 @@ def test_a_session_is_forgotten_at_the_same_time_in_any_company() -> None:
     )
     flights = assert_as_alone(flown, range(4))
     ended = [sum(event == SessionEnded(vehicle=1) for *_, event in run.events) for run in flights]
-    assert sum(ended) >= 3
+    assert sum(ended) >= 2
 
 
 @pytest.mark.parametrize("name", ["demo", "paper"])
