@@ -362,7 +362,7 @@ def test_set_prints_what_may_change_what_has_and_what_was_refused(
 
 
 def test_no_loop_is_needed_to_close_what_was_never_driven(tmp_path: Path) -> None:
-    """A process that fails before it flies leaves no socket behind; without a path there is none."""
+    """A process that fails before it flies leaves none behind; without a path there is none."""
     path = tmp_path / "netem"
     with controlled(path, running()) as control:
         assert control is not None
