@@ -9,8 +9,8 @@ from collections import deque
 import numpy as np
 
 from server.controller import BLOCK
-from server.endpoint import Server
 from server.desired import Desired
+from server.endpoint import Server
 from server.planner import Planner
 from server.scheme import foresight
 from shared.chance import stream

@@ -18,6 +18,7 @@ import tyro
 
 from client.fleet import Fleet
 from client.link import Link, Plain
+from client.navigation import navigation
 from client.plant import FirstOrderPlant
 from client.secure import Secure
 from client.vehicle import Client
@@ -101,6 +102,7 @@ def fly(argv: Sequence[str]) -> None:
                 vehicle=number,
                 boot_id=secrets.randbits(64),
                 link=link(number),
+                navigation=navigation(scenario, stream(scenario.seed, "sensor", number)),
                 recorder=recording.recorder,
             )
             for number in numbers

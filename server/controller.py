@@ -3,8 +3,9 @@
     observations → x̂(k), x̂(k+d) (`replay` or `estimator`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`planner`) → event? (`trigger`) → what is sent, remembered.
 
-With the schemes "predictive" and "none" d is 0. Every vehicle is planned for at every step, for
-planning is a small part of what a step costs.
+With the schemes "predictive" and "none" d is 0; with "dead_reckoning" nothing is planned, and
+`reckoning` stands in place of estimator and planner. Every vehicle is planned for at every step,
+for planning is a small part of what a step costs.
 """
 
 from collections import Counter
@@ -17,6 +18,7 @@ from server.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from server.desired import Desired
 from server.estimator import Estimator
 from server.planner import Figures, Planner
+from server.reckoning import Reckoning
 from server.replay import Replay
 from server.scheme import Foresight, Scheme, foresight
 from server.trigger import Situation, Verdict, make_trigger
@@ -88,17 +90,22 @@ class Controller:
         """Longest delay to a vehicle that a horizon has room for [ns]."""
         if not terms.indexed:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
-        self._scheme: Scheme = (
-            Replay(terms, control, room, clock)
-            if terms.commits
-            else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
-        )
         self.desired = Desired(scenario, terms, room, block, references)
         """What is known of the desired trajectories."""
-        self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
-        """Plans of every vehicle."""
+        self._scheme: Scheme
+        self.planner: Planner | Reckoning
+        """Plans of every vehicle, or what is sent in place of a plan."""
+        if terms.reckons:
+            self._scheme = self.planner = Reckoning(control, terms, self.desired, room, block)
+        else:
+            self._scheme = (
+                Replay(terms, control, room, clock)
+                if terms.commits
+                else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
+            )
+            self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
         self._trigger = make_trigger(control, room)
-        self._found = foresight(block, terms.axes, terms.horizon, most)
+        self._found = foresight(block, terms.axes, terms.planned, most)
         self._stopwatch = stopwatch
         self.last_step = np.full(room, -1, dtype=np.int64)
         """Step of each vehicle that was decided last, or -1; shape (room,)."""

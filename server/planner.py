@@ -50,14 +50,17 @@ FIGURES = record(
     ("error", "f8"),
     ("cost_gap", "f8"),
     ("deviation_m", "f8"),
+    ("left_m", "f8"),
+    ("moved_m", "f8"),
     ("fresh", "?"),
     ("solved", "?"),
 )
 """What is known of a vehicle once its plan is made: its row; k; k + d, where planning starts; the
 steps since planning started before; V(k) of eq. (16); the cost of flying on with
 what was sent, above that of the plan; the largest distance between that and the generator's last
-plan [m]; whether it is at its first step or after a gap that no plan reached over; and whether the
-plan is new and right, so that it may be sent."""
+plan [m]; with dead reckoning, how far the desired position has left where both ends expect it, and
+has moved since it was sent last [m]; whether it is at its first step or after a gap that no plan
+reached over; and whether the plan is new and right, so that it may be sent."""
 Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
 """Shape (n,)."""
 

@@ -110,6 +110,9 @@ class ControlConfig(Section, frozen=True):
     """Extra cost of flying on with what was sent, above which the policy `cost_gap` sends."""
     deviation_m: Amount = 0.05
     """Distance from the plan, above which the policy `deviation` sends [m]."""
+    tolerance_m: Amount = 0.1
+    """Distance of the desired position from where it was expected, above which the policy
+    `tolerance` sends, and from where it was sent, above which `delta` does [m]."""
     state_weight: tuple[Amount, Amount] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: tuple[Amount, Amount] = (50.0, 20.0)
@@ -148,6 +151,8 @@ class ReferenceConfig(Section, frozen=True):
     """Altitude of circle, figure-eight and square in space [m]."""
     points_m: tuple[tuple[Position, ...], ...] = ()
     """Waypoints [m], at least two; the one point to hover at; where a live point begins."""
+    velocity_mps: tuple[Speed, ...] = ()
+    """Velocity of a live point, where it is known [m/s]; left out: estimated from its moves."""
     speed_mps: Factor = 1.0
     """Speed between waypoints, and the largest of a target along an axis [m/s]."""
     loop: bool = False
@@ -207,6 +212,9 @@ class SensorConfig(Section, frozen=True):
     """Time from one velocity to the next [s]; 0: one at every step; never: positions alone."""
     delay_s: Annotated[float, Meta(ge=0, le=2)] = 0.0
     """Time from measuring to having the measurement [s]."""
+    process_noise: Factor = 0.15
+    """Strength of the white acceleration that the filter reckons with [m/s per √s]: of wind, and of
+    all in which the vehicle is unlike its model."""
 
 
 class DirectionConfig(Section, frozen=True):

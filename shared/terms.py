@@ -69,12 +69,27 @@ class Terms(NamedTuple):
     @property
     def indexed(self) -> bool:
         """Whether the vehicle reads a horizon by the step it is at, and not always its first."""
-        return self.scheme != "none"
+        return self.scheme not in ("dead_reckoning", "none")
 
     @property
     def commits(self) -> bool:
         """Whether horizons begin with committed inputs."""
         return self.scheme == "committed"
+
+    @property
+    def reckons(self) -> bool:
+        """Whether horizons bring no plan, but the state that the vehicle goes on from."""
+        return self.scheme == "dead_reckoning"
+
+    @property
+    def planned(self) -> int:
+        """Number of a horizon's inputs behind the committed ones: H, or 1 without a plan."""
+        return 1 if self.reckons else self.horizon
+
+    @property
+    def reach(self) -> int:
+        """Steps behind the committed ones for which a horizon is good: H, or the age bound."""
+        return self.age_max if self.reckons else self.horizon
 
     @property
     def age_max(self) -> int:
@@ -130,10 +145,10 @@ _OWNERS = {
     "the server's: how it estimates": "control.observer_s",
     "the server's: when it sends": """
         control.trigger control.period control.epsilon control.decay_rate control.cost_gap
-        control.deviation_m
+        control.deviation_m control.tolerance_m
     """,
     "the server's: what only it knows": """
-        reference.preview reference.agility
+        reference.preview reference.agility reference.velocity_mps
     """,
     "the server's: how it plans": """
         model.dead_time_s control.solver control.state_weight control.terminal_weight
@@ -149,6 +164,7 @@ _OWNERS = {
     "the vehicle's: what it measures": """
         sensor.filter sensor.position_noise_m sensor.velocity_noise_mps sensor.position_bias_m
         sensor.velocity_bias_mps sensor.position_every_s sensor.velocity_every_s sensor.delay_s
+        sensor.process_noise
     """,
     "the vehicle's: the air it flies in": """
         vehicle.wind vehicle.steady_wind_mps vehicle.gust_mps2 vehicle.gust_every_s
@@ -170,6 +186,11 @@ FREE: Mapping[str, str] = MappingProxyType(
     {key: whose for whose, keys in _OWNERS.items() for key in keys.split()}
 )
 """Keys of the scenario that may differ, and whose they are."""
+
+
+def keys_of(whose: str) -> frozenset[str]:
+    """Keys of the scenario that may differ, of those with these words in `FREE`."""
+    return frozenset(_OWNERS[whose].split())
 
 
 def _text(name: str, value: object) -> str:

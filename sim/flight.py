@@ -23,6 +23,7 @@ import msgspec
 
 from client import secure as client_secure
 from client.link import Link
+from client.navigation import navigation
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
@@ -197,6 +198,7 @@ class Run:
                 vehicle=self._before + vehicle,
                 boot_id=BOOT_ID,
                 link=_link(keyring, scenario.seed, self._before + vehicle),
+                navigation=navigation(scenario, stream(scenario.seed, "sensor", vehicle)),
                 recorder=recorder,
             )
             for vehicle in range(1, vehicles + 1)

@@ -3,7 +3,6 @@
 `OnPaper` is section 4.1 once more, for one vehicle, with a dense solver and no batch.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import msgspec
