@@ -54,6 +54,7 @@ from shared.protocol import (
 )
 from shared.record import Reason, Recorder
 from shared.steady import JUMP_NS
+from shared.terms import keys_of
 
 NEVER = (0, 0)
 """Echo of a server that was not heard yet."""
@@ -70,15 +71,7 @@ DEGRADED = "the server misses its deadlines"
 """Why no newer horizon comes, as it seems, of a server that plans and says that it is degraded."""
 IMPOSSIBLE = frozenset({"from the future", "observation"})
 """Reasons for which a horizon is dropped that is made for an impossible time."""
-AIR = frozenset(
-    {
-        "vehicle.wind",
-        "vehicle.steady_wind_mps",
-        "vehicle.gust_mps2",
-        "vehicle.gust_every_s",
-        "vehicle.gust_s",
-    }
-)
+AIR = keys_of("the vehicle's: the air it flies in")
 """Keys of the air that a simulated vehicle flies in."""
 
 

@@ -107,10 +107,14 @@ class Desired:
         """Let a vehicle begin in this row."""
         self._number[row] = vehicle if self._references else 0
 
-    def move(self, position: Array, velocity: Array | None, now_ns: int) -> None:
-        """Move a live point, see `LivePoint.move`; any other trajectory stays as it is."""
+    def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
+        """Move a live point, see `LivePoint.move`; any other trajectory stays as it is.
+
+        Without a position it goes on from where it is by then.
+        """
         if self._point:
-            self._point.move(position, velocity, now_ns)
+            here = self._point.at(now_ns)[:, 0] if position is None else position
+            self._point.move(here, velocity, now_ns)
 
     def tick(self, now_ns: int) -> None:
         """Take note of the time [ns]: a live point has moved on."""

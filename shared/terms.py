@@ -188,6 +188,11 @@ FREE: Mapping[str, str] = MappingProxyType(
 """Keys of the scenario that may differ, and whose they are."""
 
 
+def keys_of(whose: str) -> frozenset[str]:
+    """Keys of the scenario that may differ, of those with these words in `FREE`."""
+    return frozenset(_OWNERS[whose].split())
+
+
 def _text(name: str, value: object) -> str:
     """A term as the scenario writes it."""
     if name == "dt_ns" and isinstance(value, int):

@@ -53,6 +53,7 @@ OTHER: dict[str, Any] = {
     "network.uplink.delay": "none",
     "network.downlink.delay": "none",
     "title": "another",
+    "armed": False,
 }
 """Another value of the keys that are no numbers, or that not every number may be."""
 
