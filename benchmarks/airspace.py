@@ -9,6 +9,7 @@ from collections import deque
 import numpy as np
 
 from server.controller import BLOCK
+from server.desired import Desired
 from server.endpoint import Server
 from server.planner import Planner
 from server.scheme import foresight
@@ -74,7 +75,8 @@ class PlannedFleet:
 
     def __init__(self, scenario: Scenario, count: int) -> None:
         terms = scenario.terms()
-        self._planner = Planner(scenario, terms, count, BLOCK, Stopwatch())
+        desired = Desired(scenario, terms, count, BLOCK)
+        self._planner = Planner(scenario.control, terms, desired, count, BLOCK, Stopwatch())
         self._found = foresight(BLOCK, terms.axes, terms.horizon, committed_max(terms))
         self._vehicles = Vehicles(scenario, count)
         self._blocks = [

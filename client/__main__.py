@@ -18,6 +18,7 @@ import tyro
 
 from client.fleet import Fleet
 from client.link import Link, Plain
+from client.navigation import navigation
 from client.plant import FirstOrderPlant
 from client.secure import Secure
 from client.vehicle import Client
@@ -43,8 +44,6 @@ class Options:
     """HOST:PORT of netem, or of the server itself; an IPv6 host in brackets, as in [::1]:47000."""
     number: Annotated[int, tyro.conf.arg(name="id")] = 1
     """Number of this vehicle (0 to 65535); no two vehicles of a server may have the same."""
-    arm: bool = True
-    """Whether plans may be flown at all; --no-arm for a vehicle that is to stay where it is."""
     vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of vehicles to fly in this process, numbered from --id on."""
     keys: Path | None = None
@@ -62,6 +61,8 @@ class Options:
     json: Path | None = None
     """File for the summary of the flight, as far as the vehicle knows it; of several vehicles, for
     what was counted, and the CPU time it took."""
+    control: Path | None = None
+    """Unix socket to make, through which keys change in flight, see `skytether set`."""
     config: ScenarioFlags = Scenario()
 
 
@@ -100,8 +101,8 @@ def fly(argv: Sequence[str]) -> None:
                 server=server,
                 vehicle=number,
                 boot_id=secrets.randbits(64),
-                armed=options.arm,
                 link=link(number),
+                navigation=navigation(scenario, stream(scenario.seed, "sensor", number)),
                 recorder=recording.recorder,
             )
             for number in numbers
@@ -111,6 +112,7 @@ def fly(argv: Sequence[str]) -> None:
         command.drive(
             "client",
             Steady(endpoint),
+            scenario,
             bind=None,
             peers=[server],
             waiting_for=f"the server at {options.server}",
@@ -119,6 +121,7 @@ def fly(argv: Sequence[str]) -> None:
             log=options.log,
             json=None if alone else options.json,
             recording=recording,
+            control=options.control,
         )
         if alone and len(rows := recording.rows()):
             summary = summarise(scenario, options.scenario, rows, secure=keyring is not None)

@@ -37,19 +37,20 @@ LOCKING = BROKEN | {Reason.LATE}
 """Causes of braking after which no horizon is taken before the vehicle hovers on a good link."""
 CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
 """Causes that end the session: another WELCOME is needed."""
-DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE}
+DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED}
 """Causes for which the horizon held is dropped."""
 
 Table = Mapping[tuple[Mode, Reason], Mode]
 
 _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not Mode.FAULT}
-_TO_BRAKE = BROKEN | {Reason.ENDED, Reason.LATE, Reason.STALLED}
+_TO_BRAKE = BROKEN | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED}
 
 TABLE: Table = MappingProxyType(
     {
         (Mode.INIT, Reason.OPENED): Mode.SYNC,
         (Mode.SYNC, Reason.GOOD): Mode.READY,
         (Mode.READY, Reason.UNARMED): Mode.READY,
+        (Mode.READY, Reason.GOOD): Mode.READY,
         (Mode.READY, Reason.HORIZON): Mode.TRACK,
         (Mode.TRACK, Reason.HORIZON): Mode.TRACK,
         (Mode.TRACK, Reason.OLD): Mode.COAST,
@@ -91,7 +92,7 @@ class Failsafe:
 
     Args:
         table: `TABLE` or `HOLD`.
-        armed: whether horizons may be flown at all.
+        armed: whether horizons may be flown at all, see `armed`.
         timeout_ns: time of silence after which the link is lost, and without a newer horizon after
             which the vehicle coasts [ns].
         land_after_ns: time of hovering with a lost link after which it lands [ns].
@@ -109,7 +110,8 @@ class Failsafe:
         changed: Callable[[Mode, Reason, Reason, int], None],
     ) -> None:
         self._table = table
-        self._armed = armed
+        self.armed = armed
+        """Whether horizons may be flown at all; it may change in flight."""
         self._timeout_ns = timeout_ns
         self._land_after_ns = land_after_ns
         self._changed = changed
@@ -136,7 +138,7 @@ class Failsafe:
     def takes(self) -> bool:
         """Whether a horizon that comes now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
-        return may and self._armed and self.reason not in LOCKING
+        return may and self.armed and self.reason not in LOCKING
 
     @property
     def brakes(self) -> bool:
@@ -203,9 +205,10 @@ class Failsafe:
         if lost and not locked:
             self.meet(Reason.LOST, now_ns=now_ns)
         good = self._is_good(now_ns) and now_ns - self._good_ns >= GOOD_NS
-        if good and (locked or self.mode is Mode.SYNC):
+        armed_now = self.armed and self.reason is Reason.UNARMED
+        if good and (locked or armed_now or self.mode is Mode.SYNC):
             self.meet(Reason.GOOD, now_ns=now_ns)
-        if not self._armed:
+        if not self.armed:
             self.meet(Reason.UNARMED, now_ns=now_ns)
         if now_ns - self._horizon_ns > self._timeout_ns:
             self.meet(Reason.OLD, now_ns=now_ns)

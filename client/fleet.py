@@ -5,6 +5,7 @@ from heapq import heapify, heappop, heappush
 from typing import Any
 
 from client.vehicle import Client
+from shared.config import Scenario
 from shared.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint
 from shared.events import Failure
 
@@ -15,6 +16,7 @@ class Fleet(Endpoint):
     def __init__(self, clients: Sequence[Client]) -> None:
         super().__init__()
         self._clients = clients
+        self.changeable = Client.changeable
         self._due_ns = [client.next_wake_ns() for client in clients]
         self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns) if due_ns is not None]
         """Wakes that clients have asked for: time and client; one that is no longer wanted stays
@@ -51,6 +53,11 @@ class Fleet(Endpoint):
             self._due_ns[n] = None
             self._clients[n].wake(now_ns=now_ns)
             self._after(n)
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        """Let every vehicle fly the other scenario."""
+        for client in self._clients:
+            client.change(scenario, keys, now_ns=now_ns)
 
     def close(self, *, now_ns: int) -> None:
         """Let every vehicle say that it ends."""

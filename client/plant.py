@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from shared.config import Scenario
+from shared.config import Scenario, VehicleConfig
 from shared.endpoint import SECOND_NS, seconds_to_ns
 from shared.model import Array, advance, discretise
 
@@ -27,6 +27,9 @@ class Plant(Protocol):
 
     def advance(self, command: Array) -> None:
         """Fly one step with this desired velocity [m/s]; shape (axes,)."""
+
+    def change(self, vehicle: VehicleConfig) -> None:
+        """Let other winds blow from the next step on; nothing but the air is another."""
 
 
 class FirstOrderPlant:
@@ -49,17 +52,26 @@ class FirstOrderPlant:
         self._B_before = (model.B - after.B).tolist() if rest_ns else []
         """The part of B that is still the input's flown before."""
         self._rng = rng
-        self._wind = (vehicle.wind * white_acceleration(tau, dt)).tolist() if vehicle.wind else []
-        self._gust_mps2 = vehicle.gust_mps2
-        self._gust_end_chance = float(-np.expm1(-dt / vehicle.gust_s))
-        self._gust_start_chance = float(-np.expm1(-dt / vehicle.gust_every_s))
-        self._gusty = False
+        self._dt_s = dt
         self._tau = tau
-        self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(tau)))
-        self._push = self._steady_mps.tolist()
-        """Push w + τ a on each axis, gusts included [m/s]."""
+        self._gust: Array | None = None
+        """Way that the gust blows, of any length; shape (axes,). None between gusts."""
+        self.change(vehicle)
         start = scenario.vehicle.start_m or scenario.make_reference()(np.zeros(()))[:, 0]
         self._x = [(float(position), 0.0) for position in start]
+
+    def change(self, vehicle: VehicleConfig) -> None:
+        """See `Plant`."""
+        white = vehicle.wind * white_acceleration(self._tau, self._dt_s)
+        self._wind = white.tolist() if vehicle.wind else []
+        self._gust_mps2 = vehicle.gust_mps2
+        self._gust_end_chance = float(-np.expm1(-self._dt_s / vehicle.gust_s))
+        self._gust_start_chance = float(-np.expm1(-self._dt_s / vehicle.gust_every_s))
+        self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(self._tau)))
+        if self._gust_mps2 == 0.0:
+            self._gust = None
+        self._push = self._pushed()
+        """Push w + τ a on each axis, gusts included [m/s]."""
 
     def state(self) -> Array:
         """See `Plant`."""
@@ -85,15 +97,21 @@ class FirstOrderPlant:
         if self._gust_mps2 == 0.0:
             return
         chance = self._rng.random()
-        if self._gusty:
+        if self._gust is not None:
             if chance < self._gust_end_chance:
-                self._gusty = False
-                self._push = self._steady_mps.tolist()
+                self._gust = None
+                self._push = self._pushed()
         elif chance < self._gust_start_chance:
-            self._gusty = True
-            way = self._rng.standard_normal(len(self._tau))
-            gust_mps2 = self._gust_mps2 * way / np.linalg.norm(way)
-            self._push = (self._steady_mps + self._tau * gust_mps2).tolist()
+            self._gust = self._rng.standard_normal(len(self._tau))
+            self._push = self._pushed()
+
+    def _pushed(self) -> list[float]:
+        """Push of the air now on each axis [m/s]."""
+        if self._gust is None:
+            return self._steady_mps.tolist()
+        gust_mps2 = self._gust_mps2 * self._gust / np.linalg.norm(self._gust)
+        pushed: list[float] = (self._steady_mps + self._tau * gust_mps2).tolist()
+        return pushed
 
 
 def white_acceleration(tau_s: Array, dt_s: float) -> Array:

@@ -8,7 +8,8 @@ that. What the vehicle does at all, `client.failsafe` decides; which input of a 
 
 import math
 from collections import Counter
-from typing import Any, Literal
+from itertools import chain
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from client.clamp import clamped
 from client.compensator import Compensator
 from client.failsafe import CLOSING, DROPPING, HOLD, LATE_SHARE, TABLE, Failsafe
 from client.link import AGAIN_NS, Link, Plain
+from client.navigation import Navigation
 from client.plant import Plant
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
@@ -68,6 +70,32 @@ DEGRADED = "the server misses its deadlines"
 """Why no newer horizon comes, as it seems, of a server that plans and says that it is degraded."""
 IMPOSSIBLE = frozenset({"from the future", "observation"})
 """Reasons for which a horizon is dropped that is made for an impossible time."""
+AIR = frozenset(
+    {
+        "vehicle.wind",
+        "vehicle.steady_wind_mps",
+        "vehicle.gust_mps2",
+        "vehicle.gust_every_s",
+        "vehicle.gust_s",
+    }
+)
+"""Keys of the air that a simulated vehicle flies in."""
+
+
+class Known(NamedTuple):
+    """A vehicle's state at a step: position [m] and velocity [m/s], each of shape (axes, 2)."""
+
+    state: Array
+    """What it is in truth, as far as anybody knows."""
+    measured: Array
+    """What the vehicle has measured of it since the step before; NaN where it has not."""
+    estimate: Array
+    """What it takes it for."""
+
+    @property
+    def finite(self) -> bool:
+        """Whether it is one that can be flown by."""
+        return all(map(math.isfinite, [*self.state.flat, *self.estimate.flat]))
 
 
 class Client(Endpoint):
@@ -79,10 +107,12 @@ class Client(Endpoint):
         server: address of the server, or of the netem before it.
         vehicle: number of the vehicle, unlike that of any other vehicle of the server.
         boot_id: number that no other life of this vehicle has had.
-        armed: whether horizons may be flown.
         link: how messages become datagrams.
+        navigation: what the vehicle knows of its state; left out: the plant's state as it is.
         recorder: takes one row a step.
     """
+
+    changeable = AIR | {"armed"}
 
     def __init__(
         self,
@@ -92,8 +122,8 @@ class Client(Endpoint):
         server: Address,
         vehicle: int,
         boot_id: int,
-        armed: bool = True,
         link: Link | None = None,
+        navigation: Navigation | None = None,
         recorder: Recorder | None = None,
     ) -> None:
         super().__init__()
@@ -102,7 +132,7 @@ class Client(Endpoint):
         self._steps = scenario.steps
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._connect_ns = seconds_to_ns(scenario.link.connect_s)
-        self._plant = plant
+        self._plant, self._navigation = plant, navigation
         self._compensator = Compensator(self._terms)
         self._server = server
         self.vehicle = vehicle
@@ -113,7 +143,7 @@ class Client(Endpoint):
         holds = self._terms.exhausted == "hold"
         self._failsafe = Failsafe(
             HOLD if holds else TABLE,
-            armed=armed,
+            armed=scenario.armed,
             timeout_ns=self._timeout_ns,
             land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
             changed=self._mode_changed,
@@ -210,10 +240,10 @@ class Client(Endpoint):
         One that was planned when the vehicle had not yet said that it would fly it begins where the
         vehicle is not: the server reckoned with none.
         """
-        H = self._terms.horizon
+        terms = self._terms
         if horizon.step > self._compensator.newest:
-            passed = self._step - horizon.step - (horizon.inputs.shape[1] - H)
-            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * H, now_ns=now_ns)
+            passed = self._step - horizon.step - (horizon.inputs.shape[1] - terms.planned)
+            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
         observed = self._step_at(horizon.observed_ns)
         if self._takes_from is None or 0 <= observed < self._takes_from:
             raise ProtocolError("not taken")
@@ -249,6 +279,7 @@ class Client(Endpoint):
             self._failsafe.meet(Reason.RESTARTED, now_ns=now_ns)
         if self._epoch_ns is None:
             self._epoch_ns = now_ns
+            self._measure()
             self._events.append(Flying(vehicle=self.vehicle))
             self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
 
@@ -308,6 +339,12 @@ class Client(Endpoint):
         self.failure = failure
         self._events.append(failure)
 
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+        """See `Endpoint`."""
+        self._failsafe.armed = scenario.armed
+        if keys & AIR:
+            self._plant.change(scenario.vehicle)
+
     # -- time --------------------------------------------------------------------------------
 
     def next_wake_ns(self) -> int | None:
@@ -343,29 +380,42 @@ class Client(Endpoint):
         self.missed += present - self._step
         for _ in range(self._flown, present):
             self._plant.advance(self._input)
+            self._measure()
         late_ns = now_ns - epoch_ns - self._step * self._dt_ns
         self._flown = self._step = present
         self._failsafe.step(late_ns=late_ns, now_ns=now_ns)
-        state, stamp_ns = self._plant.state(), epoch_ns + present * self._dt_ns
-        self._input = self._choose(state, now_ns)
+        known = self._know()
+        self._input = self._choose(known, now_ns)
         if not self._failsafe.takes:
             self._takes_from = None
         elif self._takes_from is None:
             self._takes_from = present
         self._step = present + 1
         self._note_end(now_ns)
-        self._report(state, stamp_ns)
+        self._report(known, epoch_ns + present * self._dt_ns)
 
-    def _choose(self, state: Array, now_ns: int) -> Array:
+    def _measure(self) -> None:
+        """Measure the state at the begin of a step, where it is not known as it is."""
+        if self._navigation is not None:
+            self._navigation.advance(self._plant.state(), self._input)
+
+    def _know(self) -> Known:
+        """What is known of the state at the present step, and the state itself."""
+        state = self._plant.state()
+        if self._navigation is None:
+            return Known(state, state, state)
+        return Known(state, self._navigation.measured, self._navigation.estimate)
+
+    def _choose(self, known: Known, now_ns: int) -> Array:
         """Input of the present step [m/s], shape (axes,), and what follows from it."""
         failsafe, compensator = self._failsafe, self._compensator
-        if not np.isfinite(state).all():
+        if not known.finite:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         had_plan = compensator.covered
-        wanted = compensator.choose(self._step, state).tolist()
+        wanted = compensator.choose(self._step, known.estimate).tolist()
         if failsafe.mode is Mode.LAND:
             wanted = [0.0] * self._terms.axes
-            if self._terms.axes > ALTITUDE and state[ALTITUDE, 0] > 0.0:
+            if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE, 0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
         flown = clamped(
             wanted,
@@ -391,12 +441,12 @@ class Client(Endpoint):
             return math.inf
         return max(0.0, math.hypot(*before) - (0.0 if had_plan else self._terms.brake))
 
-    def _report(self, state: Array, stamp_ns: int) -> None:
+    def _report(self, known: Known, stamp_ns: int) -> None:
         """Send and record the step that has just begun; a state that is none is only recorded."""
         step, failsafe, compensator = self._flown, self._failsafe, self._compensator
         server_ns, received_ns = self._echo
         assert self._session is not None
-        if np.isfinite(state).all():
+        if known.finite:
             self._send(
                 Observation(
                     self.vehicle,
@@ -409,7 +459,7 @@ class Client(Endpoint):
                     received_ns,
                     failsafe.mode,
                     int(failsafe.takes),
-                    state,
+                    known.estimate,
                     self._input,
                 )
             )
@@ -419,7 +469,7 @@ class Client(Endpoint):
         self._recorder.append_row(
             self.vehicle,
             step,
-            *state.ravel().tolist(),
+            *chain.from_iterable(of.ravel().tolist() for of in known),
             *self._input.tolist(),
             compensator.covered,
             compensator.in_force,

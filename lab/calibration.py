@@ -122,6 +122,8 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (Free("control.epsilon", 1e-4, 1e4), Free("control.decay_rate", 1e-2, 1e2)),
     "cost_gap": (Free("control.cost_gap", 1e-6, 1e3),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
+    "tolerance": (Free("control.tolerance_m", 1e-4, 1e1),),
+    "delta": (Free("control.tolerance_m", 1e-4, 1e1),),
 }
 """Keys of each policy that looks at the flight, so that weights decide what it sends, too."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
@@ -133,7 +135,8 @@ HERE = "here"
 def trigger_keys(trigger: str) -> Sequence[Free]:
     """Keys of the policies in a trigger; a policy with numbers of its own has none."""
     bare = (each.name for each in policy.policies(policy.parse(trigger)) if not each.values)
-    return [key for name in dict.fromkeys(bare) for key in TRIGGER_KEYS.get(name, ())]
+    keys = (key for name in bare for key in TRIGGER_KEYS.get(name, ()))
+    return list(dict.fromkeys(keys))
 
 
 @dataclass(frozen=True, slots=True)

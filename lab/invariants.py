@@ -265,7 +265,7 @@ class Life(Recorder):
         """
         axes = self._terms.axes
         step, now_ns = int(values[1]), self._clock()
-        state, rest = values[2 : 2 + 2 * axes], values[2 + 2 * axes :]
+        state, rest = values[2 : 2 + 2 * axes], values[2 + 6 * axes :]
         flown = list(rest[:axes])
         covered, in_force, age_ns, _, missed, number, _ = rest[axes:]
         mode, asleep = Mode(int(number)), int(missed) - self.missed

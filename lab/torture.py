@@ -26,6 +26,7 @@ from lab.saboteur import NETEM, SERVER, STRANGERS, Saboteur
 from netem.proxy import Proxy
 from server import secure as server_secure
 from server.endpoint import Server
+from server.planner import Planner
 from server.sessions import WELCOME_NS
 from server.solver import Solver
 from shared import config
@@ -327,6 +328,7 @@ class Torture:
     def set_solver(self, share: float, *, failing: bool) -> None:
         """Let a share of solves of the present life of the server fail, or none any more."""
         planner = self._server.controller.planner
+        assert isinstance(planner, Planner)
         solvers = [getattr(solver, "inner", solver) for solver in planner.solvers]
         if failing:
             rng = self._chance

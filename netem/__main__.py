@@ -45,6 +45,8 @@ class Options:
     system allows."""
     json: Path | None = None
     """File for what was counted, and the CPU time it took."""
+    control: Path | None = None
+    """Unix socket to make, through which keys change in flight, see `skytether set`."""
     config: ScenarioFlags = Scenario()
 
 
@@ -64,6 +66,7 @@ def emulate(argv: Sequence[str]) -> None:
         command.drive(
             "netem",
             endpoint,
+            options.config,
             bind=bind,
             peers=[server],
             waiting_for=f"clients of {options.server}",
@@ -71,6 +74,7 @@ def emulate(argv: Sequence[str]) -> None:
             log=options.log,
             json=options.json,
             recording=recording,
+            control=options.control,
         )
 
 

@@ -10,12 +10,13 @@ send takes no place from those who fly, and none for long from those who come.
 """
 
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
-from netem.fate import fates
+from netem.fate import Fate, fates
 from netem.link import Lane, Link
-from shared.config import Scenario
+from shared.config import DirectionConfig, Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
 from shared.events import FlowOpened
 from shared.record import DOWNLINK, UPLINK, Recorder
@@ -51,6 +52,12 @@ class Proxy(Endpoint):
         flows: most clients at once, a socket each.
         recorder: takes one row a packet.
     """
+
+    changeable = frozenset(
+        f"network.{way}.{key}"
+        for way in ("uplink", "downlink")
+        for key in DirectionConfig.__struct_fields__
+    )
 
     def __init__(
         self,
@@ -127,12 +134,11 @@ class Proxy(Endpoint):
             socket = oldest.socket
         number = self._opened
         self._opened += 1
-        network, seed = self._scenario.network, self._scenario.seed
         flow = Flow(
             client,
             socket,
-            Lane(number, fates(network.uplink, seed, "uplink", number)),
-            Lane(number, fates(network.downlink, seed, "downlink", number)),
+            Lane(number, self._fates("uplink", number)),
+            Lane(number, self._fates("downlink", number)),
             now_ns,
             self._unanswered,
         )
@@ -140,6 +146,18 @@ class Proxy(Endpoint):
         host, port = client
         self._events.append(FlowOpened(flow=number, host=host, port=port))
         return flow
+
+    def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Iterator[Fate]:
+        """Fates of the packets of a flow in one direction."""
+        direction: DirectionConfig = getattr(self._scenario.network, name)
+        return fates(direction, self._scenario.seed, name, flow)
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+        """See `Endpoint`; packets that are under way keep their fate."""
+        self._scenario = scenario
+        for flow in self._by_socket.values():
+            flow.uplink.fates = self._fates("uplink", flow.uplink.flow)
+            flow.downlink.fates = self._fates("downlink", flow.downlink.flow)
 
     def _oldest(self, now_ns: int) -> Flow | None:
         """Flow that gives way to a new client, if one does."""

@@ -51,7 +51,7 @@ class Options:
     """Most vehicles at once, in each worker."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of processes that share the address and the vehicles, one a core; with several, each
-    writes files of its own, numbered, as in RECORD.1."""
+    has files of its own, numbered, as in RECORD.1."""
     json: Path | None = None
     """File for what was counted, and the CPU time it took."""
     keys: Path | None = None
@@ -59,6 +59,8 @@ class Options:
     link is plaintext, which is refused where other machines can reach it."""
     insecure: bool = False
     """Do without keys even where other machines can reach it: anybody there can fly vehicles."""
+    control: Path | None = None
+    """Unix socket to make, through which keys change in flight, see `skytether set`."""
     config: ScenarioFlags = Scenario()
 
 
@@ -112,6 +114,7 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
         command.drive(
             f"server{suffix}",
             Steady(endpoint),
+            options.config,
             bind=bind,
             forms=FORMS if keyring else (),
             waiting_for="vehicles",
@@ -121,4 +124,5 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
             json=own(options.json),
             stopwatch=stopwatch,
             recording=recording,
+            control=own(options.control),
         )

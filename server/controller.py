@@ -3,25 +3,30 @@
     observations → x̂(k), x̂(k+d) (`replay` or `estimator`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`planner`) → event? (`trigger`) → what is sent, remembered.
 
-With the schemes "predictive" and "none" d is 0. Every vehicle is planned for at every step, for
-planning is a small part of what a step costs.
+With the schemes "predictive" and "none" d is 0; with "dead_reckoning" nothing is planned, and
+`reckoning` stands in place of estimator and planner. Every vehicle is planned for at every step,
+for planning is a small part of what a step costs.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from server.clock import UNSEEN, ClockMap, Seen, shortest_ns
+from server.desired import Desired
 from server.estimator import Estimator
 from server.planner import Figures, Planner
+from server.reckoning import Reckoning
 from server.replay import Replay
 from server.scheme import Foresight, Scheme, foresight
 from server.trigger import Situation, Verdict, make_trigger
-from shared.config import Scenario
+from shared.config import ControlConfig, Scenario
 from shared.kernel import B1, I1, kernel
 from shared.model import Array, Flags, Indices
 from shared.protocol import Idle, Observation, committed_max
+from shared.reference import Reference
 from shared.stopwatch import Stopwatch
 from shared.terms import Terms
 
@@ -64,10 +69,17 @@ class Controller:
         terms: the same, as far as both ends agree on it.
         clock: knows half of the smallest round trip of each vehicle.
         stopwatch: measures the parts; the core has no clock of its own.
+        references: see `Desired`.
     """
 
     def __init__(
-        self, scenario: Scenario, terms: Terms, room: int, clock: ClockMap, stopwatch: Stopwatch
+        self,
+        scenario: Scenario,
+        terms: Terms,
+        room: int,
+        clock: ClockMap,
+        stopwatch: Stopwatch,
+        references: Callable[[int], Reference] | None = None,
     ) -> None:
         control = scenario.control
         block = min(room, BLOCK)
@@ -78,15 +90,22 @@ class Controller:
         """Longest delay to a vehicle that a horizon has room for [ns]."""
         if not terms.indexed:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
-        self._scheme: Scheme = (
-            Replay(terms, control, room, clock)
-            if terms.commits
-            else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
-        )
-        self.planner = Planner(scenario, terms, room, block, stopwatch)
-        """Plans of every vehicle."""
+        self.desired = Desired(scenario, terms, room, block, references)
+        """What is known of the desired trajectories."""
+        self._scheme: Scheme
+        self.planner: Planner | Reckoning
+        """Plans of every vehicle, or what is sent in place of a plan."""
+        if terms.reckons:
+            self._scheme = self.planner = Reckoning(control, terms, self.desired, room, block)
+        else:
+            self._scheme = (
+                Replay(terms, control, room, clock)
+                if terms.commits
+                else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
+            )
+            self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
         self._trigger = make_trigger(control, room)
-        self._found = foresight(block, terms.axes, terms.horizon, most)
+        self._found = foresight(block, terms.axes, terms.planned, most)
         self._stopwatch = stopwatch
         self.last_step = np.full(room, -1, dtype=np.int64)
         """Step of each vehicle that was decided last, or -1; shape (room,)."""
@@ -102,6 +121,10 @@ class Controller:
     def counts(self) -> Counter[str]:
         """Events that were counted, by name."""
         return Counter({**self._counts, **self._scheme.counts})
+
+    def change_trigger(self, control: ControlConfig) -> None:
+        """Ask another trigger from the next step on; it knows of nothing that was sent before."""
+        self._trigger = make_trigger(control, len(self.last_step))
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""

@@ -62,6 +62,7 @@ from shared.protocol import (
     encode_horizon,
 )
 from shared.record import Recorder
+from shared.reference import Reference
 from shared.stopwatch import Stopwatch
 
 VEHICLES_MAX = 64
@@ -76,6 +77,15 @@ TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
 
+TRIGGER = frozenset(
+    f"control.{key}"
+    for key in ("trigger", "period", "epsilon", "decay_rate", "cost_gap", "deviation_m")
+)
+"""Keys of when horizons are sent."""
+POINT = frozenset({"reference.points_m", "reference.velocity_mps"})
+"""Keys of a point that is led by hand."""
+
+
 class Server(Endpoint):
     """Plans for every vehicle that asks.
 
@@ -87,6 +97,8 @@ class Server(Endpoint):
         room: for how many vehicles at once.
         recorder: takes one row a tick and vehicle.
         stopwatch: measures the parts of a tick; the core has no clock of its own.
+        references: desired trajectory of each vehicle, by its number, where they differ; left out:
+            the scenario's for all.
     """
 
     def __init__(
@@ -99,8 +111,10 @@ class Server(Endpoint):
         room: int = VEHICLES_MAX,
         recorder: Recorder | None = None,
         stopwatch: Stopwatch | None = None,
+        references: Callable[[int], Reference] | None = None,
     ) -> None:
         super().__init__()
+        self.changeable = TRIGGER | POINT if scenario.reference.shape == "live" else TRIGGER
         self._terms = scenario.terms()
         self._heartbeat_ns = seconds_to_ns(self._terms.heartbeat_s)
         self._boot_id = boot_id
@@ -109,7 +123,9 @@ class Server(Endpoint):
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, self._terms.dt_ns)
         self._plausibility = Plausibility(self._terms, room)
-        self.controller = Controller(scenario, self._terms, room, self._clock, self.stopwatch)
+        self.controller = Controller(
+            scenario, self._terms, room, self._clock, self.stopwatch, references
+        )
         self.sessions = Sessions(room, entropy, seconds_to_ns(scenario.link.timeout_s))
         """Who flies."""
         self._idle = np.zeros(room, dtype=np.int64)
@@ -255,9 +271,20 @@ class Server(Endpoint):
         session.line = call.line
         self._plausibility.forget(session.row)
         self._anew(session.row)
+        self.controller.desired.assign(session.row, session.vehicle)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))
         return session
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        """See `Endpoint`; the terms of the flight stay as they were agreed upon."""
+        if keys & TRIGGER:
+            self.controller.change_trigger(scenario.control)
+        if keys & POINT:
+            self._lead(scenario, now_ns)
+
+    def _lead(self, scenario: Scenario, now_ns: int) -> None:
+        """Move the point that is led."""
 
     # -- time --------------------------------------------------------------------------------
 
@@ -342,7 +369,7 @@ class Server(Endpoint):
         inputs, begin = in_a_row(found, sent), 0
         columns = (sent, decisions.rows[sent], decisions.step[sent], found.ahead[sent])
         for i, row, step, d in zip(*(column.tolist() for column in columns), strict=True):
-            session, end = self.sessions.at(row), begin + width * (d + self._terms.horizon)
+            session, end = self.sessions.at(row), begin + width * (d + self._terms.planned)
             payload = encode_horizon(
                 session.vehicle,
                 session.number,
@@ -373,6 +400,7 @@ class Server(Endpoint):
             n,
             vehicle=self.sessions.vehicle[rows],
             step=decisions.step,
+            reference=self.controller.desired.now(rows, decisions.step),
             estimate=found.estimate[:n],
             ahead=found.ahead[:n],
             planned=decisions.planned,

@@ -15,6 +15,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from server.desired import Desired, Window
 from server.exact import ExactSolver, Workspace, active_set
 from server.model import advance, axis_at
 from server.mpc import (
@@ -32,18 +33,12 @@ from server.mpc import (
 )
 from server.scheme import Foresight
 from server.solver import OsqpSolver, Solver
-from shared.config import ControlConfig, Scenario
-from shared.kernel import F1, F2, F3, F4, I1, inline, kernel, part, plain, record, records
+from shared.config import ControlConfig
+from shared.kernel import F1, F2, F3, F4, I1, inline, kernel, part, record, records
 from shared.model import Indices
 from shared.stopwatch import Stopwatch
 from shared.terms import Terms
 
-PAGE = 128
-"""Steps of the desired trajectory in a page."""
-PAGES = 256
-"""Places for pages: more than a block of vehicles can need at once."""
-EMPTY = -1
-"""In place of the page that a place holds."""
 GENERATOR, TRACKER, CONCLUDE = 0, 1, 2
 """First index of what both MPCs have; the last is the move behind both."""
 
@@ -55,14 +50,17 @@ FIGURES = record(
     ("error", "f8"),
     ("cost_gap", "f8"),
     ("deviation_m", "f8"),
+    ("left_m", "f8"),
+    ("moved_m", "f8"),
     ("fresh", "?"),
     ("solved", "?"),
 )
 """What is known of a vehicle once its plan is made: its row; k; k + d, where planning starts; the
 steps since planning started before; V(k) of eq. (16); the cost of flying on with
 what was sent, above that of the plan; the largest distance between that and the generator's last
-plan [m]; whether it is at its first step or after a gap that no plan reached over; and whether the
-plan is new and right, so that it may be sent."""
+plan [m]; with dead reckoning, how far the desired position has left where both ends expect it, and
+has moved since it was sent last [m]; whether it is at its first step or after a gap that no plan
+reached over; and whether the plan is new and right, so that it may be sent."""
 Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
 """Shape (n,)."""
 
@@ -98,16 +96,6 @@ class Draft(NamedTuple):
     """Scratch: squares of distances [m²]; shape (H + 1,)."""
 
 
-class Desired(NamedTuple):
-    """The desired trajectory, looked up in pages rather than computed each time."""
-
-    pages: F4
-    """Desired states of PAGE steps, and of H more, in each page [m, m/s]; shape
-    (PAGES, axes, PAGE + H + 1, 2)."""
-    held: I1
-    """Which page of the trajectory each is, or EMPTY; shape (PAGES,)."""
-
-
 class Batch(NamedTuple):
     """A block of vehicles, and all that their plans are made of."""
 
@@ -121,55 +109,12 @@ class Batch(NamedTuple):
     """What is remembered of all vehicles."""
     draft: Draft
     """The plans in the making."""
-    desired: Desired
-    """The desired trajectory."""
+    desired: Window
+    """The desired trajectory, as far as plans go."""
     found: Foresight
     """What is foreseen of the vehicles."""
     figures: Figures
     """What their plans are worth."""
-
-
-class Reference:
-    """The desired trajectory at any step."""
-
-    def __init__(self, scenario: Scenario, terms: Terms) -> None:
-        self._sample = scenario.make_reference()
-        self._dt_s = terms.dt_s
-        self._steps = np.arange(PAGE + terms.horizon + 1)
-        self._desired = Desired(
-            pages=np.zeros((PAGES, terms.axes, len(self._steps), 2)),
-            held=np.full(PAGES, EMPTY, dtype=np.int64),
-        )
-
-    def open(self, steps: Indices, ahead: Indices) -> Desired:
-        """The desired trajectory, with all pages that vehicles need at their steps k + d."""
-        pages, held = self._desired
-        while (page := _missing(self._desired, steps, ahead)) != EMPTY:
-            if np.count_nonzero(held == EMPTY) == 1:
-                held[:] = EMPTY
-            at = plain(_place)(held, page)
-            states = self._sample((page * PAGE + self._steps) * self._dt_s)
-            pages[at], held[at] = states.transpose(1, 0, 2), page
-        return self._desired
-
-
-@inline
-def _place(held: I1, page: int) -> int:
-    """Where a page is held, or where there is room for it; one place at least must be EMPTY."""
-    at = page % PAGES
-    while held[at] != page and held[at] != EMPTY:
-        at = (at + 1) % PAGES
-    return at
-
-
-@kernel
-def _missing(desired: Desired, steps: I1, ahead: I1) -> int:
-    """A page that vehicles need and that is not held, or EMPTY."""
-    for i in range(len(steps)):
-        page = (steps[i] + ahead[i]) // PAGE
-        if desired.held[_place(desired.held, page)] != page:
-            return page
-    return EMPTY
 
 
 def make_solver(control: ControlConfig, problem: Problem) -> Solver:
@@ -181,10 +126,16 @@ class Planner:
     """Trajectory generator and tracker of up to `capacity` vehicles, `block` of them at a time."""
 
     def __init__(
-        self, scenario: Scenario, terms: Terms, capacity: int, block: int, stopwatch: Stopwatch
+        self,
+        control: ControlConfig,
+        terms: Terms,
+        desired: Desired,
+        capacity: int,
+        block: int,
+        stopwatch: Stopwatch,
     ) -> None:
-        control, axes, H = scenario.control, terms.axes, terms.horizon
-        self._reference = Reference(scenario, terms)
+        axes, H = terms.axes, terms.horizon
+        self._desired = desired
         mpc = make_mpc(terms, control)
         self._mpc = mpc
         self._terminal_weight = np.array(control.terminal_weight)
@@ -235,7 +186,7 @@ class Planner:
             compares=self._compares,
             memory=self._memory,
             draft=self._draft,
-            desired=self._reference.open(step, found.ahead),
+            desired=self._desired.window(rows, step, found.ahead),
             found=found,
             figures=self.figures,
         )
@@ -284,7 +235,7 @@ def _pose_generator(
     mpc: MPC,
     memory: Memory,
     draft: Draft,
-    desired: Desired,
+    desired: Window,
     found: Foresight,
     plan: Any,
     i: int,
@@ -298,8 +249,8 @@ def _pose_generator(
     else:
         x = (memory.states[row, axis, gap, 0], memory.states[row, axis, gap, 1])
     draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
-    place, first = _place(desired.held, plan.start // PAGE), plan.start % PAGE
-    target = desired.pages[place, axis, first : first + H + 1]
+    place, first = desired.place[i], desired.first[i]
+    target = desired.states[place, axis, first : first + H + 1]
     previous, g = memory.inputs[GENERATOR, row, axis], draft.gradient[at, axis]
     # The generator plans for no vehicle in particular, and so for no disturbance.
     lead(mpc, axis, x, 0.0, target, draft.drift)

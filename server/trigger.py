@@ -117,10 +117,13 @@ class Periodic:
 def silence(control: ControlConfig, capacity: int, seconds: float) -> Periodic:
     """No silence is longer than so many seconds or half a horizon, or a step where that is longer.
 
-    A horizon of which half is left is replaced in time even if the first that follows is lost.
+    A horizon of which half is left is replaced in time even if the first that follows is lost. With
+    dead reckoning no horizon is planned that could end.
     """
     steps = int(seconds / control.dt + 1e-9)  # as much as floating point may take from 0.35 / 0.05
-    return Periodic(control, capacity, min(steps, control.horizon // 2))
+    if control.scheme != "dead_reckoning":
+        steps = min(steps, control.horizon // 2)
+    return Periodic(control, capacity, steps)
 
 
 class Budget:
@@ -228,6 +231,16 @@ def cost_gap(control: ControlConfig, capacity: int, c: float) -> Above:  # noqa:
     return Above("cost_gap", c)
 
 
+def tolerance(control: ControlConfig, capacity: int, metres: float) -> Above:  # noqa: ARG001
+    """The desired position has left what both ends expect by more than so many metres."""
+    return Above("left_m", metres)
+
+
+def delta(control: ControlConfig, capacity: int, metres: float) -> Above:  # noqa: ARG001
+    """The desired position has moved by more than so many metres since it was sent last."""
+    return Above("moved_m", metres)
+
+
 class Combined:
     """Two triggers, of which both (`np.logical_and`) or either (`np.logical_or`) must fire."""
 
@@ -262,6 +275,8 @@ POLICIES: dict[str, Callable[..., Trigger]] = {
     "state_gap": StateGap,
     "cost_gap": cost_gap,
     "deviation": deviation,
+    "tolerance": tolerance,
+    "delta": delta,
     "silence": silence,
     "budget": Budget,
 }

@@ -110,6 +110,9 @@ class ControlConfig(Section, frozen=True):
     """Extra cost of flying on with what was sent, above which the policy `cost_gap` sends."""
     deviation_m: Amount = 0.05
     """Distance from the plan, above which the policy `deviation` sends [m]."""
+    tolerance_m: Amount = 0.1
+    """Distance of the desired position from where it was expected, above which the policy
+    `tolerance` sends, and from where it was sent, above which `delta` does [m]."""
     state_weight: tuple[Amount, Amount] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: tuple[Amount, Amount] = (50.0, 20.0)
@@ -207,6 +210,9 @@ class SensorConfig(Section, frozen=True):
     """Time from one velocity to the next [s]; 0: one at every step; never: positions alone."""
     delay_s: Annotated[float, Meta(ge=0, le=2)] = 0.0
     """Time from measuring to having the measurement [s]."""
+    process_noise: Factor = 0.15
+    """Strength of the white acceleration that the filter reckons with [m/s per √s]: of wind, and of
+    all in which the vehicle is unlike its model."""
 
 
 class DirectionConfig(Section, frozen=True):
@@ -284,6 +290,8 @@ class Scenario(Section, frozen=True):
     """Time at the start that RMSE leaves out [s]."""
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 1
     """Seed of everything random: delays, losses, wind."""
+    armed: bool = True
+    """Whether plans may be flown at all; without, the vehicle stays where it is."""
     model: ModelConfig = ModelConfig()
     control: ControlConfig = ControlConfig()
     reference: ReferenceConfig = ReferenceConfig()
@@ -417,21 +425,25 @@ def load(name: str) -> Scenario:
         raise ConfigError(f"{name}: nested too deeply") from None
 
 
-def check(raw: Mapping[str, Any], source: str) -> Scenario:
+def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = None) -> Scenario:
     """The scenario in a table of plain values, every one of them checked.
 
     Args:
         source: the file or command line they come from, for the message.
+        known: a scenario that was checked before: where its trajectory is the same, no file of it
+            is read again.
 
     Raises:
         ConfigError: the first thing that is wrong.
     """
+    where = f"{source}: " if source else ""
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {_explain(str(error), raw)}") from None
-    for key, given, expected in chain(_infinite(to_table(scenario)), contradictions(scenario)):
-        raise ConfigError(f"{source}: {key}: got {_short(str(given))}, expected {expected}")
+        raise ConfigError(f"{where}{_explain(str(error), raw)}") from None
+    wrong = chain(_infinite(to_table(scenario)), contradictions(scenario, known))
+    for key, given, expected in wrong:
+        raise ConfigError(f"{where}{key}: got {_short(str(given))}, expected {expected}")
     return scenario
 
 

@@ -22,8 +22,14 @@ LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
 
-def contradictions(scenario: "Scenario") -> Iterator[Contradiction]:
-    """All that is wrong with a scenario whose values are right one by one."""
+def contradictions(
+    scenario: "Scenario", known: "Scenario | None" = None
+) -> Iterator[Contradiction]:
+    """All that is wrong with a scenario whose values are right one by one.
+
+    Args:
+        known: a scenario with which nothing is wrong; a trajectory that it has is not made again.
+    """
     model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
     axes = model.axes
     for key, values in (
@@ -52,10 +58,20 @@ def contradictions(scenario: "Scenario") -> Iterator[Contradiction]:
     if vehicle.exhausted == "brake" and vehicle.slew_mps2 < vehicle.brake_mps2:
         least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, for it to brake"
         yield "vehicle.slew_mps2", vehicle.slew_mps2, least
+    sensor = scenario.sensor
+    if sensor.velocity_every_s == "never" and sensor.filter == "none":
+        yield (
+            "sensor.filter",
+            repr(sensor.filter),
+            "'kalman' with sensor.velocity_every_s = 'never'",
+        )
+    if control.scheme == "dead_reckoning" and not control.feedback:
+        yield "control.feedback", "false", "true with control.scheme = 'dead_reckoning'"
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
     yield from _no_trigger(control)
-    yield from _no_reference(scenario)
+    if known is None or scenario.reference != known.reference or axes != known.model.axes:
+        yield from _no_reference(scenario)
 
 
 def _too_slow(scenario: "Scenario") -> Iterator[Contradiction]:
@@ -89,7 +105,8 @@ def _too_short(scenario: "Scenario") -> Iterator[Contradiction]:
     control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
     covered_s, lossy = control.horizon * control.dt, scenario.network.uplink.loss > LOSSY
     least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
-    if vehicle.exhausted == "brake" and control.scheme != "none" and covered_s < least_s - TINY:
+    plans = control.scheme in ("committed", "predictive")
+    if vehicle.exhausted == "brake" and plans and covered_s < least_s - TINY:
         what = "what" if lossy else "half of what"
         lost = f", with over {LOSSY:.0%} of the packets to the vehicle lost" if lossy else ""
         least = f"at least {least_s:g} s, {what} braking from u_max takes{lost}"
@@ -108,8 +125,10 @@ def _no_trigger(control: "ControlConfig") -> Iterator[Contradiction]:
         yield "control.trigger", repr(error.given), error.expected
         return
     for name in (part.name for part in policy.policies(trigger)):
-        if policy.SIGNATURES[name].committed and not control.commits:
-            yield "control.scheme", repr(control.scheme), f"'committed' with the trigger {name}"
+        schemes = policy.SIGNATURES[name].schemes
+        if schemes and control.scheme not in schemes:
+            expected = " or ".join(map(repr, schemes))
+            yield "control.scheme", repr(control.scheme), f"{expected} with the trigger {name}"
 
 
 def _no_reference(scenario: "Scenario") -> Iterator[Contradiction]:

@@ -9,9 +9,12 @@ many in virtual time.
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from shared.events import Event, Omitted
+
+if TYPE_CHECKING:
+    from shared.config import Scenario
 
 Address = tuple[str, int]
 """Host and port of a UDP socket. The host is a name, an IPv4 address or an IPv6 address without
@@ -84,6 +87,9 @@ class _Events(deque[Event]):
 class Endpoint(ABC):
     """Something that talks UDP. `now_ns` is always the driver's monotonic clock [ns]."""
 
+    changeable: frozenset[str] = frozenset()
+    """Keys of its scenario that may change in flight, see `shared.change`."""
+
     def __init__(self) -> None:
         self._out: list[Datagram] = []
         self._events = _Events()
@@ -102,6 +108,20 @@ class Endpoint(ABC):
 
     def close(self, *, now_ns: int) -> None:  # noqa: B027 - most have nothing to say
         """Say what peers must know before the driver ends; nothing else is called after it."""
+
+    def change(self, scenario: "Scenario", keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+        """Fly another scenario from now on; called between two steps. Never fails.
+
+        Args:
+            scenario: the scenario with all that was changed so far, checked.
+            keys: keys that were given a value just now, all of them `changeable`.
+            now_ns: time now.
+        """
+        assert not keys  # there are none that may change
+
+    def tell(self, event: Event) -> None:
+        """Say something that was done to it from outside."""
+        self._events.append(event)
 
     def figures(self) -> dict[str, Any]:
         """Numbers counted so far, by name; a nested dictionary is a group of them."""

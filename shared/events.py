@@ -130,6 +130,29 @@ class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return "degraded: it misses ticks" if self.degraded else "it is in time again"
 
 
+class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A key of the scenario has another value from now on."""
+
+    key: str
+    before: str
+    """Value that it had, as a scenario's file has it."""
+    after: str
+    """Value that it has."""
+
+    def __str__(self) -> str:
+        return f"{self.key} is {self.after} from now on, it was {self.before}"
+
+
+class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """Somebody has asked for a change in flight that cannot be, and nothing is changed."""
+
+    reason: str
+    """Why it cannot be; names the key, what was given and what was expected."""
+
+    def __str__(self) -> str:
+        return f"a change is refused: {self.reason}"
+
+
 class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Base of the events of one vehicle."""
 
@@ -330,6 +353,8 @@ Event = (
     | FlowOpened
     | Unauthenticated
     | Degraded
+    | Changed
+    | ChangeRefused
     | SessionOpened
     | SessionEnded
     | SessionRefused

@@ -66,8 +66,8 @@ class Signature:
     """Name and parameters of a policy."""
 
     parameters: tuple[Parameter, ...] = ()
-    committed: bool = False
-    """Whether it compares committed inputs with new ones, and so needs a scheme that commits."""
+    schemes: tuple[str, ...] = ()
+    """Schemes in which there is what it compares; empty for all."""
 
     def takes(self, values: Sequence[Any]) -> bool:
         """Whether these arguments are allowed; none at all where a key has the value of each."""
@@ -90,10 +90,15 @@ SIGNATURES = {
     "always": Signature(),
     "periodic": Signature((Parameter("N", 1, PERIOD_MAX, whole=True, key="period"),)),
     "state_gap": Signature(
-        (Parameter("epsilon", 0, key="epsilon"), Parameter("decay_rate", 0, key="decay_rate"))
+        (Parameter("epsilon", 0, key="epsilon"), Parameter("decay_rate", 0, key="decay_rate")),
+        schemes=("committed", "predictive", "none"),
     ),
-    "cost_gap": Signature((Parameter("c", 0, key="cost_gap"),), committed=True),
-    "deviation": Signature((Parameter("metres", 0, key="deviation_m"),), committed=True),
+    "cost_gap": Signature((Parameter("c", 0, key="cost_gap"),), schemes=("committed",)),
+    "deviation": Signature((Parameter("metres", 0, key="deviation_m"),), schemes=("committed",)),
+    "tolerance": Signature(
+        (Parameter("metres", 0, key="tolerance_m"),), schemes=("dead_reckoning",)
+    ),
+    "delta": Signature((Parameter("metres", 0, key="tolerance_m"),), schemes=("dead_reckoning",)),
     "silence": Signature((Parameter("seconds", 0.001, 3600),)),
     "budget": Signature(
         (Parameter("packets_per_s", 0.001, 1_000_000), Parameter("burst", 1, 1_000_000))

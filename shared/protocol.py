@@ -152,7 +152,8 @@ class Horizon(NamedTuple):
     observed_ns: int
     """Stamp of the observation it was computed from, echoed [client clock]."""
     inputs: NDArray[np.float32]
-    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`."""
+    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`; or
+    (axes, 1) with dead reckoning, the velocity at which the vehicle goes on."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """The position [m] and velocity [m/s] at `step` that they lead on from, the disturbance that
     was reckoned with [m/s], and the gains on what the position [1/s] and the velocity are away from
@@ -264,8 +265,8 @@ def _input(value: object, ours: Terms) -> NDArray[np.float64]:
 
 
 def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
-    most = ours.horizon + committed_max(ours)
-    inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, most))
+    most = ours.planned + (0 if ours.reckons else committed_max(ours))
+    inputs = _array(value, _FLOAT32, ours.axes, (ours.planned, most))
     largest = np.abs(inputs).max(axis=1).tolist()  # NaN where there is one
     if not all(map(math.isfinite, largest)):
         raise ProtocolError("not finite")

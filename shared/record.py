@@ -71,6 +71,8 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("vehicle", "<u2"),
             ("step", "<i8"),
             ("state", "<f8", (axes, 2)),  # true position [m] and velocity [m/s]
+            ("measured", "<f8", (axes, 2)),  # had of it since the step before, NaN for nothing
+            ("estimate", "<f8", (axes, 2)),  # what is reported and flown by
             ("input", "<f8", (axes,)),  # desired velocity that is flown from here on [m/s]
             ("covered", "?"),  # whether that is an input of a horizon, neither hovering nor braking
             ("in_force", "<i8"),  # step that its horizon was made for, -1 for none
@@ -89,6 +91,7 @@ def server_columns(axes: int) -> np.dtype[np.void]:
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),
+            ("reference", "<f8", (axes, 2)),  # x_d(k), as the server knew it then
             ("estimate", "<f8", (axes, 2)),  # x̂(k)
             ("ahead", "<i8"),  # d: planning starts at k + d
             ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)

@@ -13,6 +13,7 @@ A stall of the host, in which real time passes, is no jump: it is passed on as i
 from collections.abc import Sequence
 from typing import Any
 
+from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Datagram, Endpoint
 from shared.events import Event
 
@@ -34,6 +35,7 @@ class Steady(Endpoint):
     def __init__(self, inner: Endpoint) -> None:
         super().__init__()
         self._inner = inner
+        self.changeable = inner.changeable
         self._seen_ns: int | None = None
         """Time that the clock showed last."""
         self._jumps_ns = 0
@@ -69,6 +71,14 @@ class Steady(Endpoint):
     def close(self, *, now_ns: int) -> None:
         """See `Endpoint`."""
         self._inner.close(now_ns=self._steady(now_ns))
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        self._inner.change(scenario, keys, now_ns=self._steady(now_ns))
+
+    def tell(self, event: Event) -> None:
+        """See `Endpoint`."""
+        self._inner.tell(event)
 
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""

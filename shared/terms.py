@@ -69,12 +69,27 @@ class Terms(NamedTuple):
     @property
     def indexed(self) -> bool:
         """Whether the vehicle reads a horizon by the step it is at, and not always its first."""
-        return self.scheme != "none"
+        return self.scheme not in ("dead_reckoning", "none")
 
     @property
     def commits(self) -> bool:
         """Whether horizons begin with committed inputs."""
         return self.scheme == "committed"
+
+    @property
+    def reckons(self) -> bool:
+        """Whether horizons bring no plan, but the state that the vehicle goes on from."""
+        return self.scheme == "dead_reckoning"
+
+    @property
+    def planned(self) -> int:
+        """Number of a horizon's inputs behind the committed ones: H, or 1 without a plan."""
+        return 1 if self.reckons else self.horizon
+
+    @property
+    def reach(self) -> int:
+        """Steps behind the committed ones for which a horizon is good: H, or the age bound."""
+        return self.age_max if self.reckons else self.horizon
 
     @property
     def age_max(self) -> int:
@@ -123,13 +138,14 @@ KEYS: Mapping[str, str] = MappingProxyType(
 _OWNERS = {
     "a word for people": "title",
     "the vehicle's: how long it flies": "duration",
+    "the vehicle's: whether it flies plans": "armed",
     "the vehicle's: what its summary leaves out": "settle",
     "of chance, at each end its own": "seed",
     "the server's: where it plans from": "control.delay_bound",
     "the server's: how it estimates": "control.observer_s",
     "the server's: when it sends": """
         control.trigger control.period control.epsilon control.decay_rate control.cost_gap
-        control.deviation_m
+        control.deviation_m control.tolerance_m
     """,
     "the server's: what only it knows": """
         reference.preview reference.agility
@@ -148,6 +164,7 @@ _OWNERS = {
     "the vehicle's: what it measures": """
         sensor.filter sensor.position_noise_m sensor.velocity_noise_mps sensor.position_bias_m
         sensor.velocity_bias_mps sensor.position_every_s sensor.velocity_every_s sensor.delay_s
+        sensor.process_noise
     """,
     "the vehicle's: the air it flies in": """
         vehicle.wind vehicle.steady_wind_mps vehicle.gust_mps2 vehicle.gust_every_s

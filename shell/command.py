@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from errno import EMFILE
 from inspect import cleandoc
@@ -29,11 +29,13 @@ from rich.table import Table
 from rich.text import Text
 
 from shared import config
+from shared.change import Running
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint, Form
 from shared.events import Counted, Listening, Plaintext, address_text
 from shared.stopwatch import Stopwatch
 from shared.summary import Summary
+from shell.control import ControlError, controlled
 from shell.driver import Shell, run
 from shell.log import Log, LogFormat
 from shell.recording import Recording
@@ -218,6 +220,7 @@ def _until_the_end(recording: Recording) -> Iterator[Recording]:
 def drive(
     process: str,
     endpoint: Endpoint,
+    scenario: Scenario,
     *,
     bind: Address | socket | None,
     peers: Sequence[Address] = (),
@@ -229,12 +232,14 @@ def drive(
     json: Path | None = None,
     stopwatch: Stopwatch | None = None,
     recording: Recording | None = None,
+    control: Path | None = None,
 ) -> None:
     """Run one endpoint as a process until it has finished or is told to stop.
 
     Args:
         process: name of the process in its log.
         endpoint: what to run.
+        scenario: what it flies.
         bind, peers, forms, stopwatch: see `Shell`.
         waiting_for: whose datagrams it waits for, for the operator.
         secure: whether it has keys; None of one that only passes on what others say.
@@ -242,55 +247,60 @@ def drive(
         log: form of its log on stdout.
         json: file for its last figures.
         recording: where it records; waited for at the end.
+        control: where the socket for changes in flight is made.
 
     Raises:
         CommandError: it cannot start, must not without keys, or the file cannot be written.
     """
-    try:
-        shell = Shell(endpoint, bind, peers, stopwatch, forms)
-    except AddressError as error:
-        raise CommandError(str(error)) from None
-    if secure is False and not (shell.is_local or insecure):
-        at = ", ".join(address_text(*peer) for peer in peers) or address_text(*shell.address)
-        expected = "expected --keys FILE (see skytether keygen), or --insecure"
-        said = f"{at} is not on this machine alone, and there are no keys: {expected}"
-        raise CommandError(said, CONFIGURATION)
-    began_s = time.process_time()
+    with ExitStack() as stack:
+        try:
+            heeds = stack.enter_context(controlled(control, Running(endpoint, scenario)))
+            shell = Shell(endpoint, bind, peers, stopwatch, forms, heeds)
+        except ControlError as error:
+            raise CommandError(f"--control: {error}", CONFIGURATION) from None
+        except AddressError as error:
+            raise CommandError(str(error)) from None
+        if secure is False and not (shell.is_local or insecure):
+            at = ", ".join(address_text(*peer) for peer in peers) or address_text(*shell.address)
+            expected = "expected --keys FILE (see skytether keygen), or --insecure"
+            said = f"{at} is not on this machine alone, and there are no keys: {expected}"
+            raise CommandError(said, CONFIGURATION)
+        began_s = time.process_time()
 
-    def start() -> None:
-        host, port = shell.address
-        out.say(Listening(host=host, port=port, waiting_for=waiting_for))
-        if secure is False:
-            out.say(Plaintext(local=shell.is_local))
+        def start() -> None:
+            host, port = shell.address
+            out.say(Listening(host=host, port=port, waiting_for=waiting_for))
+            if secure is False:
+                out.say(Plaintext(local=shell.is_local))
 
-    def figures() -> dict[str, Any]:
-        return endpoint.figures() | {
-            "cpu_s": time.process_time() - began_s,
-            "kernel_drops": shell.kernel_drops(),
-            "send_errors": shell.send_errors,
-        }
+        def figures() -> dict[str, Any]:
+            return endpoint.figures() | {
+                "cpu_s": time.process_time() - began_s,
+                "kernel_drops": shell.kernel_drops(),
+                "send_errors": shell.send_errors,
+            }
 
-    def each_second(*, last: bool = False) -> None:
-        if recording and (news := recording.news()):
-            out.say(news)
-        out.each_second(last=last)
+        def each_second(*, last: bool = False) -> None:
+            if recording and (news := recording.news()):
+                out.say(news)
+            out.each_second(last=last)
 
-    with _told_once() as told, closing(Log(process, log)) as out:
-        run(
-            [shell],
-            on_start=start,
-            on_event=out.hear,
-            on_usr1=lambda: out.say(Counted(figures=figures())),
-            on_second=each_second,
-        )
-        told()
-        if recording:
-            recording.end()
-        each_second(last=True)
-        last = figures()
-        out.say(Counted(figures=last))
-        if json:
-            write(json, msgspec.json.encode(last))
+        with _told_once() as told, closing(Log(process, log)) as out:
+            run(
+                [shell],
+                on_start=start,
+                on_event=out.hear,
+                on_usr1=lambda: out.say(Counted(figures=figures())),
+                on_second=each_second,
+            )
+            told()
+            if recording:
+                recording.end()
+            each_second(last=True)
+            last = figures()
+            out.say(Counted(figures=last))
+            if json:
+                write(json, msgspec.json.encode(last))
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from typing import Any
 from shared.endpoint import Address, Datagram, Endpoint, Form
 from shared.events import Event, Fault
 from shared.stopwatch import Stopwatch
+from shell.control import Control
 from shell.timer import make_timer
 from shell.udp import (
     Names,
@@ -59,6 +60,7 @@ class Shell:
             is written here, in place of whatever the kernel calls it.
         stopwatch: measures receiving and sending.
         forms: forms of the datagrams that may come to socket 0; without any, all may.
+        control: heeds changes in flight.
 
     Raises:
         AddressError: the address cannot be bound, or a name cannot be found.
@@ -71,9 +73,11 @@ class Shell:
         peers: Sequence[Address] = (),
         stopwatch: Stopwatch | None = None,
         forms: Sequence[Form] = (),
+        control: Control | None = None,
     ) -> None:
         self.endpoint = endpoint
         self._stopwatch = stopwatch or Stopwatch()
+        self._control = control
         self.send_errors = 0
         """Number of datagrams that could not be sent."""
         self._drops = 0
@@ -103,12 +107,16 @@ class Shell:
         self._timer = make_timer(self._loop, self._wake)
         for number in self._sockets:
             self._listen(number)
+        if self._control:
+            self._control.begin(self._loop, self._after)
         resolver = self._loop.create_task(self._keep_resolving())
         try:
             self._after()
             await self._done
         finally:
             resolver.cancel()
+            if self._control:
+                self._control.end()
             self._timer.close()
             self.endpoint.close(now_ns=time.monotonic_ns())
             for datagram in self.endpoint.outbox():

@@ -14,13 +14,16 @@ import hashlib
 import io
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
 
 from client import secure as client_secure
 from client.link import Link
+from client.navigation import navigation
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from netem.proxy import Proxy
@@ -28,8 +31,9 @@ from server import secure as server_secure
 from server.endpoint import Server
 from shared import keys
 from shared.chance import stream
-from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Address, seconds_to_ns
+from shared.change import Running
+from shared.config import ConfigError, Scenario
+from shared.endpoint import SECOND_NS, Address, Endpoint, seconds_to_ns
 from shared.events import Event, Failure, RecordIncomplete, VehicleEvent
 from shared.keys import Keyring
 from shared.record import (
@@ -93,6 +97,7 @@ def fly(
     *,
     vehicles: int = 1,
     secure: bool = False,
+    changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
     stopwatch: Stopwatch | None = None,
     on_second: Callable[[int], None] = lambda _: None,
     stopped: Callable[[], bool] = lambda: False,
@@ -107,12 +112,16 @@ def fly(
         vehicles: number of vehicles, numbered from 1, all with the same plan and winds of their
             own.
         secure: whether the link is sealed, with keys from the seed.
+        changes: when keys get other values in flight [s; as `Flight.events` have it], and which, as
+            in `shared.change`; what is refused is an event, and the flight goes on.
         stopwatch: measures the server; what it measures differs from flight to flight.
         on_second: called with the time flown [s], once a second of it.
         stopped: asked often; once it says so, the flight is broken off.
     """
     keyring = make_keys(scenario.seed, vehicles) if secure else None
-    (flight,) = _fly(scenario, (scenario.seed,), on_second, stopped, vehicles, stopwatch, keyring)
+    (flight,) = _fly(
+        scenario, (scenario.seed,), on_second, stopped, vehicles, stopwatch, keyring, changes
+    )
     return flight
 
 
@@ -172,8 +181,8 @@ class Run:
             recorder=Recorder(PACKET_COLUMNS, self._sinks[1]),
         )
         netem_at = world.add(f"netem {scenario.seed}", self.netem)
-        self.hosts = [netem_at[0]]
-        """Names of its hosts."""
+        self.hosts: dict[str, Endpoint] = {netem_at[0]: self.netem}
+        """Endpoints by the names of its hosts."""
         self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
         simulation = scenario.simulation
         clock = Clock(
@@ -189,6 +198,7 @@ class Run:
                 vehicle=self._before + vehicle,
                 boot_id=BOOT_ID,
                 link=_link(keyring, scenario.seed, self._before + vehicle),
+                navigation=navigation(scenario, stream(scenario.seed, "sensor", vehicle)),
                 recorder=recorder,
             )
             for vehicle in range(1, vehicles + 1)
@@ -201,7 +211,7 @@ class Run:
                 start_ns=start_ns,
                 on_finished=self._one_has_finished,
             )
-            self.hosts.append(host)
+            self.hosts[host] = client
         self.flying = vehicles
         """Number of vehicles that have not finished."""
         self._ends: tuple[int | None, int | None] = None, None
@@ -264,6 +274,7 @@ def _fly(
     vehicles: int = 1,
     stopwatch: Stopwatch | None = None,
     keyring: Keyring | None = None,
+    changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
 ) -> list[Flight]:
     def on_event(time_ns: int, host: str, event: Event) -> None:
         if host == SERVER[0]:
@@ -277,6 +288,8 @@ def _fly(
 
     world, sink = World(on_event), io.BytesIO()
     entropy = stream(scenario.seed, "entropy").bytes
+    each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]
+    targets = [run.make_reference() for run in each if run.reference.shape == "target"]
     server = Server(
         scenario,
         boot_id=BOOT_ID,
@@ -285,15 +298,14 @@ def _fly(
         room=len(seeds) * vehicles,
         recorder=Recorder(server_columns(scenario.model.axes), sink),
         stopwatch=stopwatch,
+        references=(lambda vehicle: targets[(vehicle - 1) // vehicles]) if targets else None,
     )
-    runs = [
-        Run(world, msgspec.structs.replace(scenario, seed=seed), server, number, vehicles, keyring)
-        for number, seed in enumerate(seeds)
-    ]
+    runs = [Run(world, run, server, number, vehicles, keyring) for number, run in enumerate(each)]
     run_of = {host: run for run in runs for host in run.hosts}
     # Added last, it is woken last: it has heard all there is to hear at that instant.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
+    _plan(world, scenario, {SERVER[0]: server, **runs[0].hosts}, changes)
     flown_s, flying = 0, runs.copy()
 
     def over() -> bool:
@@ -309,3 +321,24 @@ def _fly(
     world.run(over, limit_ns=seconds_to_ns(longest_s))
     server_rows = parse(sink.getvalue())
     return [run.flight(server_rows) for run in runs]
+
+
+def _plan(
+    world: World,
+    scenario: Scenario,
+    endpoints: Mapping[str, Endpoint],
+    changes: Sequence[tuple[float, Mapping[str, Any]]],
+) -> None:
+    """Have keys changed in flight, each at the hosts where it can be, or refused by the first."""
+    running = {host: Running(endpoint, scenario) for host, endpoint in endpoints.items()}
+    changeable = frozenset[str]().union(*(each.changeable for each in running.values()))
+
+    def change(values: Mapping[str, Any]) -> None:
+        for i, (host, each) in enumerate(running.items()):
+            here = each.changeable if i else each.changeable | (values.keys() - changeable)
+            if own := {key: value for key, value in values.items() if key in here}:
+                with suppress(ConfigError):  # it is told as an event
+                    world.act(host, partial(each.change, own))
+
+    for time_s, values in changes:
+        world.at(seconds_to_ns(time_s), partial(change, values))

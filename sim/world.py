@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
+from typing import Protocol
 
 from shared.endpoint import Address, Datagram, Endpoint
 from shared.events import Event
@@ -109,6 +110,13 @@ class Host:
 ACTION, ARRIVAL = -1, 0
 """Turns of an action and of a datagram: what happens to hosts comes first, and what has arrived is
 heard before anybody acts on the time."""
+
+
+class Act(Protocol):
+    """Something that is done to an endpoint, by its own clock."""
+
+    def __call__(self, *, now_ns: int) -> object:
+        """Do it."""
 
 
 class World:
@@ -239,6 +247,17 @@ class World:
     def rearm(self, name: str) -> None:
         """Ask a host when it wants to be woken, after an action has given it something to do."""
         self._arm(self._hosts[name])
+
+    def act(self, name: str, act: Act) -> None:
+        """Do something to a host's endpoint now, and let it say what it has to say of that.
+
+        Args:
+            name: name of the host.
+            act: called with the time that the host's clock shows.
+        """
+        host = self._hosts[name]
+        act(now_ns=host.clock.local(self.now_ns))
+        self._after(host, self.now_ns)
 
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""

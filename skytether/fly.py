@@ -13,7 +13,15 @@ import numpy as np
 from lab import figures
 from shared import config, record
 from shared.config import ConfigError, Scenario
-from shared.events import Event, ModeChanged, NotFlown, PlanningStopped, RecordIncomplete
+from shared.events import (
+    Changed,
+    ChangeRefused,
+    Event,
+    ModeChanged,
+    NotFlown,
+    PlanningStopped,
+    RecordIncomplete,
+)
 from shared.protocol import Mode
 from shared.summary import Summary, summarise
 from shell import command
@@ -21,7 +29,7 @@ from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
 from skytether import processes
 
-TOLD = ModeChanged, PlanningStopped, RecordIncomplete
+TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused
 """Events that are shown while it flies."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 """Names of the modes before the first plan is flown, which are not worth a word."""
@@ -37,6 +45,9 @@ class Options:
     """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
+    control: Path | None = None
+    """Folder for sockets called server, netem and client, through which keys change in flight, see
+    `skytether set`; it is made where there is none. Not in virtual time."""
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
@@ -56,6 +67,8 @@ def fly(argv: Sequence[str]) -> None:
     scenario = options.config
     if options.figure:
         figures.check(options.figure)
+    if options.control:
+        _make_folder(options.control, virtual=options.virtual)
     beside = _beside(options)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{options.scenario}, {where}, seed {scenario.seed}"
@@ -86,6 +99,22 @@ def fly(argv: Sequence[str]) -> None:
         raise CommandError(missing)
     if flown.failure:
         raise CommandError(str(flown.failure))
+
+
+def _make_folder(folder: Path, *, virtual: bool) -> None:
+    """Make the folder of the sockets, for its owner alone.
+
+    Raises:
+        CommandError: it cannot be, or nobody could reach the sockets in time.
+    """
+    if virtual:
+        said = "--control: got a folder, expected none with --virtual, which nobody can follow"
+        raise CommandError(said, command.CONFIGURATION)
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        said = f"--control: {folder}: no folder can be made: {error.strerror}"
+        raise CommandError(said, command.CONFIGURATION) from None
 
 
 def _beside(options: Options) -> Scenario | None:
@@ -124,6 +153,7 @@ def _really(
             interrupted=interrupted,
             on_event=_tell,
             secure=options.secure,
+            control=options.control,
         )
         axes = scenario.model.axes
         return flight.Flight(

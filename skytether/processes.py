@@ -178,6 +178,7 @@ def run(
     workers: int = 1,
     watched: bool = True,
     secure: bool = False,
+    control: Path | None = None,
 ) -> list[Shortfall]:
     """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
 
@@ -194,6 +195,7 @@ def run(
         workers: number of processes of the server.
         watched: whether server and netem record, too.
         secure: whether the link is sealed, with keys that are made for this flight.
+        control: folder for a socket of each process, through which keys change in flight.
 
     Raises:
         CommandError: one of the processes failed, the folder cannot be written to, or it was
@@ -212,7 +214,8 @@ def run(
 
     def common(name: str, *, recorded: bool) -> list[str]:
         part = ["--record", str(parts / name)] if recorded else []
-        return [name, str(file), "--json", str(parts / f"{name}.json"), *part]
+        heeds = ["--control", str(control / name)] if control else []
+        return [name, str(file), "--json", str(parts / f"{name}.json"), *part, *heeds]
 
     fleet = ["--vehicles", str(vehicles)]
     server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]

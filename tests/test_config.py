@@ -22,7 +22,7 @@ WRONG = {
     ),
     "a key like no other": (
         "model.colour = 1",
-        "model.colour: no such key; there are axes, tau_s, u_max",
+        "model.colour: no such key; there are axes, tau_s, u_max, dead_time_s",
     ),
     "a text for a number": ('control.dt = "fast"', "control.dt: got 'fast', expected a number"),
     "a fraction for a whole number": (
@@ -132,22 +132,22 @@ WRONG = {
     # Not one of the choices.
     "a scheme that is none": (
         'control.scheme = "papr"',
-        "control.scheme: got 'papr', expected 'committed' or 'feedback' or 'predictive' or 'none'",
+        (
+            "control.scheme: got 'papr', expected 'committed' or 'predictive' or 'dead_reckoning' "
+            "or 'none'"
+        ),
     ),
     "a trigger nobody knows": (
         'control.trigger = "often"',
         (
             "control.trigger: got 'often', expected a policy; there are always, periodic, "
-            "state_gap, cost_gap, deviation, silence, budget"
+            "state_gap, cost_gap, deviation, tolerance, delta, silence, budget"
         ),
     ),
     "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),
     "a trigger for another scheme": (
         'control.scheme = "predictive"\ncontrol.trigger = "cost_gap"',
-        (
-            "control.scheme: got 'predictive', "
-            "expected 'committed' or 'feedback' with the trigger cost_gap"
-        ),
+        ("control.scheme: got 'predictive', expected 'committed' with the trigger cost_gap"),
     ),
     "a negative cost": (
         "control.cost_gap = -1.0",
@@ -174,7 +174,7 @@ WRONG = {
         'reference.shape = "ring"',
         (
             "reference.shape: got 'ring', expected 'circle' or 'figure-eight' or 'square' "
-            "or 'waypoints' or 'hover' or 'csv'"
+            "or 'waypoints' or 'hover' or 'csv' or 'target' or 'live'"
         ),
     ),
     "a fourth dimension": ("model.axes = 4", "model.axes: got 4, expected 2 or 3"),
@@ -678,8 +678,8 @@ def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
     """With one number an axis, and the step in nanoseconds."""
     terms = Scenario().terms()
     assert terms[:5] == (50_000_000, 40, 2, (0.84, 0.84), (1.6, 1.6))
-    assert terms[5:9] == ("committed", "brake", 2.0, 0.1)
-    assert terms[9:] == (5.0, "circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
+    assert terms[5:10] == ("committed", False, "brake", 2.0, 0.1)
+    assert terms[10:] == (5.0, "circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
 
 
 @pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])

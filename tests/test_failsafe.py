@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -62,7 +63,7 @@ class Hand:
     """A vehicle, and a hand that plays its server: a heartbeat each 0.1 s, horizons on request."""
 
     def __init__(self, *, secure: bool = False, armed: bool = True, **sections: Any) -> None:
-        self.scenario = scenario(**sections)
+        self.scenario = msgspec.structs.replace(scenario(**sections), armed=armed)
         self.terms = self.scenario.terms()
         self.sink = io.BytesIO()
         self.plant = FirstOrderPlant(self.scenario, stream(1, "wind"))
@@ -72,7 +73,6 @@ class Hand:
             server=SERVER,
             vehicle=4,
             boot_id=99,
-            armed=armed,
             link=Sealed() if secure else Plain(),
             recorder=Recorder(client_columns(self.terms.axes), self.sink),
         )

@@ -3,7 +3,6 @@
 `OnPaper` is section 4.1 once more, for one vehicle, with a dense solver and no batch.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import msgspec
@@ -16,20 +15,16 @@ from scipy.optimize import lsq_linear
 import server.planner
 from benchmarks.problems import gradients, listening, solving
 from server.controller import BLOCK
+from server.desired import Desired
 from server.exact import ExactSolver, Workspace
 from server.mpc import FIRST, LATER, Problem, make_mpc, pose
 from server.planner import (
-    EMPTY,
     FIGURES,
     GENERATOR,
-    PAGE,
-    PAGES,
     TRACKER,
     Batch,
     Figures,
     Planner,
-    Reference,
-    _place,
 )
 from server.scheme import Foresight, foresight
 from server.solver import OsqpSolver
@@ -67,7 +62,9 @@ def problem(which: int) -> Problem:
 
 def make(capacity: int = 1, scenario: Scenario = SCENARIO) -> Planner:
     """A planner that has not planned yet."""
-    return Planner(scenario, scenario.terms(), capacity, capacity, Stopwatch())
+    terms = scenario.terms()
+    desired = Desired(scenario, terms, capacity, capacity)
+    return Planner(scenario.control, terms, desired, capacity, capacity, Stopwatch())
 
 
 class Plan(NamedTuple):
@@ -482,50 +479,9 @@ def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> 
     np.testing.assert_array_equal(plans[1].tracked[0], shift(plans[0].tracked[0], 1))
 
 
-def looked_up(reference: Reference, steps: Indices, ahead: Indices) -> Array:
-    """The desired states at k + d … k + d + H of each vehicle; shape (n, H + 1, axes, 2)."""
-    pages, held = reference.open(steps, ahead)
-    states = []
-    for start in (steps + ahead).tolist():
-        at, first = _place(held, start // PAGE), start % PAGE
-        states.append(pages[at, :, first : first + H + 1].transpose(1, 0, 2))
-    return np.array(states)
-
-
-def desired_at(start: int) -> Array:
-    """What `looked_up` should find; shape (H + 1, axes, 2)."""
-    return SCENARIO.make_reference()((start + np.arange(H + 1)) * SCENARIO.control.dt)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.lists(st.integers(0, 9 * PAGE), min_size=1, max_size=4), min_size=1, max_size=5))
-def test_the_reference_looked_up_is_the_reference(calls: list[list[int]]) -> None:
-    """To the last bit: forwards and backwards, near each other and far apart."""
-    reference = Reference(SCENARIO, TERMS)
-    for steps in calls:
-        found = looked_up(reference, np.array(steps), np.zeros(len(steps), dtype=np.int64))
-        np.testing.assert_array_equal(found, [desired_at(step) for step in steps])
-
-
 def hours_apart(rng: np.random.Generator) -> Indices:
     """Steps of a full block of vehicles, all over a day: of more pages than there are places."""
     return rng.integers(0, 86_400 / SCENARIO.control.dt, BLOCK)
-
-
-def test_the_reference_is_right_for_vehicles_that_are_hours_apart() -> None:
-    """Also where pages have to make room for others, and where they want the same place."""
-    assert BLOCK < PAGES  # one block finds room, and a place is left EMPTY
-    reference, rng, pages = Reference(SCENARIO, TERMS), np.random.default_rng(1), set()
-    for _ in range(8):
-        steps, ahead = hours_apart(rng), rng.integers(0, H + 1, BLOCK)
-        steps[0] = PAGES * PAGE + steps[1]  # the place of another
-        found = looked_up(reference, steps, ahead)
-        expected = [desired_at(start) for start in (steps + ahead).tolist()]
-        np.testing.assert_array_equal(found, expected)
-        pages |= set(((steps + ahead) // PAGE).tolist())
-        _, held = reference.open(steps[:0], ahead[:0])
-        assert EMPTY in held
-    assert len(pages) > 2 * PAGES
 
 
 def test_vehicles_hours_apart_are_planned_for_as_if_alone() -> None:
@@ -543,26 +499,3 @@ def test_vehicles_hours_apart_are_planned_for_as_if_alone() -> None:
                 alone = plan(single, np.array([0]), step[row : row + 1], one)
                 np.testing.assert_array_equal(made.inputs[:, row], alone.inputs[:, 0])
                 np.testing.assert_array_equal(made.states[row], alone.states[0])
-
-
-def test_the_reference_is_computed_once_for_a_page_of_steps(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Steps within the page take the reference that was computed before."""
-    asked, sample = [], SCENARIO.make_reference()
-
-    def make_reference(_: Scenario) -> Callable[[Array], Array]:
-        def reference(times: Array) -> Array:
-            asked.append(times)
-            return sample(times)
-
-        return reference
-
-    monkeypatch.setattr(Scenario, "make_reference", make_reference)
-    reference, now = Reference(SCENARIO, TERMS), np.array([0])
-    for step in range(PAGE):
-        looked_up(reference, np.array([step]), now)
-    assert len(asked) == 1
-    looked_up(reference, np.array([PAGE]), now)
-    looked_up(reference, np.array([0, PAGE]), np.array([0, 0]))
-    assert [times.shape for times in asked] == [(PAGE + H + 1,), (PAGE + H + 1,)]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from shared import config, policy
 from shared.config import ConfigError
-from shared.policy import SIGNATURES, TEXT_MAX, Combination, Policy, policies
+from shared.policy import SIGNATURES, TEXT_MAX, Combination, Policy, PolicyError, policies
 
 FORM = "policies such as 'state_gap & budget(5, 2) | silence(1)'"
 STATE_GAP, ALWAYS = Policy("state_gap", ()), Policy("always", ())
@@ -123,18 +123,27 @@ def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
     assert list(policies(policy.parse(longest))) == [STATE_GAP] * 16
 
 
-@pytest.mark.parametrize("name", [name for name in SIGNATURES if SIGNATURES[name].committed])
-def test_what_compares_committed_inputs_needs_their_scheme(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "needed", "given"),
+    [
+        ("cost_gap", "'committed'", "predictive"),
+        ("deviation", "'committed'", "dead_reckoning"),
+        ("tolerance", "'dead_reckoning'", "committed"),
+        ("delta", "'dead_reckoning'", "none"),
+        ("state_gap", "'committed' or 'predictive' or 'none'", "dead_reckoning"),
+    ],
+)
+def test_what_is_compared_needs_a_scheme_that_has_it(name: str, needed: str, given: str) -> None:
     """Deep in an expression, too."""
-    text = f"silence(1) | {name}(1) & budget(5, 2)"
-    control = {"trigger": text, "scheme": "predictive"}
+    text = f"silence(1) | {name} & budget(5, 2)"
+    control = {"trigger": text, "scheme": given, "feedback": True}
     with pytest.raises(config.ConfigError) as caught:
         config.check({"control": control}, "mine")
     assert str(caught.value) == (
-        "mine: control.scheme: got 'predictive', "
-        f"expected 'committed' or 'feedback' with the trigger {name}"
+        f"mine: control.scheme: got {given!r}, expected {needed} with the trigger {name}"
     )
-    config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
+    for scheme in needed.replace("'", "").split(" or "):
+        config.check({"control": control | {"scheme": scheme}}, "mine")
 
 
 words = st.sampled_from(
@@ -172,12 +181,16 @@ def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
     """Nothing else: no other error, no warning of Python's, and nothing happens."""
     said, found = "", []
     try:
-        config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
         found = list(policies(policy.parse(text)))
+        config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
+    except PolicyError:
+        said = refusal(text)
+        assert said.startswith("mine: control.trigger: got ")
     except ConfigError as error:
         said = str(error)
-    assert bool(found) != said.startswith("mine: control.trigger: got ")
-    assert len(said.splitlines()) == (not found)
+        assert said.endswith(("with the trigger tolerance", "with the trigger delta"))
+    assert bool(said) or found
+    assert len(said.splitlines()) == bool(said)
     assert all(SIGNATURES[one.name].takes(one.values) for one in found)
 
 

@@ -23,7 +23,7 @@ from shared.terms import FREE, KEYS
 HERE = config.check(
     {
         "model": {"axes": 2},
-        "control": {"horizon": 50, "trigger": "cost_gap | silence(1)"},
+        "control": {"horizon": 50, "trigger": "state_gap | silence(1)"},
         "reference": {"points_m": [[0.0, 0.0], [1.0, 0.0]]},
     },
     "here",
@@ -31,7 +31,7 @@ HERE = config.check(
 """What the server flies, with as little as possible that forbids a single change."""
 OTHER: dict[str, Any] = {
     "model.axes": 3,
-    "control.scheme": "none",
+    "control.scheme": "predictive",
     "control.feedback": True,
     "reference.preview": 1.0,
     "sensor.filter": "none",

@@ -1,0 +1,180 @@
+"""A Kalman filter aboard: where the vehicle is and how fast, from measurements with noise.
+
+Each axis has the state x = [p, v, w]: position [m], velocity [m/s], and what acts on the vehicle
+like an input of its own [m/s], as steady wind and a wrong gain do. The inputs u are known, for the
+vehicle flies them itself:
+
+    p, v follow eq. (4) with the input u + w              w(k+1) = w(k)
+    P(k+1) = F P(k) Fᵀ + Q                                F: eq. (4) of [p, v, w]
+
+Q is that of white acceleration of the strength q = `sensor.process_noise` over a step, and of a
+slow walk of w. Measurements are taken one number after the other, z = h x + noise of the variance
+r:
+
+    K = P hᵀ / (h P hᵀ + r)        x ← x + K (z - h x)        P ← P - K h P
+
+so that one that is missing is simply left out. A measurement that is had late tells of the step it
+was made at. There the filter stands; what is reported is its state, rolled on to the present with
+the inputs flown since.
+
+The covariance P does not depend on what is measured: axes that are alike share it.
+"""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from client.plant import white_acceleration
+from client.sensor import Measured
+from shared.config import Scenario
+from shared.model import Axis, advance
+
+DRIFT = 0.3
+"""How fast w walks: that share of q [1], so w moves by DRIFT q √t in the time t."""
+BEGIN_MPS = 1.0, 0.5
+"""Standard deviation of the velocity at the begin, where it was not measured, and of w [m/s]."""
+LEAST = 1e-6
+"""Smallest standard deviation that a measurement is taken to have [m], [m/s]."""
+
+
+class Spread(NamedTuple):
+    """Covariance P of an axis' [p, v, w]; it is symmetric, and half of it is enough."""
+
+    pp: float
+    pv: float
+    pw: float
+    vv: float
+    vw: float
+    ww: float
+
+
+Gain = tuple[float, float, float]
+"""What K says for p, v and w."""
+
+
+def widened(axis: Axis, P: Spread, noise: Spread) -> Spread:
+    """P a step later, F P Fᵀ + Q."""
+    pv = P.pv + axis.a01 * P.vv + axis.b0 * P.vw  # of the next p and this v
+    pw = P.pw + axis.a01 * P.vw + axis.b0 * P.ww
+    vw = axis.a11 * P.vw + axis.b1 * P.ww
+    return Spread(
+        P.pp + axis.a01 * P.pv + axis.b0 * P.pw + axis.a01 * pv + axis.b0 * pw + noise.pp,
+        axis.a11 * pv + axis.b1 * pw + noise.pv,
+        pw,
+        axis.a11 * (axis.a11 * P.vv + axis.b1 * P.vw) + axis.b1 * vw + noise.vv,
+        vw,
+        P.ww + noise.ww,
+    )
+
+
+def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
+    """Gain and P of a measured position."""
+    pp, pv, pw, vv, vw, ww = P
+    total = pp + variance
+    kp, kv, kw = pp / total, pv / total, pw / total
+    left = variance / total
+    return (kp, kv, kw), Spread(
+        left * pp, left * pv, left * pw, vv - kv * pv, vw - kv * pw, ww - kw * pw
+    )
+
+
+def by_velocity(P: Spread, variance: float) -> tuple[Gain, Spread]:
+    """Gain and P of a measured velocity."""
+    pp, pv, pw, vv, vw, ww = P
+    total = vv + variance
+    kp, kv, kw = pv / total, vv / total, vw / total
+    left = variance / total
+    return (kp, kv, kw), Spread(
+        pp - kp * pv, left * pv, pw - kp * vw, left * vv, left * vw, ww - kw * vw
+    )
+
+
+class Kalman:
+    """Filter of a scenario's vehicle.
+
+    Args:
+        scenario: its model, and what it is told of its sensor.
+        delay: how old a measurement is when it is had [steps].
+    """
+
+    def __init__(self, scenario: Scenario, delay: int) -> None:
+        terms, sensor = scenario.terms(), scenario.sensor
+        self._model = terms.model.axes()
+        alike = sorted(set(self._model))
+        self._kinds = [alike.index(axis) for axis in self._model]
+        """Which of the axes that differ each one is like."""
+        q, dt = sensor.process_noise, terms.dt_s
+        self._noise = []
+        for axis in alike:
+            tau_s = terms.tau_s[self._model.index(axis)]
+            (a, _), (b, c) = (q * white_acceleration(np.array([tau_s]), dt)[0]).tolist()
+            walk = (DRIFT * q) ** 2 * dt
+            self._noise.append(Spread(a * a, a * b, 0.0, b * b + c * c, 0.0, walk))
+        self._alike = alike
+        self._variances = (
+            max(sensor.position_noise_m, LEAST) ** 2,
+            max(sensor.velocity_noise_mps, LEAST) ** 2,
+        )
+        self._spreads: list[Spread] = []
+        """P of each kind of axis; empty before the first measurement."""
+        self._x: list[tuple[float, float, float]] = []
+        """State of each axis, `delay` steps ago."""
+        nothing = [0.0] * terms.axes
+        self._flown = deque([nothing] * delay, delay + 1)
+        """Inputs flown since [m/s]."""
+
+    def begin(self, measured: Measured) -> None:
+        """Take the first measurement, which has a position; the vehicle stands."""
+        assert measured.position is not None
+        v, w = BEGIN_MPS
+        if measured.velocity is not None:
+            v = self._variances[1] ** 0.5
+        velocity = measured.velocity or [0.0] * len(self._model)
+        P = Spread(self._variances[0], 0.0, 0.0, v * v, 0.0, w * w)
+        self._spreads = [P] * len(self._alike)
+        self._x = [(p, v, 0.0) for p, v in zip(measured.position, velocity, strict=True)]
+
+    def advance(self, command: list[float]) -> None:
+        """Go on by a step that was flown with this input [m/s], of each axis."""
+        self._flown.append(command)
+        inputs = self._flown.popleft()
+        self._x = [
+            (*advance(axis, p, v, u + w), w)
+            for axis, (p, v, w), u in zip(self._model, self._x, inputs, strict=True)
+        ]
+        self._spreads = [
+            widened(axis, P, noise)
+            for axis, P, noise in zip(self._alike, self._spreads, self._noise, strict=True)
+        ]
+
+    def take(self, measured: Measured) -> None:
+        """Take what was measured at the step the filter stands at."""
+        for which, (correct, values) in enumerate(
+            zip((by_position, by_velocity), measured, strict=True)
+        ):
+            if values is None:
+                continue
+            variance = self._variances[which]
+            corrected = [correct(P, variance) for P in self._spreads]
+            self._spreads = [P for _, P in corrected]
+            gains = [corrected[kind][0] for kind in self._kinds]
+            self._x = [
+                (p + kp * off, v + kv * off, w + kw * off)
+                for (p, v, w), (kp, kv, kw), off in (
+                    (x, gain, z - x[which])
+                    for x, gain, z in zip(self._x, gains, values, strict=True)
+                )
+            ]
+
+    def estimate(self) -> list[tuple[float, float]]:
+        """Position [m] and velocity [m/s] of each axis at the present step."""
+        present = [(p, v) for p, v, _ in self._x]
+        for inputs in self._flown:
+            present = [
+                advance(axis, p, v, u + w)
+                for axis, (p, v), (_, _, w), u in zip(
+                    self._model, present, self._x, inputs, strict=True
+                )
+            ]
+        return present

@@ -1,0 +1,187 @@
+"""What the server knows of the desired trajectory: the window that a vehicle is planned along.
+
+A vehicle at step k is planned for from k + d to k + d + H. How far ahead the server may look is
+`reference.preview`: with "all" it sees the whole window, and otherwise nothing behind the step
+k + preview. What lies beyond is predicted from the desired state there, which goes on at its
+velocity.
+
+A trajectory is looked up in pages rather than computed at each step. Where vehicles have
+trajectories of their own, each has pages of its own.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from shared.config import Scenario
+from shared.kernel import F4, I1, inline, kernel, plain
+from shared.model import Array, Indices
+from shared.protocol import committed_max
+from shared.reference import Reference
+from shared.terms import Terms
+
+PAGE = 128
+"""Steps of a desired trajectory in a page."""
+PAGES = 256
+"""Places for pages: more than a block of vehicles can need at once."""
+EMPTY = -1
+"""In place of the key of the page that a place holds."""
+FOUND = -1
+"""In place of the vehicle whose page is missing."""
+TRAJECTORY = 2**40
+"""Number of pages that a trajectory may have, by which those of the next are told from them."""
+SPREAD = 31
+"""Number of places from the first page of a trajectory to that of the next; odd, so that no two
+have the same."""
+TINY = 1e-9
+"""As much as floating point may make of 0.15 / 0.05."""
+
+
+class Window(NamedTuple):
+    """Desired states of a block of vehicles at their steps k + d … k + d + H."""
+
+    states: F4
+    """Desired states [m, m/s]; shape (places, axes, stages, 2)."""
+    place: I1
+    """Place of each vehicle's states; shape (block,)."""
+    first: I1
+    """Stage in that place that is the step k + d; shape (block,)."""
+
+
+class Desired:
+    """The desired trajectory of every vehicle, as far as the server knows it.
+
+    Args:
+        scenario: what to fly, and how far ahead the server may look.
+        terms: the same, as far as both ends agree on it.
+        capacity: number of vehicles there can be.
+        block: number of vehicles that are asked for at a time.
+        references: the trajectory of each vehicle, by its number; left out: the scenario's for all.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        terms: Terms,
+        capacity: int,
+        block: int,
+        references: Callable[[int], Reference] | None = None,
+    ) -> None:
+        axes, H, preview = terms.axes, terms.horizon, scenario.reference.preview
+        longest = committed_max(terms) + H
+        self._all = preview == "all"
+        self._reach = H
+        """Steps of a page behind its last; with a preview, the steps that the server sees."""
+        if not self._all:
+            seen_s = 0.0 if isinstance(preview, str) else preview
+            self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
+        self._references = references
+        self._shared = scenario.make_reference()
+        self._number = np.zeros(capacity, dtype=np.int64)
+        """Number of each vehicle's trajectory; shape (capacity,)."""
+        self._dt_s = terms.dt_s
+        self._steps = np.arange(PAGE + self._reach + 1)
+        self._pages = np.zeros((PAGES, axes, len(self._steps), 2))
+        self._held = np.full(PAGES, EMPTY, dtype=np.int64)
+        """Key of the page in each place, or EMPTY; shape (PAGES,)."""
+        self._found = Window(
+            self._pages, np.zeros(block, dtype=np.int64), np.zeros(block, dtype=np.int64)
+        )
+        """Where the states from a step on are in the pages."""
+        self._foreseen = Window(
+            np.zeros((block, axes, H + 1, 2)),
+            np.arange(block),
+            np.zeros(block, dtype=np.int64),
+        )
+        """What is predicted; not used where all is seen."""
+
+    def assign(self, row: int, vehicle: int) -> None:
+        """Let a vehicle begin in this row."""
+        self._number[row] = vehicle if self._references else 0
+
+    def now(self, rows: Indices, steps: Indices) -> Array:
+        """Desired states of vehicles at their steps k [m, m/s]; shape (n, axes, 2).
+
+        Args:
+            rows: the vehicles, no more than a block; shape (n,).
+            steps: k of each; shape (n,).
+        """
+        pages, place, first = self._find(rows, steps)
+        n = len(rows)
+        states: Array = pages[place[:n], :, first[:n]]
+        return states
+
+    def window(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
+        """Desired states of vehicles from k + d on, valid until the next are asked for.
+
+        Args:
+            rows: the vehicles, no more than a block; shape (n,).
+            steps: k of each; shape (n,).
+            ahead: d of each; the n vehicles come first.
+        """
+        if self._all:
+            return self._find(rows, steps + ahead[: len(rows)])
+        found = self._find(rows, steps)
+        _foresee(found, len(rows), ahead, self._reach, self._dt_s, self._foreseen.states)
+        return self._foreseen
+
+    def _find(self, rows: Indices, steps: Indices) -> Window:
+        """Look up desired states from some steps on, and compute the pages that are missing."""
+        held = self._held
+        while (i := _find(held, self._number, rows, steps, self._found)) != FOUND:
+            if np.count_nonzero(held == EMPTY) == 1:
+                held[:] = EMPTY
+            number, page = int(self._number[rows[i]]), int(steps[i]) // PAGE
+            sample = self._references(number) if self._references else self._shared
+            at = plain(_place)(held, number, page)
+            states = sample((page * PAGE + self._steps) * self._dt_s)
+            self._pages[at], held[at] = states.transpose(1, 0, 2), number * TRAJECTORY + page
+        return self._found
+
+
+@inline
+def _place(held: I1, number: int, page: int) -> int:
+    """Where a page is held, or where there is room for it; one place at least must be EMPTY."""
+    at, key = (page + SPREAD * number) % PAGES, number * TRAJECTORY + page
+    while held[at] != key and held[at] != EMPTY:
+        at = (at + 1) % PAGES
+    return at
+
+
+@kernel
+def _find(held: I1, numbers: I1, rows: I1, steps: I1, found: Window) -> int:
+    """Fill in where the states of vehicles are; the first whose page is missing, or FOUND."""
+    for i in range(len(rows)):
+        number, page = numbers[rows[i]], steps[i] // PAGE
+        at = _place(held, number, page)
+        if held[at] == EMPTY:
+            return i
+        found.place[i], found.first[i] = at, steps[i] - page * PAGE
+    return FOUND
+
+
+@kernel
+def _foresee(known: Window, n: int, ahead: I1, reach: int, dt_s: float, window: F4) -> None:
+    """Fill in the windows of vehicles: what is seen, and what is predicted behind that.
+
+    Args:
+        known: where the desired states from k on are; none after k + reach is looked at.
+        n: number of vehicles.
+        ahead: d of each; shape (block,).
+        reach: number of steps that are seen.
+        dt_s: length of a step [s].
+        window: what is filled in [m, m/s]; shape (block, axes, H + 1, 2).
+    """
+    for i in range(n):
+        states, first = known.states[known.place[i]], known.first[i]
+        for axis in range(window.shape[1]):
+            p, v = states[axis, first + reach, 0], states[axis, first + reach, 1]
+            for stage in range(window.shape[2]):
+                step = ahead[i] + stage
+                if step <= reach:
+                    window[i, axis, stage, 0] = states[axis, first + step, 0]
+                    window[i, axis, stage, 1] = states[axis, first + step, 1]
+                else:
+                    window[i, axis, stage, 0] = p + v * (step - reach) * dt_s
+                    window[i, axis, stage, 1] = v

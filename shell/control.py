@@ -1,0 +1,203 @@
+"""The socket through which keys are changed in flight: a Unix one, that its owner alone can use.
+
+A datagram is a request of `shared.change`, and its answer goes back to whoever has sent it. Between
+two requests the socket rests: whoever floods it waits, and the endpoint does not. What nobody
+hears is not said again.
+"""
+
+import asyncio
+import os
+import socket
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from errno import EADDRINUSE, ECONNREFUSED
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from shared.change import REQUEST_BYTES_MAX, Answer, Running
+
+REST_S = 0.01
+"""Time from a request to the next that is read [s]."""
+PATIENCE_S = 5.0
+"""Longest time to wait for an answer [s]."""
+ANSWER_BYTES_MAX = 65_536
+"""Largest size of an answer [B]."""
+
+
+class ControlError(OSError):
+    """Error: the socket cannot be made, or nobody answers at it; the message says why."""
+
+
+class Control:
+    """Heeds requests to an endpoint.
+
+    Args:
+        path: where the socket is made, with mode 0600; in place of one that nobody listens at.
+        running: what may be changed.
+
+    Raises:
+        ControlError: it cannot be made there.
+    """
+
+    def __init__(self, path: Path, running: Running) -> None:
+        self._path = path
+        self._running = running
+        self._socket = _listening(path)
+        made = path.lstat()
+        self._made = made.st_dev, made.st_ino
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._after: Callable[[], None] = lambda: None
+
+    def begin(self, loop: asyncio.AbstractEventLoop, after: Callable[[], None]) -> None:
+        """Heed requests from now on.
+
+        Args:
+            loop: where it is woken.
+            after: called after each request.
+        """
+        self._loop, self._after = loop, after
+        self._listen()
+
+    def _listen(self) -> None:
+        if self._loop is not None:
+            self._loop.add_reader(self._socket, self._read)
+
+    def _read(self) -> None:
+        assert self._loop is not None
+        self._loop.remove_reader(self._socket)
+        self._loop.call_later(REST_S, self._listen)
+        try:
+            request, sender = self._socket.recvfrom(REQUEST_BYTES_MAX + 1)
+        except OSError:
+            return
+        try:
+            answer = self._running.answer(request, now_ns=time.monotonic_ns())
+            if sender:
+                with suppress(OSError):  # it is gone, or does not read
+                    self._socket.sendto(answer, sender)
+        finally:
+            self._after()
+
+    def end(self) -> None:
+        """Heed no more requests."""
+        if self._loop is not None:
+            self._loop.remove_reader(self._socket)
+            self._loop = None
+
+    def close(self) -> None:
+        """Remove the socket, if it is still ours."""
+        self._socket.close()
+        with suppress(OSError):
+            found = self._path.lstat()
+            if (found.st_dev, found.st_ino) == self._made:
+                self._path.unlink()
+
+
+def _listening(path: Path) -> socket.socket:
+    """A socket bound to a path that only its owner can send to.
+
+    Raises:
+        ControlError: it cannot be.
+    """
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        sock.setblocking(False)
+        _clear(path)
+        before = os.umask(0o177)
+        try:
+            sock.bind(str(path))
+        finally:
+            os.umask(before)
+    except OSError as error:
+        sock.close()
+        taken = "somebody listens there" if error.errno == EADDRINUSE else error.strerror or error
+        raise ControlError(f"{path}: no socket can be made: {taken}") from None
+    return sock
+
+
+def _clear(path: Path) -> None:
+    """Remove a socket of ours that nobody listens at; where anything else is, nothing happens.
+
+    Raises:
+        OSError: it cannot be removed, or another reason not to listen there.
+    """
+    try:
+        found = path.lstat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
+        raise OSError("expected a path where nothing is, or a socket that was left behind")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as caller:
+        if caller.connect_ex(str(path)) == ECONNREFUSED:
+            path.unlink()
+
+
+class Caller:
+    """Asks for changes at a socket.
+
+    Args:
+        path: the socket of a server, netem or client.
+
+    Raises:
+        ControlError: nobody listens there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._folder = tempfile.TemporaryDirectory(prefix="skytether-")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            # Answers come to an address: this one is nobody else's.
+            self._socket.bind(str(Path(self._folder.name) / "answers"))
+            self._socket.settimeout(PATIENCE_S)
+            self._socket.connect(str(path))
+        except OSError as error:
+            self.close()
+            raise self._failed(error) from None
+
+    def ask(self, values: Mapping[str, Any]) -> Answer:
+        """Ask for other values, or without any for those that may change.
+
+        Raises:
+            ControlError: no answer has come.
+        """
+        try:
+            self._socket.send(msgspec.json.encode(values))
+            answer = self._socket.recv(ANSWER_BYTES_MAX)
+        except OSError as error:
+            raise self._failed(error) from None
+        return _DECODER.decode(answer)
+
+    def close(self) -> None:
+        """Ask no more."""
+        self._socket.close()
+        self._folder.cleanup()
+
+    def _failed(self, error: OSError) -> ControlError:
+        late = f"no answer in {PATIENCE_S:g} s" if isinstance(error, TimeoutError) else None
+        return ControlError(f"{self._path}: {late or error.strerror or error}")
+
+
+_DECODER = msgspec.json.Decoder(Answer)
+
+
+@contextmanager
+def controlled(path: Path | None, running: Running) -> Iterator[Control | None]:
+    """A socket at a path for as long as the block takes; none without a path.
+
+    Raises:
+        ControlError: it cannot be made.
+    """
+    if path is None:
+        yield None
+        return
+    control = Control(path, running)
+    try:
+        yield control
+    finally:
+        control.close()
