@@ -149,6 +149,10 @@ WRONG = {
         'control.scheme = "predictive"\ncontrol.trigger = "cost_gap"',
         ("control.scheme: got 'predictive', expected 'committed' with the trigger cost_gap"),
     ),
+    "feedback without compensation": (
+        'control.scheme = "none"\ncontrol.trigger = "always"\ncontrol.feedback = true',
+        "control.feedback: got true, expected false with control.scheme = 'none'",
+    ),
     "a negative cost": (
         "control.cost_gap = -1.0",
         "control.cost_gap: got -1.0, expected a number >= 0.0",
