@@ -124,7 +124,7 @@ def test_age_is_a_round_trip_and_the_wait_for_the_next_step() -> None:
 
 
 def test_the_summary_tells_ages_effort_and_bounds_of_what_was_flown() -> None:
-    """Of a record of six steps, from the second on, counted by hand."""
+    """A record of six steps, from the second on, counted by hand."""
     flown = scenario("paper", duration=1.0, settle=0.05)
     rows = np.zeros(6, client_columns(2))
     rows["step"] = range(6)
