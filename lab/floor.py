@@ -22,7 +22,7 @@ import numpy as np
 from client.clamp import clamped
 from client.navigation import navigation
 from client.plant import FirstOrderPlant, white_acceleration
-from server.mpc import stationary_gain
+from server.gain import stationary_gain
 from shared.chance import stream
 from shared.config import Scenario
 from shared.model import Array
@@ -101,7 +101,7 @@ def fly_aboard(scenario: Scenario) -> Rows:
     known = navigation(scenario, stream(scenario.seed, "sensor", 1))
     desired = scenario.make_reference()(np.arange(scenario.steps + 1) * terms.dt_s)
     forward = (desired[1:, :, 1] - model.a11 * desired[:-1, :, 1]) / model.b1
-    gain = stationary_gain(model, scenario.control)
+    gain = stationary_gain(model, scenario.control, scenario.model.dead_time_s)
     change_max = math.inf if terms.exhausted == "hold" else vehicle.slew_mps2 * terms.dt_s
     rows = np.zeros(scenario.steps, client_columns(terms.axes))
     rows["step"] = np.arange(scenario.steps)
@@ -114,7 +114,9 @@ def fly_aboard(scenario: Scenario) -> Rows:
             known.advance(state, u)
             measured, estimate = known.measured, known.estimate
         back = (gain * (desired[k] - estimate)).sum(axis=1)
-        flown = clamped((forward[k] + back).tolist(), u.tolist(), u_max, change_max)
+        told = forward[k].tolist()
+        wanted = (forward[k] + back).tolist()
+        flown = clamped(wanted, u.tolist(), u_max, change_max, told=told)
         assert flown is not None
         u = np.array(flown)
         row["state"], row["measured"], row["estimate"], row["input"] = state, measured, estimate, u

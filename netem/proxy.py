@@ -19,6 +19,7 @@ from shared.config import DirectionConfig, Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
 from shared.events import FlowOpened
 from shared.record import DOWNLINK, UPLINK, Recorder
+from shared.terms import keys_of
 
 FLOWS_MAX = 512
 """Most clients at once, unless another number is asked for; packets of others are dropped and
@@ -52,11 +53,7 @@ class Proxy(Endpoint):
         recorder: takes one row a packet.
     """
 
-    changeable = frozenset(
-        f"network.{way}.{key}"
-        for way in ("uplink", "downlink")
-        for key in DirectionConfig.__struct_fields__
-    )
+    changeable = keys_of("netem's") - {"network.mtu"}
 
     def __init__(
         self,

@@ -151,6 +151,8 @@ class ReferenceConfig(Section, frozen=True):
     """Altitude of circle, figure-eight and square in space [m]."""
     points_m: tuple[tuple[Position, ...], ...] = ()
     """Waypoints [m], at least two; the one point to hover at; where a live point begins."""
+    velocity_mps: tuple[Speed, ...] = ()
+    """Velocity of a live point, where it is known [m/s]; left out: estimated from its moves."""
     speed_mps: Factor = 1.0
     """Speed between waypoints, and the largest of a target along an axis [m/s]."""
     loop: bool = False
@@ -210,7 +212,7 @@ class SensorConfig(Section, frozen=True):
     """Time from one velocity to the next [s]; 0: one at every step; never: positions alone."""
     delay_s: Annotated[float, Meta(ge=0, le=2)] = 0.0
     """Time from measuring to having the measurement [s]."""
-    process_noise: Factor = 0.15
+    process_noise: Factor = 0.1
     """Strength of the white acceleration that the filter reckons with [m/s per √s]: of wind, and of
     all in which the vehicle is unlike its model."""
 

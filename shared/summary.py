@@ -95,7 +95,7 @@ def summarise(
         netem: rows of netem; all flows count.
         secure: whether the link was sealed.
     """
-    error = position_error(scenario, client)
+    error = position_error(scenario, client, server)
     counted = client["step"] * scenario.control.dt >= scenario.settle
     settled, flown = error[counted], client[counted]
     squares = (settled**2).mean(axis=0) if len(settled) else np.array([np.nan])
@@ -122,7 +122,7 @@ def summarise(
         rmse_y=rmse[1] if rmse else None,
         rmse_z=rmse[2] if len(rmse) == 3 else None,
         rmse_xy=math.hypot(*rmse[:2]) if rmse else None,
-        error_max=float(distances.max()) if len(distances) else None,
+        error_max=float(distances.max()) if rmse else None,
         covered=float(client["covered"].mean()) if len(client) else None,
         modes={
             str(mode): int((client["mode"] == mode).sum()) * scenario.control.dt
@@ -153,10 +153,30 @@ def summarise(
     )
 
 
-def position_error(scenario: Scenario, client: Rows) -> Array:
-    """Position minus reference at every step [m]; shape (steps, axes)."""
-    desired = scenario.make_reference()(client["step"] * scenario.control.dt)
-    error: Array = client["state"][..., 0] - desired[..., 0]
+def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
+    """Desired position at every step of one vehicle [m]; shape (steps, axes).
+
+    Where a live point was, only the server knows: at a step that it has no row of, the point is
+    where it was before. What nobody knows is NaN.
+
+    Args:
+        client: rows of the vehicle.
+        server: rows of the server, of any vehicles.
+    """
+    if scenario.reference.shape != "live":
+        return scenario.make_reference()(client["step"] * scenario.control.dt)[..., 0]
+    known = client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]
+    if not len(known):
+        return np.full((len(client), scenario.model.axes), np.nan)
+    known = known[np.argsort(known["step"], kind="stable")]
+    at = np.searchsorted(known["step"], client["step"], side="right") - 1
+    positions: Array = known["reference"][np.maximum(at, 0), :, 0]
+    return positions
+
+
+def position_error(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
+    """Position minus desired position at every step [m]; shape (steps, axes); see `desired`."""
+    error: Array = client["state"][..., 0] - desired(scenario, client, server)
     return error
 
 
