@@ -58,6 +58,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     solve_ms_p99: float | None
     deadline_misses: int
     """Number of steps that the server or the client slept through."""
+    estimate_error_m: float | None = None
+    """Root mean square of how far the position that the vehicle flew by was from the true one, from
+    `settle` on [m]; None where it knew that."""
     secure: bool = False
     """Whether the link was authenticated and encrypted."""
 
@@ -80,8 +83,9 @@ def summarise(
         netem: rows of netem; all flows count.
         secure: whether the link was sealed.
     """
-    error = position_error(scenario, client)
-    settled = error[client["step"] * scenario.control.dt >= scenario.settle]
+    begun = client["step"] * scenario.control.dt >= scenario.settle
+    settled = position_error(scenario, client)[begun]
+    off = (client["estimate"] - client["state"])[begun, :, 0]
     squares = (settled**2).mean(axis=0) if len(settled) else np.array([np.nan])
     rmse = [float(value) for value in np.sqrt(squares)] if np.isfinite(squares).all() else []
     distances = np.linalg.norm(settled, axis=1)
@@ -124,6 +128,7 @@ def summarise(
         solve_ms_p50=_quantile(solve_ms, 0.5),
         solve_ms_p99=_quantile(solve_ms, 0.99),
         deadline_misses=missed,
+        estimate_error_m=_rms(off) if off.any() and np.isfinite(off).all() else None,
         secure=secure,
     )
 
@@ -133,6 +138,11 @@ def position_error(scenario: Scenario, client: Rows) -> Array:
     desired = scenario.make_reference()(client["step"] * scenario.control.dt)
     error: Array = client["state"][..., 0] - desired[..., 0]
     return error
+
+
+def _rms(vectors: Array) -> float:
+    """Root mean square of the lengths of vectors; shape (n, axes)."""
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 def _last(rows: Rows, name: str) -> int:
