@@ -1,8 +1,7 @@
 """How exactly netem delays: 20 000 packets/s through a real netem process on 127.0.0.1.
 
 A sender numbers and stamps its packets; the kernel stamps them as they reach the receiver. What
-netem drew for each is known, for fates are a function of seed, direction, flow and number. So the
-added-delay error is
+netem drew for each stands in its record. So the added-delay error is
 
     (received - sent) - drawn
 
@@ -26,9 +25,9 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -37,9 +36,9 @@ import tyro
 from numpy.typing import NDArray
 
 from benchmarks.harness import CONSOLE, Table, machine, median, progress, quantile_ms, sleep_until
-from shared.config import DirectionConfig
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
 from shared.events import Counted, Listening
+from shared.record import DOWNLINK, read
 from shell.log import Line
 from shell.udp import kernel_drops, open_socket
 
@@ -186,7 +185,8 @@ def measure_once(options: Options, seed: int) -> Run:
     """One run: netem, sender, receiver and sleeper, each a process; none outlives it."""
     with ExitStack() as stack:
         receiver = start(stack, receive, options)
-        netem, port = start_netem(stack, answer(receiver), seed)
+        record = Path(stack.enter_context(TemporaryDirectory())) / "netem.rec"
+        netem, port = start_netem(stack, answer(receiver), seed, record)
         sender, sleeper = start(stack, send, options, port), start(stack, sleep, options)
         answer(sender), answer(sleeper)
 
@@ -199,6 +199,7 @@ def measure_once(options: Options, seed: int) -> Run:
 
         netem.send_signal(signal.SIGTERM)
         log, _ = netem.communicate(timeout=PATIENCE_S)
+        drawn_ns = drawn_delays_ns(record, sent)
 
     numbers, stamps = np.frombuffer(heads, "<i8").reshape(-1, 2).T
     counted = msgspec.json.decode(log.splitlines()[-1], type=Line).event
@@ -207,7 +208,7 @@ def measure_once(options: Options, seed: int) -> Run:
     taken = downlink["packets"]
     # A packet that netem never read has no number there, and shifts those of all that follow.
     known = sent if taken == sent else first_missing(numbers)
-    error_ns = (np.array(arrivals) - stamps - drawn_delays_ns(seed, sent)[numbers])[numbers < known]
+    error_ns = (np.array(arrivals) - stamps - drawn_ns[numbers])[numbers < known]
     return Run(
         sent=sent,
         received=len(numbers),
@@ -238,12 +239,14 @@ def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Conne
     return ours
 
 
-def start_netem(stack: ExitStack, server_port: int, seed: int) -> tuple[subprocess.Popen[str], int]:
+def start_netem(
+    stack: ExitStack, server_port: int, seed: int, record: Path
+) -> tuple[subprocess.Popen[str], int]:
     """Run netem with the paper's delays and without losses; the process and its port."""
     # -P: without it, a `netem` in the working directory would come first.
     command = [sys.executable, "-P", "-m", "netem", "paper", f"--seed={seed}"]
     command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--log=json"]
-    command += ["--network.downlink.loss=0"]
+    command += ["--network.downlink.loss=0", f"--record={record}"]
     netem = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     stack.callback(netem.wait)
     stack.callback(netem.kill)
@@ -265,12 +268,12 @@ def scheduled_ns(pid: int) -> NDArray[np.int64]:
     return np.array(Path(f"/proc/{pid}/schedstat").read_text().split()[:2], dtype=np.int64)
 
 
-def drawn_delays_ns(seed: int, count: int) -> NDArray[np.int64]:
-    """Delays that netem drew for the packets of its first client [ns]; shape (count,)."""
-    from netem.fate import fates
-
-    drawn = islice(fates(DirectionConfig(loss=0.0), seed, "downlink", 0), count)
-    return np.array([fate.delay_ns for fate in drawn])
+def drawn_delays_ns(record: Path, count: int) -> NDArray[np.int64]:
+    """Delays that netem drew for the packets to the server, by number [ns]; shape (count,)."""
+    rows, drawn_ns = read(record), np.zeros(count, np.int64)
+    rows = rows[rows["direction"] == DOWNLINK]
+    drawn_ns[rows["number"]] = rows["delay_ns"]
+    return drawn_ns
 
 
 def first_missing(numbers: NDArray[np.int64]) -> int:

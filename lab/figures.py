@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from lab.envelope import WRONG, Envelope, Outcome, Point
 from lab.sweep import Axis
 from shared.config import ConfigError, DirectionConfig, Scenario
-from shared.model import Array, Flags, Indices
+from shared.model import Array, Flags
 from shared.record import Rows
-from shared.summary import position_error
+from shared.summary import desired, position_error
 from sim.flight import Flight
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -46,7 +46,7 @@ def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
     for (title, (scenario, flight)), (plane, events) in zip(flown.items(), grid.T, strict=True):
         dt = scenario.control.dt
         position = flight.client["state"][..., 0]
-        draw_reference(plane, scenario, flight.client["step"])
+        draw_reference(plane, scenario, flight.client, flight.server)
         plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
         plane.plot(position[0, 0], position[0, 1], "ko", markersize=4, label="start")
         plane.set_title(title, fontsize=10)
@@ -64,24 +64,33 @@ def flights(path: Path, flown: Mapping[str, tuple[Scenario, Flight]]) -> None:
     figure.savefig(path, dpi=130)
 
 
-def draw_reference(plane: Any, scenario: Scenario, step: Indices) -> None:
-    """Draw the reference, red and dashed, over some steps.
+def draw_reference(
+    plane: Any, scenario: Scenario, client: Rows, server: Rows | None = None
+) -> None:
+    """Draw the reference, red and dashed, over the steps of a vehicle.
 
     A closed curve is drawn for one round only, so that the dashes of the next do not fill its gaps.
+
+    Args:
+        client: rows of the vehicle.
+        server: rows of the server, which alone knows where a live point was.
     """
-    time_s = step * scenario.control.dt
     if scenario.reference.shape in ("circle", "figure-eight", "square"):
-        time_s = time_s[time_s - time_s[:1] <= scenario.reference.period_s]
-    x, y = scenario.make_reference()(time_s)[:, :2, 0].T
+        time_s = client["step"] * scenario.control.dt
+        client = client[time_s - time_s[:1] <= scenario.reference.period_s]
+    x, y = desired(scenario, client, server)[:, :2].T
     plane.plot(x, y, "r--", label="reference")
 
 
-def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
+def fleet(
+    path: Path, title: str, scenario: Scenario, client: Rows, server: Rows | None = None
+) -> None:
     """Draw a fleet: all paths over the reference, and how the tracking error spreads.
 
     Args:
         path: file to write, in one of FORMATS.
         client: rows of all vehicles' records.
+        server: rows of the server, which alone knows where a live point was.
     """
     from matplotlib.figure import Figure
 
@@ -91,18 +100,19 @@ def fleet(path: Path, title: str, scenario: Scenario, client: Rows) -> None:
     for rows in flights:
         x, y = rows["state"][:, :2, 0].T
         plane.plot(x, y, "k-", linewidth=0.6, alpha=max(0.05, 1 / len(flights)))
-    draw_reference(plane, scenario, np.unique(client["step"]))
+    draw_reference(plane, scenario, max(flights, key=len), server)
     plane.set_aspect("equal", adjustable="datalim")
     plane.set_xlabel("x [m]")
     plane.set_ylabel("y [m]")
     plane.legend(loc="upper right", fontsize=8)
     settled = [rows[rows["step"] * scenario.control.dt >= scenario.settle] for rows in flights]
     errors = [
-        np.sqrt((position_error(scenario, rows)[:, :2] ** 2).sum(axis=1).mean())
+        np.sqrt((position_error(scenario, rows, server)[:, :2] ** 2).sum(axis=1).mean())
         for rows in settled
         if len(rows)
     ]
-    spread.hist(errors, bins=max(5, round(np.sqrt(len(errors)))), color="0.4")
+    known = np.array(errors)[np.isfinite(errors)]
+    spread.hist(known, bins=max(5, round(np.sqrt(len(known)))), color="0.4")
     spread.set_xlabel("RMSE xy of a vehicle [m]")
     spread.set_ylabel("vehicles")
     for axes in (plane, spread):

@@ -20,7 +20,7 @@ from lab.sweep import by_name, estimate, rows_csv, to_csv
 from shared.config import ControlConfig, DirectionConfig, Scenario
 from shared.model import Array, Indices
 from shared.record import Rows
-from shared.summary import Summary, summarise
+from shared.summary import Summary, desired, summarise
 from sim.flight import Flight
 
 if TYPE_CHECKING:
@@ -139,8 +139,8 @@ def paths(samples: Samples) -> Picture:
         for plane, letter, method in zip(planes, "ab", (NONE, EVERY), strict=True):
             scenario, flights = samples[method]
             rmse.append(summarise(scenario, method, flights[0].client).rmse_xy)
-            step, desired, position = _path(scenario, flights[0])
-            _draw_path(plane, scenario, step, position)
+            step, wanted, position = _path(scenario, flights[0])
+            _draw_path(plane, scenario, flights[0])
             plane.set_title(f"({letter}) {method}, a packet at every step")
             positions.append(position)
         planes[0].legend(loc="center")
@@ -149,7 +149,7 @@ def paths(samples: Samples) -> Picture:
         f"off (RMSE xy), with both compensators {rmse[1]:.3f} m."
     )
     header = ("step", "reference_x_m", "reference_y_m", "a_x_m", "a_y_m", "b_x_m", "b_y_m")
-    rows = np.column_stack([step, desired, *positions]).tolist()
+    rows = np.column_stack([step, wanted, *positions]).tolist()
     title = "Fig. 3: position without and with delay compensation"
     return _picture(figure, "fig3", title, says, to_csv(header, rows))
 
@@ -158,11 +158,11 @@ def events(samples: Samples) -> Picture:
     """Fig. 4: the path with the event trigger, and its events below."""
     scenario, flights = samples[EVENT]
     flight, dt = flights[0], scenario.control.dt
-    step, desired, position = _path(scenario, flight)
+    step, wanted, position = _path(scenario, flight)
     sent = np.isin(step, flight.server["step"][flight.server["event"]])
     with _figure(COLUMN, 4.4) as figure:
         plane, below = figure.subplots(2, 1, height_ratios=(5, 1))
-        _draw_path(plane, scenario, step, position)
+        _draw_path(plane, scenario, flight)
         plane.legend(loc="center")
         below.vlines(step[sent] * dt, 0.0, 1.0, color="k", linewidth=0.5)
         below.set_xlim(0.0, scenario.duration)
@@ -175,21 +175,22 @@ def events(samples: Samples) -> Picture:
         f"{np.mean(flight.server['event']):.1%} of the steps."
     )
     header = ("step", "reference_x_m", "reference_y_m", "x_m", "y_m", "event")
-    rows = np.column_stack([step, desired, position, sent]).tolist()
+    rows = np.column_stack([step, wanted, position, sent]).tolist()
     title = "Fig. 4: position with the event trigger, and when it sent"
     return _picture(figure, "fig4", title, says, to_csv(header, rows))
 
 
 def _path(scenario: Scenario, flight: Flight) -> tuple[Indices, Array, Array]:
     """Steps, reference and position [m] of a flight; shapes (steps,), (steps, 2), (steps, 2)."""
-    step = flight.client["step"]
-    desired = scenario.make_reference()(step * scenario.control.dt)[:, :2, 0]
-    return step, desired, flight.client["state"][:, :2, 0]
+    client = flight.client
+    wanted = desired(scenario, client, flight.server)[:, :2]
+    return client["step"], wanted, client["state"][:, :2, 0]
 
 
-def _draw_path(plane: Any, scenario: Scenario, step: Indices, position: Array) -> None:
+def _draw_path(plane: Any, scenario: Scenario, flight: Flight) -> None:
     """Draw the path of a flight over its reference."""
-    draw_reference(plane, scenario, step)
+    draw_reference(plane, scenario, flight.client, flight.server)
+    position = flight.client["state"][:, :2, 0]
     plane.plot(position[:, 0], position[:, 1], "k-", linewidth=0.8, label="UAV")
     plane.plot(position[0, 0], position[0, 1], "ko", markersize=3, label="start")
     plane.set_aspect("equal", adjustable="box")

@@ -1,11 +1,10 @@
 """A link: one direction of the network, a bounded heap of packets by due time, and statistics."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import Any
 
-from netem.fate import Fate
+from netem.fate import SLOT_NS, Fates
 from shared.endpoint import MILLISECOND_NS, Datagram
 from shared.histogram import Histogram
 from shared.record import Recorder
@@ -28,8 +27,14 @@ class Lane:
 
     flow: int
     """Number of the flow, from 0."""
-    fates: Iterator[Fate]
-    """Fates of its packets, in their order."""
+    fates: Fates
+    """Fates of its packets."""
+    began_ns: int
+    """Time at which the flow began [ns]."""
+    slot: int = -1
+    """Slot in which its newest packet has entered, counted from when the flow began."""
+    rank: int = 0
+    """Rank of that packet among those of its slot."""
     taken: int = 0
     """Number of packets so far, lost ones included."""
     newest_out: int = -1
@@ -85,7 +90,10 @@ class Link:
     def take(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> None:
         """Take a packet that enters, addressed to where it is to come out."""
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
-        delay_ns, lost = next(lane.fates)
+        slot = (now_ns - lane.began_ns) // SLOT_NS
+        lane.rank = lane.rank + 1 if slot == lane.slot else 0
+        lane.slot = slot
+        delay_ns, lost = lane.fates.at(slot, lane.rank)
         lane.taken += 1
         counts.packets += 1
         counts.bytes += size

@@ -10,16 +10,16 @@ send takes no place from those who fly, and none for long from those who come.
 """
 
 from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from netem.fate import Fate, fates
+from netem.fate import Fates
 from netem.link import Lane, Link
 from shared.config import DirectionConfig, Scenario
 from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
 from shared.events import FlowOpened
 from shared.record import DOWNLINK, UPLINK, Recorder
+from shared.terms import keys_of
 
 FLOWS_MAX = 512
 """Most clients at once, unless another number is asked for; packets of others are dropped and
@@ -53,11 +53,7 @@ class Proxy(Endpoint):
         recorder: takes one row a packet.
     """
 
-    changeable = frozenset(
-        f"network.{way}.{key}"
-        for way in ("uplink", "downlink")
-        for key in DirectionConfig.__struct_fields__
-    )
+    changeable = keys_of("netem's") - {"network.mtu"}
 
     def __init__(
         self,
@@ -137,8 +133,8 @@ class Proxy(Endpoint):
         flow = Flow(
             client,
             socket,
-            Lane(number, self._fates("uplink", number)),
-            Lane(number, self._fates("downlink", number)),
+            Lane(number, self._fates("uplink", number), now_ns),
+            Lane(number, self._fates("downlink", number), now_ns),
             now_ns,
             self._unanswered,
         )
@@ -147,10 +143,10 @@ class Proxy(Endpoint):
         self._events.append(FlowOpened(flow=number, host=host, port=port))
         return flow
 
-    def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Iterator[Fate]:
+    def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Fates:
         """Fates of the packets of a flow in one direction."""
         direction: DirectionConfig = getattr(self._scenario.network, name)
-        return fates(direction, self._scenario.seed, name, flow)
+        return Fates(direction, self._scenario.seed, name, flow)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
         """See `Endpoint`; packets that are under way keep their fate."""

@@ -2,8 +2,9 @@
 
 A vehicle at step k is planned for from k + d to k + d + H. How far ahead the server may look is
 `reference.preview`: with "all" it sees the whole window, and otherwise nothing behind the step
-k + preview. What lies beyond is predicted from the desired state there, which goes on at its
-velocity.
+k + preview. What lies beyond is predicted from the desired state there: it goes on at its velocity,
+which fades for a target, as docs/targets.md measures it. Of a point that is moved in flight only
+the present is known (`live`), and the same for all vehicles.
 
 A trajectory is looked up in pages rather than computed at each step. Where vehicles have
 trajectories of their own, each has pages of its own.
@@ -14,11 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shared.config import Scenario
-from shared.kernel import F4, I1, inline, kernel, plain
+from server.live import LivePoint
+from shared.config import ReferenceConfig, Scenario
+from shared.kernel import F2, F4, I1, inline, kernel, plain
 from shared.model import Array, Indices
 from shared.protocol import committed_max
-from shared.reference import Reference
+from shared.reference import Reference, turning_rate
 from shared.terms import Terms
 
 PAGE = 128
@@ -68,21 +70,26 @@ class Desired:
         block: int,
         references: Callable[[int], Reference] | None = None,
     ) -> None:
-        axes, H, preview = terms.axes, terms.horizon, scenario.reference.preview
+        axes, H, wanted = terms.axes, terms.horizon, scenario.reference
         longest = committed_max(terms) + H
-        self._all = preview == "all"
+        self._point = _live(scenario) if wanted.shape == "live" else None
+        self._all = wanted.preview == "all" and self._point is None
         self._reach = H
-        """Steps of a page behind its last; with a preview, the steps that the server sees."""
+        """Steps of a page behind its last; unless all is seen, the steps that are."""
         if not self._all:
-            seen_s = 0.0 if isinstance(preview, str) else preview
+            seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
             self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
+        self._carried = carried(_rate(wanted), terms.dt_s * np.arange(longest + 1.0))
+        """How a state is carried on, by the number of steps; see `carried`."""
         self._references = references
         self._shared = scenario.make_reference()
         self._number = np.zeros(capacity, dtype=np.int64)
         """Number of each vehicle's trajectory; shape (capacity,)."""
         self._dt_s = terms.dt_s
         self._steps = np.arange(PAGE + self._reach + 1)
-        self._pages = np.zeros((PAGES, axes, len(self._steps), 2))
+        pages = (1, axes, 1, 2) if self._point else (PAGES, axes, len(self._steps), 2)
+        self._pages = np.zeros(pages)
+        """Desired states in each place [m, m/s]; of a live point its present state alone."""
         self._held = np.full(PAGES, EMPTY, dtype=np.int64)
         """Key of the page in each place, or EMPTY; shape (PAGES,)."""
         self._found = Window(
@@ -99,6 +106,20 @@ class Desired:
     def assign(self, row: int, vehicle: int) -> None:
         """Let a vehicle begin in this row."""
         self._number[row] = vehicle if self._references else 0
+
+    def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
+        """Move a live point, see `LivePoint.move`; any other trajectory stays as it is.
+
+        Without a position it goes on from where it is by then.
+        """
+        if self._point:
+            here = self._point.at(now_ns)[:, 0] if position is None else position
+            self._point.move(here, velocity, now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        """Take note of the time [ns]: a live point has moved on."""
+        if self._point:
+            self._pages[0, :, 0] = self._point.at(now_ns)
 
     def now(self, rows: Indices, steps: Indices) -> Array:
         """Desired states of vehicles at their steps k [m, m/s]; shape (n, axes, 2).
@@ -123,11 +144,13 @@ class Desired:
         if self._all:
             return self._find(rows, steps + ahead[: len(rows)])
         found = self._find(rows, steps)
-        _foresee(found, len(rows), ahead, self._reach, self._dt_s, self._foreseen.states)
+        _foresee(found, len(rows), ahead, self._reach, self._carried, self._foreseen.states)
         return self._foreseen
 
     def _find(self, rows: Indices, steps: Indices) -> Window:
         """Look up desired states from some steps on, and compute the pages that are missing."""
+        if self._point:
+            return self._found
         held = self._held
         while (i := _find(held, self._number, rows, steps, self._found)) != FOUND:
             if np.count_nonzero(held == EMPTY) == 1:
@@ -138,6 +161,31 @@ class Desired:
             states = sample((page * PAGE + self._steps) * self._dt_s)
             self._pages[at], held[at] = states.transpose(1, 0, 2), number * TRAJECTORY + page
         return self._found
+
+
+def carried(rate: float, times_s: Array) -> Array:
+    """How far a unit of velocity leads in some times [s], and what is left of it; shape (n, 2).
+
+    Args:
+        rate: rate at which velocity fades [1/s].
+        times_s: shape (n,).
+    """
+    way_s = -np.expm1(-rate * times_s) / rate if rate else times_s
+    return np.stack([way_s, np.exp(-rate * times_s)], axis=-1)
+
+
+def _rate(wanted: ReferenceConfig) -> float:
+    """Rate at which a prediction's velocity fades [1/s]."""
+    if wanted.shape != "target":
+        return 0.0
+    return turning_rate(wanted.agility, wanted.speed_mps, wanted.radius_m)
+
+
+def _live(scenario: Scenario) -> LivePoint:
+    """The live point of a scenario, where it is at first."""
+    velocity = scenario.reference.velocity_mps
+    start = scenario.make_reference()(np.zeros(()))[:, 0]
+    return LivePoint(start, np.array(velocity) if velocity else None, scenario.u_max)
 
 
 @inline
@@ -162,7 +210,7 @@ def _find(held: I1, numbers: I1, rows: I1, steps: I1, found: Window) -> int:
 
 
 @kernel
-def _foresee(known: Window, n: int, ahead: I1, reach: int, dt_s: float, window: F4) -> None:
+def _foresee(known: Window, n: int, ahead: I1, reach: int, carried: F2, window: F4) -> None:
     """Fill in the windows of vehicles: what is seen, and what is predicted behind that.
 
     Args:
@@ -170,7 +218,7 @@ def _foresee(known: Window, n: int, ahead: I1, reach: int, dt_s: float, window: 
         n: number of vehicles.
         ahead: d of each; shape (block,).
         reach: number of steps that are seen.
-        dt_s: length of a step [s].
+        carried: see `carried`, by steps after those; shape (at least d + H - reach + 1, 2).
         window: what is filled in [m, m/s]; shape (block, axes, H + 1, 2).
     """
     for i in range(n):
@@ -183,5 +231,5 @@ def _foresee(known: Window, n: int, ahead: I1, reach: int, dt_s: float, window: 
                     window[i, axis, stage, 0] = states[axis, first + step, 0]
                     window[i, axis, stage, 1] = states[axis, first + step, 1]
                 else:
-                    window[i, axis, stage, 0] = p + v * (step - reach) * dt_s
-                    window[i, axis, stage, 1] = v
+                    window[i, axis, stage, 0] = p + v * carried[step - reach, 0]
+                    window[i, axis, stage, 1] = v * carried[step - reach, 1]

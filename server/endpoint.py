@@ -64,6 +64,7 @@ from shared.protocol import (
 from shared.record import Recorder
 from shared.reference import Reference
 from shared.stopwatch import Stopwatch
+from shared.terms import keys_of
 
 VEHICLES_MAX = 64
 """Vehicles at once, unless room is made for more."""
@@ -77,10 +78,7 @@ TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
 
-TRIGGER = frozenset(
-    f"control.{key}"
-    for key in ("trigger", "period", "epsilon", "decay_rate", "cost_gap", "deviation_m")
-)
+TRIGGER = keys_of("the server's: when it sends")
 """Keys of when horizons are sent."""
 POINT = frozenset({"reference.points_m", "reference.velocity_mps"})
 """Keys of a point that is led by hand."""
@@ -281,10 +279,10 @@ class Server(Endpoint):
         if keys & TRIGGER:
             self.controller.change_trigger(scenario.control)
         if keys & POINT:
-            self._lead(scenario, now_ns)
-
-    def _lead(self, scenario: Scenario, now_ns: int) -> None:
-        """Move the point that is led."""
+            moved = "reference.points_m" in keys
+            position = scenario.make_reference()(np.zeros(()))[:, 0] if moved else None
+            velocity = np.array(scenario.reference.velocity_mps)
+            self.controller.desired.move(position, velocity if velocity.size else None, now_ns)
 
     # -- time --------------------------------------------------------------------------------
 
@@ -325,6 +323,7 @@ class Server(Endpoint):
         before_ns = self.stopwatch.spent_ns.total()
         rows = self.sessions.rows
         step = self._clock.steps(rows, tick_ns)
+        self.controller.desired.tick(tick_ns)
         able = self.controller.able(rows, step)
         if not able.all():
             rows, step = rows[able], step[able]

@@ -151,6 +151,8 @@ class ReferenceConfig(Section, frozen=True):
     """Altitude of circle, figure-eight and square in space [m]."""
     points_m: tuple[tuple[Position, ...], ...] = ()
     """Waypoints [m], at least two; the one point to hover at; where a live point begins."""
+    velocity_mps: tuple[Speed, ...] = ()
+    """Velocity of a live point, where it is known [m/s]; left out: estimated from its moves."""
     speed_mps: Factor = 1.0
     """Speed between waypoints, and the largest of a target along an axis [m/s]."""
     loop: bool = False

@@ -41,6 +41,7 @@ def contradictions(
             yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
     for key, values in (
         ("vehicle.start_m", vehicle.start_m),
+        ("reference.velocity_mps", scenario.reference.velocity_mps),
         ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
         ("sensor.position_bias_m", scenario.sensor.position_bias_m),
         ("sensor.velocity_bias_mps", scenario.sensor.velocity_bias_mps),
@@ -67,6 +68,8 @@ def contradictions(
         )
     if control.scheme == "dead_reckoning" and not control.feedback:
         yield "control.feedback", "false", "true with control.scheme = 'dead_reckoning'"
+    if control.scheme == "none" and control.feedback:
+        yield "control.feedback", "true", "false with control.scheme = 'none'"
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
     yield from _no_trigger(control)

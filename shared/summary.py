@@ -7,8 +7,11 @@ import numpy as np
 
 from shared.config import Scenario
 from shared.model import Array
-from shared.protocol import Mode
+from shared.protocol import NO_HORIZON, Mode
 from shared.record import DOWNLINK, UPLINK, Reason, Rows
+
+AT_BOUND = 1.0 - 1e-6
+"""Share of the bound from which an input is at it: inputs are rounded on the wire."""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,6 +56,18 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     age_ms_p50: float | None
     """Age of the observation behind the input being flown [ms], over all steps."""
     age_ms_p99: float | None
+    aoi_s_mean: float | None
+    """Mean age of information, of that observation [s], over the steps from `settle` on."""
+    aoi_s_peak: float | None
+    """Mean of its peaks [s]: of the age at each step before one at which it is smaller."""
+    plan_age_s_mean: float | None
+    """Mean time since the horizon in force was made [s], over the steps from `settle` on: the age
+    of all that the server alone knows, as where its target is."""
+    effort_mps: float | None
+    """Root mean square of the change of the input from step to step, over all axes together, from
+    `settle` on [m/s]."""
+    saturated: float | None
+    """Share of the steps from `settle` on at which the input is at its bound on some axis."""
     solve_ms_p50: float | None
     """Wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
     solve_ms_p99: float | None
@@ -83,13 +98,18 @@ def summarise(
         netem: rows of netem; all flows count.
         secure: whether the link was sealed.
     """
-    begun = client["step"] * scenario.control.dt >= scenario.settle
-    settled = position_error(scenario, client)[begun]
-    off = (client["estimate"] - client["state"])[begun, :, 0]
+    error = position_error(scenario, client, server)
+    counted = client["step"] * scenario.control.dt >= scenario.settle
+    settled, flown = error[counted], client[counted]
+    off = flown["estimate"][..., 0] - flown["state"][..., 0]
     squares = (settled**2).mean(axis=0) if len(settled) else np.array([np.nan])
     rmse = [float(value) for value in np.sqrt(squares)] if np.isfinite(squares).all() else []
     distances = np.linalg.norm(settled, axis=1)
     age_ms = client["age_ns"][client["age_ns"] >= 0] / 1e6
+    aoi_s = flown["age_ns"][flown["age_ns"] >= 0] / 1e9
+    planned = flown[flown["in_force"] != NO_HORIZON]
+    plan_age_s = (planned["step"] - planned["in_force"]) * scenario.control.dt
+    changes = np.diff(client["input"], axis=0)[counted[1:]]
     stale, missed = _last(client, "stale"), _last(client, "missed")
     event_ratio, solve_ms = None, np.empty(0)
     if server is not None:
@@ -106,7 +126,7 @@ def summarise(
         rmse_y=rmse[1] if rmse else None,
         rmse_z=rmse[2] if len(rmse) == 3 else None,
         rmse_xy=math.hypot(*rmse[:2]) if rmse else None,
-        error_max=float(distances.max()) if len(distances) else None,
+        error_max=float(distances.max()) if rmse else None,
         covered=float(client["covered"].mean()) if len(client) else None,
         modes={
             str(mode): int((client["mode"] == mode).sum()) * scenario.control.dt
@@ -125,6 +145,11 @@ def summarise(
         stale=stale,
         age_ms_p50=_quantile(age_ms, 0.5),
         age_ms_p99=_quantile(age_ms, 0.99),
+        aoi_s_mean=_mean(aoi_s),
+        aoi_s_peak=_mean(aoi_s[:-1][np.diff(aoi_s) < 0.0]),
+        plan_age_s_mean=_mean(plan_age_s),
+        effort_mps=math.sqrt((changes**2).sum(axis=1).mean()) if len(changes) else None,
+        saturated=_mean((np.abs(flown["input"]) >= AT_BOUND * scenario.u_max).any(axis=1)),
         solve_ms_p50=_quantile(solve_ms, 0.5),
         solve_ms_p99=_quantile(solve_ms, 0.99),
         deadline_misses=missed,
@@ -133,10 +158,30 @@ def summarise(
     )
 
 
-def position_error(scenario: Scenario, client: Rows) -> Array:
-    """Position minus reference at every step [m]; shape (steps, axes)."""
-    desired = scenario.make_reference()(client["step"] * scenario.control.dt)
-    error: Array = client["state"][..., 0] - desired[..., 0]
+def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
+    """Desired position at every step of one vehicle [m]; shape (steps, axes).
+
+    Where a live point was, only the server knows: at a step that it has no row of, the point is
+    where it was before. What nobody knows is NaN.
+
+    Args:
+        client: rows of the vehicle.
+        server: rows of the server, of any vehicles.
+    """
+    if scenario.reference.shape != "live":
+        return scenario.make_reference()(client["step"] * scenario.control.dt)[..., 0]
+    known = client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]
+    if not len(known):
+        return np.full((len(client), scenario.model.axes), np.nan)
+    known = known[np.argsort(known["step"], kind="stable")]
+    at = np.searchsorted(known["step"], client["step"], side="right") - 1
+    positions: Array = known["reference"][np.maximum(at, 0), :, 0]
+    return positions
+
+
+def position_error(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
+    """Position minus desired position at every step [m]; shape (steps, axes); see `desired`."""
+    error: Array = client["state"][..., 0] - desired(scenario, client, server)
     return error
 
 
@@ -155,6 +200,10 @@ def _count(netem: Rows | None, direction: int) -> int | None:
 
 def _bytes(netem: Rows | None, direction: int) -> int | None:
     return None if netem is None else int(netem["bytes"][netem["direction"] == direction].sum())
+
+
+def _mean(values: Array) -> float | None:
+    return float(values.mean()) if len(values) else None
 
 
 def _quantile(values: Array, share: float) -> float | None:

@@ -148,7 +148,7 @@ _OWNERS = {
         control.deviation_m control.tolerance_m
     """,
     "the server's: what only it knows": """
-        reference.preview reference.agility
+        reference.preview reference.agility reference.velocity_mps
     """,
     "the server's: how it plans": """
         model.dead_time_s control.solver control.state_weight control.terminal_weight
@@ -186,6 +186,11 @@ FREE: Mapping[str, str] = MappingProxyType(
     {key: whose for whose, keys in _OWNERS.items() for key in keys.split()}
 )
 """Keys of the scenario that may differ, and whose they are."""
+
+
+def keys_of(whose: str) -> frozenset[str]:
+    """Keys of the scenario that may differ, of those with these words in `FREE`."""
+    return frozenset(_OWNERS[whose].split())
 
 
 def _text(name: str, value: object) -> str:

@@ -1,8 +1,8 @@
 """The socket through which keys are changed in flight: a Unix one, that its owner alone can use.
 
-A datagram is a request of `shared.change`, and its answer goes back to whoever has sent it. Between
-two requests the socket rests: whoever floods it waits, and the endpoint does not. What nobody
-hears is not said again.
+A datagram is a request of `shared.change`, and its answer goes back to whoever has sent it. After
+each request the socket rests: whoever floods it waits, and the endpoint does not. An answer that
+nobody takes is not kept.
 """
 
 import asyncio
@@ -22,7 +22,10 @@ import msgspec
 from shared.change import REQUEST_BYTES_MAX, Answer, Running
 
 REST_S = 0.01
-"""Time from a request to the next that is read [s]."""
+"""Least time from a request to the next that is read [s]."""
+RESTS = 20
+"""Ratio of that time to the time that the request took, at least: requests cost the endpoint no
+more than a 21st of its time."""
 PATIENCE_S = 5.0
 """Longest time to wait for an answer [s]."""
 ANSWER_BYTES_MAX = 65_536
@@ -70,17 +73,17 @@ class Control:
     def _read(self) -> None:
         assert self._loop is not None
         self._loop.remove_reader(self._socket)
-        self._loop.call_later(REST_S, self._listen)
+        began_s = time.monotonic()
         try:
             request, sender = self._socket.recvfrom(REQUEST_BYTES_MAX + 1)
-        except OSError:
-            return
-        try:
             answer = self._running.answer(request, now_ns=time.monotonic_ns())
             if sender:
-                with suppress(OSError):  # it is gone, or does not read
-                    self._socket.sendto(answer, sender)
+                self._socket.sendto(answer, sender)
+        except OSError:  # nothing there after all, or nobody takes the answer
+            pass
         finally:
+            rest_s = max(REST_S, RESTS * (time.monotonic() - began_s))
+            self._loop.call_later(rest_s, self._listen)
             self._after()
 
     def end(self) -> None:

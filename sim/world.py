@@ -256,8 +256,10 @@ class World:
             act: called with the time that the host's clock shows.
         """
         host = self._hosts[name]
-        act(now_ns=host.clock.local(self.now_ns))
-        self._after(host, self.now_ns)
+        try:
+            act(now_ns=host.clock.local(self.now_ns))
+        finally:
+            self._after(host, self.now_ns)
 
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""

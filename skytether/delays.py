@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from netem.fate import fates
 from shared.config import Scenario, to_toml
 from shared.endpoint import MILLISECOND_NS, Address
 from shared.events import address_text
 from shared.model import Array
+from shared.record import DOWNLINK, UPLINK, read
 from skytether.processes import started
 
 EVERY_S = 0.002
@@ -57,7 +57,7 @@ def measure(
 
     Args:
         scenario: `network` and `seed` of it are used.
-        folder: folder for the scenario file that netem is given.
+        folder: folder for the scenario file that netem is given, and for its record.
         packets: number of packets to send.
         on_second: called with the time that it takes so far [s], often.
 
@@ -67,21 +67,22 @@ def measure(
     Raises:
         CommandError: netem failed.
     """
-    file = folder / "scenario.toml"
-    file.write_bytes(to_toml(scenario))
-    return asyncio.run(_measure(scenario, file, packets, on_second))
+    (folder / "scenario.toml").write_bytes(to_toml(scenario))
+    return asyncio.run(_measure(scenario, folder, packets, on_second))
 
 
 async def _measure(
-    scenario: Scenario, file: Path, packets: int, on_second: Callable[[float], None]
+    scenario: Scenario, folder: Path, packets: int, on_second: Callable[[float], None]
 ) -> Array:
     loop = asyncio.get_running_loop()
     here = ("127.0.0.1", 0)
     back, server = await loop.create_datagram_endpoint(lambda: _End(True), local_addr=here)
     forth, client = await loop.create_datagram_endpoint(lambda: _End(False), local_addr=here)
     at = address_text(*back.get_extra_info("sockname"))
+    file, record = folder / "scenario.toml", folder / "netem.rec"
+    arguments = [str(file), "--bind", "127.0.0.1:0", "--server", at, "--record", str(record)]
     try:
-        async with started("netem", str(file), "--bind", "127.0.0.1:0", "--server", at) as netem:
+        async with started("netem", *arguments) as netem:
             began_s = loop.time()
             for number in range(packets):
                 await asyncio.sleep(began_s + number * EVERY_S - loop.time())
@@ -91,15 +92,11 @@ async def _measure(
     finally:
         back.close()
         forth.close()
-    network, seed = scenario.network, scenario.seed
-    rows = []
-    for name, config, end in (
-        ("downlink", network.downlink, server),
-        ("uplink", network.uplink, client),
-    ):
-        # Packets enter in the order of their numbers: its fate is that of its number.
-        drawn = fates(config, seed, name, 0)
-        for number, fate in zip(range(packets), drawn, strict=False):
+    # Packets enter in the order of their numbers.
+    drawn, rows = read(record), []
+    for direction, end in ((DOWNLINK, server), (UPLINK, client)):
+        of = drawn[drawn["direction"] == direction]
+        for number, delay_ns in zip(of["number"].tolist(), of["delay_ns"].tolist(), strict=True):
             if number in end.delays_ns:
-                rows.append((end.delays_ns[number], fate.delay_ns))
+                rows.append((end.delays_ns[number], delay_ns))
     return np.array(rows, dtype=np.float64).reshape(-1, 2) / MILLISECOND_NS

@@ -119,6 +119,8 @@ class Flown:
     """Measure of what the machine took, over real UDP."""
     cpu_s: float | None = None
     """CPU time of everything together [s], in virtual time."""
+    server: Rows | None = None
+    """What the server recorded, in virtual time."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -150,7 +152,7 @@ def fleet(argv: Sequence[str]) -> None:
     if options.json:
         command.write(options.json, msgspec.json.encode(summary))
     if options.figure:
-        figures.fleet(options.figure, title, options.config, flown.client)
+        figures.fleet(options.figure, title, options.config, flown.client, flown.server)
     if flown.failure:
         raise CommandError(str(flown.failure))
 
@@ -176,6 +178,7 @@ def _virtually(
         processes={},
         failure=flown.failure,
         cpu_s=time.process_time() - began_s,
+        server=flown.server,
     )
 
 
@@ -250,7 +253,7 @@ def _summarise(options: Options, flown: Flown) -> FleetSummary:
         spent_us["total"] = sum(server["cpu_s"] for server in servers) * 1e6 / max(steps, 1)
     duration_s = (int(client["step"].max()) + 1) * scenario.control.dt
     each = [client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])]
-    rmse = [summarise(scenario, options.scenario, rows).rmse_xy for rows in each]
+    rmse = [summarise(scenario, options.scenario, rows, flown.server).rmse_xy for rows in each]
     known = [value for value in rmse if value is not None]
     links = (netem["uplink"], netem["downlink"])
     packets = sum(link["packets"] for link in links)

@@ -13,6 +13,8 @@ import pytest
 
 from shared.endpoint import EVENTS_MAX, Datagram, Endpoint
 from shared.events import (
+    Changed,
+    ChangeRefused,
     Counted,
     Degraded,
     Difference,
@@ -67,6 +69,11 @@ SENTENCES = [
     ),
     (Degraded(degraded=True), "degraded: it misses ticks"),
     (Degraded(degraded=False), "it is in time again"),
+    (
+        Changed(key="network.uplink.loss", before="0.1", after="0.3"),
+        "network.uplink.loss is 0.3 from now on, it was 0.1",
+    ),
+    (ChangeRefused(reason="wind: no such key"), "a change is refused: wind: no such key"),
     (SessionOpened(vehicle=1, host="::1", port=5), "vehicle 1 flies, from [::1]:5"),
     (SessionEnded(vehicle=1), "vehicle 1 is gone"),
     (

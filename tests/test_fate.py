@@ -1,6 +1,4 @@
-"""`netem.fate`: the delays of eq. (17) as corrected, and fates that depend on their names alone."""
-
-from itertools import islice
+"""`netem.fate`: the delays of eq. (17) as corrected, and fates that follow from names and time."""
 
 import numpy as np
 import pytest
@@ -8,30 +6,40 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy import stats
 
-from netem.fate import BLOCK, Fate, delays_ns, fates
-from shared.chance import stream
+from netem.fate import SLOT_NS, Fate, Fates
 from shared.config import DirectionConfig
-from shared.endpoint import MILLISECOND_NS
+from shared.endpoint import MILLISECOND_NS, SECOND_NS
 
 SAMPLES = 20_000
 TAIL = 8
 """Slots from here on are one class: Poisson(2) has 22 of 20 000 samples there."""
 
 PAPER = DirectionConfig()
-COUNT = 3 * BLOCK + 1
+COUNT = 800
 
 
 def first_fates(
-    direction: DirectionConfig = PAPER, seed: int = 1, name: str = "uplink", flow: int = 0
+    direction: DirectionConfig = PAPER,
+    seed: int = 1,
+    name: str = "uplink",
+    flow: int = 0,
+    count: int = COUNT,
 ) -> list[Fate]:
-    """The fates of a flow's first packets."""
-    return list(islice(fates(direction, seed, name, flow), COUNT))
+    """The fates of the first packets of a flow's first slots."""
+    fates = Fates(direction, seed, name, flow)
+    return [fates.at(slot) for slot in range(count)]
+
+
+def delays_ns(direction: DirectionConfig, count: int) -> NDArray[np.int64]:
+    """Delays of a flow's first slots [ns]; shape (count,)."""
+    fates = first_fates(direction, 17, count=count)
+    return np.array([fate.delay_ns for fate in fates], dtype=np.int64)
 
 
 @pytest.fixture(scope="module")
 def slots() -> NDArray[np.int64]:
     """Number m of slots of eq. (17) in sampled delays."""
-    delays = delays_ns(PAPER, stream(17, "test"), SAMPLES)
+    delays = delays_ns(PAPER, SAMPLES)
     slots, rest_ns = np.divmod(delays - 400 * MILLISECOND_NS, 20 * MILLISECOND_NS)
     assert not rest_ns.any(), "a delay off the lattice 0.4 s + 0.02 s · m"
     return slots
@@ -69,18 +77,18 @@ def test_the_mean_paper_delay_is_440_ms(slots: NDArray[np.int64]) -> None:
 def test_a_constant_delay_is_the_minimum() -> None:
     """Without the slots of the paper's."""
     constant = DirectionConfig(delay="constant", minimum_s=0.25)
-    assert delays_ns(constant, stream(1), 3).tolist() == [250 * MILLISECOND_NS] * 3
+    assert delays_ns(constant, 3).tolist() == [250 * MILLISECOND_NS] * 3
 
 
 def test_no_delay_is_none_whatever_the_minimum() -> None:
     """The numbers of other delays do not count."""
-    assert delays_ns(DirectionConfig(delay="none"), stream(1), 3).tolist() == [0, 0, 0]
+    assert delays_ns(DirectionConfig(delay="none"), 3).tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize("loss", [0.02, 0.1, 0.5])
 def test_the_share_of_lost_packets_is_as_asked(loss: float) -> None:
     """By a binomial test."""
-    drawn = islice(fates(replace(PAPER, loss=loss), 17, "uplink", 0), SAMPLES)
+    drawn = first_fates(replace(PAPER, loss=loss), 17, count=SAMPLES)
     lost = sum(fate.lost for fate in drawn)
     assert stats.binomtest(lost, SAMPLES, loss).pvalue > 0.001
 
@@ -93,7 +101,7 @@ def test_certain_losses_are_certain(loss: float, lost: int) -> None:
 
 def test_losses_are_independent_of_delays() -> None:
     """The slow packets are not lost more often: a contingency test."""
-    drawn = list(islice(fates(PAPER, 17, "uplink", 0), SAMPLES))
+    drawn = first_fates(seed=17, count=SAMPLES)
     slow = [fate.delay_ns > 440 * MILLISECOND_NS for fate in drawn]
     table = stats.contingency.crosstab(slow, [fate.lost for fate in drawn]).count
     assert stats.chi2_contingency(table).pvalue > 0.001
@@ -104,12 +112,89 @@ def test_fates_are_the_same_again() -> None:
     assert first_fates() == first_fates()
 
 
-def test_fates_do_not_depend_on_how_they_are_interleaved() -> None:
-    """Two flows that take turns meet what each would have met alone."""
-    pairs = zip(fates(PAPER, 1, "uplink", 0), fates(PAPER, 1, "uplink", 1), strict=True)
-    taken = list(islice(pairs, COUNT))
-    assert [first for first, _ in taken] == first_fates(flow=0)
-    assert [second for _, second in taken] == first_fates(flow=1)
+def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
+    """Backwards, after an idle year, before the flow began: the time alone counts."""
+    fates, bursty = (Fates(replace(PAPER, burst_s=s), 1, "uplink", 0) for s in (0.0, 0.5))
+    year = 365 * 86_400 * SECOND_NS // SLOT_NS
+    for each in (fates, bursty):
+        slots = [0, 7, 7_000, year, year + 1, -5]
+        forwards = [each.at(slot) for slot in slots]
+        assert [each.at(slot) for slot in reversed(slots)] == forwards[::-1]
+
+
+def test_packets_of_one_slot_have_fates_of_their_own() -> None:
+    """As CLOSE is sent three times at once, for one may be lost: by a binomial test."""
+    fates = Fates(PAPER, 17, "uplink", 0)
+    triples = [[fates.at(slot, rank) for rank in range(3)] for slot in range(SAMPLES)]
+    all_lost = sum(all(fate.lost for fate in triple) for triple in triples)
+    assert stats.binomtest(all_lost, SAMPLES, PAPER.loss**3).pvalue > 0.001
+    assert len({triple[0].delay_ns == triple[1].delay_ns for triple in triples}) == 2
+
+
+@pytest.mark.parametrize("mean", [0.0, 1e-9, 0.3, 40.0, 1e6])
+def test_any_number_of_slots_has_its_mean_and_variance(mean: float) -> None:
+    """Of a Poisson law, to four standard errors."""
+    config = DirectionConfig(minimum_s=0.0, slot_s=1e-3, slots_mean=mean)
+    slots = delays_ns(config, SAMPLES) / MILLISECOND_NS
+    assert slots.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean / SAMPLES) + 1e-6)
+    kurtosis = np.sqrt((2 * mean**2 + mean) / SAMPLES)
+    assert slots.var() == pytest.approx(mean, abs=4 * kurtosis + 1e-6)
+
+
+# -- bursts ----------------------------------------------------------------------------------------
+
+
+def runs_of(lost: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Lengths of the runs of lost and of other packets, but for the first and the last."""
+    edges = np.flatnonzero(np.diff(lost)) + 1
+    lengths, first = np.diff(edges), int(not lost[edges[0]])
+    return lengths[first::2], lengths[1 - first :: 2]
+
+
+@pytest.mark.parametrize(("loss", "burst_s"), [(0.1, 0.5), (0.5, 2.0)])
+def test_bursts_are_as_long_and_lose_as_much_as_asked(loss: float, burst_s: float) -> None:
+    """Both times exponential: mean lengths within four standard errors, by the 10 ms."""
+    fates = Fates(replace(PAPER, loss=loss, burst_s=burst_s), 17, "uplink", 0)
+    every, count = 10 * MILLISECOND_NS // SLOT_NS, 60_000
+    lost = np.array([fates.at(every * number).lost for number in range(count)])
+    for runs, mean_s in zip(runs_of(lost), (burst_s, burst_s * (1 / loss - 1)), strict=True):
+        lengths_s = runs * 0.01
+        # What is shorter than 10 ms may be missed: that makes the others longer by about 2 %.
+        assert lengths_s.mean() == pytest.approx(mean_s, rel=4 / np.sqrt(len(runs)) + 0.02)
+        assert lengths_s.std() == pytest.approx(mean_s, rel=8 / np.sqrt(len(runs)) + 0.02)
+    assert lost.mean() == pytest.approx(loss, rel=6 * np.sqrt(burst_s * 2 / (loss * count * 0.01)))
+
+
+def test_in_a_burst_everything_is_lost() -> None:
+    """However many packets enter in a slot: none passes that another does not."""
+    fates = Fates(replace(PAPER, loss=0.3, burst_s=0.1), 1, "uplink", 0)
+    slots = [{fates.at(slot, rank).lost for rank in range(4)} for slot in range(2000)]
+    assert all(len(fates_of) == 1 for fates_of in slots)
+    assert {True} in slots
+    assert {False} in slots
+
+
+@pytest.mark.parametrize("burst_s", [1e-9, 1e-3, 3600.0])
+@pytest.mark.parametrize(("loss", "share"), [(0.0, 0.0), (1.0, 1.0)])
+def test_certain_losses_are_certain_in_bursts(loss: float, share: float, burst_s: float) -> None:
+    """Whatever their length."""
+    drawn = first_fates(replace(PAPER, loss=loss, burst_s=burst_s))
+    assert np.mean([fate.lost for fate in drawn]) == share
+
+
+def test_bursts_shorter_than_a_slot_are_none() -> None:
+    """Each packet is then lost by itself."""
+    drawn = first_fates(replace(PAPER, loss=0.5, burst_s=1e-4))
+    assert drawn == first_fates(replace(PAPER, loss=0.5))
+
+
+def test_bursts_change_no_delay() -> None:
+    """Delays have draws of their own."""
+    drawn = first_fates(replace(PAPER, loss=0.5, burst_s=1.0))
+    assert [fate.delay_ns for fate in drawn] == [fate.delay_ns for fate in first_fates()]
+
+
+# -- names -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("other", [{"seed": 2}, {"name": "downlink"}, {"flow": 1}])
@@ -129,7 +214,7 @@ def test_the_loss_rate_changes_no_delay(loss: float) -> None:
 
 @pytest.mark.parametrize("delay", ["constant", "none"])
 def test_the_delay_model_changes_no_loss(delay: str) -> None:
-    """Each is drawn from a stream of its own."""
+    """Each has draws of its own."""
     lost = [fate.lost for fate in first_fates(replace(PAPER, delay=delay))]
     assert lost == [fate.lost for fate in first_fates()]
 

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem import link as link_module
-from netem.fate import Fate
+from netem.fate import SLOT_NS, Fate, Fates
 from netem.link import QUEUE_BYTES_MAX, Lane, Link
+from shared.config import DirectionConfig
 from shared.endpoint import MILLISECOND_NS, Datagram
 from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Recorder, Rows, parse
 
@@ -21,10 +22,22 @@ def make_link(mtu: int = 1472) -> Link:
     return Link(UPLINK, mtu, None)
 
 
+class Listed(Fates):
+    """Fates one after the other, whenever packets enter."""
+
+    def __init__(self, fates: Iterable[Fate]) -> None:
+        self._listed = iter(fates)
+
+    def at(self, slot: int, rank: int = 0) -> Fate:  # noqa: ARG002
+        """See `Fates`."""
+        return next(self._listed)
+
+
 def make_lane(*delays_ns: int, flow: int = 0, lost: Iterable[int] = ()) -> Lane:
     """A flow whose packets have these delays; those with the numbers in `lost` are lost."""
     lost = set(lost)
-    return Lane(flow, iter([Fate(delay, i in lost) for i, delay in enumerate(delays_ns)]))
+    listed = Listed(Fate(delay, i in lost) for i, delay in enumerate(delays_ns))
+    return Lane(flow, listed, began_ns=0)
 
 
 def packet(name: str) -> Datagram:
@@ -131,7 +144,7 @@ def test_a_full_queue_drops_what_comes_and_counts_it_apart_from_losses(
 
 
 def test_a_packet_that_overflows_uses_up_its_fate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fate belongs to a packet's number, so those of later packets do not shift."""
+    """Dropped or not, it counts among those of its slot, and no later one's fate shifts."""
     monkeypatch.setattr(link_module, "QUEUE_MAX", 1)
     link, lane = make_link(), make_lane(1, 100, 7)
     take(link, lane, "ab")
@@ -257,3 +270,20 @@ def test_the_fate_of_every_packet_is_written_down() -> None:
     assert rows["delay_ns"].tolist() == [70, 500, 9000]
     assert rows["lost"].tolist() == [True, False, False]
     assert rows["overtaken"].tolist() == [False, False, True]
+
+
+def test_a_packet_meets_the_fate_of_when_it_enters() -> None:
+    """By its slot since the flow began and its rank in that, whatever has gone before."""
+    fates, began_ns = Fates(DirectionConfig(loss=0.0), 1, "uplink", 0), 500
+    for before in ([], [0, 1, 2], [59] * 3, [60, 90]):  # the last: the clock went back
+        link, lane = make_link(), Lane(0, fates, began_ns)
+        for slot in (*before, 60, 60):
+            link.take(packet("a"), lane, now_ns=began_ns + slot * SLOT_NS)
+        assert (lane.slot, lane.rank) == (60, 1)
+    seen = []
+    for late_ns in (0, SLOT_NS - 1, SLOT_NS):
+        link, now_ns = make_link(), began_ns + 60 * SLOT_NS + late_ns
+        link.take(packet("a"), Lane(0, fates, began_ns), now_ns=now_ns)
+        seen.append((link.next_due_ns() or 0) - now_ns)
+    assert seen == [fates.at(slot).delay_ns for slot in (60, 60, 61)]
+    assert seen[0] != seen[2]

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from netem import link as link_module
 from netem import proxy as proxy_module
-from netem.fate import fates
+from netem.fate import Fates
 from netem.link import Link
 from netem.proxy import FLOWS_MAX, IDLE_NS, Flow, Proxy
 from shared.config import DirectionConfig, NetworkConfig, Scenario
@@ -310,7 +310,7 @@ def test_being_woken_early_does_no_harm() -> None:
 
 
 def test_each_direction_and_flow_meets_its_own_fates() -> None:
-    """Those that netem.fate names, in the order of the packets."""
+    """Those that netem.fate names, by the rank of the packets in their slot."""
     half = DirectionConfig(delay="none", loss=0.5)
     proxy = make_proxy(half, seed=7)
     for flow, client in enumerate((ALICE, BOB)):
@@ -319,7 +319,8 @@ def test_each_direction_and_flow_meets_its_own_fates() -> None:
             hear(proxy, bytes([number]), SERVER, flow + 1)
         sent = proxy.outbox()
         for name, peer in (("downlink", SERVER), ("uplink", client)):
-            drawn = [fate.lost for _, fate in zip(range(40), fates(half, 7, name, flow))]  # noqa: B905 - fates never end
+            fates = Fates(half, 7, name, flow)
+            drawn = [fates.at(0, rank).lost for rank in range(40)]
             passed = [datagram.payload[0] for datagram in sent if datagram.peer == peer]
             assert passed == [number for number in range(40) if not drawn[number]]
 

@@ -18,6 +18,7 @@ from shared import config
 from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, Datagram, Endpoint, seconds_to_ns
+from shared.events import Degraded
 from shared.record import Recorder, client_columns, parse
 from shared.steady import JUMP_NS, Steady
 from shared.summary import summarise
@@ -49,6 +50,10 @@ class Probe(Endpoint):
         """Note it."""
         self.times_ns.append(now_ns)
 
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+        """Note it."""
+        self.times_ns.append(now_ns)
+
     def next_wake_ns(self) -> int | None:
         """As it was told."""
         return self.due_ns
@@ -66,6 +71,15 @@ def test_a_clock_that_goes_on_is_passed_on_as_it_is() -> None:
     times_ns = [MIDNIGHT_NS, MIDNIGHT_NS, MIDNIGHT_NS + 5, MIDNIGHT_NS + 5 + JUMP_NS]
     hear(Steady(probe), times_ns)
     assert probe.times_ns == times_ns
+
+
+def test_a_change_is_made_at_steady_time() -> None:
+    """As all that happens to an endpoint."""
+    probe = Probe()
+    steady = Steady(probe)
+    hear(steady, [HOUR_NS])
+    steady.change(config.load("demo"), frozenset(), now_ns=HOUR_NS - 5)
+    assert probe.times_ns == [HOUR_NS, HOUR_NS]
 
 
 @pytest.mark.parametrize("jump_ns", [-1, -HOUR_NS, JUMP_NS + 1, HOUR_NS])
@@ -119,6 +133,9 @@ def test_all_else_is_the_endpoints_own() -> None:
     hear(steady, [1])
     assert steady.figures() == server.figures()
     assert steady.figures()["counts"] == {"dropped: not a message": 1}
+    steady.tell(Degraded(degraded=True))
+    assert steady.events() == (Degraded(degraded=True),)
+    assert steady.changeable == server.changeable
     probe = Probe()
     steady = Steady(probe)
     hear(steady, [1])

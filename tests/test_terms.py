@@ -43,6 +43,7 @@ OTHER: dict[str, Any] = {
     "control.solver": "osqp",
     "control.input_reference": True,
     "reference.shape": "square",
+    "reference.velocity_mps": [0.1, 0.1],
     "reference.points_m": [[0.0, 0.0], [2.0, 0.0]],
     "reference.loop": True,
     "vehicle.exhausted": "hold",
@@ -52,6 +53,7 @@ OTHER: dict[str, Any] = {
     "network.uplink.delay": "none",
     "network.downlink.delay": "none",
     "title": "another",
+    "armed": False,
 }
 """Another value of the keys that are no numbers, or that not every number may be."""
 

@@ -1,0 +1,372 @@
+"""The socket of `--control`, and `skytether set`, which speaks to it."""
+
+import os
+import random
+import socket
+import stat
+import threading
+from collections.abc import Callable
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import shell.control
+from netem.proxy import Proxy
+from shared import config
+from shared.change import Running
+from shared.events import Changed, ChangeRefused, Event
+from shell import command
+from shell.control import REST_S, RESTS, Caller, Control, ControlError, controlled
+from shell.driver import Shell, run
+from skytether.set import set_keys, value
+
+DEMO = config.load("demo")
+
+
+class Closing(Proxy):
+    """A netem that ends once a key has got a certain value."""
+
+    finished = False
+
+    def change(self, scenario: config.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        """Change, and perhaps end."""
+        super().change(scenario, keys, now_ns=now_ns)
+        self.finished = scenario.network.uplink.loss == 1.0
+
+
+def running() -> Running:
+    """A scenario that a netem flies."""
+    return Running(Proxy(DEMO, server=("server", 0)), DEMO)
+
+
+class Loop:
+    """A loop in which time passes when it is told to."""
+
+    def __init__(self) -> None:
+        self.reads: Callable[[], None] | None = None
+        self.rests: list[tuple[float, Callable[[], None]]] = []
+
+    def add_reader(self, _: object, read: Callable[[], None]) -> None:
+        """Let it read."""
+        self.reads = read
+
+    def remove_reader(self, _: object) -> None:
+        """Let it read no more."""
+        self.reads = None
+
+    def call_later(self, delay_s: float, then: Callable[[], None]) -> None:
+        """Note what is to be done."""
+        self.rests.append((delay_s, then))
+
+    def turn(self) -> bool:
+        """Let it read if it wants to; whether it wanted."""
+        if self.reads is None:
+            return False
+        self.reads()
+        return True
+
+
+def heeding(control: Control) -> tuple[Loop, list[None]]:
+    """A loop in which requests are heeded, and a list that grows by one with each."""
+    loop, heeded = Loop(), []  # type: ignore[var-annotated]
+    control.begin(loop, lambda: heeded.append(None))  # type: ignore[arg-type]
+    return loop, heeded
+
+
+# -- the socket ------------------------------------------------------------------------------------
+
+
+def test_a_process_is_changed_through_its_socket_while_it_is_driven(tmp_path: Path) -> None:
+    """The file is its owner's alone, and is gone at the end; events tell what was done."""
+    path, events, answers = tmp_path / "netem", list[Event](), list[Any]()
+
+    def operate() -> None:
+        answers.append(stat.S_IMODE(path.lstat().st_mode))
+        with closing(Caller(path)) as caller:
+            answers.append(caller.ask({}).values["network.uplink.loss"])
+            answers.append(caller.ask({"network.uplink.loss": 2}).refused)
+            answers.append(caller.ask({"network.uplink.loss": 1}).changed)
+
+    endpoint = Closing(DEMO, server=("127.0.0.1", 1))
+    with controlled(path, Running(endpoint, DEMO)) as control:
+        thread = threading.Thread(target=operate)
+        shell_ = Shell(endpoint, ("127.0.0.1", 0), control=control)
+        run([shell_], on_start=thread.start, on_event=events.append)
+        thread.join()
+    refused = "network.uplink.loss: got 2, expected a number <= 1.0"
+    changed = Changed(key="network.uplink.loss", before="0.1", after="1.0")
+    assert answers == [0o600, 0.1, refused, (changed,)]
+    assert events == [ChangeRefused(reason=refused), changed]
+    assert not path.exists()
+
+
+def test_a_flood_of_requests_is_read_one_at_a_time_with_a_rest_after_each(tmp_path: Path) -> None:
+    """However many wait: whoever sends them is told that there is no room."""
+    with closing(Control(tmp_path / "netem", running())) as control:
+        loop, heeded = heeding(control)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as flood:
+            flood.setblocking(False)
+            sent = 0
+            with suppress(BlockingIOError):
+                while sent < 100_000:
+                    flood.sendto(b'{"network.uplink.loss":0.5}', str(tmp_path / "netem"))
+                    sent += 1
+        assert sent < 100_000
+        for count in range(1, 6):
+            assert loop.turn()
+            assert not loop.turn()
+            assert len(heeded) == count
+            ((rest_s, listen),) = loop.rests
+            assert rest_s >= REST_S
+            loop.rests.clear()
+            listen()
+
+
+def test_a_request_that_takes_long_is_followed_by_a_rest_that_is_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that requests cost a share of the time, whatever they ask for."""
+    seconds = iter((10.0, 10.5))
+    with closing(Control(tmp_path / "netem", running())) as control:
+        loop, _ = heeding(control)
+        monkeypatch.setattr(shell.control.time, "monotonic", lambda: next(seconds))
+        loop.turn()
+    assert [rest_s for rest_s, _ in loop.rests] == [0.5 * RESTS]
+
+
+def test_a_socket_that_is_closed_while_it_rests_reads_no_more(tmp_path: Path) -> None:
+    """The loop that it rests in goes on for a while."""
+    with closing(Control(tmp_path / "netem", running())) as control:
+        loop, _ = heeding(control)
+        loop.turn()
+        control.end()
+        loop.rests[0][1]()
+        assert not loop.turn()
+
+
+def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: Path) -> None:
+    """Also one without an address, and one that is gone; a fault is the loop's to tell."""
+    rng = random.Random(1)
+    path = tmp_path / "netem"
+    with closing(Control(path, running())) as control:
+        loop, heeded = heeding(control)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as hostile:
+            hostile.bind(str(tmp_path / "hostile"))
+            for count in range(1000):
+                if count == 500:  # from here on answers have nowhere to go
+                    (tmp_path / "hostile").unlink()
+                hostile.sendto(rng.randbytes(rng.randrange(9000)), str(path))
+                loop.turn()
+                loop.rests.pop()[1]()
+        assert len(heeded) == 1000
+        caller = Caller(path)
+        caller._socket.send(b"{}")
+        loop.turn()
+        assert b"network.uplink.loss" in caller._socket.recv(9000)
+        caller.close()
+
+
+def test_what_is_too_long_for_a_datagram_is_refused_whole(tmp_path: Path) -> None:
+    """A change may not be cut off where it still makes sense."""
+    path = tmp_path / "netem"
+    flown = running()
+    with closing(Control(path, flown)) as control, closing(Caller(path)) as caller:
+        loop, _ = heeding(control)
+        caller._socket.send(b'{"network.uplink.loss":0.5}' + b" " * 5000)
+        loop.turn()
+        assert b"expected a shorter request" in caller._socket.recv(9000)
+    assert flown.change({"network.uplink.loss": 0.1}, now_ns=0) == ()
+
+
+# -- its place -------------------------------------------------------------------------------------
+
+
+def test_a_socket_that_a_killed_process_left_behind_gives_way(tmp_path: Path) -> None:
+    """Nobody listens there."""
+    path = tmp_path / "netem"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
+        dead.bind(str(path))
+    with controlled(path, running()):
+        assert stat.S_IMODE(path.lstat().st_mode) == 0o600
+    assert not path.exists()
+
+
+def occupied(path: Path, kind: str) -> None:
+    """Put something at a path."""
+    match kind:
+        case "a file":
+            path.write_text("precious")
+        case "a folder":
+            path.mkdir()
+        case "a link":
+            path.with_name("file").write_text("precious")
+            path.symlink_to(path.with_name("file"))
+        case "a pipe":
+            os.mkfifo(path)
+
+
+@pytest.mark.parametrize("kind", ["a file", "a folder", "a link", "a pipe"])
+def test_nothing_else_gives_way(kind: str, tmp_path: Path) -> None:
+    """It stays, as it is."""
+    path = tmp_path / "netem"
+    occupied(path, kind)
+    before = path.lstat()
+    with pytest.raises(ControlError) as refused:
+        Control(path, running())
+    assert str(refused.value) == (
+        f"{path}: no socket can be made: expected a path where nothing is, or a socket that was "
+        "left behind"
+    )
+    assert path.lstat() == before
+
+
+@pytest.mark.parametrize("kind", [socket.SOCK_DGRAM, socket.SOCK_STREAM])
+def test_a_socket_at_which_somebody_listens_stays(kind: int, tmp_path: Path) -> None:
+    """Another process of ours, or of whatever else."""
+    path = tmp_path / "netem"
+    with socket.socket(socket.AF_UNIX, kind) as other:
+        other.bind(str(path))
+        if kind == socket.SOCK_STREAM:
+            other.listen()
+        with pytest.raises(ControlError, match="somebody listens there"):
+            Control(path, running())
+        assert path.is_socket()
+
+
+def test_at_the_end_only_its_own_socket_is_removed(tmp_path: Path) -> None:
+    """Another process may have made one there since."""
+    path = tmp_path / "netem"
+    control = Control(path, running())
+    path.unlink()
+    path.write_text("precious")
+    control.close()
+    assert path.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("none/netem", "No such file or directory"), ("n" * 200, "AF_UNIX path too long")],
+)
+def test_a_socket_that_cannot_be_made_is_said_before_anything_flies(
+    name: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the flag, the path and the reason."""
+    from netem.__main__ import emulate
+
+    path = tmp_path / name
+    code = command.main(emulate, ["--bind", "127.0.0.1:0", "--control", str(path)], "netem")
+    said = f"netem: --control: {path}: no socket can be made: {reason}\n"
+    assert (code, capsys.readouterr().err) == (2, said)
+
+
+# -- skytether set ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0.3", 0.3),
+        ("[[1, 2.5]]", [[1, 2.5]]),
+        ("true", True),
+        ('"periodic(5)"', "periodic(5)"),
+        ("periodic(5)", "periodic(5)"),
+        ("cost_gap & budget(5, 2) | silence(1)", "cost_gap & budget(5, 2) | silence(1)"),
+        ("none", "none"),
+        ("", ""),
+        ("nan", "nan"),
+        ("[inf]", "[inf]"),
+        ("2026-01-01", "2026-01-01"),
+        ("1\nother = 2", "1\nother = 2"),
+        ("9" * 5000, "9" * 5000),
+        ("[" * 5000, "[" * 5000),
+    ],
+)
+def test_a_value_is_toml_or_else_a_text(text: str, expected: object) -> None:
+    """As far as a request can carry it."""
+    assert value(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        (["network.uplink.loss"], "got 'network.uplink.loss', expected KEY=VALUE"),
+        (["=1"], "got '=1', expected KEY=VALUE"),
+        (["a=1", "a=2"], "a: got two values, expected one"),
+        (
+            ["a=" + "x" * 5000],
+            "got 5008 B of keys and values, expected at most 4096 B at a time",
+        ),
+    ],
+)
+def test_what_is_no_change_is_refused_before_anybody_is_asked(
+    changes: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With exit code 2."""
+    assert command.main(set_keys, ["nowhere", *changes], "set") == 2
+    assert capsys.readouterr().err == f"set: {line}\n"
+
+
+def test_where_nobody_listens_is_said_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With exit code 1."""
+    path = tmp_path / "netem"
+    assert command.main(set_keys, [str(path)], "set") == 1
+    assert capsys.readouterr().err == f"set: {path}: No such file or directory\n"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
+        dead.bind(str(path))
+    assert command.main(set_keys, [str(path)], "set") == 1
+    assert capsys.readouterr().err == f"set: {path}: Connection refused\n"
+
+
+def test_one_that_listens_and_does_not_answer_is_not_waited_for_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A process that is stopped, for instance."""
+    path = tmp_path / "netem"
+    monkeypatch.setattr(shell.control, "PATIENCE_S", 0.05)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(str(path))
+        assert command.main(set_keys, [str(path)], "set") == 1
+    assert capsys.readouterr().err == f"set: {path}: no answer in 0.05 s\n"
+
+
+def test_set_prints_what_may_change_what_has_and_what_was_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Values as in a scenario's file, and in an order."""
+    path = tmp_path / "netem"
+    codes: list[int] = []
+
+    def operate() -> None:
+        calls = [[], ["network.uplink.loss=0.3", "network.downlink.delay=none"], ["control.dt=1"]]
+        codes.extend(command.main(set_keys, [str(path), *call], "set") for call in calls)
+        command.main(set_keys, [str(path), "network.uplink.loss=1"], "set")
+
+    endpoint = Closing(DEMO, server=("127.0.0.1", 1))
+    with controlled(path, Running(endpoint, DEMO)) as control:
+        thread = threading.Thread(target=operate)
+        run([Shell(endpoint, ("127.0.0.1", 0), control=control)], on_start=thread.start)
+        thread.join()
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert codes == [0, 0, 2]
+    assert lines[:2] == ["network.downlink.burst_s = 0.0", 'network.downlink.delay = "poisson"']
+    assert lines[12:14] == [
+        "network.uplink.loss is 0.3 from now on, it was 0.1",
+        'network.downlink.delay is "none" from now on, it was "poisson"',
+    ]
+    assert err.startswith(f"set: {path}: control.dt: cannot be changed in flight; what can be here")
+
+
+def test_no_loop_is_needed_to_close_what_was_never_driven(tmp_path: Path) -> None:
+    """A process that fails before it flies leaves none behind; without a path there is none."""
+    path = tmp_path / "netem"
+    with controlled(path, running()) as control:
+        assert control is not None
+        control.end()
+    assert not path.exists()
+    with controlled(None, running()) as control:
+        assert control is None
