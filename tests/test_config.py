@@ -11,6 +11,10 @@ from shared.config import ConfigError, Scenario
 
 WRONG = {
     # Not the form of a scenario.
+    "velocities never measured, and no filter": (
+        'sensor = { velocity_every_s = "never", filter = "none" }',
+        "sensor.filter: got 'none', expected 'kalman' with sensor.velocity_every_s = 'never'",
+    ),
     "a key misspelt": ("sead = 3", "sead: no such key; did you mean seed?"),
     "a key misspelt in a table": (
         "control.horzon = 9",
