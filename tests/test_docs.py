@@ -2,8 +2,10 @@
 
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,7 @@ def skytether(line: str) -> list[str]:
         if line.startswith(
             ("skytether fl", "skytether sc", "skytether sw", "skytether ca", "skytether en")
         )
+        and "--control" not in line
     ],
 )
 def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
@@ -106,6 +109,38 @@ def fly_together(lines: list[str], folder: Path) -> str:
     return run.stdout
 
 
+def test_the_documented_changes_are_made_in_flight(tmp_path: Path) -> None:
+    """Those of docs/control.md, one after the other, and the flight that they are for."""
+    (flies,), changes = blocks(ROOT / "docs" / "control.md")
+    with subprocess.Popen(
+        skytether(flies), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as flight:
+        try:
+            said = "".join(changed(line, tmp_path) for line in changes)
+        finally:
+            flight.send_signal(signal.SIGINT)
+            _, told = flight.communicate(timeout=60)
+    assert said.startswith("armed = false\n")
+    assert "armed is true from now on, it was false" in said
+    assert [line for line in said.splitlines() if "from now on" in line] == [
+        line for line in told.splitlines() if "from now on" in line
+    ]
+    assert said.count("from now on") == 9
+
+
+def changed(line: str, folder: Path) -> str:
+    """What a change says, once the process that it is for listens."""
+    for _ in range(600):
+        run = subprocess.run(
+            skytether(line), cwd=folder, capture_output=True, text=True, check=False
+        )
+        if run.returncode != 1:  # nobody listens yet
+            break
+        time.sleep(0.1)
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
 @pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
 def test_documented_targets_exist(line: str) -> None:
     """`make -n` knows each."""
@@ -123,6 +158,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether compare",)  # by test_compare.py
     known += ("skytether keygen ",)  # by test_keys.py
     known += ("skytether torture",)  # by test_torture.py
+    known += ("skytether set ",)
     known += ("docker compose up",)
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:
