@@ -309,6 +309,42 @@ def test_a_gust_that_blows_goes_on_with_its_new_strength() -> None:
     np.testing.assert_allclose(gained, 3.0 * before, rtol=1e-9)
 
 
+def test_a_live_point_is_led() -> None:
+    """The server knows it as it was told last, carried on, and the vehicle comes after it."""
+    flown = scenario(reference={"shape": "live"}, duration=14.0)
+    place, way = "reference.points_m", "reference.velocity_mps"
+    flight = fly(
+        flown,
+        changes=[
+            (2.0, {place: [[1.0, 2.0]], way: [0.0, 0.0]}),
+            (8.0, {way: [0.5, 0.0]}),
+            (10.0, {place: [[3.0, 2.0]]}),
+        ],
+    )
+    ((began_s, *_),) = told(flight, Flying)
+    time_s = began_s + 0.05 * flight.server["step"]
+    known = flight.server["reference"]
+    moved_m = 0.5 * np.clip(time_s - 8.0, 0.0, 2.0)
+    late_m = np.where(time_s > 10.0, 3.0 + 0.5 * (time_s - 10.0), 1.0 + moved_m)
+    wanted = np.stack([late_m, np.full(len(time_s), 2.0)], axis=-1) * (time_s > 2.0)[:, None]
+    sharp = np.abs(time_s[:, None] - [2.0, 10.0]).min(axis=1) > 0.1
+    np.testing.assert_allclose(known[sharp, :, 0], wanted[sharp], atol=0.05)
+    np.testing.assert_array_equal(known[time_s > 8.1, 0, 1], 0.5)
+    flown_m = flight.client["state"][..., 0]
+    np.testing.assert_allclose(flown_m[flight.client["step"] == 135][0], [1.0, 2.0], atol=0.1)
+
+
+def test_only_a_live_point_can_be_led() -> None:
+    """A circle goes where it goes."""
+    flight = fly(scenario(), changes=[(3.0, {"reference.points_m": [[1.0, 2.0]]})])
+    ((_, host, refused),) = told(flight, ChangeRefused)
+    assert host == "server"
+    assert str(refused).startswith(
+        "a change is refused: reference.points_m: cannot be changed in flight; what can be here: "
+        "control.cost_gap, "
+    )
+
+
 def arming(*changes: tuple[float, bool], armed: bool = True) -> Flight:
     """A flight in which the vehicle is armed and disarmed at these times [s]."""
     flown = scenario(armed=armed, duration=12.0)
