@@ -16,6 +16,7 @@ def clamped(
     u_max: Sequence[float],
     change_max: float,
     *,
+    told: Sequence[float],
     speed_max: float = math.inf,
 ) -> list[float] | None:
     """The input that may be flown [m/s], or None where it is not finite on some axis.
@@ -25,13 +26,14 @@ def clamped(
         before: input that was flown until now, of each axis, within `u_max` [m/s].
         u_max: bound of each axis [m/s].
         change_max: largest change from `before` on an axis [m/s]; may be infinite.
-        speed_max: bound of the magnitude over all axes, within `ROUNDING` [m/s].
+        told: part of it that is no feedback, of each axis [m/s].
+        speed_max: bound of the magnitude of this part over all axes, within `ROUNDING` [m/s].
     """
-    if not all(map(math.isfinite, wanted)):
+    if not all(map(math.isfinite, (*wanted, *told))):
         return None
-    flown, speed = [], math.hypot(*wanted)
-    share = speed_max / speed if speed > speed_max + ROUNDING else 1.0
-    for u, last, most in zip([share * u for u in wanted], before, u_max, strict=True):
-        near = min(max(u, last - change_max), last + change_max)
+    flown, speed = [], math.hypot(*told)
+    excess = 1.0 - speed_max / speed if speed > speed_max + ROUNDING else 0.0
+    for u, part, last, most in zip(wanted, told, before, u_max, strict=True):
+        near = min(max(u - excess * part, last - change_max), last + change_max)
         flown.append(min(max(near, -most), most))
     return flown

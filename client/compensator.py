@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 
 from shared.model import Array, advance
 from shared.protocol import NO_HORIZON, Horizon, ProtocolError
-from shared.rule import bounded, entry, flown, lasting, late_max, led_back
+from shared.rule import (
+    bounded,
+    entry,
+    flown,
+    lasting,
+    late_max,
+    leading,
+    led_back,
+    remaining,
+)
 from shared.terms import Terms
 
 
@@ -42,6 +51,8 @@ class Compensator:
         self._led: list[tuple[float, float]] = []
         """State x̄ that the horizon leads to, of each axis at stage `_led_stage` [m, m/s]."""
         self._led_stage = 0
+        self.told = self._nothing
+        """What is flown at the step chosen for last but for the feedback, of each axis [m/s]."""
         self.in_force = NO_HORIZON
         """Step that the horizon was made for, k_h, or NO_HORIZON."""
         self.newest = NO_HORIZON
@@ -92,7 +103,7 @@ class Compensator:
         self._inputs = horizon.inputs[:, :length]
         if not self._indexed:
             self._inputs = np.broadcast_to(horizon.inputs[:, :1], (len(self._bounds), length))
-        self._speed = math.sqrt(sum(u * u for u in self._told(-1)))
+        self._speed = math.sqrt(sum(u * u for u in self._input(-1)))
         self._feedback = horizon.feedback.tolist() if horizon.feedback.size else []
         self._led = [(p, v) for p, v, *_ in self._feedback]
         self._led_stage = 0
@@ -133,33 +144,44 @@ class Compensator:
             self.since, self._new = step, False
         held = self.in_force != NO_HORIZON
         stage = step - (self.in_force if held else self._dropped)
-        length = self._inputs.shape[1]
-        self.covered = held and stage < length
-        told = self._told(entry(stage, length))
+        self.covered = held and stage < self._inputs.shape[1]
+        _, self.told = self._tell(stage)
         back = self._led_back(stage, state) if self._feedback else self._nothing
         return np.array(
             [
-                flown(stage, length, u, led, self._speed, self._brake, bound)
-                for u, led, bound in zip(told, back, self._bounds, strict=True)
+                flown(stage, u, led, bound)
+                for u, led, bound in zip(self.told, back, self._bounds, strict=True)
             ]
         )
 
-    def _told(self, stage: int) -> list[float]:
-        """The horizon's input at a stage, of each axis, within the bound [m/s]."""
-        inputs = self._inputs[:, stage].tolist()
+    @property
+    def feeds_back(self) -> bool:
+        """Whether the horizon that is held brings feedback."""
+        return bool(self._feedback)
+
+    def _input(self, index: int) -> list[float]:
+        """One of the horizon's inputs, of each axis, within the bound [m/s]."""
+        inputs = self._inputs[:, index].tolist()
         return [bounded(u, bound) for u, bound in zip(inputs, self._bounds, strict=True)]
 
+    def _tell(self, stage: int) -> tuple[float, list[float]]:
+        """Share of an input that is told at a stage, and what is told, of each axis [m/s]."""
+        length = self._inputs.shape[1]
+        share = remaining(stage, length, self._speed, self._brake)
+        return share, [share * u for u in self._input(entry(stage, length))]
+
     def _led_back(self, stage: int, state: Array) -> list[float]:
-        """Feedback at a stage, of each axis [m/s]; x̄ is rolled on to there, or to its end."""
-        for reached in range(self._led_stage, min(stage, self._inputs.shape[1] - 1)):
+        """Feedback at a stage, of each axis [m/s]; x̄ is rolled on to there."""
+        for reached in range(self._led_stage, stage):
+            share, told = self._tell(reached)
             self._led = [
-                advance(axis, *led, u + told[2])
-                for axis, led, u, told in zip(
-                    self._model, self._led, self._told(reached), self._feedback, strict=True
+                advance(axis, *led, leading(u, feedback[2], share))
+                for axis, led, u, feedback in zip(
+                    self._model, self._led, told, self._feedback, strict=True
                 )
             ]
             self._led_stage = reached + 1
         return [
-            led_back(told[3], told[4], led[0] - p, led[1] - v)
-            for told, led, (p, v) in zip(self._feedback, self._led, state.tolist(), strict=True)
+            led_back(feedback[3], feedback[4], led[0] - p, led[1] - v)
+            for feedback, led, (p, v) in zip(self._feedback, self._led, state.tolist(), strict=True)
         ]

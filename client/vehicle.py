@@ -133,16 +133,16 @@ class Client(Endpoint):
         self._link = link or Plain()
         self._recorder = recorder
 
-        holds = self._terms.exhausted == "hold"
         self._failsafe = Failsafe(
-            HOLD if holds else TABLE,
+            HOLD if self._terms.exhausted == "hold" else TABLE,
             armed=scenario.armed,
             timeout_ns=self._timeout_ns,
             land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
             changed=self._mode_changed,
         )
-        slew_mps2 = scenario.vehicle.slew_mps2
-        self._change_max = math.inf if holds else slew_mps2 * self._terms.dt_s
+        self._change_max = (
+            scenario.vehicle.slew_mps2 * self._terms.dt_s if self._failsafe.brakes else math.inf
+        )
         """Largest change of the input from step to step [m/s]."""
 
         self._hello_ns = 0
@@ -164,6 +164,8 @@ class Client(Endpoint):
         not."""
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
+        self._speed = 0.0
+        """Magnitude of the part of it that is no feedback [m/s]."""
         self._covered = 0
         """Number of steps for which there was an input planned."""
         self._covered_last = 0
@@ -410,29 +412,36 @@ class Client(Endpoint):
             wanted = [0.0] * self._terms.axes
             if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE, 0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
+        told = compensator.told if compensator.feeds_back else wanted
+        speed_max = self._speed_max(had_plan)
         flown = clamped(
             wanted,
-            before := self._input.tolist(),
+            self._input.tolist(),
             self._terms.u_max,
             self._change_max,
-            speed_max=self._speed_max(had_plan, before),
+            told=told,
+            speed_max=speed_max,
         )
         if flown is None:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         elif compensator.in_force != NO_HORIZON and not compensator.covered:
             failsafe.meet(Reason.ENDED, now_ns=now_ns)
         if flown is None or failsafe.mode is Mode.FAULT:
-            flown = [0.0] * self._terms.axes
-        if not any(flown):
+            flown = told = [0.0] * self._terms.axes
+        if compensator.feeds_back:
+            self._speed = min(math.hypot(*told), speed_max)
+        else:
+            self._speed = math.hypot(*flown)
+        if not self._speed:
             failsafe.meet(Reason.STILL, now_ns=now_ns)
         return np.array(flown)
 
-    def _speed_max(self, had_plan: bool, before: list[float]) -> float:
-        """Largest speed of the input [m/s]: without a plan what was flown is braked along."""
+    def _speed_max(self, had_plan: bool) -> float:
+        """Largest speed of what is told [m/s]: without a plan what was flown is braked along."""
         brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
         if self._compensator.covered or not brakes:
             return math.inf
-        return max(0.0, math.hypot(*before) - (0.0 if had_plan else self._terms.brake))
+        return max(0.0, self._speed - (0.0 if had_plan else self._terms.brake))
 
     def _report(self, known: Known, stamp_ns: int) -> None:
         """Send and record the step that has just begun; a state that is none is only recorded."""
@@ -482,6 +491,7 @@ class Client(Endpoint):
             self._takes_from = None
         if cause in DROPPING:
             self._compensator.drop(self._step - 1, self._input)
+            self._speed = math.hypot(*self._input.tolist())
         if cause in CLOSING:
             self._in_session = False
         if cause is Reason.OLD or (was, cause) == (Reason.OLD, Reason.HORIZON):

@@ -128,6 +128,8 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
 """Keys of each policy that looks at the flight, so that weights decide what it sends, too."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
 """Keys of the schemes that have a disturbance observer."""
+OBSERVE = ("committed", "predictive")
+"""Those schemes."""
 HERE = "here"
 """Name of the one column of a point that is flown as it is."""
 
@@ -158,7 +160,7 @@ class Rmse:
     def free(self) -> Sequence[Free]:
         """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
         control, table = self.scenario.control, plain(self.scenario)
-        observer = OBSERVER_KEYS if control.commits else ()
+        observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
         keys = [*WEIGHTS, *trigger_keys(control.trigger), *observer]
         return [key for key in keys if key.of(table) > 0.0]
 

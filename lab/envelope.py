@@ -9,6 +9,9 @@ its command was u and its velocity v, must keep to the braking curve (a: brake_m
     |p(t) - p(s)| ≤ τ |v| + g (|u|²/2a + |u| Δt)                               how far that takes it
     |v(t)| ≤ |v| e^(-(t - s)/τ) + g |u| e^(-(t - s - |u|/a - Δt)/τ)            how fast it still is
 
+With feedback aboard a horizon that has ended is still held, and leads the vehicle to where it
+brakes to: then the second line alone binds, 1 m wider, until the horizon is dropped.
+
 In all, it must stay within a disc: that around the reference, 1 m and the way to stop wider. And it
 must have come near the reference once it flies a plan that was made of what it did under plans.
 """
@@ -254,7 +257,10 @@ def _faults(
     time_s = client["step"] * dt
     position, velocity = client["state"][..., 0], client["state"][..., 1]
     speed, command = np.linalg.norm(velocity, axis=1), np.linalg.norm(client["input"], axis=1)
-    begun = _begun(covered)
+    # It holds a horizon that has ended, and comes to rest where that leads.
+    led = ~covered & (client["age_ns"] >= 0) & scenario.control.feedback
+    blind = ~covered & ~led
+    begun = _begun(covered, led)
     since_s = time_s - time_s[begun]
     age_s = client["age_ns"] / SECOND_NS
     # Nobody answers the wind before it has been seen.
@@ -278,7 +284,7 @@ def _faults(
     rules: tuple[tuple[str, Flags, Array, Any], ...] = (
         (
             "it is commanded {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",
-            ~covered,
+            blind,
             command,
             np.maximum(0.0, command[begun] - brake * since_s),
         ),
@@ -286,11 +292,11 @@ def _faults(
             "it went {:.3g} m without a plan, where braking takes {:.3g} m",
             ~covered,
             travelled_m,
-            stop_m(speed[begun], on_its_way) + pushed_m,
+            stop_m(speed[begun], on_its_way) + pushed_m + NEAR_M * led,
         ),
         (
             "it has {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",
-            ~covered,
+            blind,
             speed,
             curve_mps + pushed_mps,
         ),
@@ -318,10 +324,10 @@ def _faults(
             yield step, f"at {time_s[step]:.2f} s {says.format(given[step], most[step])}"
 
 
-def _begun(covered: Flags) -> Any:
-    """Row at which the stretch with planned inputs, or without, began; shape (steps,)."""
-    rows = np.arange(len(covered))
-    changed = np.concatenate([[True], covered[1:] != covered[:-1]])
+def _begun(covered: Flags, led: Flags) -> Any:
+    """Row at which the stretch with planned inputs, led on, or without, began; shape (steps,)."""
+    rows, kind = np.arange(len(covered)), covered + 2 * led
+    changed = np.concatenate([[True], kind[1:] != kind[:-1]])
     return np.maximum.accumulate(np.where(changed, rows, 0))
 
 

@@ -22,6 +22,7 @@ from client.vehicle import ALTITUDE, LAND_MPS
 from server.gate import Call, Gate, Line
 from shared.config import Scenario
 from shared.endpoint import EVENTS_MAX, MILLISECOND_NS, SECOND_NS, Datagram, seconds_to_ns
+from shared.model import Array
 from shared.protocol import NO_HORIZON, Horizon, Mode, Observation, decode
 from shared.record import Recorder, client_columns
 from shared.terms import Terms
@@ -134,6 +135,46 @@ class _Noted:
         return self.inner.seal(payload)
 
 
+class Course:
+    """What a horizon tells and where that leads, worked out anew.
+
+    Args:
+        horizon: the horizon.
+        length: number of its inputs that may be flown.
+        terms: the rule of flight.
+    """
+
+    def __init__(self, horizon: Horizon, length: int, terms: Terms) -> None:
+        bound = np.array(terms.u_max)[:, None]
+        self._inputs = np.clip(horizon.inputs[:, :length].astype(float), -bound, bound)
+        self._speed = float(np.linalg.norm(self._inputs[:, -1]))
+        self._model, self._brake = terms.model, terms.brake
+        feedback = horizon.feedback.astype(float)
+        self.feeds_back = feedback.size > 0
+        """Whether it brings feedback."""
+        self._gain, self._disturbance = feedback[:, 3:], feedback[:, 2:3].ravel()
+        self._led, self._stage = feedback[:, :2], 0
+
+    def told(self, stage: int) -> Array:
+        """What it tells at a stage: its input, and after the last the braking curve [m/s]."""
+        length = self._inputs.shape[1]
+        u: Array = self._inputs[:, min(max(stage, 0), length - 1)]
+        left = self._speed - max(stage - length + 1, 0) * self._brake
+        return u * (max(0.0, left) / self._speed) if self._speed else 0.0 * u
+
+    def back(self, stage: int, state: Array) -> Array:
+        """Feedback at a stage, no earlier than those before, in a state of (axes, 2) [m/s]."""
+        if stage < 0 or not self.feeds_back:
+            return np.zeros(len(self._inputs))
+        for reached in range(self._stage, stage):
+            told = self.told(reached)
+            stands = reached >= self._inputs.shape[1] and not told.any()
+            self._led = self._model.step(self._led, told if stands else told + self._disturbance)
+        self._stage = max(self._stage, stage)
+        back: Array = (self._gain * (self._led - state)).sum(axis=1)
+        return back
+
+
 class Life(Recorder):
     """One life of a vehicle: its link, around the real one, and what takes its record.
 
@@ -194,6 +235,12 @@ class Life(Recorder):
         """Session, life of the server and message of each horizon that was opened."""
         self._held: tuple[int, int, Horizon] | None = None
         """The one in force, decoded."""
+        self._course: Course | None = None
+        """What it tells."""
+        self._covered = False
+        """Whether it had an input for the last step."""
+        self._speed = 0.0
+        """Magnitude of what was flown last but for the feedback [m/s]."""
         self._drifted_m = 0.0
         """How far it may have flown while asleep [m]."""
         self.input = [0.0] * self._terms.axes
@@ -276,8 +323,7 @@ class Life(Recorder):
         self._check_input(flown)
         self._check_mode(mode, covered=bool(covered), now_ns=now_ns)
         self._check_horizon(step, int(in_force), int(age_ns), now_ns)
-        if covered:
-            self._check_follows(step, flown)
+        self._check_follows(step, np.reshape(state, (axes, 2)), flown, covered=bool(covered))
         self._check_silence(mode, flown)
         self._check_place(state[::2], asleep)
         if mode not in FLYING and mode is not Mode.LAND and self._overdue():
@@ -328,10 +374,11 @@ class Life(Recorder):
     def _check_horizon(self, step: int, in_force: int, age_ns: int, now_ns: int) -> None:
         """It was sent by the present life of the server for this session, and is not too old."""
         if in_force == NO_HORIZON:
-            self._held = None
+            self._held = self._course = None
             return
         if self._held is None or self._held[2].step != in_force:
             self._held = self._find(in_force, step * self._dt_ns - age_ns)
+            self._course = None
             good_ns = self._good_ns
             if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * self._dt_ns:
                 since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
@@ -345,6 +392,9 @@ class Life(Recorder):
         observed_ns = self._times_ns.get(observed)
         if rest_ns or observed_ns is None or observed > step:
             raise Violation("observed", f"a horizon from an observation of step {observed}")
+        if self._course is None:
+            last = min(horizon.inputs.shape[1], observed + self._terms.age_max - in_force + 1)
+            self._course = Course(horizon, last, self._terms)
 
     def _find(self, made_for: int, observed_ns: int) -> tuple[int, int, Horizon]:
         """The horizon in force, by the step that it was made for and its observation."""
@@ -356,26 +406,44 @@ class Life(Recorder):
                 return session, life, horizon
         raise Violation("foreign", f"a horizon for step {made_for} that has not come")
 
-    def _check_follows(self, step: int, flown: list[float]) -> None:
-        """It flies the input of its horizon, as fast as it may change, and none that is too old."""
+    def _check_follows(self, step: int, state: Array, flown: list[float], *, covered: bool) -> None:
+        """It flies what its horizon tells, as fast as it may change, and none that is too old.
+
+        After the last input that is the braking curve, and no faster than what was told before,
+        whatever feedback adds.
+        """
+        course, before = self._course, np.array(self.input)
+        if course is None:
+            self._speed, self._covered = math.hypot(*flown), covered
+            return
         assert self._held is not None
         assert self._epoch_ns is not None
         horizon = self._held[2]
-        observed = (horizon.observed_ns - self._epoch_ns) // self._dt_ns
+        if covered:
+            self._check_age(step, (horizon.observed_ns - self._epoch_ns) // self._dt_ns)
+        stage, most = step - horizon.step, math.inf
+        told = course.told(stage)
+        if not covered:
+            most = max(0.0, self._speed - (0.0 if self._covered else self._terms.brake))
+        told = told * min(1.0, most / max(float(np.linalg.norm(told)), ROUNDING))
+        bound = np.array(self._terms.u_max)
+        want = np.clip(told + course.back(stage, state), -bound, bound)
+        near = np.clip(want, before - self._change_max, before + self._change_max)
+        for u, should, meant in zip(flown, near.tolist(), want.tolist(), strict=True):
+            if abs(u - should) > 2.0 * ROUNDING:
+                raise Violation("follows", f"{u:.4f} m/s flown, {meant:.4f} planned")
+        feeds_back = course.feeds_back
+        self._speed = float(np.linalg.norm(told)) if feeds_back else math.hypot(*flown)
+        self._covered = covered
+
+    def _check_age(self, step: int, observed: int) -> None:
+        """An input is flown no later after the observation behind it than it may be."""
         limit_ns = self._terms.age_max * self._dt_ns
         old_ns = max(self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns)
         if old_ns > limit_ns + 2 * self._dt_ns or step - observed > self._terms.age_max:
             raise Violation(
                 "expired", f"an input from an observation {old_ns / SECOND_NS:.2f} s old"
             )
-        if self._terms.feedback:
-            return
-        stage = min(max(step - horizon.step, 0), horizon.inputs.shape[1] - 1)
-        told = horizon.inputs[:, stage].tolist()
-        for u, want, before in zip(flown, told, self.input, strict=True):
-            near = min(max(want, before - self._change_max), before + self._change_max)
-            if abs(u - near) > 2.0 * ROUNDING:
-                raise Violation("follows", f"{u:.4f} m/s flown, {want:.4f} planned")
 
     def _check_silence(self, mode: Mode, flown: list[float]) -> None:
         """It has braked as long as it has lost the link, and descends at most."""

@@ -267,6 +267,11 @@ FIGURES = (
     "stale",
     "age_ms_p50",
     "age_ms_p99",
+    "aoi_s_mean",
+    "aoi_s_peak",
+    "plan_age_s_mean",
+    "effort_mps",
+    "saturated",
     "deadline_misses",
 )
 """Figures of a summary that make sense as a mean."""

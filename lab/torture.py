@@ -18,6 +18,7 @@ import numpy as np
 from client import secure as client_secure
 from client.failsafe import GOOD_NS
 from client.link import AGAIN_NS
+from client.navigation import navigation
 from client.plant import FirstOrderPlant
 from client.vehicle import Client
 from lab.faults import Fault, Kind, Trial, schedule, shrink
@@ -86,7 +87,10 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
         "network": {"uplink": direction, "downlink": direction},
         "link": {"heartbeat_s": 0.1, "timeout_s": 1.0, "age_max_s": 3.0, "connect_s": 3600.0},
     }
-    return config.check(table, "torture"), 1 + int(rng.random() < 0.3)
+    vehicles = 1 + int(rng.random() < 0.3)
+    if rng.random() < 0.3:
+        table["sensor"] = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
+    return config.check(table, "torture"), vehicles
 
 
 def short_trial(seed: int) -> Trial:
@@ -263,6 +267,9 @@ class Torture:
             vehicle=vehicle,
             boot_id=self._boot_id(),
             link=life,
+            navigation=navigation(
+                self.scenario, stream(self.trial.seed, "sensor", vehicle, number)
+            ),
             recorder=life,
         )
         return life, Steady(client)

@@ -17,6 +17,7 @@ import numpy as np
 from server.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from server.desired import Desired
 from server.estimator import Estimator
+from server.gain import feedback_gain
 from server.planner import Figures, Planner
 from server.reckoning import Reckoning
 from server.replay import Replay
@@ -92,16 +93,17 @@ class Controller:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
         self.desired = Desired(scenario, terms, room, block, references)
         """What is known of the desired trajectories."""
+        gain = feedback_gain(scenario)
         self._scheme: Scheme
         self.planner: Planner | Reckoning
         """Plans of every vehicle, or what is sent in place of a plan."""
         if terms.reckons:
-            self._scheme = self.planner = Reckoning(control, terms, self.desired, room, block)
+            self._scheme = self.planner = Reckoning(terms, gain, self.desired, room, block)
         else:
             self._scheme = (
-                Replay(terms, control, room, clock)
+                Replay(terms, control, gain, room, clock)
                 if terms.commits
-                else Estimator(terms.model, room, terms.age_max, compensate=terms.indexed)
+                else Estimator(terms, control, gain, room)
             )
             self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
         self._trigger = make_trigger(control, room)

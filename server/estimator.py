@@ -7,69 +7,131 @@ not formed: one step of (4) after the other says the same.
 
 This is the scheme "predictive", and "none", which takes the newest observation for the present.
 `server.replay` is the other.
+
+The paper has neither observer nor feedback. With `control.observer_s` a disturbance ŵ is learned
+from one observation to the next (`server.observer`), between the inputs that both say were flown,
+and added to every û. With feedback aboard x̂(k), ŵ and K go with the horizon.
 """
 
 from collections import Counter
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from server.model import Axes, advance, axes_of
+from server.model import AXIS_FIELDS, advance
+from server.observer import decay_of, learned
 from server.scheme import Foresight
-from shared.kernel import F3, I1, S3, kernel
-from shared.model import Flags, Indices, Model
+from shared.config import ControlConfig
+from shared.kernel import F2, F3, I1, S3, kernel, part, record, records
+from shared.model import Array, Flags, Indices
 from shared.protocol import Observation
+from shared.terms import Terms
+
+APART_NS = 250_000_000
+"""Longest time between two observations from which a disturbance is learned [ns]: the inputs flown
+in between are reckoned from those at both ends."""
+
+AXIS = record(*AXIS_FIELDS, ("bound", "f8"), ("gain_p", "f8"), ("gain_v", "f8"))
+"""Eq. (4) on one axis, u_max [m/s], and K on position [1/s] and velocity, 0 without feedback."""
+
+
+class Settings(NamedTuple):
+    """What is the same for all vehicles."""
+
+    axes: Annotated[NDArray[np.void], records(AXIS, 1)]
+    """Model, bound and gain; shape (axes,)."""
+    compensate: bool
+    """Whether observations are flown on to the present."""
+    dt_ns: int
+    """Length of a step [ns]."""
+    decay: float
+    """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
+    feeds_back: bool
+    """Whether horizons bring feedback."""
+
+
+class Memory(NamedTuple):
+    """What is known of every vehicle."""
+
+    observed: I1
+    """Step of the newest observation, or -1; shape (capacity,)."""
+    state: F3
+    """State of it [m, m/s]; shape (capacity, axes, 2)."""
+    flown: F2
+    """Input flown at its step [m/s]; shape (capacity, axes)."""
+    base: I1
+    """Step of the one that was learned from last, or -1; shape (capacity,)."""
+    base_velocity: F2
+    """Velocity of that [m/s]; shape (capacity, axes)."""
+    base_flown: F2
+    """Input flown at its step [m/s]; shape (capacity, axes)."""
+    disturbance: F2
+    """Disturbance ŵ [m/s]; shape (capacity, axes)."""
+    inputs: F3
+    """Input history û, a ring over the steps; 0, hovering, where nothing was computed [m/s]."""
+    last: I1
+    """Step whose û was computed last, or -1; shape (capacity,)."""
 
 
 class Estimator:
     """The paper's `Scheme`: observations and inputs of up to `capacity` vehicles.
 
     Args:
-        model: eq. (4).
-        reach: largest τ that is compensated.
-        compensate: False for "no compensation": x̂(k) is the newest observation, as it is.
+        terms: the rule of flight; with the scheme "none", x̂(k) is the newest observation, as it is.
+        control: `observer_s`, which the scheme "none" has no use for.
+        gain: K of feedback aboard, 0 without; shape (axes, 2).
     """
 
-    def __init__(self, model: Model, capacity: int, reach: int, *, compensate: bool) -> None:
-        axes = len(model.b0)
+    def __init__(self, terms: Terms, control: ControlConfig, gain: Array, capacity: int) -> None:
+        n = terms.axes
         self.counts: Counter[str] = Counter()
-        self._model = axes_of(model)
-        self._compensate = compensate
-        self.observed_step = np.full(capacity, -1, dtype=np.int64)
+        axes = np.zeros(n, dtype=AXIS)
+        for name, numbers in terms.model._asdict().items():
+            axes[name] = numbers
+        axes["bound"] = terms.u_max
+        axes["gain_p"], axes["gain_v"] = gain.T
+        self._settings = Settings(
+            axes=axes,
+            compensate=terms.indexed,
+            dt_ns=terms.dt_ns,
+            decay=decay_of(terms, control) if terms.indexed else 1.0,
+            feeds_back=terms.feedback,
+        )
+        self._memory = Memory(
+            observed=np.full(capacity, -1, dtype=np.int64),
+            state=np.zeros((capacity, n, 2)),
+            flown=np.zeros((capacity, n)),
+            base=np.full(capacity, -1, dtype=np.int64),
+            base_velocity=np.zeros((capacity, n)),
+            base_flown=np.zeros((capacity, n)),
+            disturbance=np.zeros((capacity, n)),
+            inputs=np.zeros((capacity, n, terms.age_max)),
+            last=np.full(capacity, -1, dtype=np.int64),
+        )
+        self.observed_step: Indices = self._memory.observed
         """Step of the newest observation, or -1; shape (capacity,)."""
-        self._state = np.zeros((capacity, axes, 2))
-        self._inputs = np.zeros((capacity, axes, reach))
-        """Input history û, a ring over the steps; 0, hovering, where nothing was computed [m/s]."""
-        self._last_step = np.full(capacity, -1, dtype=np.int64)
-        """Step whose û was computed last, or -1; shape (capacity,)."""
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
-        self.observed_step[row] = -1
-        self._inputs[row] = 0.0
-        self._last_step[row] = -1
+        memory = self._memory
+        memory.observed[row] = memory.base[row] = memory.last[row] = -1
+        memory.disturbance[row] = 0.0
+        memory.inputs[row] = 0.0
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
-        if observation.step <= self.observed_step[row]:
+        memory = self._memory
+        if observation.step <= memory.observed[row]:
             return False
-        self.observed_step[row] = observation.step
-        self._state[row] = observation.state
+        memory.observed[row] = observation.step
+        memory.state[row] = observation.state
+        memory.flown[row] = observation.input
         return True
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
         """See `Scheme`: planning starts at k, from x̂(k) of eq. (13)."""
-        _fly_on(
-            self._model,
-            self._state,
-            self.observed_step,
-            self._inputs,
-            self._last_step,
-            self._compensate,
-            rows,
-            step,
-            found.estimate,
-            found.start,
-        )
+        _fly_on(self._settings, self._memory, rows, step, found)
 
     def remember(
         self,
@@ -82,34 +144,56 @@ class Estimator:
 
         Steps before at which nothing was computed flew on with the input of before them.
         """
-        _write_down(self._inputs, self._last_step, rows, step, found.horizons)
+        _write_down(self._memory.inputs, self._memory.last, rows, step, found.horizons)
+
+
+@part
+def _observe_disturbance(settings: Settings, memory: Memory, row: int, k: int) -> None:
+    """Disturbance observer: from the observation before to the newest, where there is a new one."""
+    begin, end = memory.base[row], memory.observed[row]
+    m, near = end - begin, APART_NS // settings.dt_ns
+    for i in range(len(settings.axes)):
+        axis, velocity, u = (
+            settings.axes[i],
+            memory.base_velocity[row, i],
+            memory.base_flown[row, i],
+        )
+        if begin >= 0 and 0 < m <= max(1, near):
+            w, change = memory.disturbance[row, i], (memory.flown[row, i] - u) / m
+            p, v = 0.0, velocity
+            for step in range(m):
+                p, v = advance(axis, p, v, u + step * change + w)
+            off, trip_ns = memory.state[row, i, 1] - v, (k - end) * settings.dt_ns
+            memory.disturbance[row, i] = learned(
+                w, off, m, axis.a11, settings.decay, trip_ns, axis.bound
+            )
+        memory.base_velocity[row, i] = memory.state[row, i, 1]
+        memory.base_flown[row, i] = memory.flown[row, i]
+    memory.base[row] = end
 
 
 @kernel
-def _fly_on(
-    model: Axes,
-    state: F3,
-    observed_step: I1,
-    inputs: F3,
-    last_step: I1,
-    compensate: bool,
-    rows: I1,
-    steps: I1,
-    estimate: F3,
-    start: F3,
-) -> None:
-    """Fill in x̂(k), eq. (13), as `estimate` and `start`; see `Estimator` for the shapes."""
-    reach = inputs.shape[2]
+def _fly_on(settings: Settings, memory: Memory, rows: I1, steps: I1, found: Foresight) -> None:
+    """Fill in x̂(k), eq. (13), as `estimate` and `start`, ŵ, and what feedback leads on from."""
+    reach = memory.inputs.shape[2]
     for i in range(len(rows)):
-        row = rows[i]
-        for axis in range(len(model)):
-            p, v = state[row, axis, 0], state[row, axis, 1]
-            if compensate:
-                for step in range(observed_step[row], steps[i]):
-                    u = inputs[row, axis, min(step, last_step[row]) % reach]
-                    p, v = advance(model[axis], p, v, u)
-            estimate[i, axis, 0], estimate[i, axis, 1] = p, v
-            start[i, axis, 0], start[i, axis, 1] = p, v
+        row, k = rows[i], steps[i]
+        if settings.decay < 1.0:
+            _observe_disturbance(settings, memory, row, k)
+        for j in range(len(settings.axes)):
+            axis, w = settings.axes[j], memory.disturbance[row, j]
+            p, v = memory.state[row, j, 0], memory.state[row, j, 1]
+            if settings.compensate:
+                for step in range(memory.observed[row], k):
+                    u = memory.inputs[row, j, min(step, memory.last[row]) % reach]
+                    p, v = advance(axis, p, v, u + w)
+            found.estimate[i, j, 0], found.estimate[i, j, 1] = p, v
+            found.start[i, j, 0], found.start[i, j, 1] = p, v
+            found.disturbance[i, j] = w
+            if settings.feeds_back:
+                found.feedback[i, j, 0], found.feedback[i, j, 1] = p, v
+                found.feedback[i, j, 2] = w
+                found.feedback[i, j, 3], found.feedback[i, j, 4] = axis.gain_p, axis.gain_v
 
 
 @kernel

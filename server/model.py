@@ -17,6 +17,7 @@ Axes = Annotated[NDArray[np.void], records(AXIS, 1)]
 
 advance = inline(model.advance)
 entry, bounded, lasting = inline(rule.entry), inline(rule.bounded), inline(rule.lasting)
+remaining, leading = inline(rule.remaining), inline(rule.leading)
 led_back, flown = inline(rule.led_back), inline(rule.flown)
 
 

@@ -24,9 +24,6 @@ from shared.kernel import F1, F2, inline, part
 from shared.model import Array, Model
 from shared.terms import Terms
 
-ROUNDS = 10_000
-"""Largest number of rounds of the Riccati recursion, for weights with which it hardly settles."""
-
 
 class Weights(NamedTuple):
     """The weights of (9), for the first step of a flight and for all later ones.
@@ -104,26 +101,6 @@ def pose(model: Model, mpc: MPC, which: int) -> Problem:
         response = model.step(response, 0.0)
     hessian = np.einsum("aipk,ip,aipl->akl", forced, mpc.weights.states, forced)
     return Problem(model, mpc, which, hessian + np.diag(mpc.weights.inputs[which]))
-
-
-def stationary_gain(model: Model, control: ControlConfig) -> Array:
-    """K of the linear-quadratic regulator u = -K x: what (9) comes to without end and bounds.
-
-    Returns:
-        on position [1/s] and velocity; shape (axes, 2).
-    """
-    A, B, Q = model.A, model.B, np.diag(control.state_weight)
-    cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 2, 2))
-    gain = np.zeros_like(B)
-    for _ in range(ROUNDS):
-        if np.allclose(cost, before, rtol=1e-12, atol=0.0):
-            break
-        ahead = np.einsum("ai,aij->aj", B, cost)
-        weight = control.input_weight + control.change_weight + np.einsum("aj,aj->a", ahead, B)
-        gain = np.einsum("ai,aij->aj", ahead, A) / weight[:, None]
-        left = A - B[:, :, None] * gain[:, None, :]
-        cost, before = Q + np.einsum("aji,ajk,akl->ail", A, cost, left), cost
-    return gain
 
 
 @inline

@@ -19,10 +19,8 @@ from collections import Counter
 import numpy as np
 
 from server.desired import Desired
-from server.mpc import stationary_gain
 from server.planner import FIGURES, Figures
 from server.scheme import Foresight
-from shared.config import ControlConfig
 from shared.model import Array, Flags, Indices
 from shared.protocol import Observation
 from shared.terms import Terms
@@ -32,8 +30,8 @@ class Reckoning:
     """The `Scheme` of dead reckoning for up to `capacity` vehicles, and its horizons.
 
     Args:
-        control: the weights that make the gain of feedback aboard.
         terms: the rule of flight.
+        gain: K of feedback aboard; shape (axes, 2).
         desired: what the server knows of the targets.
         block: number of vehicles that are decided on at a time.
     """
@@ -43,8 +41,8 @@ class Reckoning:
 
     def __init__(
         self,
-        control: ControlConfig,
         terms: Terms,
+        gain: Array,
         desired: Desired,
         capacity: int,
         block: int,
@@ -52,7 +50,7 @@ class Reckoning:
         axes = terms.axes
         self.counts: Counter[str] = Counter()
         self._desired = desired
-        self._gain = stationary_gain(terms.model, control)
+        self._gain = gain
         self._bounds = np.array(terms.u_max)
         self._dt_s = terms.dt_s
         self._age_max = terms.age_max

@@ -13,7 +13,9 @@ had d steps and was not in force is lost, and left out.
 
 w is what else acts on the vehicle, as an input of its own: constant wind, a wrong gain. Each
 observation shows how far the velocity has come away from where the one before it, replayed, says;
-the disturbance observer follows that with a time constant of `control.observer_s`.
+the disturbance observer follows that with a time constant of `control.observer_s`. Vehicles report
+what they take their velocity for. So the observer has a velocity of its own, which follows what is
+reported within FOLLOW_S: else it would learn the noise that a filter aboard has left.
 
 With feedback aboard, a horizon tells the vehicle also where its inputs lead, x̄ from x̂(k) on, and
 how to come back to there: it flies u(i) + K (x̄(i) - x(i)). That is replayed in the same way. What
@@ -33,20 +35,29 @@ from numpy.typing import NDArray
 from server import delay
 from server.clock import ClockMap, Seen, half_trip_ns, shortest_ns
 from server.delay import DelayBound, acknowledge, at_least, begin, delay_bound
-from server.model import AXIS_FIELDS, advance, bounded, entry, flown, lasting, led_back
-from server.mpc import stationary_gain
+from server.model import (
+    AXIS_FIELDS,
+    advance,
+    bounded,
+    entry,
+    flown,
+    lasting,
+    leading,
+    led_back,
+    remaining,
+)
+from server.observer import decay_of, learned
 from server.scheme import Foresight
 from shared.config import ControlConfig
 from shared.kernel import B1, F1, F2, I1, R1, R2, S4, kernel, part, record, records
-from shared.model import Flags, Indices
+from shared.model import Array, Flags, Indices
 from shared.protocol import NO_HORIZON, Observation, committed_max
 from shared.terms import Terms
 
 MARGIN = 2
 """Steps on top of half a round trip, until a horizon has been acknowledged."""
-TRIP_NS = 1_500_000_000
-"""Longest trip, from an observation to the plan made from it, that `control.observer_s` is meant
-for [ns]; over a longer one an observer as fast as that makes the plans swing."""
+FOLLOW_S = 0.25
+"""Time constant with which the disturbance observer follows the velocity that is reported [s]."""
 HOVERS, UNKNOWN = -1, -2
 """In place of the number of a horizon: none, so that it brakes and stands still; one that was sent
 in an earlier life of ours."""
@@ -79,12 +90,14 @@ STATE = record(
     ("w", "f8"),
 )
 """On one axis of a vehicle: position [m], velocity [m/s] and input [m/s] of its newest observation
-and of the one before, and the disturbance [m/s]."""
+and of the one before, with the velocity that the observer takes it for; and the disturbance
+[m/s]."""
 SENT = record(("step", "i8"), ("due", "i8"), ("length", "i8"), ("speed", "f8"))
 """A horizon that was sent: the step it was made for; that at which it is in force, or lost; how
 many inputs it has; and the magnitude of the last [m/s]."""
-ORIGIN = record(("p", "f4"), ("v", "f4"), ("w", "f4"))
-"""Where a horizon leads on from on one axis: position [m], velocity [m/s], disturbance [m/s]."""
+LED = record(("stage", "i8"), ("p", "f8"), ("v", "f8"), ("w", "f8"))
+"""Where a horizon leads on one axis, x̄: a stage, position [m] and velocity [m/s] there, and the
+disturbance [m/s]. It goes on with what is observed, for nothing before is ever replayed again."""
 
 
 class Settings(NamedTuple):
@@ -102,6 +115,8 @@ class Settings(NamedTuple):
     """Speed that braking takes away in a step [m/s]."""
     decay: float
     """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
+    follow: float
+    """Share of what is new of the velocity that the observer has not followed after a step."""
     feeds_back: bool
     """Whether horizons bring feedback."""
 
@@ -119,8 +134,8 @@ class Memory(NamedTuple):
     """Horizons that were sent, a ring; shape (capacity, room)."""
     inputs: S4
     """Their inputs [m/s]; shape (capacity, room, axes, most + H), with the largest d."""
-    origins: Annotated[NDArray[np.void], records(ORIGIN, 3)]
-    """Where they lead on from; shape (capacity, room, axes)."""
+    led: Annotated[NDArray[np.void], records(LED, 3)]
+    """Where they lead; shape (capacity, room, axes)."""
 
 
 class Replay:
@@ -128,12 +143,13 @@ class Replay:
 
     Args:
         terms: the rule of flight.
-        control: `observer_s`, `delay_bound`, and the weights that make the gain of feedback aboard.
+        control: `observer_s` and `delay_bound`.
+        gain: K of feedback aboard, 0 without; shape (axes, 2).
         clock: knows half of the smallest round trip, which is a first guess at the delay bound.
     """
 
     def __init__(
-        self, terms: Terms, control: ControlConfig, capacity: int, clock: ClockMap
+        self, terms: Terms, control: ControlConfig, gain: Array, capacity: int, clock: ClockMap
     ) -> None:
         axes, H, most = terms.axes, terms.horizon, committed_max(terms)
         self.counts: Counter[str] = Counter()
@@ -141,15 +157,15 @@ class Replay:
         for name, numbers in terms.model._asdict().items():
             rule[name] = numbers
         rule["bound"] = terms.u_max
-        if terms.feedback:  # as the vehicle will be told it, in float32
-            rule["gain_p"], rule["gain_v"] = stationary_gain(terms.model, control).T.astype("f4")
+        rule["gain_p"], rule["gain_v"] = gain.T.astype("f4")  # as the vehicle will be told it
         self._settings = Settings(
             rule=rule,
             H=H,
             age_max=terms.age_max,
             dt_ns=terms.dt_ns,
             brake=terms.brake,
-            decay=float(np.exp(-terms.dt_s / control.observer_s)) if control.observer_s else 1.0,
+            decay=decay_of(terms, control),
+            follow=float(np.exp(-terms.dt_s / FOLLOW_S)),
             feeds_back=terms.feedback,
         )
         room = terms.age_max + H
@@ -159,7 +175,7 @@ class Replay:
             state=np.zeros((capacity, axes), dtype=STATE),
             sent=np.zeros((capacity, room), dtype=SENT),
             inputs=np.zeros((capacity, room, axes, most + H), dtype=np.float32),
-            origins=np.zeros((capacity, room, axes), dtype=ORIGIN),
+            led=np.zeros((capacity, room, axes), dtype=LED),
         )
         given = control.delay_bound
         fixed_s = None if given == "auto" else given
@@ -338,7 +354,8 @@ def _roll(
             # Of a horizon that is unknown it is as good a guess as any that it flies on.
             brake = settings.brake if number == HOVERS else 0.0
             for step in range(first, last):
-                u = flown(step - begin, 1, told_first, 0.0, speed_told, brake, rule.bound)
+                u = remaining(step - begin, 1, speed_told, brake) * told_first
+                u = flown(step - begin, u, 0.0, rule.bound)
                 track.commands[step - begin] = u
                 track.states[step - begin, 0], track.states[step - begin, 1] = p, v
                 p, v = advance(rule, p, v, u + w)
@@ -346,23 +363,26 @@ def _roll(
         slot = number % room
         horizon, inputs = memory.sent[row, slot], memory.inputs[row, slot, axis]
         made_for, length, speed = horizon.step, horizon.length, horizon.speed
-        # x̄, by now.
-        origin = memory.origins[row, slot, axis]
-        led_p, led_v, led_w = float(origin.p), float(origin.v), float(origin.w)
+        led = memory.led[row, slot, axis]
+        led_p, led_v, led_w = led.p, led.v, led.w
         if settings.feeds_back:
-            for stage in range(min(first - made_for, length - 1)):
-                u = bounded(float(inputs[stage]), rule.bound)
-                led_p, led_v = advance(rule, led_p, led_v, u + led_w)
+            for stage in range(led.stage, first - made_for):
+                share = remaining(stage, length, speed, settings.brake)
+                told = share * bounded(float(inputs[entry(stage, length)]), rule.bound)
+                led_p, led_v = advance(rule, led_p, led_v, leading(told, led_w, share))
+            if leg == 0 and first - made_for > led.stage:
+                led.stage, led.p, led.v = first - made_for, led_p, led_v
         for step in range(first, last):
             stage, back = step - made_for, 0.0
-            told = bounded(float(inputs[entry(stage, length)]), rule.bound)
+            share = remaining(stage, length, speed, settings.brake)
+            told = share * bounded(float(inputs[entry(stage, length)]), rule.bound)
             if settings.feeds_back:
                 back = led_back(rule.gain_p, rule.gain_v, led_p - p, led_v - v)
-            u = flown(stage, length, told, back, speed, settings.brake, rule.bound)
+            u = flown(stage, told, back, rule.bound)
             if step == begin:
                 u = told_first  # as it says itself, whatever the rule
-            if settings.feeds_back and 0 <= stage < length - 1:
-                led_p, led_v = advance(rule, led_p, led_v, told + led_w)
+            if settings.feeds_back and stage >= 0:
+                led_p, led_v = advance(rule, led_p, led_v, leading(told, led_w, share))
             track.commands[step - begin] = u
             track.states[step - begin, 0], track.states[step - begin, 1] = p, v
             p, v = advance(rule, p, v, u + w)
@@ -385,7 +405,9 @@ def _observe_disturbance(
         return
     before, after = _number(memory, row, seen.base_in_force), _number(memory, row, seen.in_force)
     by_rule = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
-    if by_rule and begin >= 0 and end - begin <= settings.age_max:
+    follows = by_rule and begin >= 0 and end - begin <= settings.age_max
+    m, legs, speed = end - begin, 0, _speed(memory.state[row].base_u)
+    if follows:
         first = _first_under_way(memory, row, seen.base_in_force, begin)
         legs = _chart(course, memory, row, begin, before, range(first, after))
         # What came into force, and when, is known.
@@ -396,19 +418,23 @@ def _observe_disturbance(
         elif seen.since < end:
             course.begins[legs], course.numbers[legs] = seen.since, after
             legs += 1
-        m, speed = end - begin, _speed(memory.state[row].base_u)
-        for axis in range(len(settings.rule)):
-            state, rule = memory.state[row, axis], settings.rule[axis]
+    for axis in range(len(settings.rule)):
+        state, rule, lag = memory.state[row, axis], settings.rule[axis], 0.0
+        if follows:
             x = (state.base_p, state.base_v, state.base_u, speed)
             _roll(settings, memory, row, axis, course, legs, end, x, track)
-            # A change of w changes the velocity after m steps by 1 - a11^m of it.
-            off = (state.v - track.states[m, 1]) / (1.0 - rule.a11**m)
-            slower = max(1.0, trip * settings.dt_ns / TRIP_NS)
-            w = state.w + (1.0 - settings.decay ** (m / slower)) * off
-            memory.state[row, axis].w = min(max(w, -rule.bound), rule.bound)
-    for axis in range(len(settings.rule)):
-        state = memory.state[row, axis]
-        memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v
+            off, left = state.v - track.states[m, 1], settings.follow**m
+            memory.state[row, axis].w = learned(
+                state.w,
+                (1.0 - left) * off,
+                m,
+                rule.a11,
+                settings.decay,
+                trip * settings.dt_ns,
+                rule.bound,
+            )
+            lag = left * off
+        memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v - lag
         memory.state[row, axis].base_u = state.u
     memory.seen[row].base_step, memory.seen[row].base_in_force = end, seen.in_force
     memory.seen[row].base_takes = seen.takes
@@ -515,9 +541,9 @@ def _remember(
                 memory.inputs[row, slot, axis, stage] = found.horizons[i, axis, stage]
             last = bounded(float(found.horizons[i, axis, length - 1]), settings.rule[axis].bound)
             squares += last * last
-            origin = memory.origins[row, slot, axis]
-            origin.p, origin.v = found.feedback[i, axis, 0], found.feedback[i, axis, 1]
-            origin.w = found.feedback[i, axis, 2]
+            led = memory.led[row, slot, axis]
+            led.stage, led.p = 0, found.feedback[i, axis, 0]
+            led.v, led.w = found.feedback[i, axis, 1], found.feedback[i, axis, 2]
         sent = memory.sent[row, slot]
         sent.step, sent.due = steps[i], steps[i] + found.ahead[i]
         sent.length, sent.speed = length, np.sqrt(squares)

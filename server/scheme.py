@@ -1,6 +1,7 @@
 """What the schemes of delay compensation have in common: what is foreseen, and asked of each.
 
-`server.replay` is "committed", `server.estimator` "predictive" and "none".
+`server.replay` is "committed", `server.estimator` "predictive" and "none", `server.reckoning`
+"dead_reckoning".
 """
 
 from collections import Counter

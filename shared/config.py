@@ -212,7 +212,7 @@ class SensorConfig(Section, frozen=True):
     """Time from one velocity to the next [s]; 0: one at every step; never: positions alone."""
     delay_s: Annotated[float, Meta(ge=0, le=2)] = 0.0
     """Time from measuring to having the measurement [s]."""
-    process_noise: Factor = 0.15
+    process_noise: Factor = 0.1
     """Strength of the white acceleration that the filter reckons with [m/s per √s]: of wind, and of
     all in which the vehicle is unlike its model."""
 

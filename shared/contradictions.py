@@ -68,6 +68,8 @@ def contradictions(
         )
     if control.scheme == "dead_reckoning" and not control.feedback:
         yield "control.feedback", "false", "true with control.scheme = 'dead_reckoning'"
+    if control.scheme == "none" and control.feedback:
+        yield "control.feedback", "true", "false with control.scheme = 'none'"
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
     yield from _no_trigger(control)

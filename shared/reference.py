@@ -23,6 +23,9 @@ FAST_MPS = 1e6
 GRID_S = 0.05
 """Time between two points at which the velocity of a target is drawn [s]; in between it is
 interpolated."""
+TURN_S = 3600.0
+"""Time after which a target goes its way back, and then forth again [s]: what is drawn of it stays
+bounded, whatever time it is asked for."""
 GRID_BLOCK = 1024
 """Number of points that are drawn at a time."""
 FILE_BYTES_MAX = 16_000_000
@@ -144,7 +147,8 @@ def target(
     """Random walk from the origin: white acceleration, which nobody can foresee.
 
     The velocity is reflected where it would become too large, and the position where it would leave
-    its bounds. Before time 0 the target rests at the origin.
+    its bounds. Before time 0 the target rests at the origin, and after TURN_S it comes back the way
+    it went.
 
     Args:
         rng: chance of this walk alone; it is asked for more as later times are.
@@ -156,6 +160,9 @@ def target(
 
     def sample(t: Array) -> Array:
         t = np.maximum(np.asarray(t, dtype=np.float64), 0.0)
+        legs = np.floor(t / TURN_S)
+        back = np.mod(legs, 2.0)
+        t = np.where(back, (legs + 1.0) * TURN_S - t, t - legs * TURN_S)
         velocities, positions = walk.upto(
             int(t.max(initial=0.0) / GRID_S) + 1, agility=agility, speed_mps=speed_mps
         )
@@ -164,6 +171,7 @@ def target(
         v, rise = velocities[at], (velocities[at + 1] - velocities[at]) / GRID_S
         p = positions[at] + after * (v + 0.5 * after * rise)
         position, way = _folded(p, radius_m)
+        way *= 1.0 - 2.0 * back[..., None]
         return np.stack([position, way * (v + after * rise)], axis=-1)
 
     return sample

@@ -3,13 +3,16 @@
     u*(k) = u(min(k, k_h + n - 1) | k_h)                    k_h: the step the horizon was made for
                                                             n: the inputs it has
                                                             k - k_h: the stage it is at
-With feedback aboard the vehicle is led back to where the horizon leads, x̄:
-
-    u*(k) = u(k | k_h) + K (x̄(k) - x(k)),     x̄(i+1) = A x̄(i) + B (u(i | k_h) + ŵ)
-
 No input is flown for longer than `link.age_max_s` after the observation that it was planned from:
-a horizon that reaches further ends there. After its last input it is held for ever, or braked
+a horizon that reaches further ends there. After its last input that is held for ever, or braked
 along. Without compensation all of its inputs until then are its first.
+
+With feedback aboard the vehicle is led back to where these inputs lead, x̄, also after the last:
+
+    u*(k) = u(k) + K (x̄(k) - x(k)),     x̄(i+1) = A x̄(i) + B (u(i) + ŵ)
+
+ŵ is a disturbance that the inputs reckon with. Once they are braked to nothing it is left out, so
+that x̄ comes to rest, and the vehicle stays there in whatever wind.
 
 This is the one source of that rule. The client flies by it, number by number; the server's replay
 compiles the very same functions into its kernels, and so knows what was flown. Each works on one
@@ -48,6 +51,31 @@ def bounded(u: float, bound: float) -> float:
     return min(max(u, -bound), bound)
 
 
+def remaining(stage: int, length: int, speed: float, brake: float) -> float:
+    """Share of the input at `entry` that is told: 1, and after the last what braking leaves of it.
+
+    Args:
+        stage: where in the horizon the step is; may lie before its first or after its last input.
+        length: how many inputs the horizon has.
+        speed: magnitude of its last input over all axes [m/s].
+        brake: speed that braking takes away in a step [m/s]; 0 holds the last input for ever.
+    """
+    if stage < length or brake == 0.0:
+        return 1.0
+    return max(0.0, speed - (stage - length + 1) * brake) / speed if speed > 0.0 else 0.0
+
+
+def leading(told: float, disturbance: float, share: float) -> float:
+    """Input under which x̄ goes on [m/s].
+
+    Args:
+        told: the input that is told [m/s].
+        disturbance: ŵ [m/s].
+        share: `remaining`; at 0, x̄ comes to rest.
+    """
+    return told + disturbance if share > 0.0 else 0.0
+
+
 def led_back(gain_p: float, gain_v: float, dp: float, dv: float) -> float:
     """Feedback aboard K (x̄ - x) [m/s].
 
@@ -58,22 +86,14 @@ def led_back(gain_p: float, gain_v: float, dp: float, dv: float) -> float:
     return gain_p * dp + gain_v * dv
 
 
-def flown(
-    stage: int, length: int, told: float, back: float, speed: float, brake: float, bound: float
-) -> float:
+def flown(stage: int, told: float, back: float, bound: float) -> float:
     """The input that is flown at a stage of a horizon [m/s].
 
     Args:
-        stage: where in the horizon the step is; may lie before its first or after its last input.
-        length: how many inputs the horizon has.
-        told: its input at `entry(stage, length)`, within the bound [m/s].
+        stage: where in the horizon the step is; before its first input there is no x̄.
+        told: the input that is told: `remaining` of that at `entry` [m/s].
         back: `led_back`, or 0 without feedback [m/s].
-        speed: magnitude of its last input over all axes [m/s].
-        brake: speed that braking takes away in a step [m/s]; 0 holds the last input for ever.
         bound: u_max [m/s].
     """
-    if 0 <= stage < length:
-        return min(max(told + back, -bound), bound)  # `bounded`, for numba sees no further
-    if stage < 0 or brake == 0.0:
-        return told
-    return told * (max(0.0, speed - (stage - length + 1) * brake) / speed) if speed > 0.0 else 0.0
+    u = told + back if stage >= 0 else told
+    return min(max(u, -bound), bound)  # `bounded`, for numba sees no further

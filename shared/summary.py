@@ -7,8 +7,11 @@ import numpy as np
 
 from shared.config import Scenario
 from shared.model import Array
-from shared.protocol import Mode
+from shared.protocol import NO_HORIZON, Mode
 from shared.record import DOWNLINK, UPLINK, Reason, Rows
+
+AT_BOUND = 1.0 - 1e-6
+"""Share of the bound from which an input is at it: inputs are rounded on the wire."""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,6 +56,18 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     age_ms_p50: float | None
     """Age of the observation behind the input being flown [ms], over all steps."""
     age_ms_p99: float | None
+    aoi_s_mean: float | None
+    """Mean age of information, of that observation [s], over the steps from `settle` on."""
+    aoi_s_peak: float | None
+    """Mean of its peaks [s]: of the age at each step before one at which it is smaller."""
+    plan_age_s_mean: float | None
+    """Mean time since the horizon in force was made [s], over the steps from `settle` on: the age
+    of all that the server alone knows, as where its target is."""
+    effort_mps: float | None
+    """Root mean square of the change of the input from step to step, over all axes together, from
+    `settle` on [m/s]."""
+    saturated: float | None
+    """Share of the steps from `settle` on at which the input is at its bound on some axis."""
     solve_ms_p50: float | None
     """Wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
     solve_ms_p99: float | None
@@ -81,11 +96,16 @@ def summarise(
         secure: whether the link was sealed.
     """
     error = position_error(scenario, client, server)
-    settled = error[client["step"] * scenario.control.dt >= scenario.settle]
+    counted = client["step"] * scenario.control.dt >= scenario.settle
+    settled, flown = error[counted], client[counted]
     squares = (settled**2).mean(axis=0) if len(settled) else np.array([np.nan])
     rmse = [float(value) for value in np.sqrt(squares)] if np.isfinite(squares).all() else []
     distances = np.linalg.norm(settled, axis=1)
     age_ms = client["age_ns"][client["age_ns"] >= 0] / 1e6
+    aoi_s = flown["age_ns"][flown["age_ns"] >= 0] / 1e9
+    planned = flown[flown["in_force"] != NO_HORIZON]
+    plan_age_s = (planned["step"] - planned["in_force"]) * scenario.control.dt
+    changes = np.diff(client["input"], axis=0)[counted[1:]]
     stale, missed = _last(client, "stale"), _last(client, "missed")
     event_ratio, solve_ms = None, np.empty(0)
     if server is not None:
@@ -121,6 +141,11 @@ def summarise(
         stale=stale,
         age_ms_p50=_quantile(age_ms, 0.5),
         age_ms_p99=_quantile(age_ms, 0.99),
+        aoi_s_mean=_mean(aoi_s),
+        aoi_s_peak=_mean(aoi_s[:-1][np.diff(aoi_s) < 0.0]),
+        plan_age_s_mean=_mean(plan_age_s),
+        effort_mps=math.sqrt((changes**2).sum(axis=1).mean()) if len(changes) else None,
+        saturated=_mean((np.abs(flown["input"]) >= AT_BOUND * scenario.u_max).any(axis=1)),
         solve_ms_p50=_quantile(solve_ms, 0.5),
         solve_ms_p99=_quantile(solve_ms, 0.99),
         deadline_misses=missed,
@@ -165,6 +190,10 @@ def _count(netem: Rows | None, direction: int) -> int | None:
 
 def _bytes(netem: Rows | None, direction: int) -> int | None:
     return None if netem is None else int(netem["bytes"][netem["direction"] == direction].sum())
+
+
+def _mean(values: Array) -> float | None:
+    return float(values.mean()) if len(values) else None
 
 
 def _quantile(values: Array, share: float) -> float | None:

@@ -440,6 +440,7 @@ def write(path: Path, json: bytes) -> None:
 def _rows(summary: Summary) -> list[tuple[str, str]]:
     """Rows of the table: names and values of what the summary knows."""
     s = summary
+    ages = _values(".3f", s.aoi_s_mean, s.aoi_s_peak, s.plan_age_s_mean)
     rows = [
         ("steps", f"{s.steps} in {s.duration_s:g} s"),
         ("RMSE x, y, xy [m]", _values(".4f", s.rmse_x, s.rmse_y, s.rmse_xy)),
@@ -454,6 +455,8 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ("stale packets", _values("d", s.stale)),
         ("link", "sealed" if s.secure else "plaintext"),
         ("age p50, p99 [ms]", _values(".0f", s.age_ms_p50, s.age_ms_p99)),
+        ("mean age, its peaks, age of the plan [s]", ages),
+        ("effort [m/s], share of steps at a bound", _values(".3f", s.effort_mps, s.saturated)),
         ("solve p50, p99 [ms]", _values(".2f", s.solve_ms_p50, s.solve_ms_p99)),
         ("deadline misses", _values("d", s.deadline_misses)),
     ]

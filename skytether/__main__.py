@@ -14,6 +14,7 @@ reorders and loses their packets.
   fleet [SCENARIO]      many vehicles on one server, and what each costs it
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
   envelope [SCENARIO]   the networks and settings that a scenario bears, by random flights
+  margins [SCENARIO]    whether its loop is stable, and with which vehicles, computed
   torture               flights through faults and attacks, and whether anything unsafe is flown
   reproduce             the paper's table and figures, and more, as a report
   compare               schemes and triggers on the same seeds, each at its best weights
@@ -46,6 +47,7 @@ COMMANDS = {
     "fleet": "skytether.fleet:fleet",
     "sweep": "skytether.sweep:sweep",
     "envelope": "skytether.envelope:envelope",
+    "margins": "skytether.margins:margins",
     "torture": "skytether.torture:torture",
     "reproduce": "skytether.reproduce:reproduce",
     "compare": "skytether.compare:compare",

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from server import sessions
+from server.desired import Desired
 from shared import chance, config
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
@@ -91,13 +92,30 @@ committing = st.builds(
     ),
 )
 """With triggers that need committed inputs."""
+reckoning = st.builds(
+    lambda changes, control, shape: (
+        changes | {"control": changes["control"] | control, "reference": {"shape": shape}}
+    ),
+    scenarios,
+    st.fixed_dictionaries(
+        {
+            "scheme": st.just("dead_reckoning"),
+            "feedback": st.just(True),
+            "trigger": st.sampled_from(
+                ["always", "tolerance(0.1) | silence(1)", "delta(0.2) & budget(5, 2)"]
+            ),
+        }
+    ),
+    st.sampled_from(["circle", "target"]),
+)
+"""With targets that are sent as they are."""
 companies = st.lists(st.integers(0, 2**32 - 1), min_size=2, max_size=4, unique=True)
 phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, max_size=4)
 """None leaves them to the seeds; the others make everything fall on the same instants."""
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.one_of(scenarios, committing), companies, phases_ms)
+@given(st.one_of(scenarios, committing, reckoning), companies, phases_ms)
 def test_a_run_is_the_same_in_any_company(
     changes: dict[str, Any], seeds: list[int], phases: list[int] | None
 ) -> None:
@@ -134,6 +152,22 @@ def test_runs_are_the_same_in_another_order_and_in_larger_company() -> None:
     many = fly_batch(flown, range(9, 1, -1))
     assert [run.trace_hash() for run in few] == [run.trace_hash() for run in many[2:7]][::-1]
     assert len({run.trace_hash() for run in many}) == 8
+
+
+@pytest.mark.parametrize("preview", ["none", 0.5, "all"])
+def test_each_run_follows_the_target_of_its_own_seed(
+    preview: float | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if alone; ablation: with the first run's target for all, the others are not."""
+    flown = scenario(reference={"shape": "target", "preview": preview})
+    runs = assert_as_alone(flown, (3, 1, 2))
+    monkeypatch.setattr(Desired, "assign", lambda self, row, _: self._number.put(row, 1))
+    same = [run.trace_hash() for run in fly_batch(flown, (3, 1, 2))]
+    assert [run.trace_hash() == other for run, other in zip(runs, same, strict=True)] == [
+        True,
+        False,
+        False,
+    ]
 
 
 def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:

@@ -297,8 +297,9 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
         *("scenario", "seed", "duration_s", "steps", "rmse_x", "rmse_y", "rmse_z", "rmse_xy"),
         *("error_max", "covered", "modes", "mode", "reason"),
         *("event_ratio", "uplink_packets", "uplink_bytes", "downlink_packets", "downlink_bytes"),
-        *("lost", "reordered", "stale", "age_ms_p50", "age_ms_p99", "solve_ms_p50"),
-        *("solve_ms_p99", "deadline_misses", "secure"),
+        *("lost", "reordered", "stale", "age_ms_p50", "age_ms_p99", "aoi_s_mean", "aoi_s_peak"),
+        *("plan_age_s_mean", "effort_mps", "saturated", "solve_ms_p50", "solve_ms_p99"),
+        *("deadline_misses", "secure"),
     ]
     assert (summary["scenario"], summary["seed"], summary["steps"]) == ("paper", 3, 240)
     assert summary["solve_ms_p50"] is None

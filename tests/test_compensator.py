@@ -283,14 +283,72 @@ def test_feedback_stays_within_the_bounds() -> None:
     assert compensator.choose(105, far).tolist() == [-1.8, 0.9]
 
 
-@pytest.mark.parametrize("step", [99, 100 + H, 120 + H])
-def test_there_is_no_feedback_where_there_is_no_stage(step: int) -> None:
-    """Before the first and after the last: nothing says where the vehicle should be."""
+def test_there_is_no_feedback_before_the_first_stage() -> None:
+    """Nothing says where the vehicle should be."""
     compensator, plain = Compensator(terms(exhausted="brake")), holding(100, exhausted="brake")
     compensator.offer(with_feedback(HERE, np.zeros(2)), 99, 98)
-    near, far = (compensator.choose(step, HERE + away) for away in (0.0, 3.0))
+    near, far = (compensator.choose(99, HERE + away) for away in (0.0, 3.0))
     np.testing.assert_array_equal(near, far)
-    np.testing.assert_array_equal(near, plain.choose(step, HERE))
+    np.testing.assert_array_equal(near, plain.choose(99, HERE))
+
+
+@pytest.mark.parametrize("exhausted", ["hold", "brake"])
+@pytest.mark.parametrize("step", [100 + H, 120 + H])
+def test_feedback_goes_on_after_the_last_stage(step: int, exhausted: str) -> None:
+    """Onto what is told there: the last input, or what braking leaves of it."""
+    flown = terms(exhausted=exhausted, feedback=True)
+    compensator, plain = Compensator(flown), holding(100, exhausted=exhausted)
+    disturbance, x = np.array([0.25, -0.5]), HERE
+    compensator.offer(with_feedback(HERE, disturbance), 100, 99)
+    for told in (plain.choose(k, HERE) for k in range(100, step)):
+        x = flown.model.step(x, told + disturbance if told.any() else told)
+    on_course = compensator.choose(step, x)
+    np.testing.assert_allclose(on_course, plain.choose(step, HERE), atol=1e-6)
+    np.testing.assert_array_equal(compensator.told, plain.choose(step, HERE))
+    away = np.array([[0.02, -0.01], [0.03, 0.04]])
+    back = compensator.choose(step, x + away) - on_course
+    np.testing.assert_allclose(back, [-0.045, -0.08], atol=1e-6)
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_with_feedback_it_brakes_and_stays_where_it_is_in_wind(
+    monkeypatch: pytest.MonkeyPatch, *, goes_on: bool
+) -> None:
+    """Half a minute after the last input; had feedback ended there, it would drift."""
+    flown, wind = terms(exhausted="brake", feedback=True), np.array([0.3, -0.2])
+    compensator, x, places = Compensator(flown), HERE, []
+    compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
+    if not goes_on:
+        led_back = Compensator._led_back
+
+        def end(self: Compensator, stage: int, state: Array) -> list[float]:
+            """Feedback up to the last input, as it once was."""
+            return led_back(self, stage, state) if stage < H else [0.0, 0.0]
+
+        monkeypatch.setattr(Compensator, "_led_back", end)
+    for step in range(100, 400 + H):
+        x = flown.model.step(x, compensator.choose(step, x) + wind)
+        places.append(x[:, 0])
+    drift = np.abs(places[-1] - places[-100])
+    assert not any(compensator.told)
+    if goes_on:
+        assert drift.max() < 1e-6
+        assert np.abs(x[:, 1]).max() < 1e-6
+        np.testing.assert_allclose(compensator.choose(400 + H, x), -wind, atol=1e-6)
+    else:
+        np.testing.assert_allclose(drift, [2.97, 1.98], atol=0.01)
+
+
+def test_a_horizon_that_is_dropped_leaves_no_feedback() -> None:
+    """What was flown last is braked along, whatever the state."""
+    compensator = Compensator(terms(exhausted="brake", feedback=True))
+    compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
+    compensator.drop(104, np.array([0.6, 0.8]))
+    for away in (0.0, 3.0):
+        flown = compensator.choose(105, HERE + away)
+        np.testing.assert_allclose(flown, [0.48, 0.64])
+        np.testing.assert_array_equal(compensator.told, flown)
+    assert not compensator.feeds_back
 
 
 def test_feedback_ends_with_its_horizon() -> None:

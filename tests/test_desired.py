@@ -1,4 +1,4 @@
-"""What the server knows of desired trajectories: the pages, the preview, and what is predicted."""
+"""What the server knows of desired trajectories: pages, preview, predictions, a live point."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,10 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server.controller import BLOCK
-from server.desired import EMPTY, PAGE, PAGES, Desired
-from shared.config import Scenario, check
+from server.desired import EMPTY, PAGE, PAGES, Desired, carried
+from server.live import MEMORY_S, REST_S, LivePoint
+from shared import reference as shapes
+from shared.chance import stream
+from shared.config import ConfigError, Scenario, check, load, to_table
+from shared.endpoint import SECOND_NS, seconds_to_ns
 from shared.model import Array, Indices
 from shared.reference import Reference
+from shared.summary import desired as desired_positions
+from shared.summary import summarise
+from sim.flight import Flight, fly
 
 H = 15
 
@@ -27,9 +34,11 @@ SCENARIO = scenario()
 DT_S = SCENARIO.control.dt
 
 
-def make(flown: Scenario = SCENARIO, capacity: int = BLOCK) -> Desired:
-    """The desired trajectory of a scenario."""
-    return Desired(flown, flown.terms(), capacity, capacity)
+def make(
+    flown: Scenario = SCENARIO, references: Callable[[int], Reference] | None = None
+) -> Desired:
+    """The desired trajectories of a full block of vehicles."""
+    return Desired(flown, flown.terms(), BLOCK, BLOCK, references)
 
 
 def window(desired: Desired, steps: Indices, ahead: Indices, rows: Indices | None = None) -> Array:
@@ -93,3 +102,331 @@ def test_the_reference_is_computed_once_for_a_page_of_steps(
     window(desired, np.array([PAGE]), now)
     window(desired, np.array([0, PAGE]), now)
     assert [times.shape for times in asked] == [(PAGE + H + 1,), (PAGE + H + 1,)]
+
+
+# -- preview -----------------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    shape=st.sampled_from(["circle", "square", "target"]),
+    preview=st.sampled_from(["none", 0.3, 1.0, 2.0]),
+    steps=st.lists(st.integers(0, 3 * PAGE), min_size=1, max_size=4),
+    ahead=st.integers(0, 20),
+)
+def test_a_window_is_true_as_far_as_the_preview_reaches(
+    shape: str, preview: float | str, steps: list[int], ahead: int
+) -> None:
+    """To the last bit; beyond, the state at the last step that is seen is carried on."""
+    flown = scenario(shape=shape, preview=preview)
+    desired, sample = make(flown), flown.make_reference()
+    reach = 0 if isinstance(preview, str) else round(preview / DT_S)
+    rate = shapes.turning_rate(0.3, 1.0, 1.5) if shape == "target" else 0.0
+    found = window(desired, np.array(steps), np.full(len(steps), ahead))
+    np.testing.assert_array_equal(
+        desired.now(np.arange(len(steps)), np.array(steps)), sample(np.array(steps) * DT_S)
+    )
+    for k, states in zip(steps, found, strict=True):
+        expected = truth(k + ahead, sample)
+        last = sample(np.array((k + reach) * DT_S))
+        for stage in range(H + 1):
+            beyond_s = (ahead + stage - reach) * DT_S
+            if beyond_s > 1e-9:
+                way_s, left = beyond_s, 1.0
+                if rate:
+                    left = np.exp(-rate * beyond_s)
+                    way_s = (1.0 - left) / rate
+                led = np.stack([last[:, 0] + way_s * last[:, 1], left * last[:, 1]], axis=-1)
+                np.testing.assert_allclose(states[stage], led, rtol=0, atol=1e-12)
+            else:
+                np.testing.assert_array_equal(states[stage], expected[stage])
+
+
+def test_a_preview_longer_than_any_window_is_a_full_one() -> None:
+    """To the last bit."""
+    rows, ahead = np.array([5, 70, 200]), np.array([0, 7, 20])
+    np.testing.assert_array_equal(
+        window(make(scenario(preview=3600.0)), rows, ahead), window(make(), rows, ahead)
+    )
+
+
+def test_a_table_is_previewed_too(tmp_path: Any) -> None:
+    """A path from a CSV file that turns off after a second: nobody knows before."""
+    path = tmp_path / "path.csv"
+    path.write_text("t,x,y\n0,0,0\n1,1,0\n2,1,1\n")
+    flown = scenario(shape="csv", file=str(path), preview=0.2)
+    (before,) = window(make(flown), np.array([15]), np.array([0]))
+    np.testing.assert_allclose(before[:, 1], 0.0)  # straight on
+    (seen,) = window(make(flown), np.array([16]), np.array([0]))
+    np.testing.assert_allclose(seen[:4], truth(16, flown.make_reference())[:4])
+    np.testing.assert_allclose(seen[5:, 1, 1], 1.0)  # the corner at 20 is seen
+
+
+TURN = 60
+"""Step from which on the two targets of `turning` differ."""
+
+
+def turning(scale: float) -> Reference:
+    """A target that goes on from TURN in a way of its own."""
+
+    def sample(t: Array) -> Array:
+        t = np.asarray(t, dtype=np.float64)
+        after = np.maximum(t - TURN * DT_S, 0.0)
+        position = np.stack([0.3 * t + scale * after, 0.0 * t], axis=-1)
+        velocity = np.stack([0.3 + scale * (after > 0.0), 0.0 * t], axis=-1)
+        return np.stack([position, velocity], axis=-1)
+
+    return sample
+
+
+def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> list[Flight]:
+    """The same flight after each of two targets that differ from TURN on."""
+    flown = replaced("target", {"duration": 6.0}, preview=preview)
+    flights = []
+    for scale in (0.5, -0.5):
+        monkeypatch.setattr(Scenario, "make_reference", lambda _, scale=scale: turning(scale))
+        flights.append(fly(flown))
+    return flights
+
+
+def replaced(name: str, changes: dict[str, Any], **reference: Any) -> Scenario:
+    """A packaged scenario with some keys changed."""
+    table = to_table(load(name)) | changes
+    table["reference"] |= reference
+    return check(table, "test")
+
+
+def first_difference(flights: list[Flight]) -> int:
+    """First step at which what the servers planned or decided differs."""
+    one, other = (flight.server for flight in flights)
+    n = min(len(one), len(other))
+    unlike = [
+        (one[name][:n] != other[name][:n]).reshape(n, -1).any(axis=1)
+        for name in ("planned", "input", "error", "event")
+    ]
+    return int(one["step"][:n][np.any(unlike, axis=0)][0])
+
+
+@pytest.mark.parametrize(("preview", "reach"), [("none", 0), (0.5, 10), (1.0, 20)])
+def test_a_server_never_sees_ahead(
+    preview: float | str, reach: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a target will do later changes nothing of what is planned and sent before."""
+    # At TURN itself the target is where it would have been, and as fast.
+    assert first_difference(flights_that_turn(preview, monkeypatch)) == TURN + 1 - reach
+
+
+def test_a_server_that_sees_all_plans_for_what_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation of the preview: plans differ from the beginning."""
+    assert first_difference(flights_that_turn("all", monkeypatch)) < TURN - 40
+
+
+# -- prediction --------------------------------------------------------------------------------
+
+
+def test_a_fading_velocity_predicts_a_target_better_than_a_constant_one() -> None:
+    """By as much as docs/targets.md says; an acceleration taken from the past is far worse."""
+    ahead_s, every_s = 2.0, 0.5
+    rate = shapes.turning_rate(0.3, 1.0, 10.0)
+    assert 1.0 / rate == pytest.approx(6.21, abs=0.01)
+    times = np.arange(1.0, 300.0, every_s)
+    errors: dict[str, list[Array]] = {"constant": [], "fading": [], "accelerating": []}
+    for seed in range(1, 41):
+        rng = stream(seed, "target")
+        sample = shapes.target(rng, 2, agility=0.3, speed_mps=1.0, radius_m=10.0)
+        now, past, then = (sample(times + shift) for shift in (0.0, -1.0, ahead_s))
+        p, v, old = now[..., 0], now[..., 1], past[..., 1]
+        (way_s, _), (_, left) = carried(rate, np.array([ahead_s, ahead_s]))
+        errors["constant"].append(p + ahead_s * v - then[..., 0])
+        errors["fading"].append(p + way_s * v - then[..., 0])
+        errors["accelerating"].append(errors["constant"][-1] + 0.5 * ahead_s**2 * (v - old))
+        assert left == np.exp(-rate * ahead_s)
+    rms = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
+    assert rms["constant"] == pytest.approx(0.554, abs=0.01)
+    assert rms["fading"] == pytest.approx(0.516, abs=0.01)
+    assert rms["accelerating"] > 0.9
+
+
+def test_a_velocity_that_does_not_fade_leads_on() -> None:
+    """At rate 0 a state is carried on by its velocity."""
+    np.testing.assert_array_equal(carried(0.0, np.array([0.0, 2.0])), [[0.0, 1.0], [2.0, 1.0]])
+
+
+# -- a trajectory for each vehicle -------------------------------------------------------------
+
+
+def straight(vehicle: int) -> Reference:
+    """A line of its own for each vehicle."""
+    return shapes.timed_path(np.array([0.0, 1e4]), np.array([[0.0, 0.0], [1e2 * vehicle, -1e3]]))
+
+
+@pytest.mark.parametrize("preview", ["all", "none", 0.5])
+def test_each_vehicle_has_a_trajectory_of_its_own(preview: float | str) -> None:
+    """A full block of them, in whatever row, over more pages than there are places."""
+    desired = make(scenario(preview=preview), references=straight)
+    rows = np.arange(BLOCK)
+    for row in rows.tolist():
+        desired.assign(row, BLOCK - row)
+    for k in (0, PAGE - 3, 5 * PAGE, 5 * PAGE - 1):
+        steps, ahead = np.full(BLOCK, k), rows % 5
+        found = window(desired, steps, ahead)
+        for row in rows.tolist():
+            expected = truth(k + row % 5, straight(BLOCK - row))
+            np.testing.assert_allclose(found[row], expected, rtol=0, atol=1e-9)
+        assert EMPTY in desired._held
+
+
+def test_a_row_that_another_vehicle_takes_has_its_trajectory() -> None:
+    """Not that of who was there before."""
+    desired, at = make(references=straight), np.array([10])
+    for vehicle in (3, 8, 3):
+        desired.assign(0, vehicle)
+        found = desired.now(np.array([0]), at)
+        np.testing.assert_array_equal(found[0], straight(vehicle)(at * DT_S)[0])
+
+
+# -- a live point ------------------------------------------------------------------------------
+
+
+def live(**reference: Any) -> Scenario:
+    """A live point that begins at (1, 2)."""
+    return scenario(**{"shape": "live", "points_m": [[1.0, 2.0]]} | reference)
+
+
+def test_a_live_point_is_carried_on_by_its_velocity() -> None:
+    """It is what all vehicles follow, from the newest move on, whatever their steps."""
+    desired = make(live(preview="all"))
+    desired.tick(5 * SECOND_NS)
+    steps, ahead = np.array([0, 900]), np.array([0, 4])
+    at_rest = window(desired, steps, ahead)
+    np.testing.assert_array_equal(at_rest[..., 0], np.broadcast_to([1.0, 2.0], (2, H + 1, 2)))
+    np.testing.assert_array_equal(at_rest[..., 1], 0.0)
+    desired.move(np.array([3.0, 0.0]), np.array([0.5, -1.0]), 6 * SECOND_NS)
+    desired.tick(8 * SECOND_NS)
+    np.testing.assert_allclose(desired.now(np.arange(2), steps), [[[4.0, 0.5], [-2.0, -1.0]]] * 2)
+    found = window(desired, steps, ahead)
+    for states, d in zip(found, ahead.tolist(), strict=True):
+        after_s = (d + np.arange(H + 1)) * DT_S
+        np.testing.assert_allclose(states[:, 0, 0], 4.0 + 0.5 * after_s)
+        np.testing.assert_allclose(states[:, 1, 0], -2.0 - after_s)
+        np.testing.assert_allclose(states[:, :, 1], np.broadcast_to([0.5, -1.0], (H + 1, 2)))
+
+
+def test_only_a_live_point_can_be_moved() -> None:
+    """Any other trajectory stays as it is."""
+    desired = make()
+    desired.move(np.array([3.0, 0.0]), None, SECOND_NS)
+    desired.tick(SECOND_NS)
+    np.testing.assert_array_equal(desired.now(np.array([0]), np.array([7]))[0], truth(7)[0])
+
+
+def point(velocity: Array | None = None) -> LivePoint:
+    """A point at the origin, for vehicles that fly 2 m/s."""
+    return LivePoint(np.zeros(2), velocity, np.full(2, 2.0))
+
+
+def led(hz: int, velocity: float, until_s: float = 2.0) -> LivePoint:
+    """A point that is moved so often along x at a velocity, until some time."""
+    moved = point()
+    for i in range(1, round(until_s * hz) + 1):
+        moved.move(np.array([velocity * i / hz, 0.0]), None, seconds_to_ns(i / hz))
+    return moved
+
+
+@pytest.mark.parametrize("hz", [2, 10, 50])
+def test_moves_tell_the_velocity(hz: int) -> None:
+    """However often there are any; it is learned within some time constants."""
+    state = led(hz, 0.7).at(seconds_to_ns(2.1))
+    np.testing.assert_allclose(state, [[0.7 * 2.1, 0.7], [0.0, 0.0]], atol=1e-3)
+
+
+def test_a_point_that_is_not_moved_any_more_rests_where_it_was_moved_to() -> None:
+    """It is carried on for REST_S, and then no further; the next move says nothing of velocity."""
+    moved = led(10, 0.7)
+    assert moved.at(seconds_to_ns(2.0 + REST_S))[0, 0] == pytest.approx(0.7 * (2.0 + REST_S), 1e-3)
+    np.testing.assert_allclose(moved.at(seconds_to_ns(2.01 + REST_S)), [[1.4, 0.0], [0.0, 0.0]])
+    moved.move(np.array([9.0, 9.0]), None, seconds_to_ns(60.0))
+    np.testing.assert_allclose(moved.at(seconds_to_ns(60.5)), [[9.0, 0.0], [9.0, 0.0]])
+
+
+def test_a_point_whose_velocity_is_told_goes_on() -> None:
+    """From the first time it is asked for, as long as nobody says otherwise."""
+    told = point(np.array([1.0, 0.0]))
+    np.testing.assert_allclose(told.at(100 * SECOND_NS)[:, 0], [0.0, 0.0])
+    np.testing.assert_allclose(told.at(160 * SECOND_NS), [[60.0, 1.0], [0.0, 0.0]])
+
+
+def test_a_leap_makes_no_velocity_that_no_vehicle_can_fly() -> None:
+    """Two moves at once, or a kilometre in an instant; a clock set back makes none at all."""
+    moved = led(10, 0.5)
+    moved.move(np.array([1000.0, 0.0]), None, seconds_to_ns(2.001))
+    assert moved.at(seconds_to_ns(2.001))[0].tolist() == [1000.0, 2.0]
+    moved = led(10, 0.5)
+    for now_s in (2.0, 1.5):
+        moved.move(np.array([8.0, 0.0]), None, seconds_to_ns(now_s))
+        np.testing.assert_allclose(moved.at(seconds_to_ns(1.0)), [[8.0, 0.5], [0.0, 0.0]], 1e-3)
+
+
+def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a centimetre, 50 times a second; ablation: the difference of two alone is useless."""
+
+    def spread() -> float:
+        rng, moved, velocities = np.random.default_rng(1), point(), []
+        for i in range(1, 500):
+            along = 0.5 * i / 50 + 0.01 * rng.standard_normal()
+            moved.move(np.array([along, 0.0]), None, seconds_to_ns(i / 50))
+            velocities.append(moved.at(seconds_to_ns(i / 50))[0, 1])
+        return float(np.std(velocities[50:]))
+
+    assert MEMORY_S == 0.2
+    assert spread() < 0.07
+    monkeypatch.setattr("server.live.MEMORY_S", 1e-6)
+    assert spread() > 0.5
+
+
+def test_a_live_flight_is_judged_by_where_the_server_knew_the_point() -> None:
+    """A point that goes straight on is followed closely; without the server nobody can tell."""
+    changes = {"duration": 12.0, "settle": 8.0}
+    flown = replaced(
+        "target", changes, shape="live", points_m=[[0.0, 0.0]], velocity_mps=[0.3, -0.2]
+    )
+    flight = fly(flown)
+    rows = flight.server
+    known = rows["reference"][-1]
+    np.testing.assert_allclose(known[:, 1], [0.3, -0.2])
+    np.testing.assert_allclose(known[:, 0], known[:, 1] * rows["step"][-1] * DT_S, rtol=0.2)
+    result = summarise(flown, "test", flight.client, rows)
+    assert result.rmse_xy is not None
+    assert result.rmse_xy < 0.1
+    nobody = summarise(flown, "test", flight.client)
+    assert (nobody.rmse_xy, nobody.error_max) == (None, None)
+
+
+def test_the_desired_position_of_a_live_flight_is_held_where_the_server_has_no_row() -> None:
+    """Rows are joined by vehicle and step; before the first of them its own counts."""
+    flown = live()
+    client = np.zeros(5, [("vehicle", "<u2"), ("step", "<i8")])
+    client["vehicle"], client["step"] = 2, np.arange(5)
+    rows = np.zeros(4, [("vehicle", "<u2"), ("step", "<i8"), ("reference", "<f8", (2, 2))])
+    rows["vehicle"], rows["step"] = [2, 1, 2, 2], [1, 2, 3, 3]
+    rows["reference"][:, :, 0] = [[1, 1], [7, 7], [3, 3], [4, 4]]
+    found = desired_positions(flown, client, rows)
+    np.testing.assert_array_equal(found[:, 0], [1.0, 1.0, 1.0, 4.0, 4.0])
+    assert np.isnan(desired_positions(flown, client, rows[1:2])).all()
+
+
+def test_the_record_tells_what_was_known_of_the_reference() -> None:
+    """The desired state at the step, whatever the preview."""
+    for preview in ("all", "none"):
+        flown = replaced("target", {"duration": 6.0}, preview=preview)
+        rows = fly(flown).server
+        known = flown.make_reference()(rows["step"] * DT_S)
+        np.testing.assert_array_equal(rows["reference"], known)
+
+
+def test_a_live_velocity_has_a_number_for_each_axis() -> None:
+    """As a scenario says it."""
+    with pytest.raises(
+        ConfigError, match=r"reference.velocity_mps: got \[1.0\], expected 2 numbers"
+    ):
+        live(velocity_mps=[1.0])

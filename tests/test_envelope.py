@@ -223,6 +223,30 @@ def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, s
 
 
 @pytest.mark.parametrize(
+    ("feedback", "is_held", "away_m", "outcome"),
+    [
+        (True, True, 0.9, "hovering"),
+        (True, True, 1.2, "flyaway"),
+        (True, False, 0.9, "flyaway"),
+        (False, True, 0.9, "flyaway"),
+    ],
+)
+def test_feedback_may_lead_back_after_a_horizon_s_end(
+    *, feedback: bool, is_held: bool, away_m: float, outcome: str
+) -> None:
+    """By a metre, and for as long as the horizon is held; at rest when it has ended."""
+    state, rest = PATH.copy(), PATH[400, :, 0]
+    state[400:] = np.stack([rest, 0.0 * rest], axis=-1)
+    state[500:, 0, 0] += away_m
+    inputs = np.where(UNPLANNED[:, None], PATH[..., 1], [0.3, 0.0])
+    rows = record(state, inputs, UNPLANNED)
+    rows["age_ns"][400:] = round(3e9) if is_held else -1
+    table = config.to_table(SCENARIO)
+    table["control"]["feedback"] = feedback
+    assert judge(config.check(table, "test"), rows).outcome == outcome
+
+
+@pytest.mark.parametrize(
     ("moves_mps", "has_mps", "said"),
     [
         (0.5, 0.0, "m without a plan, where braking takes 0.311 m"),

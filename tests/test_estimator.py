@@ -1,5 +1,7 @@
 """Downlink delay compensator, eq. (12)-(13): x̂(k) is the old state flown on by the known inputs."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,8 +10,10 @@ from hypothesis import strategies as st
 from server.clock import ClockMap
 from server.controller import Controller
 from server.estimator import Estimator
+from server.gain import feedback_gain
 from server.scheme import Foresight, foresight
 from shared import config
+from shared.config import Scenario
 from shared.model import Array, Indices, discretise
 from shared.protocol import NO_HORIZON, Mode, Observation
 from shared.stopwatch import Stopwatch
@@ -17,7 +21,8 @@ from shared.stopwatch import Stopwatch
 quick = settings(max_examples=60, deadline=None)
 
 H, REACH = 3, 12
-MODEL = discretise(np.array([0.81, 0.3]), 0.05)
+DT, TAU_S = 0.05, [0.81, 0.3]
+MODEL = discretise(TAU_S, DT)
 ROW = np.array([0])
 SENT = np.array([True])
 """Which vehicles are sent their horizon; (12) does not ask."""
@@ -30,7 +35,26 @@ def seen(step: int, state: Array) -> Observation:
 
 def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
     """An estimator over twelve steps."""
-    return Estimator(MODEL, capacity, REACH, compensate=compensate)
+    flown = scenario("predictive" if compensate else "none")
+    return Estimator(flown.terms(), flown.control, feedback_gain(flown), capacity)
+
+
+def scenario(scheme: str, **control: Any) -> Scenario:
+    """A network without delay, on which twelve steps may pass after an observation."""
+    direct = {"delay": "none"}
+    raw = {
+        "model": {"tau_s": TAU_S, "u_max": [1.6]},
+        "control": {
+            "dt": DT,
+            "scheme": scheme,
+            "observer_s": 0.0,
+            "trigger": "always",
+            **control,
+        },
+        "network": {"uplink": direct, "downlink": direct},
+        "link": {"age_max_s": REACH * DT},
+    }
+    return config.check(raw, "test")
 
 
 def computed(inputs: Array) -> Foresight:

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
+import client.compensator
 import client.vehicle
 from client import failsafe
 from client.clamp import clamped
@@ -28,6 +29,7 @@ from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
 from shared.events import Event, ModeChanged
 from shared.protocol import (
     ACCEPTED,
+    NO_FEEDBACK,
     NO_HORIZON,
     Close,
     Heartbeat,
@@ -95,13 +97,26 @@ class Hand:
         """Say that the server lives."""
         self.say(Heartbeat(4, self.session, 1, Idle.PLANS, 0))
 
-    def horizon(self, made_for: int | None = None, *, observed: int | None = None) -> None:
-        """A horizon, of the step that was flown last unless told."""
+    def horizon(
+        self,
+        made_for: int | None = None,
+        *,
+        observed: int | None = None,
+        gain: tuple[float, float] | None = None,
+    ) -> None:
+        """A horizon, of the step that was flown last unless told, with feedback if there is a gain.
+
+        It leads on from where the vehicle said that it was.
+        """
         step = self.step if made_for is None else made_for
         observed_ns = self.epoch_ns + (self.step if observed is None else observed) * 20_000_000
         inputs = np.zeros((self.terms.axes, D + self.terms.horizon), np.float32)
         inputs[0] = SPEED
-        self.say(Horizon(4, self.session, step, 1, observed_ns, inputs))
+        feedback = NO_FEEDBACK
+        if gain is not None:
+            aboard = [[p, v, 0.0, *gain] for p, v in self.said[-1].state.tolist()]
+            feedback = np.array(aboard, np.float32)
+        self.say(Horizon(4, self.session, step, 1, observed_ns, inputs, feedback))
 
     @property
     def step(self) -> int:
@@ -282,6 +297,39 @@ def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() ->
     hand.horizon()
     hand.fly(0.02)
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+
+
+def test_with_feedback_it_hovers_where_it_came_to_rest_in_whatever_wind() -> None:
+    """What is told is braked to zero, so it hovers; what it flies stands against the wind."""
+    wind = [0.4, -0.3]
+    hand = Hand(control={"feedback": True}, vehicle={"steady_wind_mps": wind})
+    hand.fly(1.2)
+    hand.horizon(gain=(8.0, 2.0))
+    hand.fly((D + H) / STEPS_PER_S + 0.1)
+    assert hand.mode is Mode.BRAKE
+    hand.fly(0.4)
+    assert hand.mode is Mode.HOVER
+    hand.fly(8.0)
+    places = hand.rows()["state"][:, :, 0]
+    assert np.abs(places[-1] - places[-100]).max() < 1e-3
+    np.testing.assert_allclose(hand.said[-1].input, np.negative(wind), atol=1e-3)
+    hand.fly(2.0, beats=False)  # the link is lost: nothing of a plan is flown any more
+    assert (hand.mode, hand.speed, hand.said[-1].in_force) == (Mode.HOVER, 0.0, NO_HORIZON)
+
+
+def test_what_is_told_while_braking_never_speeds_up_whatever_feedback_adds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A compensator that tells full speed again after the last input is kept from it."""
+    hand = Hand(control={"feedback": True})
+    hand.fly(1.2)
+    hand.horizon(gain=(0.0, 0.0))
+    hand.fly((D + H) / STEPS_PER_S + 0.3)
+    braked = hand.speed
+    assert (hand.mode, 0.2 < braked < 0.8) == (Mode.BRAKE, True)
+    monkeypatch.setattr(client.compensator, "remaining", lambda *_: 1.0)
+    hand.fly(0.02)
+    assert hand.speed == pytest.approx(braked - 2.0 * 0.02, abs=1e-6)
 
 
 def test_a_silent_server_ends_in_brake_with_horizon_left() -> None:
@@ -532,15 +580,29 @@ def test_the_last_clamp_bounds_value_and_change(
     wanted: list[float], flown: list[float] | None
 ) -> None:
     """From 0.8 and 0.2 m/s, at most 1.6 m/s, and 1 m/s a step; nothing of what is not finite."""
-    assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0) == flown
+    assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0, told=wanted) == flown
 
 
 def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
     """Along the way that was chosen; what is over by rounding alone stays as it is."""
-    loose = [9.0, 9.0], 9.0
-    assert clamped([3.0, 4.0], [0.0, 0.0], *loose, speed_max=2.5) == pytest.approx([1.5, 2.0])
-    assert clamped([3.0, 4.0], [0.0, 0.0], *loose, speed_max=5.0 - 1e-12) == [3.0, 4.0]
-    assert clamped([3.0, 4.0], [0.0, 0.0], *loose, speed_max=0.0) == [0.0, 0.0]
+
+    def slowed(wanted: list[float], speed_max: float) -> list[float] | None:
+        """What is left of an input without feedback."""
+        at_rest, loose = [0.0, 0.0], [9.0, 9.0]
+        return clamped(wanted, at_rest, loose, 9.0, told=wanted, speed_max=speed_max)
+
+    assert slowed([3.0, 4.0], 2.5) == pytest.approx([1.5, 2.0])
+    assert slowed([3.0, 4.0], 5.0 - 1e-12) == [3.0, 4.0]
+    assert slowed([3.0, 4.0], 0.0) == [0.0, 0.0]
+
+
+def test_the_last_clamp_lets_feedback_through_while_braking() -> None:
+    """What is told is slowed from 5 to 2.5 m/s; the 1 m/s of feedback on top of it stays."""
+    loose = [0.0, 0.0], [9.0, 9.0], 9.0
+    flown = clamped([2.0, 4.0], *loose, told=[3.0, 4.0], speed_max=2.5)
+    assert flown == pytest.approx([0.5, 2.0])
+    assert clamped([2.0, 4.0], *loose, told=[0.0, 0.0], speed_max=0.0) == [2.0, 4.0]
+    assert clamped([2.0, 4.0], *loose, told=[np.nan, 0.0], speed_max=0.0) is None
 
 
 @pytest.mark.parametrize("clamps", [True, False])

@@ -12,7 +12,7 @@ from shared import config
 from shared.config import Scenario
 from shared.events import Finished, FlowOpened, Flying, ModeChanged, SessionOpened
 from shared.model import Array
-from shared.record import DOWNLINK, UPLINK
+from shared.record import DOWNLINK, UPLINK, client_columns
 from shared.summary import Summary, summarise
 from sim.flight import Flight, fly
 
@@ -121,6 +121,24 @@ def test_age_is_a_round_trip_and_the_wait_for_the_next_step() -> None:
     result = summary(flown, fly(flown))
     assert result.age_ms_p50 is not None
     assert 850 <= result.age_ms_p50 <= 1050
+
+
+def test_the_summary_tells_ages_effort_and_bounds_of_what_was_flown() -> None:
+    """Of a record of six steps, from the second on, counted by hand."""
+    flown = scenario("paper", duration=1.0, settle=0.05)
+    rows = np.zeros(6, client_columns(2))
+    rows["step"] = range(6)
+    rows["input"][:, 0] = [0.0, 0.3, 0.3, flown.u_max[0], flown.u_max[0], 0.0]
+    rows["input"][:, 1] = [0.0, 0.4, 0.4, 0.0, 0.0, -np.float32(flown.u_max[1])]
+    rows["in_force"] = [-1, -1, 0, 0, 3, 4]
+    rows["age_ns"] = np.array([-1, -1, 500, 550, 450, 400]) * 1_000_000
+    result = summarise(flown, "test", rows)
+    assert (result.aoi_s_mean, result.aoi_s_peak) == (pytest.approx(0.475), pytest.approx(0.5))
+    assert result.plan_age_s_mean == pytest.approx(0.05 * (2 + 3 + 1 + 1) / 4)
+    u = float(flown.u_max[0])
+    changes = [0.25, 0.0, (u - 0.3) ** 2 + 0.16, 0.0, 2 * u**2]
+    assert result.effort_mps == pytest.approx(np.sqrt(np.mean(changes)))
+    assert result.saturated == pytest.approx(3 / 5)
 
 
 @pytest.mark.parametrize("offset_s", [-3600.0, 0.5, 86000.0])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 
 from benchmarks.problems import gradients
@@ -22,7 +21,6 @@ from server.mpc import (
     make_mpc,
     pose,
     shifted,
-    stationary_gain,
 )
 from server.solver import OsqpSolver
 from shared.config import ControlConfig, ModelConfig, Scenario
@@ -276,22 +274,3 @@ def test_shifting_twice_is_shifting_once_by_the_sum(one: int, other: int) -> Non
     inputs = np.random.default_rng(0).normal(size=7)
     twice = carried(carried(inputs, one), other)
     np.testing.assert_array_equal(twice, carried(inputs, one + other))
-
-
-@quick
-@given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0), st.floats(0.0, 10.0))
-def test_stationary_gain_is_that_of_the_riccati_equation(q: float, r: float, s: float) -> None:
-    """On either axis, with S beside R."""
-    weights = control(20, state_weight=(7.1, q), input_weight=r, change_weight=s)
-    gain = stationary_gain(TWO_TAUS, weights)
-    for A, B, K in zip(TWO_TAUS.A, TWO_TAUS.B[:, :, None], gain, strict=True):
-        X = solve_discrete_are(A, B, np.diag([7.1, q]), np.array([[r + s]]))
-        expected = np.linalg.solve(r + s + B.T @ X @ B, B.T @ X @ A)[0]
-        np.testing.assert_allclose(K, expected, rtol=1e-7)
-
-
-def test_stationary_gain_where_nothing_weighs_the_position() -> None:
-    """Nothing leads back to it then."""
-    gain = stationary_gain(TWO_TAUS, control(20, state_weight=(0.0, 1.0)))
-    np.testing.assert_allclose(gain[:, 0], 0.0, atol=1e-12)
-    assert (gain[:, 1] > 0.0).all()

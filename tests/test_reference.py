@@ -175,6 +175,7 @@ def test_hover_stays_where_it_is() -> None:
         {"shape": "square"},
         {"shape": "waypoints", "points_m": [[0, 0, 0], [1, 2, 2]]},
         {"shape": "hover", "points_m": [[1, 2, 3]]},
+        {"shape": "target"},
     ],
 )
 def test_array_of_times_is_its_single_times(table: dict[str, object], axes: int) -> None:
@@ -185,6 +186,24 @@ def test_array_of_times_is_its_single_times(table: dict[str, object], axes: int)
     times = np.array([[0.0, 0.3, 2.9], [14.2, 17.0, 100.0]])
     singles = [[desired(np.array(t)) for t in row] for row in times]
     np.testing.assert_array_equal(desired(times), singles)
+
+
+def test_a_target_stays_within_its_bounds_and_comes_back_the_way_it_went() -> None:
+    """However far in the future it is asked for: no more of it is drawn than an hour."""
+    rng = np.random.default_rng(1)
+    desired = reference.target(rng, 2, agility=0.5, speed_mps=0.8, radius_m=2.0)
+    times = np.arange(0.0, 200.0, 0.01)
+    states = desired(times)
+    assert np.abs(states[..., 0]).max() == pytest.approx(2.0, abs=0.01)
+    assert np.abs(states[..., 1]).max() == pytest.approx(0.8, abs=0.01)
+    travelled = np.abs(np.diff(states[..., 0], axis=0)).max() / 0.01
+    assert travelled <= 0.8 + 1e-9
+    back = desired(2.0 * reference.TURN_S - times)
+    np.testing.assert_allclose(back[..., 0], states[..., 0], atol=1e-6)
+    np.testing.assert_allclose(back[1:, :, 1], -states[1:, :, 1], atol=1e-6)
+    again = desired(times + 1e6 * reference.TURN_S)
+    np.testing.assert_allclose(again[..., 0], states[..., 0], atol=1e-5)
+    assert desired(np.array(9e9)).shape == (2, 2)  # and no memory is asked for
 
 
 def test_file_is_flown_in_straight_lines(tmp_path: Path) -> None:

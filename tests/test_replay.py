@@ -7,7 +7,7 @@ import pytest
 
 from client.compensator import Compensator
 from server.clock import ClockMap
-from server.mpc import stationary_gain
+from server.gain import feedback_gain
 from server.planner import Planner
 from server.replay import Replay
 from server.scheme import Foresight, foresight
@@ -56,7 +56,8 @@ def small(exhausted: str = "brake", age_max_s: float = 5.0, **control: Any) -> S
 
 def make(flown: Scenario) -> Replay:
     """Room for one vehicle."""
-    return Replay(flown.terms(), flown.control, 1, ClockMap(1, flown.dt_ns))
+    clock, gain = ClockMap(1, flown.dt_ns), feedback_gain(flown)
+    return Replay(flown.terms(), flown.control, gain, 1, clock)
 
 
 def see(
@@ -82,11 +83,12 @@ def by_rule(replay: Replay, step: int, in_force: int) -> Array:
         made_for, _, length, speed = memory.sent[0, slot].tolist()
         if made_for == in_force:
             stage = step - made_for
-            told = memory.inputs[0, slot, :, rule.entry(stage, length)].tolist()
+            inputs = memory.inputs[0, slot, :, rule.entry(stage, length)].tolist()
+            share = rule.remaining(stage, length, speed, brake)
             return np.array(
                 [
-                    rule.flown(stage, length, rule.bounded(u, bound), 0.0, speed, brake, bound)
-                    for u, bound in zip(told, bounds, strict=True)
+                    rule.flown(stage, share * rule.bounded(u, bound), 0.0, bound)
+                    for u, bound in zip(inputs, bounds, strict=True)
                 ]
             )
     return np.zeros(2)
@@ -256,7 +258,7 @@ def test_it_makes_no_difference_when_a_horizon_with_feedback_arrives() -> None:
     inputs = 0.3 * inputs
     terms, replay = flown.terms(), make(flown)
     before, after = Compensator(terms), Compensator(terms)
-    gain = stationary_gain(terms.model, flown.control)
+    gain = feedback_gain(flown)
     feedback = np.concatenate([x, np.zeros((2, 1)), gain], axis=1).astype(np.float32)
     before.offer(Horizon(1, 1, 100, 0, 0, inputs.astype(np.float32), feedback), 100, 99)
     send(replay, 100, inputs, feedback)

@@ -8,14 +8,23 @@ from hypothesis import strategies as st
 from client.compensator import Compensator
 from server import model as compiled
 from server.clock import ClockMap
-from server.mpc import stationary_gain
+from server.gain import feedback_gain
 from server.replay import Replay
 from server.scheme import Foresight, foresight
 from shared import rule
 from shared.config import Scenario, check
 from shared.model import Array
 from shared.protocol import NO_HORIZON, Horizon, Mode, Observation
-from shared.rule import bounded, entry, flown, lasting, late_max, led_back
+from shared.rule import (
+    bounded,
+    entry,
+    flown,
+    lasting,
+    late_max,
+    leading,
+    led_back,
+    remaining,
+)
 
 quick = settings(max_examples=200, deadline=None)
 
@@ -55,33 +64,38 @@ def test_feedback_leads_back_in_position_and_velocity() -> None:
     assert led_back(3.0, 1.5, 0.25, -0.5) == 0.0
 
 
-@pytest.mark.parametrize("stage", [0, 9])
-@pytest.mark.parametrize("brake", [0.0, 0.2])
 @pytest.mark.parametrize(
     ("told", "back", "u"), [(0.5, 0.0, 0.5), (0.5, 0.25, 0.75), (1.5, 9.0, 1.8), (0.5, -9.0, -1.8)]
 )
-def test_within_the_horizon_feedback_is_added_within_the_bound(
-    stage: int, brake: float, told: float, back: float, u: float
+def test_feedback_is_added_within_the_bound_from_the_first_stage_on(
+    told: float, back: float, u: float
 ) -> None:
-    """At its first stage as at its last; nothing is braked there."""
-    assert flown(stage, 10, told, back, 1.0, brake, 1.8) == u
+    """Also after the last; before the first there is nothing to be led back to."""
+    assert [flown(stage, told, back, 1.8) for stage in (0, 9, 10, 10**12)] == [u] * 4
+    assert flown(-1, told, back, 1.8) == told
 
 
-@pytest.mark.parametrize(("stage", "brake"), [(-1, 0.0), (-1, 0.2), (10, 0.0), (10**12, 0.0)])
-def test_an_input_is_held_without_feedback_where_the_horizon_has_none(
-    stage: int, brake: float
-) -> None:
-    """Before the first stage, and after the last for ever where nothing is braked."""
-    assert flown(stage, 10, 0.5, 0.25, 1.0, brake, 1.8) == 0.5
+@pytest.mark.parametrize(
+    ("stage", "brake"), [(-1, 0.0), (-1, 0.2), (9, 0.2), (10, 0.0), (10**12, 0.0)]
+)
+def test_an_input_is_told_in_full_until_it_is_braked(stage: int, brake: float) -> None:
+    """For ever, where nothing is braked."""
+    assert remaining(stage, 10, 1.0, brake) == 1.0
 
 
 def test_braking_takes_away_its_part_of_the_speed_at_every_step_until_rest() -> None:
-    """Speed of 0.5 m/s over all axes, less 0.125 m/s a step; the direction stays."""
-    for told, u in ((0.3, 0.3), (-0.4, -0.4)):
-        braked = [flown(stage, 10, told, 9.0, 0.5, 0.125, 1.8) for stage in range(10, 16)]
-        assert braked == [0.75 * u, 0.5 * u, 0.25 * u, 0.0, 0.0, 0.0]
-    assert flown(10**12, 10, 0.3, 0.0, 0.5, 0.125, 1.8) == 0.0
-    assert flown(10, 10, 0.0, 0.0, 0.0, 0.125, 1.8) == 0.0  # at rest already
+    """Speed of 0.5 m/s over all axes, less 0.125 m/s a step."""
+    left = [remaining(stage, 10, 0.5, 0.125) for stage in range(10, 16)]
+    assert left == [0.75, 0.5, 0.25, 0.0, 0.0, 0.0]
+    assert remaining(10**12, 10, 0.5, 0.125) == 0.0
+    assert remaining(10, 10, 0.0, 0.125) == 0.0  # at rest already
+
+
+def test_where_it_leads_is_blown_along_only_until_it_stands() -> None:
+    """The disturbance counts while anything of the inputs is left."""
+    assert leading(0.5, -0.25, 1.0) == 0.25
+    assert leading(0.0, -0.25, 0.01) == -0.25
+    assert leading(0.0, -0.25, 0.0) == 0.0
 
 
 speeds = st.floats(-3.0, 3.0)
@@ -97,9 +111,13 @@ def test_compiled_it_says_the_same(
     stage: int, length: int, numbers: tuple[float, float, float, float, float]
 ) -> None:
     """To the last bit, each function."""
-    assert compiled.flown(stage, length, *numbers) == flown(stage, length, *numbers)
+    told, back, speed, brake, bound = numbers
+    share = remaining(stage, length, speed, brake)
+    assert compiled.remaining(stage, length, speed, brake) == share
+    assert compiled.leading(told, back, share) == leading(told, back, share)
+    assert compiled.flown(stage, told, back, bound) == flown(stage, told, back, bound)
     assert compiled.led_back(*numbers[:4]) == led_back(*numbers[:4])
-    assert compiled.bounded(numbers[0], numbers[4]) == bounded(numbers[0], numbers[4])
+    assert compiled.bounded(told, bound) == bounded(told, bound)
     assert compiled.entry(stage, length) == entry(stage, length)
     assert compiled.lasting(length, 100, 100 - stage, 20) == lasting(length, 100, 100 - stage, 20)
 
@@ -202,9 +220,10 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
     setting = scenario(exhausted, age_max, feedback=feedback)
     terms = setting.terms()
     assert terms.age_max == age_max
-    gain = stationary_gain(terms.model, setting.control) if terms.feedback else np.zeros((2, 0))
+    K = feedback_gain(setting)
+    gain = K if feedback else np.zeros((2, 0))
     vehicle = Compensator(terms)
-    replay = Replay(terms, setting.control, 1, ClockMap(1, terms.dt_ns))
+    replay = Replay(terms, setting.control, K, 1, ClockMap(1, terms.dt_ns))
 
     x, states, inputs = rng.normal(size=(2, 2)), [], []
     arriving = {begin: (make_horizon(rng, FIRST, first, x, gain), begin - observed)}
@@ -241,5 +260,5 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
 
 def test_the_server_compiles_the_very_functions_that_the_vehicle_calls() -> None:
     """There is one source of the rule."""
-    for name in ("lasting", "entry", "bounded", "led_back", "flown"):
+    for name in ("lasting", "entry", "bounded", "remaining", "leading", "led_back", "flown"):
         assert getattr(compiled, name).py_func is getattr(rule, name)

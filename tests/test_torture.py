@@ -20,6 +20,7 @@ import lab.torture
 import server.plausibility
 import shared.channel
 import skytether.torture
+from client.compensator import Compensator
 from client.failsafe import LOCKING, TABLE
 from lab.faults import RANGES, Fault, Kind, Trial, dumps, loads
 from lab.invariants import Violation, check_bounds
@@ -27,6 +28,7 @@ from lab.torture import CLOCK_NS, fly, long_trial, make_scenario, short_trial, s
 from netem.proxy import Proxy
 from server.endpoint import Server
 from shared.endpoint import SECOND_NS, Datagram, Endpoint
+from shared.model import Array
 from shared.protocol import Mode
 from shared.record import Reason
 from shell.command import CommandError
@@ -139,6 +141,18 @@ def no_clamp(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(client.vehicle, "clamped", lambda wanted, *_, **__: list(wanted))
 
 
+def no_feedback_at_the_end(patch: pytest.MonkeyPatch) -> None:
+    """Feedback that stops after the last input, aboard."""
+    led_back = Compensator._led_back
+
+    def end(self: Compensator, stage: int, state: Array) -> list[float]:
+        """Feedback up to the last input."""
+        ended = stage >= self._inputs.shape[1]
+        return self._nothing if ended else led_back(self, stage, state)
+
+    patch.setattr(Compensator, "_led_back", end)
+
+
 def no_window(patch: pytest.MonkeyPatch) -> None:
     """No replay window."""
     patch.setattr(shared.channel.Window, "is_new", lambda *_: True)
@@ -218,6 +232,15 @@ ABLATIONS: list[tuple[Patch, str, tuple[Fault, ...]]] = [
     (no_steady, "recovers", (fault(Kind.STEP, "server", 5, 0, -3600.0),)),
     (no_latch, "table", (fault(Kind.PARTITION, "both", 5, 14),)),
 ]
+
+
+def test_feedback_that_ends_too_early_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight with feedback whose observations are lost brakes, and holds its place in wind."""
+    seed = next(seed for seed in range(100) if make_scenario(seed)[0].control.feedback)
+    trial = Trial(seed, (fault(Kind.LOSS, "downlink", 5, 8),))
+    assert not fly(trial).failure
+    no_feedback_at_the_end(monkeypatch)
+    assert fly(trial).invariant == "follows"
 
 
 @pytest.mark.parametrize(("switch_off", "invariant", "faults"), ABLATIONS)

@@ -1,0 +1,540 @@
+"""The closed loop where no bound is active: linear, given which packet arrives when.
+
+Every push, a step's wind or a measurement's noise, is followed through vehicle, observations,
+horizons in flight and disturbance observer along the timing of a flight, as a column of numbers.
+What each does by itself is what `server.replay`, `server.planner`, `client.compensator` and
+`client.plant` do, without bounds.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from client.plant import white_acceleration
+from server.model import advance, lasting
+from server.mpc import LATER, MPC, make_mpc, pose, stationary_gain
+from server.replay import HOVERS, TRIP_NS, UNKNOWN
+from shared import policy
+from shared.config import Scenario
+from shared.endpoint import SECOND_NS, seconds_to_ns
+from shared.kernel import B1, F1, F2, F3, I1, kernel, part
+from shared.model import Array, Axis, Model, discretise
+from shared.protocol import committed_max
+from sim.flight import Flight
+
+WIND, NOISE = 2, 2
+"""Columns of a step's wind on an axis, and of its measurement."""
+COMMITTED, PREDICTIVE, NONE = 0, 1, 2
+"""The schemes, as kernels take them."""
+
+
+class Timing(NamedTuple):
+    """Which packets of a flight arrived when, as both ends recorded it."""
+
+    in_force: I1
+    """Step that the horizon in force at each step was made for, or -1; shape (steps,)."""
+    step: I1
+    """Step k of each tick of the server; shape (ticks,)."""
+    ahead: I1
+    """Delay bound d at each tick [steps]; shape (ticks,)."""
+    observed: I1
+    """Step of the newest observation at each tick; shape (ticks,)."""
+    event: B1
+    """Whether a horizon was sent; shape (ticks,)."""
+
+
+class Loop(NamedTuple):
+    """The loop on one axis, with all that is linear in it."""
+
+    model: Axis
+    """Eq. (4) as both ends know it."""
+    true: Axis
+    """Eq. (4) of the vehicle that flies, its gain in b0 and b1."""
+    late: F1
+    """What of b0 and b1 is still the input's flown a step before, by its dead time; shape (2,)."""
+    dead_steps: int
+    """Whole steps of dead time."""
+    push: F2
+    """Square root of a step's covariance under white acceleration of strength 1; shape (2, 2)."""
+    noise: bool
+    """Whether measurements have noise."""
+    scheme: int
+    """COMMITTED, PREDICTIVE or NONE."""
+    plan: F2
+    """Inputs of a plan for position and velocity where it begins, and for ŵ; shape (H, 3)."""
+    before: F2
+    """Inputs of a plan for those of the plan before, shifted; shape (H, H), or (0, 0)."""
+    back: F1
+    """Feedback aboard, on position [1/s] and velocity; 0 without; shape (2,)."""
+    decay: float
+    """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
+    holds: bool
+    """Whether the last input of a horizon is held for ever, rather than braked along."""
+    age_max: int
+    """Largest age of an observation that counts [steps]."""
+    dt_ns: int
+    """Length of a step [ns]."""
+
+
+class Past(NamedTuple):
+    """What the loop remembers; the last axis of each array has a column for each push."""
+
+    reported: F3
+    """State that each step reports, a ring; shape (reach, 2, columns)."""
+    flown: F2
+    """Input of each step, a ring; shape (reach, columns)."""
+    first: F2
+    """First input of the plan of each step, û of eq. (12), a ring; shape (reach, columns)."""
+    made: I1
+    """Step that each horizon that was sent was made for, a ring; shape (room,)."""
+    due: I1
+    """Step at which it is in force, or lost; shape (room,)."""
+    length: I1
+    """How many inputs of it are flown; shape (room,)."""
+    inputs: F3
+    """Its inputs; shape (room, most + H, columns)."""
+    origins: F3
+    """Position, velocity and ŵ that it leads on from; shape (room, 3, columns)."""
+    plan: F2
+    """Inputs planned last; shape (H, columns)."""
+    scratch: F2
+    """Inputs that are being planned; shape (H, columns)."""
+    disturbance: F1
+    """ŵ; shape (columns,)."""
+    led: F2
+    """x̄ of the horizon in force; shape (2, columns)."""
+    commands: F2
+    """Inputs of a roll; shape (longest, columns)."""
+    track: F3
+    """States of a roll; shape (longest + 1, 2, columns)."""
+    marks: I1
+    """Numbers that change, by the names below; shape (5,)."""
+
+
+SENT, BASE, START, LED_MADE, LED_STAGE = range(5)
+"""Number of horizons sent; step of the observation that the observer knows; where the plan before
+began; and the horizon and the stage that x̄ belongs to."""
+
+
+# -- one flight's timing ---------------------------------------------------------------------------
+
+
+@part
+def _number(past: Past, made_for: int) -> int:
+    """Number of the horizon made for a step, see `server.replay`."""
+    room, sent = len(past.made), past.marks[SENT]
+    if made_for < 0:
+        return HOVERS
+    for number in range(sent - 1, max(sent - room, 0) - 1, -1):
+        if past.made[number % room] <= made_for:
+            return number if past.made[number % room] == made_for else UNKNOWN
+    return UNKNOWN
+
+
+@part
+def _first_under_way(past: Past, in_force: int, observed: int) -> int:
+    """Number of the first horizon made after the one in force, and not due yet."""
+    room, sent = len(past.made), past.marks[SENT]
+    number = sent
+    while number > max(sent - room, 0):
+        slot = (number - 1) % room
+        if past.made[slot] <= in_force or past.due[slot] <= observed:
+            break
+        number -= 1
+    return number
+
+
+@part
+def _move(axis: Axis, x: F2, u: F1, w: F1, to: F2) -> None:
+    """Advance all columns a step, from `x` to `to`, which may be the same."""
+    for c in range(x.shape[1]):
+        to[0, c], to[1, c] = advance(axis, x[0, c], x[1, c], u[c] + w[c])
+
+
+@part
+def _flown(loop: Loop, past: Past, slot: int, stage: int, led: F2, x: F2, u: F1) -> None:
+    """Fill in what is flown at a stage of a horizon, as `shared.rule` has it without bounds."""
+    length = past.length[slot]
+    if stage >= length and not loop.holds:
+        u[:] = 0.0
+        return
+    u[:] = past.inputs[slot, min(max(stage, 0), length - 1) if loop.scheme != NONE else 0]
+    if 0 <= stage < length and loop.back[0] != 0.0:
+        for c in range(len(u)):
+            u[c] += loop.back[0] * (led[0, c] - x[0, c]) + loop.back[1] * (led[1, c] - x[1, c])
+
+
+@part
+def _lead(loop: Loop, past: Past, slot: int, stage: int, led: F2) -> None:
+    """Advance x̄ of a horizon from a stage to the next; it stays at the last."""
+    if 0 <= stage < past.length[slot] - 1:
+        _move(loop.model, led, past.inputs[slot, stage], past.origins[slot, 2], led)
+
+
+@part
+def _fly_leg(loop: Loop, past: Past, number: int, begin: int, first: int, last: int) -> None:
+    """Fly what is in force from one step to another, in the roll that began at `begin`."""
+    room, w, slot, led = len(past.made), past.disturbance, 0, past.scratch[:2]
+    if number >= 0:
+        slot = number % room
+        if loop.back[0] != 0.0:
+            led[:] = past.origins[slot, :2]
+            for stage in range(first - past.made[slot]):
+                _lead(loop, past, slot, stage, led)
+    for step in range(first, last):
+        i = step - begin
+        u, x = past.commands[i], past.track[i]
+        if i == 0:
+            u[:] = past.flown[step % len(past.flown)]  # as it says itself
+        elif number >= 0:
+            _flown(loop, past, slot, step - past.made[slot], led, x, u)
+        elif loop.holds or number == UNKNOWN:
+            u[:] = past.commands[0]
+        else:
+            u[:] = 0.0
+        if number >= 0 and loop.back[0] != 0.0:
+            _lead(loop, past, slot, step - past.made[slot], led)
+        _move(loop.model, x, u, w, past.track[i + 1])
+
+
+@part
+def _roll(loop: Loop, past: Past, begin: int, flying: int, under_way: range, end: int) -> None:
+    """Fly from an observation on with what is in force, then what is under way, to step `end`."""
+    past.track[0] = past.reported[begin % len(past.reported)]
+    first, number = begin, flying
+    for following in under_way:
+        due = past.due[following % len(past.made)]
+        if due <= begin:
+            number = following
+            continue
+        _fly_leg(loop, past, number, begin, first, min(due, end))
+        first, number = min(due, end), following
+    _fly_leg(loop, past, number, begin, first, end)
+
+
+@part
+def _observe(loop: Loop, timing: Timing, past: Past, t: int) -> None:
+    """Disturbance observer, from the observation before to that of tick `t`."""
+    begin, end = past.marks[BASE], timing.observed[t]
+    if begin >= 0 and 0 < end - begin <= loop.age_max:
+        before = timing.in_force[begin]
+        after = timing.in_force[end]
+        since = end
+        while since > 0 and timing.in_force[since - 1] == after:
+            since -= 1
+        flying, newest = _number(past, before), _number(past, after)
+        if min(flying, newest) > UNKNOWN:
+            # Up to `since` by what was expected, and from there on by what is known.
+            if since <= begin:
+                _roll(loop, past, begin, newest, range(0), end)
+            else:
+                first = _first_under_way(past, before, begin)
+                _roll(loop, past, begin, flying, range(first, max(newest, first)), since)
+                _fly_leg(loop, past, newest, begin, since, end)
+            m = end - begin
+            slower = max(1.0, (timing.step[t] + timing.ahead[t] - end) * loop.dt_ns / TRIP_NS)
+            share = (1.0 - loop.decay ** (m / slower)) / (1.0 - loop.model.a11**m)
+            velocity = past.reported[end % len(past.reported), 1]
+            for c in range(len(velocity)):
+                past.disturbance[c] += share * (velocity[c] - past.track[m, 1, c])
+    past.marks[BASE] = end
+
+
+@part
+def _estimate(loop: Loop, timing: Timing, past: Past, t: int) -> None:
+    """Eq. (13): the newest observation, moved on to the present by û."""
+    k, o, reach = timing.step[t], timing.observed[t], len(past.first)
+    past.track[0] = past.reported[o % len(past.reported)]
+    if loop.scheme == NONE:
+        return
+    for step in range(o, k):
+        _move(
+            loop.model,
+            past.track[step - o],
+            past.first[step % reach],
+            past.disturbance,
+            past.track[step - o + 1],
+        )
+
+
+@part
+def _plan(loop: Loop, past: Past, start: int, x: F2) -> None:
+    """Plan from a state at step `start`, without bounds; into `past.plan`."""
+    H, w, plan = len(loop.plan), past.disturbance, past.plan
+    gap = start - past.marks[START]
+    past.marks[START] = start
+    if len(loop.before):
+        past.scratch[:] = plan
+    for stage in range(H):
+        on_p, on_v, on_w = loop.plan[stage]
+        for c in range(len(w)):
+            plan[stage, c] = on_p * x[0, c] + on_v * x[1, c] + on_w * w[c]
+    for stage in range(len(loop.before)):
+        for i in range(H):
+            share, then = loop.before[stage, i], past.scratch[min(max(i + gap, 0), H - 1)]
+            for c in range(len(w)):
+                plan[stage, c] += share * then[c]
+
+
+@part
+def _tick(loop: Loop, timing: Timing, past: Past, t: int) -> None:
+    """Do what the server does at a tick."""
+    k, d, o, H = timing.step[t], timing.ahead[t], timing.observed[t], len(loop.plan)
+    if loop.scheme == COMMITTED:
+        if loop.decay < 1.0:
+            _observe(loop, timing, past, t)
+        if not (timing.event[t] or len(loop.before)):
+            return
+        flying = _number(past, timing.in_force[o])
+        first = _first_under_way(past, timing.in_force[o], o)
+        _roll(loop, past, o, flying, range(first, past.marks[SENT]), k + d)
+        start = past.track[max(k + d - o, 0)]
+    else:
+        d = 0
+        _estimate(loop, timing, past, t)
+        start = past.track[max(k - o, 0) if loop.scheme == PREDICTIVE else 0]
+    now, slot = k - o, past.marks[SENT] % len(past.made)
+    if timing.event[t]:
+        past.origins[slot, :2] = past.track[max(now, 0)]
+        past.origins[slot, 2] = past.disturbance
+        past.inputs[slot, :d] = 0.0
+        for stage in range(max(-now, 0), d):
+            past.inputs[slot, stage] = past.commands[now + stage]
+    _plan(loop, past, k + d, start)
+    if loop.scheme != COMMITTED:
+        reach = len(past.first)
+        last = timing.step[t - 1] if t else k
+        for missed in range(max(last + 1, k - reach + 1), k):
+            past.first[missed % reach] = past.first[last % reach]
+        past.first[k % reach] = past.plan[0]
+    if timing.event[t]:
+        past.inputs[slot, d : d + H] = past.plan
+        given = d + H if loop.scheme != NONE else loop.age_max + H
+        past.made[slot], past.due[slot] = k, k + d
+        past.length[slot] = lasting(given, k, o, loop.age_max)
+        past.marks[SENT] += 1
+
+
+@part
+def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
+    """Do what the compensator aboard does at step `s`."""
+    reach = len(past.flown)
+    u, x = past.flown[s % reach], past.reported[s % reach]
+    number = _number(past, timing.in_force[s])
+    if number < 0:
+        u[:] = 0.0
+        if loop.holds:
+            u[:] = past.flown[(s - 1) % reach]
+        return
+    slot, stage = number % len(past.made), s - timing.in_force[s]
+    if loop.back[0] != 0.0:
+        if past.marks[LED_MADE] != timing.in_force[s]:
+            past.led[:] = past.origins[slot, :2]
+            past.marks[LED_MADE], past.marks[LED_STAGE] = timing.in_force[s], 0
+        for reached in range(past.marks[LED_STAGE], stage):
+            _lead(loop, past, slot, reached, past.led)
+        past.marks[LED_STAGE] = max(stage, past.marks[LED_STAGE])
+    _flown(loop, past, slot, stage, past.led, x, u)
+
+
+@part
+def _forget(past: Past, x: F2, column: int) -> None:
+    """Forget a push, so that its column can take another."""
+    x[:, column] = 0.0
+    for rows in (past.flown, past.first, past.plan, past.led):
+        rows[:, column] = 0.0
+    for blocks in (past.reported, past.inputs, past.origins):
+        blocks[:, :, column] = 0.0
+    past.disturbance[column] = 0.0
+
+
+@kernel
+def _respond(
+    loop: Loop, timing: Timing, past: Past, begin: int, every: int, squares: F3, counts: I1
+) -> None:
+    """Follow pushes from step `begin` on along a flight's timing.
+
+    Args:
+        every: steps from one push to the next; there are as many at a time as there are columns.
+        squares: what is added to: p² and u² of each source so many steps after a push; shape
+            (2, sources, window).
+        counts: how many pushes were added to each; shape (window,).
+    """
+    sources, window = squares.shape[1], squares.shape[2]
+    reach, tick, steps = len(past.reported), 0, len(timing.in_force)
+    width = past.reported.shape[2] // sources
+    x, true = np.zeros((2, sources * width)), loop.true
+    none = np.zeros(sources * width)
+    for s in range(steps):
+        # What was in force had been made, and what was made had been observed, before.
+        made = max(timing.in_force[s], s - 1)
+        while tick < len(timing.step) and timing.step[tick] <= made and timing.observed[tick] < s:
+            _tick(loop, timing, past, tick)
+            tick += 1
+        pushed, push = s >= begin and (s - begin) % every == 0, (s - begin) // every
+        if pushed:
+            for source in range(sources):
+                _forget(past, x, source * width + push % width)
+        past.reported[s % reach] = x
+        if pushed and loop.noise:
+            past.reported[s % reach, 0, WIND * width + push % width] += 1.0
+            past.reported[s % reach, 1, (WIND + 1) * width + push % width] += 1.0
+        _choose(loop, timing, past, s)
+        u = past.flown[s % reach]
+        for before in range(max(push - width + 1, 0), push + 1):
+            age = s - begin - before * every
+            if 0 <= age < window:
+                counts[age] += 1
+                for source in range(sources):
+                    column = source * width + before % width
+                    squares[0, source, age] += x[0, column] ** 2
+                    squares[1, source, age] += u[column] ** 2
+        due = past.flown[(s - loop.dead_steps) % reach]
+        late = past.flown[(s - loop.dead_steps - 1) % reach]
+        _move(true, x, due, none, x)
+        for c in range(x.shape[1]):
+            x[0, c] += loop.late[0] * (late[c] - due[c])
+            x[1, c] += loop.late[1] * (late[c] - due[c])
+        if pushed:
+            x[0, push % width] += loop.push[0, 0]
+            x[1, push % width] += loop.push[1, 0]
+            x[1, width + push % width] += loop.push[1, 1]
+
+
+# -- a scenario's loops ----------------------------------------------------------------------------
+
+
+def make_loops(scenario: Scenario) -> list[Loop]:
+    """The loop on each axis of a scenario."""
+    terms, control, vehicle = scenario.terms(), scenario.control, scenario.vehicle
+    dt, tau = control.dt, scenario.true_tau_s
+    whole, rest_ns = divmod(seconds_to_ns(vehicle.dead_time_s), scenario.dt_ns)
+    true, after = discretise(tau, dt), discretise(tau, dt - rest_ns / SECOND_NS)
+    late = vehicle.gain * (true.B - after.B) if rest_ns else np.zeros_like(true.B)
+    mpc = make_mpc(terms, control)
+    plans, before = _plans(terms.model, mpc)
+    back = np.zeros_like(true.B)
+    if terms.feedback:
+        back = stationary_gain(terms.model, control).astype("f4").astype("f8")
+    observes = terms.commits and control.observer_s > 0.0
+    sensor = scenario.sensor
+    pushes = white_acceleration(tau, dt)
+    return [
+        Loop(
+            model=model,
+            true=Axis(axis.a01, axis.a11, vehicle.gain * axis.b0, vehicle.gain * axis.b1),
+            late=late[i],
+            dead_steps=whole,
+            push=pushes[i],
+            noise=sensor.position_noise_m > 0.0 or sensor.velocity_noise_mps > 0.0,
+            scheme={"committed": COMMITTED, "predictive": PREDICTIVE, "none": NONE}[terms.scheme],
+            plan=plans[i],
+            before=before[i] if control.change_weight > 0.0 else np.zeros((0, 0)),
+            back=back[i],
+            decay=float(np.exp(-dt / control.observer_s)) if observes else 1.0,
+            holds=terms.brake == 0.0,
+            age_max=terms.age_max,
+            dt_ns=terms.dt_ns,
+        )
+        for i, (model, axis) in enumerate(zip(terms.model.axes(), true.axes(), strict=True))
+    ]
+
+
+def _plans(model: Model, mpc: MPC) -> tuple[Array, Array]:
+    """Unconstrained plans of (9), U = -𝓗⁻¹ g, by what g is linear in.
+
+    Returns:
+        for position and velocity where planning starts and ŵ, shape (axes, H, 3), and for the
+        horizon before, shape (axes, H, H).
+    """
+    H, axes = len(mpc.weights.states), len(model.b0)
+    hessian = pose(model, mpc, LATER).hessian
+    free = np.zeros((axes, 3, H, 2))
+    """States 1 … H without any input, from a unit of each."""
+    forced = np.zeros((axes, H, H, 2))
+    """Those that come of a unit of the input at each stage."""
+    for j, start in enumerate(([1.0, 0.0], [0.0, 1.0], [0.0, 0.0])):
+        x = np.tile(start, (axes, 1))
+        for i in range(H):
+            x = free[:, j, i] = model.step(x, np.full(axes, float(j == 2)))
+    for j in range(H):
+        x = np.zeros((axes, 2))
+        for i in range(j, H):
+            x = forced[:, j, i] = model.step(x, np.full(axes, float(i == j)))
+    gradient = np.einsum("auip,ip,ajip->auj", forced, mpc.weights.states, free)
+    gradient[:, :, 2] += mpc.weights.input
+    changes = np.tile(np.diag(mpc.weights.changes[LATER]), (axes, 1, 1))
+    return -np.linalg.solve(hessian, gradient), np.linalg.solve(hessian, changes)
+
+
+def timing_of(flight: Flight) -> Timing:
+    """The timing of a flight of one vehicle, from its record."""
+    client, server = flight.client, flight.server
+    assert (np.diff(client["step"]) == 1).all()
+    return Timing(
+        in_force=client["in_force"].copy(),
+        step=server["step"].copy(),
+        ahead=server["ahead"].copy(),
+        observed=server["observed_step"].copy(),
+        event=server["event"].copy(),
+    )
+
+
+def respond(
+    scenario: Scenario, loop: Loop, timing: Timing, begin: int, window: int, width: int
+) -> tuple[Array, Array]:
+    """What pushes leave of them along a flight's timing.
+
+    Args:
+        begin: step of the first push.
+        window: number of steps for which each push is followed.
+        width: number of pushes of each source that are followed at a time.
+
+    Returns:
+        p² and u² of each source 0 … window - 1 steps after a push of strength 1, summed over the
+        pushes, shape (2, sources, window), and the number of pushes, shape (window,).
+    """
+    terms, control = scenario.terms(), scenario.control
+    H, most, sources = terms.horizon, committed_max(terms), WIND + NOISE * loop.noise
+    periods = [
+        int(each.values[0]) if each.values else control.period
+        for each in policy.policies(policy.parse(control.trigger))
+        if each.name == "periodic"
+    ]
+    every = -(-window // width)
+    while math.gcd(every, math.prod(periods)) > 1:  # pushes come anywhere between two packets
+        every += 1
+    columns = sources * width
+    steps, observed = timing.step, timing.observed
+    last = np.concatenate([observed[:1], observed[:-1]])
+    known = observed - last <= terms.age_max
+    longest = int(max((steps + timing.ahead - observed).max(initial=0), terms.age_max)) + 2
+    reach = int((steps - last)[known].max(initial=1)) + loop.dead_steps + 8
+    sent = steps[timing.event]
+    needed = [
+        np.searchsorted(sent, np.arange(len(timing.in_force)))
+        - np.searchsorted(sent, timing.in_force),
+        np.searchsorted(sent, steps) - np.searchsorted(sent, timing.in_force[last]),
+    ]
+    room = int(max(each.max(initial=0) for each in needed)) + 3
+    past = Past(
+        reported=np.zeros((reach, 2, columns)),
+        flown=np.zeros((reach, columns)),
+        first=np.zeros((reach, columns)),
+        made=np.full(room, -1),
+        due=np.full(room, -1),
+        length=np.ones(room, dtype=np.int64),
+        inputs=np.zeros((room, most + H, columns)),
+        origins=np.zeros((room, 3, columns)),
+        plan=np.zeros((H, columns)),
+        scratch=np.zeros((max(H, 2), columns)),
+        disturbance=np.zeros(columns),
+        led=np.zeros((2, columns)),
+        commands=np.zeros((longest, columns)),
+        track=np.zeros((longest + 1, 2, columns)),
+        marks=np.array([0, -1, 0, -1, 0]),
+    )
+    squares, counts = np.zeros((2, sources, window)), np.zeros(window, dtype=np.int64)
+    _respond(loop, timing, past, begin, every, squares, counts)
+    return squares, counts

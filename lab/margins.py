@@ -1,0 +1,260 @@
+"""Margins: whether a loop over a bad network is stable, and how far the vehicle may differ.
+
+Where no bound is active the loop is linear, given its timing (`lab.linear`), and the timing of
+triggers that look at the clock alone depends on the network alone: flights in virtual time give it.
+With h(n) the mean of p² n steps after a push of strength 1, over pushes and timings,
+
+    variance of p  =  strength² · Σ h(n)              under white wind or noise, once it is settled
+    growth         =  lim h(n+1) / h(n)               of the second moment, at each step
+
+and the loop is stable in the mean square where the growth is below 1. The vehicle that is pushed
+may differ from the model that the server plans with.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+from scipy import stats
+
+from lab.linear import WIND, Loop, Timing, make_loops, respond, timing_of
+from lab.sweep import interval
+from shared import policy
+from shared.config import ConfigError, ReferenceConfig, Scenario, SensorConfig
+from shared.model import Array
+from sim.flight import fly_batch
+
+FLIGHT_S = 60.0
+"""Length of the flights that timings are taken from [s]."""
+SETTLE_S = 5.0
+"""Time until a flight's session and its delay bound are as they stay [s]."""
+FOLLOWED_S = 12.0
+"""Time for which a push is followed [s]: three time constants of a usual disturbance observer."""
+PUSHES = 64
+"""Number of pushes of each source that are followed at a time."""
+WIND_ALONE = 0.1
+"""Wind of which the error is told where a scenario has neither wind nor noise."""
+CLOCK_ONLY = ("always", "periodic", "silence", "budget")
+"""Policies that do not look at the state."""
+RATE_RUNS = 4
+"""Number of flights from which it is learned how often a trigger sends."""
+
+
+class Margin(msgspec.Struct, frozen=True, kw_only=True):
+    """What is computed of a loop whose vehicle is, or differs from, the model."""
+
+    vehicle: str
+    """Name of the vehicle in a table."""
+    growth: float
+    """Growth of the second moment at each step."""
+    growth_ci95: float | None
+    """Half the width of its 95 % interval over timings; None for one timing."""
+    stable: bool
+    """Whether the upper end of that is below 1."""
+    rms_m: tuple[float, ...] | None
+    """Root mean square of the position's deviation, of each axis [m]; None if it is not stable."""
+    rms_ci95_m: tuple[float, ...] | None
+    """Half the width of the 95 % interval of each; None if it is not stable, or for one timing."""
+    rms_input_mps: tuple[float, ...] | None
+    """Root mean square of the input's deviation, of each axis [m/s]; None if it is not stable."""
+
+    def saturated(self, u_max: Sequence[float]) -> float | None:
+        """Share of the steps at which the input, were it normal, would lie beyond its bound."""
+        if self.rms_input_mps is None:
+            return None
+        beyond = [
+            math.erfc(bound / (rms * math.sqrt(2.0))) if rms else 0.0
+            for bound, rms in zip(u_max, self.rms_input_mps, strict=True)
+        ]
+        return 1.0 - math.prod(1.0 - share for share in beyond)
+
+
+class Differing(NamedTuple):
+    """How a vehicle differs from the model."""
+
+    tau: float = 1.0
+    """Its time constants over those of the model."""
+    gain: float = 1.0
+    """Gain of its velocity loop."""
+    dead_time_s: float = 0.0
+    """Its dead time [s]."""
+
+    def of(self, scenario: Scenario) -> Scenario:
+        """The scenario with such a vehicle."""
+        tau_s = tuple(self.tau * tau for tau in scenario.model.tau_s)
+        vehicle = replace(
+            scenario.vehicle, tau_s=tau_s, gain=self.gain, dead_time_s=self.dead_time_s
+        )
+        return replace(scenario, vehicle=vehicle)
+
+
+AS_IT_IS = "as the scenario has it"
+VEHICLES: dict[str, Differing] = {
+    "the model": Differing(),
+    "twice as quick": Differing(tau=0.5),
+    "half as quick": Differing(tau=2.0),
+    "gain 0.7": Differing(gain=0.7),
+    "gain 1.3": Differing(gain=1.3),
+    "dead time 0.1 s": Differing(dead_time_s=0.1),
+    "dead time 0.2 s": Differing(dead_time_s=0.2),
+    "dead time 0.3 s": Differing(dead_time_s=0.3),
+}
+"""Vehicles that a margin is computed for, besides the scenario's own."""
+
+
+def check(scenario: Scenario) -> None:
+    """Refuse what is not linear, and what is not known here.
+
+    Raises:
+        ConfigError: with the key.
+    """
+    sensor, noisy = scenario.sensor, scenario.sensor != SensorConfig(filter=scenario.sensor.filter)
+    if noisy and sensor.filter != "none":
+        raise ConfigError(
+            f"sensor.filter: got {sensor.filter!r} with noise, which margins are not computed for "
+            "yet, expected 'none'"
+        )
+    if scenario.control.scheme == "dead_reckoning":
+        raise ConfigError(
+            "control.scheme: got 'dead_reckoning', which margins are not computed for yet, "
+            "expected 'committed', 'predictive' or 'none'"
+        )
+
+
+def looks_at_state(scenario: Scenario) -> bool:
+    """Whether the trigger looks at the state, so that the loop is not linear."""
+    trigger = policy.parse(scenario.control.trigger)
+    return any(each.name not in CLOCK_ONLY for each in policy.policies(trigger))
+
+
+def equivalent_period(
+    scenario: Scenario, *, stopped: Callable[[], bool] = lambda: False
+) -> Scenario:
+    """The scenario with the policy `periodic` that sends as often as its own trigger does."""
+    seeds = range(scenario.seed, scenario.seed + RATE_RUNS)
+    flights = fly_batch(scenario, seeds, stopped=stopped)
+    events = np.concatenate([flight.server["event"] for flight in flights])
+    period = max(1, round(1.0 / max(events.mean(), 1.0 / policy.PERIOD_MAX)))
+    return replace(scenario, control=replace(scenario.control, trigger=f"periodic({period})"))
+
+
+def timings(
+    scenario: Scenario,
+    runs: int,
+    *,
+    on_second: Callable[[int], None] = lambda _: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> list[Timing]:
+    """Timings of so many flights, with seeds that count up from the scenario's.
+
+    The vehicle is the model, without wind, and hovers: none of that makes a difference.
+    """
+    vehicle = replace(
+        scenario.vehicle,
+        tau_s=(),
+        gain=1.0,
+        dead_time_s=0.0,
+        start_m=(),
+        wind=0.0,
+        steady_wind_mps=(),
+        gust_mps2=0.0,
+    )
+    point = (0.0,) * scenario.model.axes
+    calm = replace(
+        scenario,
+        duration=max(FLIGHT_S, scenario.control.dt * 10 * scenario.control.horizon),
+        settle=0.0,
+        reference=ReferenceConfig(shape="hover", points_m=(point,)),
+        vehicle=vehicle,
+        sensor=SensorConfig(),
+    )
+    seeds = range(scenario.seed, scenario.seed + runs)
+    flights = fly_batch(calm, seeds, on_second=on_second, stopped=stopped)
+    return [timing_of(flight) for flight in flights]
+
+
+def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
+    """What is computed of a scenario along some timings.
+
+    Args:
+        vehicle: name of the scenario's vehicle.
+    """
+    taus = list(zip(scenario.tau_s.tolist(), scenario.true_tau_s.tolist(), strict=True))
+    known: dict[tuple[float, float], Responses] = {}
+    for tau, loop in zip(taus, make_loops(scenario), strict=True):
+        if tau not in known:
+            known[tau] = responses(scenario, loop, given)
+    growth, half = max((each.growth() for each in known.values()), key=lambda pair: pair[0])
+    stable = growth + (half or 0.0) < 1.0
+    settled = [known[tau].rms(scenario) for tau in taus if stable]
+    return Margin(
+        vehicle=vehicle,
+        growth=growth,
+        growth_ci95=half,
+        stable=stable,
+        rms_m=tuple(each[0] for each in settled) if stable else None,
+        rms_ci95_m=tuple(each[1] for each in settled) if stable and len(given) > 1 else None,
+        rms_input_mps=tuple(each[2] for each in settled) if stable else None,
+    )
+
+
+class Responses(NamedTuple):
+    """Mean squares of position and input so many steps after a push of strength 1."""
+
+    squares: Array
+    """Shape (timings, 2, sources, window)."""
+
+    def growth(self) -> tuple[float, float | None]:
+        """Growth of the second moment, and half the width of its 95 % interval (jackknife)."""
+        h = self.squares[:, 0, :WIND].sum(axis=1)
+        n, mean = len(h), _growth(h.mean(axis=0))
+        if n < 2:
+            return mean, None
+        others = np.array([_growth(np.delete(h, i, axis=0).mean(axis=0)) for i in range(n)])
+        error = math.sqrt((n - 1) * others.var())
+        return mean, float(stats.t.ppf(0.975, n - 1)) * error
+
+    def rms(self, scenario: Scenario) -> tuple[float, float, float]:
+        """Root mean square of the position, half of its 95 % interval, and that of the input."""
+        wind, noises = strengths(scenario)
+        sources = np.array([wind, wind, *noises])[: self.squares.shape[2]]
+        each = np.einsum("tqsn,s->tq", self.squares, sources**2)
+        # What is left when a push is not followed any longer goes on to die away as it did.
+        growth, _ = self.growth()
+        each += np.einsum("tqs,s->tq", self.squares[..., -1], sources**2) * growth / (1.0 - growth)
+        variance, half = interval(each[:, 0].tolist())
+        rms = math.sqrt(variance or 0.0)
+        rms_input = math.sqrt(each[:, 1].mean())
+        return rms, 0.5 * half / rms if half and rms else 0.0, rms_input
+
+
+def _growth(h: Array) -> float:
+    """Growth at each step in the second half of a response, by least squares of its logarithm."""
+    steps = np.arange(len(h) // 2, len(h))
+    steps = steps[h[steps] > 0.0]
+    if len(steps) < 2:
+        return 0.0
+    return float(np.exp(np.polyfit(steps, np.log(h[steps]), 1)[0]))
+
+
+def strengths(scenario: Scenario) -> tuple[float, tuple[float, float]]:
+    """White wind, and standard deviations of the noise, that the error is told of."""
+    sensor = scenario.sensor
+    noises = (sensor.position_noise_m, sensor.velocity_noise_mps)
+    alone = not any(noises) and scenario.vehicle.wind == 0.0
+    return WIND_ALONE if alone else scenario.vehicle.wind, noises
+
+
+def responses(scenario: Scenario, loop: Loop, given: Sequence[Timing]) -> Responses:
+    """What pushes leave in a loop along each timing."""
+    dt = scenario.control.dt
+    begin, window = round(SETTLE_S / dt), max(round(FOLLOWED_S / dt), 2)
+    each = []
+    for timing in given:
+        window = max(2, min(window, (len(timing.in_force) - begin) // 2))
+        squares, counts = respond(scenario, loop, timing, begin, window, min(PUSHES, window))
+        each.append(squares / np.maximum(counts, 1))
+    return Responses(np.array(each))
