@@ -133,7 +133,7 @@ def test_what_cannot_be_is_refused_with_one_line_and_nothing_changes(
 
 
 def test_a_request_without_keys_is_answered_with_what_may_change() -> None:
-    """And the present values."""
+    """Each key with its present value."""
     _, running = probe()
     running.change({"vehicle.steady_wind_mps": [0.5, 0]}, now_ns=5)
     assert answer(running, b"{}").values == {
@@ -192,7 +192,7 @@ def test_a_request_may_be_so_long_and_no_longer() -> None:
 
 @pytest.mark.parametrize("kind", [Server, Proxy, Client, Fleet])
 def test_what_may_change_is_a_key_of_the_scenario(kind: type[Endpoint]) -> None:
-    """Of whatever endpoint, and each has some."""
+    """Each endpoint has some, and may be asked to leave all as it is."""
     endpoint = make(kind)
     values = answer(Running(endpoint, DEMO), b"{}").values
     assert values.keys() == endpoint.changeable
@@ -243,7 +243,7 @@ def test_netem_loses_what_it_is_told_to_from_then_on() -> None:
 
 
 def test_another_delay_is_that_of_the_packets_to_come() -> None:
-    """Of a flow that is there and of both directions by themselves."""
+    """Also in a flow that is there; each direction by itself."""
     values = {"network.downlink.delay": "constant", "network.downlink.minimum_s": 0.1}
     packets = fly(scenario(), changes=[(4.0, values)]).netem
     down = packets[packets["direction"] != UPLINK]
@@ -298,7 +298,7 @@ def test_wind_blows_from_the_next_step_on_and_changes_nothing_before() -> None:
 
 
 def test_a_gust_that_blows_goes_on_with_its_new_strength() -> None:
-    """The same way, and as if it had always had it."""
+    """It blows the way it did, as if it had always had it."""
     air = VehicleConfig(gust_mps2=1.0, gust_every_s=1e-9, gust_s=1e9)
     plant = FirstOrderPlant(msgspec.structs.replace(DEMO, vehicle=air), stream(1, "wind"))
     plant.advance(np.zeros(2))
