@@ -6,7 +6,7 @@ same values change at the same times. Target and wind are the same in both, to t
 enter the network at other milliseconds, and so have other fates: what chance alone makes of a
 flight is told by more of them in virtual time, each in another network and wind.
 
-`python -m benchmarks.lead` flies three seeds of 60 s, which takes three and a half minutes.
+`python -m benchmarks.lead` flies three seeds of 60 s, which takes about four minutes.
 """
 
 import sys
