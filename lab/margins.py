@@ -20,10 +20,10 @@ import numpy as np
 from msgspec.structs import replace
 from scipy import stats
 
-from lab.linear import WIND, Loop, Timing, make_loops, respond, timing_of
+from lab.linear import WIND, Loop, Timing, make_loops, no_packets, respond, timing_of
 from lab.sweep import interval
 from shared import policy
-from shared.config import ConfigError, ReferenceConfig, Scenario, SensorConfig
+from shared.config import ReferenceConfig, Scenario, SensorConfig
 from shared.model import Array
 from sim.flight import fly_batch
 
@@ -105,29 +105,10 @@ VEHICLES: dict[str, Differing] = {
 """Vehicles that a margin is computed for, besides the scenario's own."""
 
 
-def check(scenario: Scenario) -> None:
-    """Refuse what is not linear, and what is not known here.
-
-    Raises:
-        ConfigError: with the key.
-    """
-    sensor, noisy = scenario.sensor, scenario.sensor != SensorConfig(filter=scenario.sensor.filter)
-    if noisy and sensor.filter != "none":
-        raise ConfigError(
-            f"sensor.filter: got {sensor.filter!r} with noise, which margins are not computed for "
-            "yet, expected 'none'"
-        )
-    if scenario.control.scheme == "dead_reckoning":
-        raise ConfigError(
-            "control.scheme: got 'dead_reckoning', which margins are not computed for yet, "
-            "expected 'committed', 'predictive' or 'none'"
-        )
-
-
 def looks_at_state(scenario: Scenario) -> bool:
     """Whether the trigger looks at the state, so that the loop is not linear."""
-    trigger = policy.parse(scenario.control.trigger)
-    return any(each.name not in CLOCK_ONLY for each in policy.policies(trigger))
+    trigger, reckons = policy.parse(scenario.control.trigger), scenario.terms().reckons
+    return not reckons and any(each.name not in CLOCK_ONLY for each in policy.policies(trigger))
 
 
 def equivalent_period(
@@ -163,9 +144,12 @@ def timings(
         gust_mps2=0.0,
     )
     point = (0.0,) * scenario.model.axes
+    duration = max(FLIGHT_S, 10 * scenario.control.horizon * scenario.control.dt)
+    if scenario.terms().reckons:  # it flies by itself, whatever arrives
+        return [no_packets(round(duration / scenario.control.dt))] * runs
     calm = replace(
         scenario,
-        duration=max(FLIGHT_S, scenario.control.dt * 10 * scenario.control.horizon),
+        duration=duration,
         settle=0.0,
         reference=ReferenceConfig(shape="hover", points_m=(point,)),
         vehicle=vehicle,
@@ -183,8 +167,9 @@ def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
         vehicle: name of the scenario's vehicle.
     """
     taus = list(zip(scenario.tau_s.tolist(), scenario.true_tau_s.tolist(), strict=True))
+    steps = max(len(timing.in_force) for timing in given)
     known: dict[tuple[float, float], Responses] = {}
-    for tau, loop in zip(taus, make_loops(scenario), strict=True):
+    for tau, loop in zip(taus, make_loops(scenario, steps), strict=True):
         if tau not in known:
             known[tau] = responses(scenario, loop, given)
     growth, half = max((each.growth() for each in known.values()), key=lambda pair: pair[0])
