@@ -123,6 +123,9 @@ class Kalman:
         nothing = [0.0] * terms.axes
         self._flown = deque([nothing] * delay, delay + 1)
         """Inputs flown since [m/s]."""
+        self.gains: list[list[Gain]] = [[], []]
+        """Gains by which position and velocity were corrected last, of each axis; empty where that
+        was not measured at the last step."""
 
     def begin(self, measured: Measured) -> None:
         """Take the first measurement, which has a position; the vehicle stands."""
@@ -153,12 +156,13 @@ class Kalman:
         for which, (correct, values) in enumerate(
             zip((by_position, by_velocity), measured, strict=True)
         ):
+            self.gains[which] = []
             if values is None:
                 continue
             variance = self._variances[which]
             corrected = [correct(P, variance) for P in self.spreads]
             self.spreads = [P for _, P in corrected]
-            gains = [corrected[kind][0] for kind in self._kinds]
+            gains = self.gains[which] = [corrected[kind][0] for kind in self._kinds]
             self.x = [
                 (p + kp * off, v + kv * off, w + kw * off)
                 for (p, v, w), (kp, kv, kw), off in (

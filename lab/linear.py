@@ -11,21 +11,28 @@ from typing import NamedTuple
 
 import numpy as np
 
+from client.filter import Kalman
 from client.plant import white_acceleration
+from client.sensor import Sensor
+from server.estimator import APART_NS
+from server.gain import feedback_gain
 from server.model import advance, lasting
-from server.mpc import LATER, MPC, make_mpc, pose, stationary_gain
-from server.replay import HOVERS, TRIP_NS, UNKNOWN
+from server.mpc import LATER, MPC, make_mpc, pose
+from server.observer import decay_of, learned
+from server.replay import HOVERS, UNKNOWN
 from shared import policy
+from shared.chance import stream
 from shared.config import Scenario
 from shared.endpoint import SECOND_NS, seconds_to_ns
 from shared.kernel import B1, F1, F2, F3, I1, kernel, part
-from shared.model import Array, Axis, Model, discretise
+from shared.model import Array, Axis, Indices, Model, discretise
 from shared.protocol import committed_max
 from sim.flight import Flight
 
 WIND, NOISE = 2, 2
 """Columns of a step's wind on an axis, and of its measurement."""
-COMMITTED, PREDICTIVE, NONE = 0, 1, 2
+COMMITTED, PREDICTIVE, NONE, DEAD_RECKONING = range(4)
+SCHEMES = ("committed", "predictive", "none", "dead_reckoning")
 """The schemes, as kernels take them."""
 
 
@@ -57,16 +64,24 @@ class Loop(NamedTuple):
     """Whole steps of dead time."""
     push: F2
     """Square root of a step's covariance under white acceleration of strength 1; shape (2, 2)."""
-    noise: bool
-    """Whether measurements have noise."""
+    sensor_delay: int
+    """Time from measuring to having the measurement [steps]."""
+    corrections: F3
+    """What a measured position, and a measured velocity, corrects of the filter's position,
+    velocity and disturbance at each step; 0 where there is none; shape (steps, 2, 3). Without steps
+    the state is known as it is."""
+    predicts: bool
+    """Whether the filter moves its state on by the model between measurements."""
     scheme: int
-    """COMMITTED, PREDICTIVE or NONE."""
+    """COMMITTED, PREDICTIVE, NONE or DEAD_RECKONING."""
     plan: F2
     """Inputs of a plan for position and velocity where it begins, and for ŵ; shape (H, 3)."""
     before: F2
     """Inputs of a plan for those of the plan before, shifted; shape (H, H), or (0, 0)."""
+    feeds_back: bool
+    """Whether there is feedback aboard."""
     back: F1
-    """Feedback aboard, on position [1/s] and velocity; 0 without; shape (2,)."""
+    """Its gain, on position [1/s] and velocity; shape (2,)."""
     decay: float
     """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
     holds: bool
@@ -80,6 +95,10 @@ class Loop(NamedTuple):
 class Past(NamedTuple):
     """What the loop remembers; the last axis of each array has a column for each push."""
 
+    true: F3
+    """State at each step, a ring; shape (reach, 2, columns)."""
+    filtered: F2
+    """Position, velocity and disturbance of the filter aboard; shape (3, columns)."""
     reported: F3
     """State that each step reports, a ring; shape (reach, 2, columns)."""
     flown: F2
@@ -153,23 +172,32 @@ def _move(axis: Axis, x: F2, u: F1, w: F1, to: F2) -> None:
 
 
 @part
-def _flown(loop: Loop, past: Past, slot: int, stage: int, led: F2, x: F2, u: F1) -> None:
-    """Fill in what is flown at a stage of a horizon, as `shared.rule` has it without bounds."""
+def _tell(loop: Loop, past: Past, slot: int, stage: int, u: F1) -> bool:
+    """Fill in what a horizon tells at a stage; False where it has been braked to nothing."""
     length = past.length[slot]
     if stage >= length and not loop.holds:
         u[:] = 0.0
-        return
+        return False
     u[:] = past.inputs[slot, min(max(stage, 0), length - 1) if loop.scheme != NONE else 0]
-    if 0 <= stage < length and loop.back[0] != 0.0:
+    return True
+
+
+@part
+def _flown(loop: Loop, past: Past, slot: int, stage: int, led: F2, x: F2, u: F1) -> None:
+    """Fill in what is flown at a stage of a horizon, as `shared.rule` has it without bounds."""
+    _tell(loop, past, slot, stage, u)
+    if stage >= 0 and loop.feeds_back:
         for c in range(len(u)):
             u[c] += loop.back[0] * (led[0, c] - x[0, c]) + loop.back[1] * (led[1, c] - x[1, c])
 
 
 @part
 def _lead(loop: Loop, past: Past, slot: int, stage: int, led: F2) -> None:
-    """Advance x̄ of a horizon from a stage to the next; it stays at the last."""
-    if 0 <= stage < past.length[slot] - 1:
-        _move(loop.model, led, past.inputs[slot, stage], past.origins[slot, 2], led)
+    """Advance x̄ of a horizon from a stage to the next."""
+    u = past.scratch[2]
+    if stage >= 0:
+        goes = _tell(loop, past, slot, stage, u)
+        _move(loop.model, led, u, past.origins[slot, 2] if goes else u, led)
 
 
 @part
@@ -178,7 +206,7 @@ def _fly_leg(loop: Loop, past: Past, number: int, begin: int, first: int, last: 
     room, w, slot, led = len(past.made), past.disturbance, 0, past.scratch[:2]
     if number >= 0:
         slot = number % room
-        if loop.back[0] != 0.0:
+        if loop.feeds_back:
             led[:] = past.origins[slot, :2]
             for stage in range(first - past.made[slot]):
                 _lead(loop, past, slot, stage, led)
@@ -193,7 +221,7 @@ def _fly_leg(loop: Loop, past: Past, number: int, begin: int, first: int, last: 
             u[:] = past.commands[0]
         else:
             u[:] = 0.0
-        if number >= 0 and loop.back[0] != 0.0:
+        if number >= 0 and loop.feeds_back:
             _lead(loop, past, slot, step - past.made[slot], led)
         _move(loop.model, x, u, w, past.track[i + 1])
 
@@ -214,31 +242,57 @@ def _roll(loop: Loop, past: Past, begin: int, flying: int, under_way: range, end
 
 
 @part
+def _learn(loop: Loop, past: Past, end: int, m: int, trip_ns: int) -> None:
+    """Correct ŵ by where the velocity is that a roll of `m` steps says, see `server.observer`."""
+    velocity, w = past.reported[end % len(past.reported), 1], past.disturbance
+    for c in range(len(w)):
+        off = velocity[c] - past.track[m, 1, c]
+        w[c] = learned(w[c], off, m, loop.model.a11, loop.decay, trip_ns, np.inf)
+
+
+@part
 def _observe(loop: Loop, timing: Timing, past: Past, t: int) -> None:
-    """Disturbance observer, from the observation before to that of tick `t`."""
+    """Disturbance observer of committed inputs, to the observation of tick `t`."""
     begin, end = past.marks[BASE], timing.observed[t]
-    if begin >= 0 and 0 < end - begin <= loop.age_max:
-        before = timing.in_force[begin]
-        after = timing.in_force[end]
-        since = end
-        while since > 0 and timing.in_force[since - 1] == after:
-            since -= 1
-        flying, newest = _number(past, before), _number(past, after)
-        if min(flying, newest) > UNKNOWN:
-            # Up to `since` by what was expected, and from there on by what is known.
-            if since <= begin:
-                _roll(loop, past, begin, newest, range(0), end)
-            else:
-                first = _first_under_way(past, before, begin)
-                _roll(loop, past, begin, flying, range(first, max(newest, first)), since)
-                _fly_leg(loop, past, newest, begin, since, end)
-            m = end - begin
-            slower = max(1.0, (timing.step[t] + timing.ahead[t] - end) * loop.dt_ns / TRIP_NS)
-            share = (1.0 - loop.decay ** (m / slower)) / (1.0 - loop.model.a11**m)
-            velocity = past.reported[end % len(past.reported), 1]
-            for c in range(len(velocity)):
-                past.disturbance[c] += share * (velocity[c] - past.track[m, 1, c])
     past.marks[BASE] = end
+    if begin < 0 or not 0 < end - begin <= loop.age_max:
+        return
+    before, after, since = timing.in_force[begin], timing.in_force[end], end
+    while since > 0 and timing.in_force[since - 1] == after:
+        since -= 1
+    flying, newest = _number(past, before), _number(past, after)
+    if min(flying, newest) == UNKNOWN:
+        return
+    # Up to `since` by what was expected, and from there on by what is known.
+    if since <= begin:
+        _roll(loop, past, begin, newest, range(0), end)
+    else:
+        first = _first_under_way(past, before, begin)
+        _roll(loop, past, begin, flying, range(first, max(newest, first)), since)
+        _fly_leg(loop, past, newest, begin, since, end)
+    _learn(loop, past, end, end - begin, (timing.step[t] + timing.ahead[t] - end) * loop.dt_ns)
+
+
+@part
+def _observe_between(loop: Loop, timing: Timing, past: Past, t: int) -> None:
+    """Disturbance observer of eq. (13), to the observation of tick `t`."""
+    begin, end, reach = past.marks[BASE], timing.observed[t], len(past.reported)
+    m = end - begin
+    past.marks[BASE] = end
+    if begin < 0 or not 0 < m <= max(1, APART_NS // loop.dt_ns):
+        return
+    one, other = past.flown[begin % reach], past.flown[end % reach]
+    past.track[0] = past.reported[begin % reach]
+    for step in range(m):
+        past.commands[step] = one + (step / m) * (other - one)
+        _move(
+            loop.model,
+            past.track[step],
+            past.commands[step],
+            past.disturbance,
+            past.track[step + 1],
+        )
+    _learn(loop, past, end, m, (timing.step[t] - end) * loop.dt_ns)
 
 
 @part
@@ -265,7 +319,7 @@ def _plan(loop: Loop, past: Past, start: int, x: F2) -> None:
     gap = start - past.marks[START]
     past.marks[START] = start
     if len(loop.before):
-        past.scratch[:] = plan
+        past.scratch[:H] = plan
     for stage in range(H):
         on_p, on_v, on_w = loop.plan[stage]
         for c in range(len(w)):
@@ -292,6 +346,8 @@ def _tick(loop: Loop, timing: Timing, past: Past, t: int) -> None:
         start = past.track[max(k + d - o, 0)]
     else:
         d = 0
+        if loop.decay < 1.0:
+            _observe_between(loop, timing, past, t)
         _estimate(loop, timing, past, t)
         start = past.track[max(k - o, 0) if loop.scheme == PREDICTIVE else 0]
     now, slot = k - o, past.marks[SENT] % len(past.made)
@@ -321,6 +377,10 @@ def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
     """Do what the compensator aboard does at step `s`."""
     reach = len(past.flown)
     u, x = past.flown[s % reach], past.reported[s % reach]
+    if loop.scheme == DEAD_RECKONING:
+        for c in range(len(u)):
+            u[c] = -loop.back[0] * x[0, c] - loop.back[1] * x[1, c]
+        return
     number = _number(past, timing.in_force[s])
     if number < 0:
         u[:] = 0.0
@@ -328,7 +388,7 @@ def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
             u[:] = past.flown[(s - 1) % reach]
         return
     slot, stage = number % len(past.made), s - timing.in_force[s]
-    if loop.back[0] != 0.0:
+    if loop.feeds_back:
         if past.marks[LED_MADE] != timing.in_force[s]:
             past.led[:] = past.origins[slot, :2]
             past.marks[LED_MADE], past.marks[LED_STAGE] = timing.in_force[s], 0
@@ -339,12 +399,42 @@ def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
 
 
 @part
-def _forget(past: Past, x: F2, column: int) -> None:
+def _know(loop: Loop, past: Past, s: int, push: int) -> None:
+    """Fill in what the vehicle reports at step `s`, from what it measures and filters.
+
+    Args:
+        push: column of its noise, or -1.
+    """
+    reach, delay = len(past.reported), loop.sensor_delay
+    filtered, reported = past.filtered, past.reported[s % reach]
+    if s >= len(loop.corrections):
+        reported[:] = past.true[s % reach]
+        return
+    if loop.predicts and s > 0:
+        _move(loop.model, filtered, past.flown[(s - 1 - delay) % reach], filtered[2], filtered)
+    measured, width = past.true[(s - delay) % reach], filtered.shape[1] // (WIND + NOISE)
+    for which in range(2):
+        on_p, on_v, on_w = loop.corrections[s, which]
+        if on_p == 0.0 and on_v == 0.0 and on_w == 0.0:
+            continue
+        for c in range(filtered.shape[1]):
+            noise = 1.0 if push >= 0 and c == (WIND + which) * width + push else 0.0
+            off = measured[which, c] + noise - filtered[which, c]
+            filtered[0, c] += on_p * off
+            filtered[1, c] += on_v * off
+            filtered[2, c] += on_w * off
+    reported[:] = filtered[:2]
+    if loop.predicts:
+        for back in range(delay, 0, -1):
+            _move(loop.model, reported, past.flown[(s - back) % reach], filtered[2], reported)
+
+
+@part
+def _forget(past: Past, column: int) -> None:
     """Forget a push, so that its column can take another."""
-    x[:, column] = 0.0
-    for rows in (past.flown, past.first, past.plan, past.led):
+    for rows in (past.filtered, past.flown, past.first, past.plan, past.led):
         rows[:, column] = 0.0
-    for blocks in (past.reported, past.inputs, past.origins):
+    for blocks in (past.true, past.reported, past.inputs, past.origins):
         blocks[:, :, column] = 0.0
     past.disturbance[column] = 0.0
 
@@ -364,7 +454,6 @@ def _respond(
     sources, window = squares.shape[1], squares.shape[2]
     reach, tick, steps = len(past.reported), 0, len(timing.in_force)
     width = past.reported.shape[2] // sources
-    x, true = np.zeros((2, sources * width)), loop.true
     none = np.zeros(sources * width)
     for s in range(steps):
         # What was in force had been made, and what was made had been observed, before.
@@ -375,13 +464,10 @@ def _respond(
         pushed, push = s >= begin and (s - begin) % every == 0, (s - begin) // every
         if pushed:
             for source in range(sources):
-                _forget(past, x, source * width + push % width)
-        past.reported[s % reach] = x
-        if pushed and loop.noise:
-            past.reported[s % reach, 0, WIND * width + push % width] += 1.0
-            past.reported[s % reach, 1, (WIND + 1) * width + push % width] += 1.0
+                _forget(past, source * width + push % width)
+        _know(loop, past, s, push % width if pushed else -1)
         _choose(loop, timing, past, s)
-        u = past.flown[s % reach]
+        x, u, then = past.true[s % reach], past.flown[s % reach], past.true[(s + 1) % reach]
         for before in range(max(push - width + 1, 0), push + 1):
             age = s - begin - before * every
             if 0 <= age < window:
@@ -392,33 +478,31 @@ def _respond(
                     squares[1, source, age] += u[column] ** 2
         due = past.flown[(s - loop.dead_steps) % reach]
         late = past.flown[(s - loop.dead_steps - 1) % reach]
-        _move(true, x, due, none, x)
+        _move(loop.true, x, due, none, then)
         for c in range(x.shape[1]):
-            x[0, c] += loop.late[0] * (late[c] - due[c])
-            x[1, c] += loop.late[1] * (late[c] - due[c])
+            then[0, c] += loop.late[0] * (late[c] - due[c])
+            then[1, c] += loop.late[1] * (late[c] - due[c])
         if pushed:
-            x[0, push % width] += loop.push[0, 0]
-            x[1, push % width] += loop.push[1, 0]
-            x[1, width + push % width] += loop.push[1, 1]
+            then[0, push % width] += loop.push[0, 0]
+            then[1, push % width] += loop.push[1, 0]
+            then[1, width + push % width] += loop.push[1, 1]
 
 
 # -- a scenario's loops ----------------------------------------------------------------------------
 
 
-def make_loops(scenario: Scenario) -> list[Loop]:
-    """The loop on each axis of a scenario."""
+def make_loops(scenario: Scenario, steps: int) -> list[Loop]:
+    """The loop on each axis of a scenario, for flights of so many steps."""
     terms, control, vehicle = scenario.terms(), scenario.control, scenario.vehicle
     dt, tau = control.dt, scenario.true_tau_s
     whole, rest_ns = divmod(seconds_to_ns(vehicle.dead_time_s), scenario.dt_ns)
     true, after = discretise(tau, dt), discretise(tau, dt - rest_ns / SECOND_NS)
     late = vehicle.gain * (true.B - after.B) if rest_ns else np.zeros_like(true.B)
-    mpc = make_mpc(terms, control)
-    plans, before = _plans(terms.model, mpc)
-    back = np.zeros_like(true.B)
-    if terms.feedback:
-        back = stationary_gain(terms.model, control).astype("f4").astype("f8")
-    observes = terms.commits and control.observer_s > 0.0
-    sensor = scenario.sensor
+    plans, before = np.zeros((terms.axes, 1, 3)), np.zeros((terms.axes, 0, 0))
+    if not terms.reckons:
+        plans, before = _plans(terms.model, make_mpc(terms, control))
+    back = feedback_gain(scenario).astype("f4").astype("f8")
+    delay, corrections = _corrections(scenario, steps)
     pushes = white_acceleration(tau, dt)
     return [
         Loop(
@@ -427,12 +511,15 @@ def make_loops(scenario: Scenario) -> list[Loop]:
             late=late[i],
             dead_steps=whole,
             push=pushes[i],
-            noise=sensor.position_noise_m > 0.0 or sensor.velocity_noise_mps > 0.0,
-            scheme={"committed": COMMITTED, "predictive": PREDICTIVE, "none": NONE}[terms.scheme],
+            sensor_delay=delay,
+            corrections=corrections[i],
+            predicts=scenario.sensor.filter == "kalman",
+            scheme=SCHEMES.index(terms.scheme),
             plan=plans[i],
             before=before[i] if control.change_weight > 0.0 else np.zeros((0, 0)),
+            feeds_back=terms.feedback,
             back=back[i],
-            decay=float(np.exp(-dt / control.observer_s)) if observes else 1.0,
+            decay=decay_of(terms, control) if terms.commits or terms.indexed else 1.0,
             holds=terms.brake == 0.0,
             age_max=terms.age_max,
             dt_ns=terms.dt_ns,
@@ -468,6 +555,30 @@ def _plans(model: Model, mpc: MPC) -> tuple[Array, Array]:
     return -np.linalg.solve(hessian, gradient), np.linalg.solve(hessian, changes)
 
 
+def _corrections(scenario: Scenario, steps: int) -> tuple[int, Array]:
+    """Delay of the sensor [steps], and `Loop.corrections` of each axis."""
+    sensor, axes = Sensor(scenario, stream(scenario.seed, "sensor")), scenario.model.axes
+    if sensor.exact:
+        return 0, np.zeros((axes, 0, 2, 3))
+    found, nothing = np.zeros((axes, steps, 2, 3)), np.zeros((axes, 2))
+    kalman = Kalman(scenario, sensor.delay) if scenario.sensor.filter == "kalman" else None
+    for step in range(steps):
+        measured = sensor.measure(nothing)
+        if kalman is None:  # each number as it is
+            for which, values in enumerate(measured):
+                found[:, step, which, which] = values is not None
+            continue
+        if step == 0:
+            kalman.begin(measured)
+            continue
+        kalman.advance([0.0] * axes)
+        kalman.take(measured)
+        for which, gains in enumerate(kalman.gains):
+            if gains:
+                found[:, step, which] = gains
+    return sensor.delay, found
+
+
 def timing_of(flight: Flight) -> Timing:
     """The timing of a flight of one vehicle, from its record."""
     client, server = flight.client, flight.server
@@ -481,9 +592,28 @@ def timing_of(flight: Flight) -> Timing:
     )
 
 
+def no_packets(steps: int) -> Timing:
+    """The timing of a flight without any packet."""
+    none = np.zeros(0, dtype=np.int64)
+    return Timing(np.full(steps, HOVERS), none, none, none, none.astype(np.bool_))
+
+
+def _periods(scenario: Scenario) -> list[int]:
+    """What is periodic in a loop [steps]; pushes must come at any place in it."""
+    control, sensor = scenario.control, scenario.sensor
+    periods = [
+        int(each.values[0]) if each.values else control.period
+        for each in policy.policies(policy.parse(control.trigger))
+        if each.name == "periodic"
+    ]
+    measured = (sensor.position_every_s, sensor.velocity_every_s)
+    times_s = [each for each in measured if isinstance(each, float) and each > 0.0]
+    return periods + [-(-seconds_to_ns(each) // scenario.dt_ns) for each in times_s]
+
+
 def respond(
     scenario: Scenario, loop: Loop, timing: Timing, begin: int, window: int, width: int
-) -> tuple[Array, Array]:
+) -> tuple[Array, Indices]:
     """What pushes leave of them along a flight's timing.
 
     Args:
@@ -495,22 +625,18 @@ def respond(
         p² and u² of each source 0 … window - 1 steps after a push of strength 1, summed over the
         pushes, shape (2, sources, window), and the number of pushes, shape (window,).
     """
-    terms, control = scenario.terms(), scenario.control
-    H, most, sources = terms.horizon, committed_max(terms), WIND + NOISE * loop.noise
-    periods = [
-        int(each.values[0]) if each.values else control.period
-        for each in policy.policies(policy.parse(control.trigger))
-        if each.name == "periodic"
-    ]
+    terms = scenario.terms()
+    H, most = terms.planned, committed_max(terms)
+    sources = WIND + (NOISE if len(loop.corrections) else 0)
     every = -(-window // width)
-    while math.gcd(every, math.prod(periods)) > 1:  # pushes come anywhere between two packets
+    while math.gcd(every, math.prod(_periods(scenario))) > 1:
         every += 1
     columns = sources * width
     steps, observed = timing.step, timing.observed
     last = np.concatenate([observed[:1], observed[:-1]])
     known = observed - last <= terms.age_max
     longest = int(max((steps + timing.ahead - observed).max(initial=0), terms.age_max)) + 2
-    reach = int((steps - last)[known].max(initial=1)) + loop.dead_steps + 8
+    reach = int((steps - last)[known].max(initial=1)) + loop.dead_steps + loop.sensor_delay + 8
     sent = steps[timing.event]
     needed = [
         np.searchsorted(sent, np.arange(len(timing.in_force)))
@@ -519,6 +645,8 @@ def respond(
     ]
     room = int(max(each.max(initial=0) for each in needed)) + 3
     past = Past(
+        true=np.zeros((reach, 2, columns)),
+        filtered=np.zeros((3, columns)),
         reported=np.zeros((reach, 2, columns)),
         flown=np.zeros((reach, columns)),
         first=np.zeros((reach, columns)),
@@ -528,13 +656,14 @@ def respond(
         inputs=np.zeros((room, most + H, columns)),
         origins=np.zeros((room, 3, columns)),
         plan=np.zeros((H, columns)),
-        scratch=np.zeros((max(H, 2), columns)),
+        scratch=np.zeros((max(H, 3), columns)),
         disturbance=np.zeros(columns),
         led=np.zeros((2, columns)),
         commands=np.zeros((longest, columns)),
         track=np.zeros((longest + 1, 2, columns)),
         marks=np.array([0, -1, 0, -1, 0]),
     )
-    squares, counts = np.zeros((2, sources, window)), np.zeros(window, dtype=np.int64)
+    squares: Array = np.zeros((2, sources, window))
+    counts = np.zeros(window, dtype=np.int64)
     _respond(loop, timing, past, begin, every, squares, counts)
     return squares, counts

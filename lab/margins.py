@@ -13,6 +13,7 @@ may differ from the model that the server plans with.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import msgspec
@@ -20,10 +21,10 @@ import numpy as np
 from msgspec.structs import replace
 from scipy import stats
 
-from lab.linear import WIND, Loop, Timing, make_loops, respond, timing_of
+from lab.linear import WIND, Loop, Timing, make_loops, no_packets, respond, timing_of
 from lab.sweep import interval
 from shared import policy
-from shared.config import ConfigError, ReferenceConfig, Scenario, SensorConfig
+from shared.config import ReferenceConfig, Scenario, SensorConfig
 from shared.model import Array
 from sim.flight import fly_batch
 
@@ -105,29 +106,10 @@ VEHICLES: dict[str, Differing] = {
 """Vehicles that a margin is computed for, besides the scenario's own."""
 
 
-def check(scenario: Scenario) -> None:
-    """Refuse what is not linear, and what is not known here.
-
-    Raises:
-        ConfigError: with the key.
-    """
-    sensor, noisy = scenario.sensor, scenario.sensor != SensorConfig(filter=scenario.sensor.filter)
-    if noisy and sensor.filter != "none":
-        raise ConfigError(
-            f"sensor.filter: got {sensor.filter!r} with noise, which margins are not computed for "
-            "yet, expected 'none'"
-        )
-    if scenario.control.scheme == "dead_reckoning":
-        raise ConfigError(
-            "control.scheme: got 'dead_reckoning', which margins are not computed for yet, "
-            "expected 'committed', 'predictive' or 'none'"
-        )
-
-
 def looks_at_state(scenario: Scenario) -> bool:
     """Whether the trigger looks at the state, so that the loop is not linear."""
-    trigger = policy.parse(scenario.control.trigger)
-    return any(each.name not in CLOCK_ONLY for each in policy.policies(trigger))
+    trigger, reckons = policy.parse(scenario.control.trigger), scenario.terms().reckons
+    return not reckons and any(each.name not in CLOCK_ONLY for each in policy.policies(trigger))
 
 
 def equivalent_period(
@@ -141,16 +123,16 @@ def equivalent_period(
     return replace(scenario, control=replace(scenario.control, trigger=f"periodic({period})"))
 
 
-def timings(
-    scenario: Scenario,
-    runs: int,
-    *,
-    on_second: Callable[[int], None] = lambda _: None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> list[Timing]:
-    """Timings of so many flights, with seeds that count up from the scenario's.
+def hovering(scenario: Scenario) -> Scenario:
+    """The scenario with a point to hover at in place of its reference."""
+    point = (0.0,) * scenario.model.axes
+    return replace(scenario, reference=ReferenceConfig(shape="hover", points_m=(point,)))
 
-    The vehicle is the model, without wind, and hovers: none of that makes a difference.
+
+def calm(scenario: Scenario) -> Scenario:
+    """The scenario with the model for a vehicle, at rest: what timings are taken from.
+
+    None of what it leaves out makes a difference to when packets arrive.
     """
     vehicle = replace(
         scenario.vehicle,
@@ -162,18 +144,33 @@ def timings(
         steady_wind_mps=(),
         gust_mps2=0.0,
     )
-    point = (0.0,) * scenario.model.axes
-    calm = replace(
-        scenario,
-        duration=max(FLIGHT_S, scenario.control.dt * 10 * scenario.control.horizon),
-        settle=0.0,
-        reference=ReferenceConfig(shape="hover", points_m=(point,)),
-        vehicle=vehicle,
-        sensor=SensorConfig(),
-    )
-    seeds = range(scenario.seed, scenario.seed + runs)
-    flights = fly_batch(calm, seeds, on_second=on_second, stopped=stopped)
-    return [timing_of(flight) for flight in flights]
+    duration = max(FLIGHT_S, 10 * scenario.control.horizon * scenario.control.dt)
+    still = replace(hovering(scenario), vehicle=vehicle, sensor=SensorConfig())
+    return replace(still, duration=duration, settle=0.0)
+
+
+def timings(
+    scenario: Scenario, runs: int, *, stopped: Callable[[], bool] = lambda: False
+) -> list[Timing]:
+    """Timings of so many flights, with seeds that count up from the scenario's."""
+    flown = calm(scenario)
+    if flown.terms().reckons:  # it flies by itself, whatever arrives
+        return [no_packets(flown.steps)] * runs
+    seeds = range(flown.seed, flown.seed + runs)
+    return [timing_of(flight) for flight in fly_batch(flown, seeds, stopped=stopped)]
+
+
+@lru_cache(maxsize=4)
+def _known_timings(still: Scenario, runs: int) -> list[Timing]:
+    """See `timings`, of a scenario that is calm already."""
+    return timings(still, runs)
+
+
+def growth_of(scenario: Scenario, runs: int) -> tuple[float, float | None]:
+    """Growth of a scenario along so many timings, and half the width of its 95 % interval."""
+    given = _known_timings(calm(scenario), runs)
+    known = _responses_of_axes(scenario, given)
+    return max((each.growth() for each in known.values()), key=lambda pair: pair[0])
 
 
 def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
@@ -182,14 +179,10 @@ def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
     Args:
         vehicle: name of the scenario's vehicle.
     """
-    taus = list(zip(scenario.tau_s.tolist(), scenario.true_tau_s.tolist(), strict=True))
-    known: dict[tuple[float, float], Responses] = {}
-    for tau, loop in zip(taus, make_loops(scenario), strict=True):
-        if tau not in known:
-            known[tau] = responses(scenario, loop, given)
+    known = _responses_of_axes(scenario, given)
     growth, half = max((each.growth() for each in known.values()), key=lambda pair: pair[0])
     stable = growth + (half or 0.0) < 1.0
-    settled = [known[tau].rms(scenario) for tau in taus if stable]
+    settled = [known[tau].rms(scenario) for tau in _taus(scenario) if stable]
     return Margin(
         vehicle=vehicle,
         growth=growth,
@@ -199,6 +192,20 @@ def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
         rms_ci95_m=tuple(each[1] for each in settled) if stable and len(given) > 1 else None,
         rms_input_mps=tuple(each[2] for each in settled) if stable else None,
     )
+
+
+def _taus(scenario: Scenario) -> list[tuple[float, float]]:
+    """Time constants of the model and of the vehicle, of each axis [s]; axes may be alike."""
+    return list(zip(scenario.tau_s.tolist(), scenario.true_tau_s.tolist(), strict=True))
+
+
+def _responses_of_axes(
+    scenario: Scenario, given: Sequence[Timing]
+) -> "dict[tuple[float, float], Responses]":
+    """Responses of each kind of axis, by its time constants."""
+    steps = max(len(timing.in_force) for timing in given)
+    loops = dict(zip(_taus(scenario), make_loops(scenario, steps), strict=True))
+    return {tau: responses(scenario, loop, given) for tau, loop in loops.items()}
 
 
 class Responses(NamedTuple):
