@@ -15,7 +15,7 @@ from shared.record import UPLINK
 from shared.summary import Summary
 from sim.flight import fly_batch
 
-PERIODS = (1, 2, 5, 10, 20, 40)
+PERIODS = (1, 3, 10, 30)
 """Steps between two packets at which the floor is drawn."""
 RUNS = 4
 """Number of flights for a point of the floor."""

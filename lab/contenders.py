@@ -94,11 +94,11 @@ RECKONING = {
 
 ALWAYS = {"trigger": "always"}
 PERIODIC = {"trigger": "periodic", "period": 10}
-STATE_GAP = {"trigger": "state_gap", "epsilon": 100.0}
+STATE_GAP = {"trigger": "state_gap", "epsilon": 5e4}
 COST_GAP = {"trigger": "cost_gap", "cost_gap": 300.0}
-DEVIATION = {"trigger": "deviation", "deviation_m": 0.3}
-TOLERANCE = {"trigger": "tolerance", "tolerance_m": 0.1}
-DELTA = {"trigger": "delta", "tolerance_m": 0.5}
+DEVIATION = {"trigger": "deviation", "deviation_m": 1.0}
+TOLERANCE = {"trigger": "tolerance", "tolerance_m": 0.05}
+DELTA = {"trigger": "delta", "tolerance_m": 0.4}
 
 
 def _contenders() -> tuple[Contender, ...]:
