@@ -15,7 +15,7 @@ r:
 
 so that one that is missing is simply left out. A measurement that is had late tells of the step it
 was made at. There the filter stands; what is reported is its state, rolled on to the present with
-the inputs flown since.
+the inputs flown since. A constant error of a sensor it cannot tell from the truth.
 
 The covariance P does not depend on what is measured: axes that are alike share it.
 """
@@ -116,9 +116,9 @@ class Kalman:
             max(sensor.position_noise_m, LEAST) ** 2,
             max(sensor.velocity_noise_mps, LEAST) ** 2,
         )
-        self._spreads: list[Spread] = []
+        self.spreads: list[Spread] = []
         """P of each kind of axis; empty before the first measurement."""
-        self._x: list[tuple[float, float, float]] = []
+        self.x: list[tuple[float, float, float]] = []
         """State of each axis, `delay` steps ago."""
         nothing = [0.0] * terms.axes
         self._flown = deque([nothing] * delay, delay + 1)
@@ -135,20 +135,20 @@ class Kalman:
             v = self._variances[1] ** 0.5
         velocity = measured.velocity or [0.0] * len(self._model)
         P = Spread(self._variances[0], 0.0, 0.0, v * v, 0.0, w * w)
-        self._spreads = [P] * len(self._alike)
-        self._x = [(p, v, 0.0) for p, v in zip(measured.position, velocity, strict=True)]
+        self.spreads = [P] * len(self._alike)
+        self.x = [(p, v, 0.0) for p, v in zip(measured.position, velocity, strict=True)]
 
     def advance(self, command: list[float]) -> None:
         """Go on by a step that was flown with this input [m/s], of each axis."""
         self._flown.append(command)
         inputs = self._flown.popleft()
-        self._x = [
+        self.x = [
             (*advance(axis, p, v, u + w), w)
-            for axis, (p, v, w), u in zip(self._model, self._x, inputs, strict=True)
+            for axis, (p, v, w), u in zip(self._model, self.x, inputs, strict=True)
         ]
-        self._spreads = [
+        self.spreads = [
             widened(axis, P, noise)
-            for axis, P, noise in zip(self._alike, self._spreads, self._noise, strict=True)
+            for axis, P, noise in zip(self._alike, self.spreads, self._noise, strict=True)
         ]
 
     def take(self, measured: Measured) -> None:
@@ -160,25 +160,25 @@ class Kalman:
             if values is None:
                 continue
             variance = self._variances[which]
-            corrected = [correct(P, variance) for P in self._spreads]
-            self._spreads = [P for _, P in corrected]
+            corrected = [correct(P, variance) for P in self.spreads]
+            self.spreads = [P for _, P in corrected]
             gains = self.gains[which] = [corrected[kind][0] for kind in self._kinds]
-            self._x = [
+            self.x = [
                 (p + kp * off, v + kv * off, w + kw * off)
                 for (p, v, w), (kp, kv, kw), off in (
                     (x, gain, z - x[which])
-                    for x, gain, z in zip(self._x, gains, values, strict=True)
+                    for x, gain, z in zip(self.x, gains, values, strict=True)
                 )
             ]
 
     def estimate(self) -> list[tuple[float, float]]:
         """Position [m] and velocity [m/s] of each axis at the present step."""
-        present = [(p, v) for p, v, _ in self._x]
+        present = [(p, v) for p, v, _ in self.x]
         for inputs in self._flown:
             present = [
                 advance(axis, p, v, u + w)
                 for axis, (p, v), (_, _, w), u in zip(
-                    self._model, present, self._x, inputs, strict=True
+                    self._model, present, self.x, inputs, strict=True
                 )
             ]
         return present

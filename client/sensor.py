@@ -2,9 +2,9 @@
 
     z(k) = x(k - D) + b + σ n          D: delay [steps]   b: bias   σ n: noise, drawn anew each time
 
-A measurement is made at the begin of a step, and is had after whole steps: a delay, and the time
-from one to the next, that lie between two steps count as the longer. Before its first step the
-vehicle has stood where it starts, and has measured that.
+A measurement is made at the begin of a step, and had at the begin of another: of the first that is
+no earlier than it is due, and than its delay allows. At step 0 everything is due that is measured
+at all. Until then the vehicle has stood where it starts.
 """
 
 from collections import deque
@@ -37,20 +37,16 @@ class Sensor:
         sensor, self._dt_ns = scenario.sensor, scenario.dt_ns
         self.delay = -(-seconds_to_ns(sensor.delay_s) // self._dt_ns)
         """Time from measuring to having the measurement, D [steps]."""
-        never = sensor.velocity_every_s == "never"
-        velocity_every_s = (
-            0.0 if isinstance(sensor.velocity_every_s, str) else sensor.velocity_every_s
-        )
-        self._every_ns = (
-            max(seconds_to_ns(sensor.position_every_s), self._dt_ns),
-            0 if never else max(seconds_to_ns(velocity_every_s), self._dt_ns),
-        )
+        self._every_ns = [
+            0 if every_s == "never" else max(seconds_to_ns(every_s), self._dt_ns)
+            for every_s in (sensor.position_every_s, sensor.velocity_every_s)
+        ]
         """Time from one position, and one velocity, to the next [ns]; 0: never."""
         self._noise = sensor.position_noise_m, sensor.velocity_noise_mps
         nothing = (0.0,) * scenario.model.axes
         self._bias = sensor.position_bias_m or nothing, sensor.velocity_bias_mps or nothing
         wrong = any(self._noise) or any(map(any, self._bias))
-        late = self.delay > 0 or self._every_ns != (self._dt_ns, self._dt_ns)
+        late = self.delay > 0 or self._every_ns != [self._dt_ns, self._dt_ns]
         self.exact = not (wrong or late)
         """Whether it measures the whole state as it is, at every step."""
         self._rng = rng

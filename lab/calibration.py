@@ -1,4 +1,4 @@
-"""What a search is after: the paper's Table 1, or the smallest error at a share of packets.
+"""What a search is after: the paper's Table 1, or the smallest error within some limits.
 
 An objective (see `lab.search.Objective`) flies a point of a search, a scenario, with the same seeds
 as every other point, and scores what came out: the smaller the score, the better.
@@ -6,7 +6,7 @@ as every other point, and scores what came out: the smaller the score, the bette
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -118,9 +118,11 @@ WEIGHTS = (
     Free("control.change_weight", 1e-4, 1e4),
 )
 """Weights that are searched for; only ratios matter, so the position's keeps its value."""
+REGULATOR = (WEIGHTS[0], WEIGHTS[3])
+"""Those of them that make the gain aboard, where nothing is planned."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
-    "state_gap": (Free("control.epsilon", 1e-4, 1e4), Free("control.decay_rate", 1e-2, 1e2)),
-    "cost_gap": (Free("control.cost_gap", 1e-6, 1e3),),
+    "state_gap": (Free("control.epsilon", 1e-4, 1e8), Free("control.decay_rate", 1e-2, 1e2)),
+    "cost_gap": (Free("control.cost_gap", 1e-6, 1e6),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
     "tolerance": (Free("control.tolerance_m", 1e-4, 1e1),),
     "delta": (Free("control.tolerance_m", 1e-4, 1e1),),
@@ -130,6 +132,8 @@ OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
 """Keys of the schemes that have a disturbance observer."""
 OBSERVE = ("committed", "predictive")
 """Those schemes."""
+MEANS = ("rmse_xy", "event_ratio", "effort_mps", "saturated")
+"""Figures of a point whose means over the seeds are kept."""
 HERE = "here"
 """Name of the one column of a point that is flown as it is."""
 
@@ -142,43 +146,57 @@ def trigger_keys(trigger: str) -> Sequence[Free]:
 
 
 @dataclass(frozen=True, slots=True)
-class Rmse:
-    """The objective of the smallest RMSE xy, at no more than a share of packets.
+class Limits:
+    """What may be spent on a small error."""
 
-    The share binds only a trigger that looks at the flight.
-    """
+    packets: float = 1.0
+    """Largest share of steps that may send; it binds only a trigger that looks at the flight."""
+    effort_mps: float = math.inf
+    """Largest effort, the RMS change of the command from step to step [m/s]."""
+    saturated: float = 1.0
+    """Largest share of steps with an input at its bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rmse:
+    """The objective of the smallest RMSE xy within some limits."""
 
     scenario: Scenario
     """What is flown, but for the keys that are searched for."""
-    packets: float
-    """Largest share of steps that may send."""
+    limits: Limits
 
     def settings(self) -> Mapping[str, Any]:
-        """Name of the objective and its share of packets, as plain values."""
-        return {"objective": "rmse", "packets": self.packets}
+        """Name of the objective and its limits, as plain values."""
+        return {"objective": "rmse", **asdict(self.limits)}
 
     def free(self) -> Sequence[Free]:
         """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
         control, table = self.scenario.control, plain(self.scenario)
+        weights = REGULATOR if control.scheme == "dead_reckoning" else WEIGHTS
         observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
-        keys = [*WEIGHTS, *trigger_keys(control.trigger), *observer]
+        keys = [*weights, *trigger_keys(control.trigger), *observer]
         return [key for key in keys if key.of(table) > 0.0]
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
         """Means over seeds, and the upper end of the event ratio's 95 % interval."""
         runs = sweep.summaries(HERE, scenario, seeds)
-        rmse, ratio = _mean(runs, "rmse_xy"), _mean(runs, "event_ratio")
+        found = {name: _mean(runs, name) for name in MEANS}
         _, half = sweep.estimate(runs, "event_ratio")
+        ratio = found["event_ratio"]
         most = None if ratio is None else ratio + (half or 0.0)
-        return {HERE: {"rmse_xy": rmse, "event_ratio": ratio, "event_ratio_most": most}}
+        return {HERE: {**found, "event_ratio_most": most}}
 
     def score(self, values: Values) -> float:
-        """RMSE xy [m], times the cube of how many times too many packets there may be."""
-        rmse, most = values[HERE]["rmse_xy"], values[HERE]["event_ratio_most"]
-        if rmse is None or most is None:
+        """RMSE xy [m], times the cube of how many times too much of anything limited is spent."""
+        here = values[HERE]
+        rmse, most = here["rmse_xy"], here["event_ratio_most"]
+        effort, saturated = here["effort_mps"], here["saturated"]
+        if rmse is None or most is None or effort is None or saturated is None:
             return UNFLYABLE
-        over = most / self.packets if self._binds() else 1.0
-        return rmse * max(1.0, over) ** 3
+        over = [effort / self.limits.effort_mps, saturated / self.limits.saturated]
+        if self._binds():
+            over.append(most / self.limits.packets)
+        return rmse * math.prod(max(1.0, each) ** 3 for each in over)
 
     def _binds(self) -> bool:
         """Whether the share of packets follows from what is flown."""

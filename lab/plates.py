@@ -391,55 +391,95 @@ def _estimate_error(flight: Flight) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Bought:
-    """A point of `trade`: what is sent, and the error that it leaves."""
+    """A point of `trade`: what is spent, and the error that it leaves."""
 
     packets_per_s: float
-    """Packets up per second."""
+    """Packets up per second; of none a line is drawn."""
     bytes_per_s: float
-    """Bytes per second, both ways."""
+    """Bytes up per second."""
+    effort_mps: float
+    """RMS change of the command from step to step [m/s]."""
     rmse_m: float | None
     """Mean RMSE xy [m]; None where none flew."""
     rmse_half_m: float | None
     """Half the width of the 95 % interval of `rmse_m` [m]."""
+    median_m: float | None
+    """Median RMSE xy [m]; None where none flew."""
     tuned: bool
     """Whether the threshold is the one that was searched for."""
 
 
-COLOURS = ("0.5", "#c1272d", "#e69f00", "black", "#56b4e9", "#0072b2", "#009e73", "#cc79a7")
-"""Colours of the curves of `trade`, in order."""
-MARKERS = "sov^D<P*"
-"""Markers of the curves of `trade`, in order, which tell them apart without colour."""
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A curve of `trade`."""
+
+    scheme: str
+    """Name of the scheme, which has a colour."""
+    trigger: str
+    """Name of the trigger, which has a marker."""
+    points: Sequence[Bought]
+    """Points in the order in which they are joined."""
+
+
+COLOURS = ("#c1272d", "#cc79a7", "#e69f00", "#56b4e9", "0.5", "black", "#009e73", "#0072b2")
+"""Colours of the schemes of `trade`, in order."""
+MARKERS = "sovD^P<*"
+"""Markers of the triggers of `trade`, in order, which tell them apart without colour."""
 
 
 def trade(
-    name: str, title: str, says: str, curves: Mapping[str, Sequence[Bought]], csv: str
+    name: str,
+    title: str,
+    says: str,
+    curves: Sequence[Curve],
+    floor: Sequence[tuple[float, float]],
+    csv: str,
 ) -> Picture:
-    """RMSE over what is sent, in packets and in bytes, with 95 % bands.
+    """RMSE over what is spent, in packets, in bytes and in effort, with 95 % bands.
 
     Args:
-        curves: points of each curve, by its label.
+        floor: points of a floor: packets up per second, and RMSE xy [m].
         csv: the numbers, as `Picture` has them.
     """
-    with _figure(PAGE, 3.9) as figure:
-        panes = figure.subplots(1, 2, sharey=True)
-        for (label, points), colour, marker in zip(
-            curves.items(), COLOURS[: len(curves)], MARKERS[: len(curves)], strict=True
-        ):
-            flown = [point for point in points if point.rmse_m]
+    schemes, triggers = (
+        dict(zip(dict.fromkeys(names), styles, strict=False))
+        for names, styles in (
+            ((curve.scheme for curve in curves), COLOURS),
+            ((curve.trigger for curve in curves), MARKERS),
+        )
+    )
+    with _figure(PAGE, 5.0) as figure:
+        panes = figure.subplots(1, 3, sharey=True)
+        for curve in curves:
+            flown = [point for point in curve.points if point.rmse_m]
             rmse = np.array([point.rmse_m for point in flown], np.float64)
             half = np.array([point.rmse_half_m or 0.0 for point in flown], np.float64)
+            median = np.array([point.median_m for point in flown], np.float64)
             large = np.array([point.tuned for point in flown], np.bool_)
-            packets = np.array([point.packets_per_s for point in flown])
-            octets = np.array([point.bytes_per_s for point in flown])
-            for plane, cost in zip(panes, (packets, octets), strict=True):
-                style: Any = {"color": colour, "marker": marker, "linestyle": "none"}
-                plane.plot(cost, rmse, color=colour, linewidth=0.8)
-                plane.plot(cost, rmse, **style, markersize=2.5)
-                plane.plot(cost[large], rmse[large], **style, markersize=6, label=label)
-                low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic scale has no 0
-                plane.fill_between(cost, low, rmse + half, color=colour, alpha=0.2, linewidth=0)
-                plane.errorbar(cost, rmse, [rmse - low, half], fmt="none", color=colour, lw=0.6)
-        for plane, label in zip(panes, ("packets up /s", "bytes /s, both ways"), strict=True):
+            low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic scale has no 0
+            if flown and not flown[0].packets_per_s:
+                for plane in panes:
+                    plane.axhline(rmse[0], color="0.3", linestyle="--", label=curve.scheme)
+                continue
+            style: Any = {"color": schemes[curve.scheme], "linestyle": "none"}
+            shape = triggers[curve.trigger]
+            label = f"{curve.scheme}, {curve.trigger}"
+            for plane, spent in zip(panes, SPENT, strict=True):
+                cost = np.array([getattr(point, spent) for point in flown], np.float64)
+                plane.plot(cost, rmse, **style, marker=shape, markersize=2.5)
+                plane.plot(
+                    cost[large], rmse[large], **style, marker=shape, markersize=6, label=label
+                )
+                plane.plot(cost[large], median[large], **style, marker="_", markersize=9)
+                if spent == "effort_mps":
+                    continue  # with the threshold it may rise or fall
+                plane.plot(cost, rmse, color=style["color"], linewidth=0.8)
+                plane.fill_between(
+                    cost, low, rmse + half, color=style["color"], alpha=0.2, linewidth=0
+                )
+        if floor:
+            panes[0].plot(*zip(*floor, strict=True), color="0.3", linestyle=":", label="floor")
+        for plane, label in zip(panes, SPENT.values(), strict=True):
             plane.set_xscale("log")
             plane.set_yscale("log")
             plane.set_xlabel(label)
@@ -447,6 +487,14 @@ def trade(
         handles, labels = panes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3)
     return _picture(figure, name, title, says, csv)
+
+
+SPENT = {
+    "packets_per_s": "packets up /s",
+    "bytes_per_s": "bytes up /s",
+    "effort_mps": "effort [m/s]",
+}
+"""What is spent, and how an axis calls it."""
 
 
 def intervals(samples: Samples) -> Picture:

@@ -2,9 +2,10 @@
 
 A vehicle at step k is planned for from k + d to k + d + H. How far ahead the server may look is
 `reference.preview`: with "all" it sees the whole window, and otherwise nothing behind the step
-k + preview. What lies beyond is predicted from the desired state there: it goes on at its velocity,
-which fades for a target, as docs/targets.md measures it. Of a point that is moved in flight only
-the present is known (`live`), and the same for all vehicles.
+k + preview. What lies beyond is predicted from the desired state there, which goes on at its
+velocity; that of a target turns round at the bounds within which it moves (docs/targets.md has what
+else was tried). Of a point that is moved in flight only the present is known (`live`), and the same
+for all vehicles.
 
 A trajectory is looked up in pages rather than computed at each step. Where vehicles have
 trajectories of their own, each has pages of its own.
@@ -16,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from server.live import LivePoint
-from shared.config import ReferenceConfig, Scenario
-from shared.kernel import F2, F4, I1, inline, kernel, plain
+from shared.config import Scenario
+from shared.kernel import F4, I1, inline, kernel, plain
 from shared.model import Array, Indices
 from shared.protocol import committed_max
-from shared.reference import Reference, turning_rate
+from shared.reference import Reference
 from shared.terms import Terms
 
 PAGE = 128
@@ -79,8 +80,8 @@ class Desired:
         if not self._all:
             seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
             self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
-        self._carried = carried(_rate(wanted), terms.dt_s * np.arange(longest + 1.0))
-        """How a state is carried on, by the number of steps; see `carried`."""
+        self._bound_m = wanted.radius_m if wanted.shape == "target" else np.inf
+        """Coordinate at which a prediction turns round [m]."""
         self._references = references
         self._shared = scenario.make_reference()
         self._number = np.zeros(capacity, dtype=np.int64)
@@ -144,7 +145,8 @@ class Desired:
         if self._all:
             return self._find(rows, steps + ahead[: len(rows)])
         found = self._find(rows, steps)
-        _foresee(found, len(rows), ahead, self._reach, self._carried, self._foreseen.states)
+        window = self._foreseen.states
+        _foresee(found, len(rows), ahead, self._reach, self._dt_s, self._bound_m, window)
         return self._foreseen
 
     def _find(self, rows: Indices, steps: Indices) -> Window:
@@ -161,24 +163,6 @@ class Desired:
             states = sample((page * PAGE + self._steps) * self._dt_s)
             self._pages[at], held[at] = states.transpose(1, 0, 2), number * TRAJECTORY + page
         return self._found
-
-
-def carried(rate: float, times_s: Array) -> Array:
-    """How far a unit of velocity leads in some times [s], and what is left of it; shape (n, 2).
-
-    Args:
-        rate: rate at which velocity fades [1/s].
-        times_s: shape (n,).
-    """
-    way_s = -np.expm1(-rate * times_s) / rate if rate else times_s
-    return np.stack([way_s, np.exp(-rate * times_s)], axis=-1)
-
-
-def _rate(wanted: ReferenceConfig) -> float:
-    """Rate at which a prediction's velocity fades [1/s]."""
-    if wanted.shape != "target":
-        return 0.0
-    return turning_rate(wanted.agility, wanted.speed_mps, wanted.radius_m)
 
 
 def _live(scenario: Scenario) -> LivePoint:
@@ -209,8 +193,21 @@ def _find(held: I1, numbers: I1, rows: I1, steps: I1, found: Window) -> int:
     return FOUND
 
 
+@inline
+def _led(p: float, v: float, after_s: float, bound_m: float) -> tuple[float, float]:
+    """Position [m] and velocity [m/s] some time later, between walls that turn the velocity."""
+    p += v * after_s
+    if abs(p) <= bound_m:
+        return p, v
+    crossed = np.floor((p + bound_m) / (2.0 * bound_m))
+    way = 1.0 - 2.0 * (crossed % 2.0)
+    return way * (p - 2.0 * bound_m * crossed), way * v
+
+
 @kernel
-def _foresee(known: Window, n: int, ahead: I1, reach: int, carried: F2, window: F4) -> None:
+def _foresee(
+    known: Window, n: int, ahead: I1, reach: int, dt_s: float, bound_m: float, window: F4
+) -> None:
     """Fill in the windows of vehicles: what is seen, and what is predicted behind that.
 
     Args:
@@ -218,18 +215,17 @@ def _foresee(known: Window, n: int, ahead: I1, reach: int, carried: F2, window: 
         n: number of vehicles.
         ahead: d of each; shape (block,).
         reach: number of steps that are seen.
-        carried: see `carried`, by steps after those; shape (at least d + H - reach + 1, 2).
+        dt_s: length of a step [s].
+        bound_m: coordinate at which a prediction turns round [m].
         window: what is filled in [m, m/s]; shape (block, axes, H + 1, 2).
     """
     for i in range(n):
         states, first = known.states[known.place[i]], known.first[i]
         for axis in range(window.shape[1]):
-            p, v = states[axis, first + reach, 0], states[axis, first + reach, 1]
             for stage in range(window.shape[2]):
                 step = ahead[i] + stage
-                if step <= reach:
-                    window[i, axis, stage, 0] = states[axis, first + step, 0]
-                    window[i, axis, stage, 1] = states[axis, first + step, 1]
-                else:
-                    window[i, axis, stage, 0] = p + v * carried[step - reach, 0]
-                    window[i, axis, stage, 1] = v * carried[step - reach, 1]
+                seen = first + min(step, reach)
+                p, v = states[axis, seen, 0], states[axis, seen, 1]
+                if step > reach:
+                    p, v = _led(p, v, (step - reach) * dt_s, bound_m)
+                window[i, axis, stage, 0], window[i, axis, stage, 1] = p, v

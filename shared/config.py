@@ -95,7 +95,7 @@ class ControlConfig(Section, frozen=True):
     """Longest time from making a horizon to its being in force [s]; auto: as was seen."""
     observer_s: Duration = 4.0
     """Time constant of learning steady wind and a wrong gain [s], longer where observations are
-    old; 0: they are not learned."""
+    old; 0: they are not learned, nor with the scheme "none"."""
     trigger: Annotated[str, Meta(max_length=policy.TEXT_MAX)] = "cost_gap | silence(1)"
     """Rule for sending a horizon: policies combined with & and |, as in docs/triggers.md."""
     period: Annotated[int, Meta(ge=1, le=policy.PERIOD_MAX)] = 10

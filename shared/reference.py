@@ -6,7 +6,6 @@ A reference is a function of time since the epoch [s; any shape] that gives the 
 
 import csv
 import io
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -175,17 +174,6 @@ def target(
         return np.stack([position, way * (v + after * rise)], axis=-1)
 
     return sample
-
-
-def turning_rate(agility: float, speed_mps: float, radius_m: float) -> float:
-    """Rate at which the velocity of a `target` fades in the mean [1/s].
-
-    Walls hold the velocity: the slowest mode of a diffusion of agility² / 2 between ±speed fades at
-    (π / (2 · speed))² times that. And walls hold the position: at half the largest speed in the
-    mean one is met every 4 · radius / speed seconds, and turns the velocity round, which takes
-    twice of it.
-    """
-    return (math.pi * agility / speed_mps) ** 2 / 8.0 + speed_mps / (2.0 * radius_m)
 
 
 class _Walk:

@@ -73,6 +73,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     solve_ms_p99: float | None
     deadline_misses: int
     """Number of steps that the server or the client slept through."""
+    estimate_error_m: float | None = None
+    """Root mean square of how far the position that the vehicle flew by was from the true one, from
+    `settle` on [m]; None where it knew that."""
     secure: bool = False
     """Whether the link was authenticated and encrypted."""
 
@@ -98,6 +101,7 @@ def summarise(
     error = position_error(scenario, client, server)
     counted = client["step"] * scenario.control.dt >= scenario.settle
     settled, flown = error[counted], client[counted]
+    off = flown["estimate"][..., 0] - flown["state"][..., 0]
     squares = (settled**2).mean(axis=0) if len(settled) else np.array([np.nan])
     rmse = [float(value) for value in np.sqrt(squares)] if np.isfinite(squares).all() else []
     distances = np.linalg.norm(settled, axis=1)
@@ -149,6 +153,7 @@ def summarise(
         solve_ms_p50=_quantile(solve_ms, 0.5),
         solve_ms_p99=_quantile(solve_ms, 0.99),
         deadline_misses=missed,
+        estimate_error_m=_rms(off) if off.any() and np.isfinite(off).all() else None,
         secure=secure,
     )
 
@@ -178,6 +183,11 @@ def position_error(scenario: Scenario, client: Rows, server: Rows | None = None)
     """Position minus desired position at every step [m]; shape (steps, axes); see `desired`."""
     error: Array = client["state"][..., 0] - desired(scenario, client, server)
     return error
+
+
+def _rms(vectors: Array) -> float:
+    """Root mean square of the lengths of vectors; shape (n, axes)."""
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 def _last(rows: Rows, name: str) -> int:

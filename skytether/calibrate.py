@@ -1,5 +1,6 @@
 """`skytether calibrate`: search for the numbers that the paper does not print, or the best ones."""
 
+import math
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lab import calibration
-from lab.calibration import HERE, Rmse, Table1
+from lab.calibration import HERE, Limits, Rmse, Table1
 from lab.journal import Journal, write
 from lab.report import as_text
 from lab.search import SIGMA, Free, Point, Search, Values, best, check_free
@@ -40,6 +41,9 @@ class Options:
     packets: float = 0.1
     """Largest share of steps that may send, with the objective rmse and a trigger that looks at
     the flight."""
+    effort: Annotated[float, tyro.conf.arg(metavar="MPS")] = math.inf
+    """Largest effort with the objective rmse, the RMS change of the command from step to step
+    [m/s]; no limit unless given."""
     free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=LOW:HIGH")] = ()
     """Keys that may change, each within its bounds, on a logarithmic scale. Unless given, table1
     changes weights and plant, and rmse the weights (but the position's, for only ratios matter) and
@@ -74,10 +78,13 @@ def calibrate(argv: Sequence[str]) -> None:
     for flag, share in (("--sigma", options.sigma), ("--packets", options.packets)):
         if not 0.0 < share <= 1.0:
             raise CommandError(f"{flag}: got {share:g}, expected more than 0, at most 1", 2)
+    if not options.effort > 0.0:
+        raise CommandError(f"--effort: got {options.effort:g}, expected more than 0", 2)
     options.pool.check()
     scenario = options.config
     is_rmse = options.objective == "rmse"
-    objective = Rmse(scenario, options.packets) if is_rmse else Table1()
+    limits = Limits(packets=options.packets, effort_mps=options.effort)
+    objective = Rmse(scenario, limits) if is_rmse else Table1()
     free = list(map(Free.parse, options.free)) or objective.free()
     check_free(free, scenario)
     search = Search(
@@ -117,6 +124,7 @@ def _print_rmse(points: Sequence[Point]) -> None:
     table.add_row("score", f"{found.score:.4f}")
     table.add_row(Text("RMSE xy [m]"), as_text(here["rmse_xy"], ".4f"))
     table.add_row("event ratio", as_text(here["event_ratio"], ".4f"))
+    table.add_row(Text("effort [m/s]"), as_text(here["effort_mps"], ".4f"))
     for key, value in found.keys.items():
         table.add_row(key, f"{value:g}")
     Console().print(table)

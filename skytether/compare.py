@@ -9,8 +9,9 @@ from typing import Annotated
 import tyro
 
 from lab import comparison, contenders
-from lab.calibration import HERE, Rmse
-from lab.contenders import CONTENDERS, PACKETS, PLANT, Found, Plan, Scale
+from lab.beside import Beside, Work, floor_of, fly_aboard
+from lab.calibration import HERE, Limits, Rmse
+from lab.contenders import CASES, PACKETS, SATURATED, Found, Plan, Scale
 from lab.journal import Journal, write
 from lab.report import as_text
 from lab.search import Point, Search, best
@@ -18,7 +19,7 @@ from shared import config
 from shell import command
 from skytether import page
 from skytether.page import Call
-from skytether.pool import Flags, PoolFlags, crew, writing
+from skytether.pool import Crew, Flags, PoolFlags, crew, writing
 
 WEIGHTS = "weights.toml"
 """File of the weights that a search has found."""
@@ -35,10 +36,12 @@ class Options:
     what it holds."""
     quick: bool = False
     """Take a first look: few flights, cases and thresholds."""
+    cases: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CASE")] = ()
+    """Cases that are flown; all unless given."""
     tune: bool = False
     """Only search for the weights of every contender in every case, with the same effort for each,
     and write them to OUT/weights.toml."""
-    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 40
+    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 20
     """Number of generations of each of these searches."""
     weights: Annotated[str, tyro.conf.arg(metavar="FILE")] = config.COMPARED
     """File of the weights, as --tune writes it; those that come with Skytether unless given."""
@@ -46,7 +49,7 @@ class Options:
 
 
 def compare(argv: Sequence[str]) -> None:
-    """Fly every scheme with every trigger, with wind, gusts and a wrong model, on the same seeds.
+    """Fly every scheme with every trigger after a target that only the server sees.
 
     OUT/report.html has the tables and figures, and opens anywhere; each is in OUT as CSV, PNG and
     PDF as well. Everything flown is kept: after Ctrl-C, or a crash, the same command goes on; once
@@ -56,8 +59,10 @@ def compare(argv: Sequence[str]) -> None:
     command.check_count("--runs", options.runs, 100_000)
     command.check_count("--generations", options.generations, 10**6)
     options.pool.check()
-    scaled = contenders.quick if options.quick else Scale
-    scale = scaled(options.runs, options.generations)
+    cases = contenders.cases(options.cases)
+    scale = Scale(options.runs, options.generations, cases=cases)
+    if options.quick:
+        scale = contenders.quick(scale)
     with writing(options.out):
         if options.tune:
             _tune(options, scale)
@@ -68,31 +73,43 @@ def compare(argv: Sequence[str]) -> None:
 def _compare(options: Options, scale: Scale, call: Call) -> None:
     """Fly all contenders in all cases, and write the report."""
     plans = [Plan(case, options.weights, scale) for case in scale.cases]
-    total = sum(len(plan.sweep.cells) * scale.runs for plan in plans)
+    total = sum(len(plan.sweep.cells) * plan.runs for plan in plans)
     with crew(options.pool, "comparing", total) as flyers:
         results = []
         for plan in plans:
             folder = options.out / "sweeps" / plan.case.name
             done = flyers.flown(plan.sweep, folder, plan.case.title)
-            results.append((plan.case, comparison.flown(plan, done)))
-    drawn = comparison.draw(results, scale.runs)
+            beside = _beside(flyers, plan, options.out / "beside" / plan.case.name)
+            results.append(comparison.compared(plan, done, beside))
+    drawn = comparison.draw(results)
     runs = flyers.spent.runs
-    page.write(options.out, drawn, config.load(PLANT), call, runs)
+    page.write(options.out, drawn, config.load(CASES[0].plant), call, runs)
     for table in drawn.tables:
         page.show(table)
     print(f"{options.out / page.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
 
 
+def _beside(flyers: Crew, plan: Plan, folder: Path) -> Beside:
+    """What stands beside the contenders of a case that has its own weights."""
+    if plan.case.weights:
+        return Beside()
+    work = Work(plan)
+    with closing(Journal(folder, work.settings(), Beside)) as journal:
+        if not journal.entries:
+            floor = flyers.map(floor_of, work.regular)
+            journal.append(Beside(floor, flyers.map(fly_aboard, work.aboard)))
+        return journal.entries[0]
+
+
 def _tune(options: Options, scale: Scale) -> None:
     """Search for the weights of every contender in every case, and write them to a file."""
-    pairs = [(contender, case) for contender in CONTENDERS for case in scale.cases]
     found = []
-    total = len(pairs) * scale.generations
+    total = len(scale.searched) * scale.generations
     with crew(options.pool, "searching", total, "generations") as flyers:
-        for contender, case in pairs:
+        for contender, case in scale.searched:
             start = contenders.search_start(contender, case, scale)
-            objective = Rmse(start, PACKETS)
+            objective = Rmse(start, Limits(PACKETS, case.effort_mps, SATURATED))
             search = Search(
                 start=start,
                 objective=objective,
@@ -105,8 +122,12 @@ def _tune(options: Options, scale: Scale) -> None:
             with closing(Journal(folder, search.settings(), list[Point])) as journal:
                 points = flyers.search(search, journal, scale.generations, f"{name}: ")
             point = best(points)
-            rmse, ratio = (point.values[HERE][key] for key in ("rmse_xy", "event_ratio"))
-            says = f"RMSE xy {as_text(rmse, '.4f')} m at {as_text(ratio, '.1%')} of the steps"
+            here = point.values[HERE]
+            says = (
+                f"RMSE xy {as_text(here['rmse_xy'], '.4f')} m at "
+                f"{as_text(here['event_ratio'], '.1%')} of the steps, effort "
+                f"{as_text(here['effort_mps'], '.3f')} m/s"
+            )
             found.append(Found(contender, case, search.scenario(point), says))
             print(f"{name}: {says}")
     write(options.out / WEIGHTS, contenders.to_file(found, scale).encode())

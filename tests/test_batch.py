@@ -63,7 +63,7 @@ scenarios = st.fixed_dictionaries(
                 "epsilon": st.sampled_from([0.01, 0.5]),
                 "solver": st.sampled_from(["exact", "exact", "exact", "osqp"]),
             }
-        ),
+        ).filter(lambda control: not (control["feedback"] and control["scheme"] == "none")),
         "model": st.fixed_dictionaries({"axes": st.sampled_from([2, 3])}),
         "vehicle": st.fixed_dictionaries(
             {"wind": st.sampled_from([0.0, 0.3]), "gust_mps2": st.sampled_from([0.0, 0.5])}

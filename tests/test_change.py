@@ -133,7 +133,7 @@ def test_what_cannot_be_is_refused_with_one_line_and_nothing_changes(
 
 
 def test_a_request_without_keys_is_answered_with_what_may_change() -> None:
-    """And the present values."""
+    """Each key with its present value."""
     _, running = probe()
     running.change({"vehicle.steady_wind_mps": [0.5, 0]}, now_ns=5)
     assert answer(running, b"{}").values == {
@@ -192,7 +192,7 @@ def test_a_request_may_be_so_long_and_no_longer() -> None:
 
 @pytest.mark.parametrize("kind", [Server, Proxy, Client, Fleet])
 def test_what_may_change_is_a_key_of_the_scenario(kind: type[Endpoint]) -> None:
-    """Of whatever endpoint, and each has some."""
+    """Each endpoint has some, and may be asked to leave all as it is."""
     endpoint = make(kind)
     values = answer(Running(endpoint, DEMO), b"{}").values
     assert values.keys() == endpoint.changeable
@@ -243,7 +243,7 @@ def test_netem_loses_what_it_is_told_to_from_then_on() -> None:
 
 
 def test_another_delay_is_that_of_the_packets_to_come() -> None:
-    """Of a flow that is there and of both directions by themselves."""
+    """Also in a flow that is there; each direction by itself."""
     values = {"network.downlink.delay": "constant", "network.downlink.minimum_s": 0.1}
     packets = fly(scenario(), changes=[(4.0, values)]).netem
     down = packets[packets["direction"] != UPLINK]
@@ -298,7 +298,7 @@ def test_wind_blows_from_the_next_step_on_and_changes_nothing_before() -> None:
 
 
 def test_a_gust_that_blows_goes_on_with_its_new_strength() -> None:
-    """The same way, and as if it had always had it."""
+    """It blows the way it did, as if it had always had it."""
     air = VehicleConfig(gust_mps2=1.0, gust_every_s=1e-9, gust_s=1e9)
     plant = FirstOrderPlant(msgspec.structs.replace(DEMO, vehicle=air), stream(1, "wind"))
     plant.advance(np.zeros(2))
@@ -307,6 +307,42 @@ def test_a_gust_that_blows_goes_on_with_its_new_strength() -> None:
     plant.advance(np.zeros(2))
     gained = plant.state()[:, 1] - before * np.exp(-0.05 / DEMO.tau_s)
     np.testing.assert_allclose(gained, 3.0 * before, rtol=1e-9)
+
+
+def test_a_live_point_is_led() -> None:
+    """The server knows it as it was told last, carried on, and the vehicle comes after it."""
+    flown = scenario(reference={"shape": "live"}, duration=14.0)
+    place, way = "reference.points_m", "reference.velocity_mps"
+    flight = fly(
+        flown,
+        changes=[
+            (2.0, {place: [[1.0, 2.0]], way: [0.0, 0.0]}),
+            (8.0, {way: [0.5, 0.0]}),
+            (10.0, {place: [[3.0, 2.0]]}),
+        ],
+    )
+    ((began_s, *_),) = told(flight, Flying)
+    time_s = began_s + 0.05 * flight.server["step"]
+    known = flight.server["reference"]
+    moved_m = 0.5 * np.clip(time_s - 8.0, 0.0, 2.0)
+    late_m = np.where(time_s > 10.0, 3.0 + 0.5 * (time_s - 10.0), 1.0 + moved_m)
+    wanted = np.stack([late_m, np.full(len(time_s), 2.0)], axis=-1) * (time_s > 2.0)[:, None]
+    sharp = np.abs(time_s[:, None] - [2.0, 10.0]).min(axis=1) > 0.1
+    np.testing.assert_allclose(known[sharp, :, 0], wanted[sharp], atol=0.05)
+    np.testing.assert_array_equal(known[time_s > 8.1, 0, 1], 0.5)
+    flown_m = flight.client["state"][..., 0]
+    np.testing.assert_allclose(flown_m[flight.client["step"] == 135][0], [1.0, 2.0], atol=0.1)
+
+
+def test_only_a_live_point_can_be_led() -> None:
+    """A circle goes where it goes."""
+    flight = fly(scenario(), changes=[(3.0, {"reference.points_m": [[1.0, 2.0]]})])
+    ((_, host, refused),) = told(flight, ChangeRefused)
+    assert host == "server"
+    assert str(refused).startswith(
+        "a change is refused: reference.points_m: cannot be changed in flight; what can be here: "
+        "control.cost_gap, "
+    )
 
 
 def arming(*changes: tuple[float, bool], armed: bool = True) -> Flight:

@@ -134,6 +134,12 @@ def start() -> Iterator[Callable[..., Process]]:
         (["fly", "papr"], 2, "fly: papr: no such scenario; did you mean paper?"),
         (["flyy"], 2, "skytether: no command 'flyy'; did you mean fly?"),
         (
+            ["fly", "demo", "--virtual", "--control", "sockets"],
+            2,
+            "fly: --control: got a folder, expected none with --virtual, which nobody can follow",
+        ),
+        (["set", "nobody", "armed"], 2, "set: got 'armed', expected KEY=VALUE"),
+        (
             ["fly", "demo", "--control.dt", "0"],
             2,
             "fly: demo and the command line: control.dt: got 0.0, expected a number >= 0.001",

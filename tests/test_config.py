@@ -11,6 +11,10 @@ from shared.config import ConfigError, Scenario
 
 WRONG = {
     # Not the form of a scenario.
+    "velocities never measured, and no filter": (
+        'sensor = { velocity_every_s = "never", filter = "none" }',
+        "sensor.filter: got 'none', expected 'kalman' with sensor.velocity_every_s = 'never'",
+    ),
     "a key misspelt": ("sead = 3", "sead: no such key; did you mean seed?"),
     "a key misspelt in a table": (
         "control.horzon = 9",
@@ -148,6 +152,10 @@ WRONG = {
     "a trigger for another scheme": (
         'control.scheme = "predictive"\ncontrol.trigger = "cost_gap"',
         ("control.scheme: got 'predictive', expected 'committed' with the trigger cost_gap"),
+    ),
+    "feedback without compensation": (
+        'control.scheme = "none"\ncontrol.trigger = "always"\ncontrol.feedback = true',
+        "control.feedback: got true, expected false with control.scheme = 'none'",
     ),
     "a negative cost": (
         "control.cost_gap = -1.0",

@@ -9,12 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server.controller import BLOCK
-from server.desired import EMPTY, PAGE, PAGES, Desired, carried
+from server.desired import EMPTY, PAGE, PAGES, Desired, _led
 from server.live import MEMORY_S, REST_S, LivePoint
 from shared import reference as shapes
 from shared.chance import stream
 from shared.config import ConfigError, Scenario, check, load, to_table
 from shared.endpoint import SECOND_NS, seconds_to_ns
+from shared.kernel import plain
 from shared.model import Array, Indices
 from shared.reference import Reference
 from shared.summary import desired as desired_positions
@@ -121,7 +122,6 @@ def test_a_window_is_true_as_far_as_the_preview_reaches(
     flown = scenario(shape=shape, preview=preview)
     desired, sample = make(flown), flown.make_reference()
     reach = 0 if isinstance(preview, str) else round(preview / DT_S)
-    rate = shapes.turning_rate(0.3, 1.0, 1.5) if shape == "target" else 0.0
     found = window(desired, np.array(steps), np.full(len(steps), ahead))
     np.testing.assert_array_equal(
         desired.now(np.arange(len(steps)), np.array(steps)), sample(np.array(steps) * DT_S)
@@ -132,11 +132,13 @@ def test_a_window_is_true_as_far_as_the_preview_reaches(
         for stage in range(H + 1):
             beyond_s = (ahead + stage - reach) * DT_S
             if beyond_s > 1e-9:
-                way_s, left = beyond_s, 1.0
-                if rate:
-                    left = np.exp(-rate * beyond_s)
-                    way_s = (1.0 - left) / rate
-                led = np.stack([last[:, 0] + way_s * last[:, 1], left * last[:, 1]], axis=-1)
+                led = last.copy()
+                led[:, 0] += beyond_s * last[:, 1]
+                if shape == "target":
+                    np.testing.assert_array_less(np.abs(states[stage, :, 0]), 1.5)
+                    far = np.abs(led[:, 0]) > 1.5  # no target here goes over more than one wall
+                    led[far, 0] = 3.0 * np.sign(led[far, 0]) - led[far, 0]
+                    led[far, 1] *= -1.0
                 np.testing.assert_allclose(states[stage], led, rtol=0, atol=1e-12)
             else:
                 np.testing.assert_array_equal(states[stage], expected[stage])
@@ -180,7 +182,7 @@ def turning(scale: float) -> Reference:
 
 
 def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> list[Flight]:
-    """The same flight after each of two targets that differ from TURN on."""
+    """Two flights of one seed, after targets that differ from TURN on."""
     flown = replaced("target", {"duration": 6.0}, preview=preview)
     flights = []
     for scale in (0.5, -0.5):
@@ -224,32 +226,43 @@ def test_a_server_that_sees_all_plans_for_what_comes(monkeypatch: pytest.MonkeyP
 # -- prediction --------------------------------------------------------------------------------
 
 
-def test_a_fading_velocity_predicts_a_target_better_than_a_constant_one() -> None:
+def test_a_prediction_that_turns_round_at_the_bounds_is_better() -> None:
     """By as much as docs/targets.md says; an acceleration taken from the past is far worse."""
-    ahead_s, every_s = 2.0, 0.5
-    rate = shapes.turning_rate(0.3, 1.0, 10.0)
-    assert 1.0 / rate == pytest.approx(6.21, abs=0.01)
-    times = np.arange(1.0, 300.0, every_s)
-    errors: dict[str, list[Array]] = {"constant": [], "fading": [], "accelerating": []}
+    ahead_s, times = 2.0, np.arange(1.0, 300.0, 0.5)
+    errors: dict[str, list[Array]] = {"turns": [], "goes on": [], "accelerates": []}
     for seed in range(1, 41):
         rng = stream(seed, "target")
         sample = shapes.target(rng, 2, agility=0.3, speed_mps=1.0, radius_m=10.0)
         now, past, then = (sample(times + shift) for shift in (0.0, -1.0, ahead_s))
         p, v, old = now[..., 0], now[..., 1], past[..., 1]
-        (way_s, _), (_, left) = carried(rate, np.array([ahead_s, ahead_s]))
-        errors["constant"].append(p + ahead_s * v - then[..., 0])
-        errors["fading"].append(p + way_s * v - then[..., 0])
-        errors["accelerating"].append(errors["constant"][-1] + 0.5 * ahead_s**2 * (v - old))
-        assert left == np.exp(-rate * ahead_s)
+        error = p + ahead_s * v - then[..., 0]
+        errors["goes on"].append(error)
+        errors["accelerates"].append(error + 0.5 * ahead_s**2 * (v - old))
+        lead = np.vectorize(lambda p, v: plain(_led)(p, v, ahead_s, 10.0)[0])
+        errors["turns"].append(lead(p, v) - then[..., 0])
     rms = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
-    assert rms["constant"] == pytest.approx(0.554, abs=0.01)
-    assert rms["fading"] == pytest.approx(0.516, abs=0.01)
-    assert rms["accelerating"] > 0.9
+    assert rms["goes on"] == pytest.approx(0.55, abs=0.02)
+    assert rms["turns"] == pytest.approx(0.44, abs=0.02)
+    assert rms["accelerates"] > 0.9
 
 
-def test_a_velocity_that_does_not_fade_leads_on() -> None:
-    """At rate 0 a state is carried on by its velocity."""
-    np.testing.assert_array_equal(carried(0.0, np.array([0.0, 2.0])), [[0.0, 1.0], [2.0, 1.0]])
+@pytest.mark.parametrize(
+    ("p", "v", "after_s", "expected"),
+    [
+        (1.0, 0.5, 2.0, (2.0, 0.5)),
+        (1.0, 1.0, 2.0, (1.0, -1.0)),
+        (-1.0, -1.0, 2.0, (-1.0, 1.0)),
+        (0.0, 1.0, 7.0, (-1.0, 1.0)),
+        (0.0, -1.0, 7.0, (1.0, -1.0)),
+        (0.0, 3.0, 8.0, (0.0, 3.0)),
+    ],
+)
+def test_a_prediction_goes_to_and_fro_between_walls(
+    p: float, v: float, after_s: float, expected: tuple[float, float]
+) -> None:
+    """Walls at 2 m, however often they are met; without walls it goes straight on."""
+    assert plain(_led)(p, v, after_s, 2.0) == expected
+    assert plain(_led)(p, v, after_s, np.inf) == (p + v * after_s, v)
 
 
 # -- a trajectory for each vehicle -------------------------------------------------------------

@@ -2,14 +2,18 @@
 
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from shared.protocol import PAYLOAD_BYTES_MAX
 from shared.summary import Summary
+from shell import command
+from skytether.set import set_keys
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
@@ -43,6 +47,7 @@ def skytether(line: str) -> list[str]:
         if line.startswith(
             ("skytether fl", "skytether sc", "skytether sw", "skytether ca", "skytether en")
         )
+        and "--control" not in line
     ],
 )
 def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
@@ -106,6 +111,31 @@ def fly_together(lines: list[str], folder: Path) -> str:
     return run.stdout
 
 
+def test_the_documented_changes_are_made_in_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of docs/control.md, one after the other, and the flight that they are for."""
+    monkeypatch.chdir(tmp_path)
+    (flies,), changes = blocks(ROOT / "docs" / "control.md")
+    with subprocess.Popen(
+        skytether(flies), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as flight:
+        try:
+            while not Path("flying/client").exists():  # it is started last
+                assert flight.poll() is None
+                time.sleep(0.05)
+            for line in changes:
+                assert command.main(set_keys, shlex.split(line)[2:], "set") == 0
+        finally:
+            flight.send_signal(signal.SIGINT)
+            _, told = flight.communicate()
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "armed = false"
+    made = [line for line in said if "from now on" in line]
+    assert len(made) == 9
+    assert sorted(made) == sorted(line for line in told.splitlines() if "from now on" in line)
+
+
 @pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
 def test_documented_targets_exist(line: str) -> None:
     """`make -n` knows each."""
@@ -123,6 +153,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether compare",)  # by test_compare.py
     known += ("skytether keygen ",)  # by test_keys.py
     known += ("skytether torture",)  # by test_torture.py
+    known += ("skytether set ",)
     known += ("docker compose up",)
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:

@@ -324,7 +324,8 @@ def test_a_vehicle_that_does_not_brake_is_caught_and_one_that_does_is_not() -> N
         scenario = changed(**keys, duration=40.0)
         return judge(scenario, flight.fly(scenario).client).outcome
 
-    assert (outcome("hold"), outcome("brake")) == ("flyaway", "interrupted")
+    assert outcome("hold") == "flyaway"
+    assert outcome("brake") in ("interrupted", "hovering")
 
 
 def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them(

@@ -17,6 +17,8 @@ from shared.config import Scenario
 from shared.model import Array, Indices, discretise
 from shared.protocol import NO_HORIZON, Mode, Observation
 from shared.stopwatch import Stopwatch
+from shared.summary import summarise
+from sim.flight import fly
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -261,6 +263,118 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
         single.observe(0, seen(observed, x))
     expected = [estimate(single, int(k) + 1) for single, k in zip(singles, step, strict=True)]
     np.testing.assert_array_equal(estimates(together, rows, step + 1), expected)
+
+
+# -- with observer and feedback ------------------------------------------------------------------
+
+
+def told(step: int, state: Array, u: Array) -> Observation:
+    """Observation of the one vehicle, with the input that it flies."""
+    return seen(step, state)._replace(input=u)
+
+
+def watch(
+    estimator: Estimator, wind: Array, every: int = 1, *, steps: int = 200, row: int = 0
+) -> Array:
+    """Disturbance learned of a vehicle that flies about in steady wind, seen now and then."""
+    x, found = np.zeros((2, 2)), foresight(1, 2, H, 1)
+    for step in range(steps):
+        u = 0.2 * np.array([np.sin(0.1 * step), np.cos(0.1 * step)])
+        if step % every == 0:
+            estimator.observe(row, told(step, x, u))
+            estimator.foresee(np.array([row]), np.array([step]), found)
+        x = MODEL.step(x, u + wind)
+    return found.disturbance[0]
+
+
+def learning(scheme: str = "predictive", **control: Any) -> Estimator:
+    """An estimator of two vehicles with an observer of half a second."""
+    flown = scenario(scheme, observer_s=0.5, **control)
+    return Estimator(flown.terms(), flown.control, feedback_gain(flown), 2)
+
+
+WIND = np.array([0.3, -0.2])
+
+
+@pytest.mark.parametrize("every", [1, 2, 5])
+def test_a_disturbance_is_learned_from_the_inputs_that_were_flown(every: int) -> None:
+    """Those between two observations are between theirs; and û has no part in it."""
+    estimator = learning()
+    remember(estimator, np.full((200, 2), 9.0))
+    np.testing.assert_allclose(watch(estimator, WIND, every), WIND, atol=5e-3)
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_where_there_is_none_none_is_learned(every: int) -> None:
+    """By inputs that change, either; to rounding where every step is seen."""
+    np.testing.assert_allclose(
+        watch(learning(), 0.0 * WIND, every), 0.0, atol=1e-9 if every == 1 else 5e-3
+    )
+
+
+def test_observations_far_apart_teach_nothing() -> None:
+    """Nobody knows what was flown in 0.3 s."""
+    assert not watch(learning(), WIND, 6).any()
+
+
+def test_the_disturbance_is_flown_on_with_every_input() -> None:
+    """Eq. (13) with u + w in place of u."""
+    estimator = learning()
+    w, x = watch(estimator, WIND), np.ones((2, 2))
+    estimator.observe(0, told(300, x, np.zeros(2)))  # too late to learn from
+    remember(estimator, np.full((5, 2), 0.5), start=300)
+    expected = flown(x, np.full((5, 2), 0.5) + w)
+    np.testing.assert_allclose(estimates(estimator, ROW, np.array([305]))[0], expected, atol=1e-12)
+
+
+def test_what_was_learned_is_forgotten_with_the_vehicle() -> None:
+    """That of another stays."""
+    estimator, found = learning(), foresight(2, 2, H, 1)
+    for row in (0, 1):
+        watch(estimator, WIND, row=row)
+    estimator.forget(0)
+    for row, step in ((0, 5), (1, 300)):
+        estimator.observe(row, told(step, np.ones((2, 2)), np.zeros(2)))
+    estimator.foresee(np.array([0, 1]), np.array([5, 300]), found)
+    np.testing.assert_allclose(found.disturbance, [0.0 * WIND, WIND], atol=2e-3)
+
+
+def test_without_compensation_nothing_is_learned() -> None:
+    """The newest observation is taken for the present, and that is all."""
+    assert not watch(learning("none"), WIND).any()
+
+
+def test_feedback_leads_on_from_where_the_vehicle_is_now() -> None:
+    """From x̂(k), with the disturbance and the gain."""
+    estimator, found = learning(feedback=True), foresight(1, 2, H, 1)
+    w = watch(estimator, WIND)
+    estimator.observe(0, told(199, np.ones((2, 2)), np.zeros(2)))
+    estimator.foresee(ROW, np.array([203]), found)
+    gain = feedback_gain(scenario("predictive", feedback=True))
+    expected = np.column_stack([found.estimate[0], w, gain])
+    np.testing.assert_array_equal(found.feedback[0], expected.astype(np.float32))
+    assert (gain > 1.0).all()
+
+
+def test_the_paper_s_scheme_flies_better_with_observer_and_with_feedback() -> None:
+    """Steady wind is for the observer, wind that is noise for feedback."""
+
+    def rmse(wind: dict[str, Any], **control: Any) -> float:
+        """RMSE of 25 s with a packet at every step [m]."""
+        table = config.to_table(config.load("paper-every-step")) | {"duration": 25.0}
+        table["control"] |= control
+        table["vehicle"] |= wind
+        windy = config.check(table, "test")
+        error = summarise(windy, "test", fly(windy).client).rmse_xy
+        assert error is not None
+        return error
+
+    steady, white = {"steady_wind_mps": WIND.tolist()}, {"wind": 0.1}
+    assert rmse(steady) > 1.0
+    assert rmse(steady, observer_s=2.0) < 0.4
+    assert rmse(steady, observer_s=2.0, feedback=True) < 0.15
+    assert rmse(white) > 0.18
+    assert rmse(white, feedback=True) < 0.12
 
 
 # -- how long an observation counts --------------------------------------------------------------

@@ -133,7 +133,7 @@ def test_packets_of_one_slot_have_fates_of_their_own() -> None:
 
 @pytest.mark.parametrize("mean", [0.0, 1e-9, 0.3, 40.0, 1e6])
 def test_any_number_of_slots_has_its_mean_and_variance(mean: float) -> None:
-    """Of a Poisson law, to four standard errors."""
+    """As Poisson's law says, to four standard errors."""
     config = DirectionConfig(minimum_s=0.0, slot_s=1e-3, slots_mean=mean)
     slots = delays_ns(config, SAMPLES) / MILLISECOND_NS
     assert slots.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean / SAMPLES) + 1e-6)

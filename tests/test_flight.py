@@ -115,6 +115,24 @@ def test_the_summary_counts_what_the_network_saw() -> None:
     assert result.rmse_xy == pytest.approx(np.hypot(result.rmse_x or 0, result.rmse_y or 0))
 
 
+def test_two_contenders_of_a_seed_meet_the_same_network() -> None:
+    """What enters at one time meets one fate, whoever sent it and however much before."""
+    met: list[dict[tuple[int, int], tuple[int, bool]]] = []
+    bursts = {"uplink": {"burst_s": 0.5}, "downlink": {"burst_s": 0.5}}
+    for trigger, scheme in (("always", "predictive"), ("periodic(7)", "committed")):
+        control = {"trigger": trigger, "scheme": scheme}
+        rows = fly(scenario("paper", duration=20.0, control=control, network=bursts)).netem
+        fates = zip(rows["delay_ns"].tolist(), rows["lost"].tolist(), strict=True)
+        entries = zip(rows["direction"].tolist(), rows["arrived_ns"].tolist(), strict=True)
+        met.append(dict(zip(entries, fates, strict=True)))
+    every, seldom = met
+    for direction, least in ((UPLINK, 50), (DOWNLINK, 350)):
+        both = [entry for entry in every if entry in seldom and entry[0] == direction]
+        assert len(both) >= least
+        assert any(every[entry][1] for entry in both)
+        assert [every[entry] for entry in both] == [seldom[entry] for entry in both]
+
+
 def test_age_is_a_round_trip_and_the_wait_for_the_next_step() -> None:
     """At least 0.8 s of delay, at most 0.25 s of waiting and jitter at the median."""
     flown = scenario("paper-every-step", duration=20.0)
@@ -124,7 +142,7 @@ def test_age_is_a_round_trip_and_the_wait_for_the_next_step() -> None:
 
 
 def test_the_summary_tells_ages_effort_and_bounds_of_what_was_flown() -> None:
-    """Of a record of six steps, from the second on, counted by hand."""
+    """A record of six steps, from the second on, counted by hand."""
     flown = scenario("paper", duration=1.0, settle=0.05)
     rows = np.zeros(6, client_columns(2))
     rows["step"] = range(6)

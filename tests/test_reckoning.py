@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from client.compensator import Compensator
 from server.desired import Desired
-from server.mpc import stationary_gain
+from server.gain import stationary_gain
 from server.reckoning import Reckoning
 from server.scheme import Foresight, foresight
 from shared import config
