@@ -141,7 +141,9 @@ class Client(Endpoint):
             changed=self._mode_changed,
         )
         self._change_max = (
-            scenario.vehicle.slew_mps2 * self._terms.dt_s if self._failsafe.brakes else math.inf
+            math.inf
+            if self._terms.exhausted == "hold"
+            else scenario.vehicle.slew_mps2 * self._terms.dt_s
         )
         """Largest change of the input from step to step [m/s]."""
 

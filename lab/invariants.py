@@ -312,7 +312,8 @@ class Life(Recorder):
         """
         axes = self._terms.axes
         step, now_ns = int(values[1]), self._clock()
-        state, rest = values[2 : 2 + 2 * axes], values[2 + 6 * axes :]
+        state, estimate = values[2 : 2 + 2 * axes], values[2 + 4 * axes : 2 + 6 * axes]
+        rest = values[2 + 6 * axes :]
         flown = list(rest[:axes])
         covered, in_force, age_ns, _, missed, number, _ = rest[axes:]
         mode, asleep = Mode(int(number)), int(missed) - self.missed
@@ -323,7 +324,8 @@ class Life(Recorder):
         self._check_input(flown)
         self._check_mode(mode, covered=bool(covered), now_ns=now_ns)
         self._check_horizon(step, int(in_force), int(age_ns), now_ns)
-        self._check_follows(step, np.reshape(state, (axes, 2)), flown, covered=bool(covered))
+        known = np.reshape(estimate, (axes, 2))
+        self._check_follows(step, known, flown, covered=bool(covered))
         self._check_silence(mode, flown)
         self._check_place(state[::2], asleep)
         if mode not in FLYING and mode is not Mode.LAND and self._overdue():

@@ -21,7 +21,7 @@ from server.gain import feedback_gain
 from server.planner import Figures, Planner
 from server.reckoning import Reckoning
 from server.replay import Replay
-from server.scheme import Foresight, Scheme, foresight
+from server.scheme import DOUBTS, Foresight, Scheme, foresight
 from server.trigger import Situation, Verdict, make_trigger
 from shared.config import ControlConfig, Scenario
 from shared.kernel import B1, I1, kernel
@@ -106,8 +106,8 @@ class Controller:
                 else Estimator(terms, control, gain, room)
             )
             self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
-        self._trigger = make_trigger(control, room)
-        self._found = foresight(block, terms.axes, terms.planned, most)
+        self._terms, self._room, self._block = terms, room, block
+        self.change_trigger(control)
         self._stopwatch = stopwatch
         self.last_step = np.full(room, -1, dtype=np.int64)
         """Step of each vehicle that was decided last, or -1; shape (room,)."""
@@ -126,7 +126,12 @@ class Controller:
 
     def change_trigger(self, control: ControlConfig) -> None:
         """Ask another trigger from the next step on; it knows of nothing that was sent before."""
-        self._trigger = make_trigger(control, len(self.last_step))
+        terms = self._terms
+        self._trigger = make_trigger(control, self._room)
+        doubts = DOUBTS if self._trigger.doubts else 0
+        self._found = foresight(
+            self._block, terms.axes, terms.planned, committed_max(terms), doubts
+        )
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""

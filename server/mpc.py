@@ -189,14 +189,37 @@ def gradient(
 
 
 @part
-def add_cost(mpc: MPC, axis: int, change: F1, cost: float) -> float:
-    """Add ΔUᵀ 𝓗 ΔU of one axis to `cost`: twice what a change of the optimal inputs costs.
+def slope(mpc: MPC, axis: int, which: int, u: F1, g: F1, drift: F2) -> None:
+    """Turn g into 𝓗 U + g of one axis: 0 where U is optimal and within its bounds.
 
     Args:
+        which: FIRST or LATER.
+        u: U [m/s]; shape (H,).
+        g: gradient of the QP, and what is filled in; shape (H,).
+        drift: scratch; shape (H, 2).
+    """
+    model, W, rho = axis_at(mpc.model, axis), mpc.weights.states, mpc.weights.inputs[which]
+    p, v = 0.0, 0.0
+    for i in range(len(u)):
+        p, v = advance(model, p, v, u[i])
+        drift[i, 0], drift[i, 1] = W[i, 0] * p, W[i, 1] * v
+    l0, l1 = 0.0, 0.0
+    for i in range(len(u) - 1, -1, -1):
+        l0, l1 = l0 + drift[i, 0], model.a01 * l0 + model.a11 * l1 + drift[i, 1]
+        g[i] += model.b0 * l0 + model.b1 * l1 + rho[i] * u[i]
+
+
+@part
+def add_cost(mpc: MPC, axis: int, x: tuple[float, float], change: F1, cost: float) -> float:
+    """Add to `cost` twice what other states and inputs cost, as far as that is quadratic.
+
+    Args:
+        x: by how much position [m] and velocity [m/s] are others at stage 0; with 0 what is added
+            is ΔUᵀ 𝓗 ΔU.
         change: ΔU [m/s]; shape (H,).
     """
     model, W, rho = axis_at(mpc.model, axis), mpc.weights.states, mpc.weights.inputs
-    p, v = 0.0, 0.0
+    p, v = x
     for i in range(len(change)):
         u = change[i]
         p, v = advance(model, p, v, u)

@@ -30,6 +30,7 @@ from server.mpc import (
     make_mpc,
     pose,
     shifted,
+    slope,
 )
 from server.scheme import Foresight
 from server.solver import OsqpSolver, Solver
@@ -49,6 +50,7 @@ FIGURES = record(
     ("gap", "i8"),
     ("error", "f8"),
     ("cost_gap", "f8"),
+    ("expected_gap", "f8"),
     ("deviation_m", "f8"),
     ("left_m", "f8"),
     ("moved_m", "f8"),
@@ -57,7 +59,8 @@ FIGURES = record(
 )
 """What is known of a vehicle once its plan is made: its row; k; k + d, where planning starts; the
 steps since planning started before; V(k) of eq. (16); the cost of flying on with
-what was sent, above that of the plan; the largest distance between that and the generator's last
+what was sent, above that of the plan, and what is to be expected of it where packets in flight may
+be lost; the largest distance between that and the generator's last
 plan [m]; with dead reckoning, how far the desired position has left where both ends expect it, and
 has moved since it was sent last [m]; whether it is at its first step or after a gap that no plan
 reached over; and whether the plan is new and right, so that it may be sent."""
@@ -293,6 +296,32 @@ def _deviate(
 
 
 @inline
+def _add_gap(
+    mpc: MPC,
+    axis: int,
+    x: tuple[float, float],
+    held: F1,
+    u: F1,
+    steep: F1,
+    change: F1,
+    cost: float,
+) -> float:
+    """Add to `cost` what flying on with other inputs costs above the optimum, twice, on one axis.
+
+    Args:
+        x: by how much the state at stage 0 is another then [m, m/s].
+        held: the other inputs [m/s]; shape (H,).
+        u: the optimal ones [m/s]; shape (H,).
+        steep: `slope` there, by which the cost rises where a bound is active; shape (H,).
+        change: scratch; shape (H,).
+    """
+    for stage in range(len(u)):
+        change[stage] = held[stage] - u[stage]
+        cost += 2.0 * max(0.0, steep[stage] * change[stage])
+    return add_cost(mpc, axis, x, change, cost)
+
+
+@inline
 def _conclude(
     mpc: MPC,
     terminal_weight: F1,
@@ -307,7 +336,9 @@ def _conclude(
     """Appraise the plan of vehicle `i`, whose answers are in the draft, and remember it."""
     axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
     row, d, error, cost = plan.row, found.ahead[i], 0.0, 0.0
-    change, distance, furthest = draft.gradient[at, 0], draft.distance, 0.0
+    change, distance, furthest = draft.guess[at, 0], draft.distance, 0.0
+    which = FIRST if plan.fresh else LATER
+    sure, doubted = 1.0, 0.0
     if compares:
         distance[:] = 0.0
     for axis in range(axes):
@@ -317,9 +348,19 @@ def _conclude(
         off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
         error += off_p * off_p * P[0] + off_v * off_v * P[1]
         if compares:
-            for stage in range(H):
-                change[stage] = found.held[i, axis, stage] - u[stage]
-            cost = add_cost(mpc, axis, change, cost)
+            steep = draft.gradient[at, axis]
+            slope(mpc, axis, which, u, steep, draft.drift)
+            x = (0.0, 0.0)
+            cost = _add_gap(mpc, axis, x, found.held[i, axis], u, steep, change, cost)
+            for j in range(found.doubt.shape[1]):
+                share = found.doubt[i, j]
+                if share > 0.0:
+                    x = (
+                        found.doubted_start[i, j, axis, 0] - found.start[i, axis, 0],
+                        found.doubted_start[i, j, axis, 1] - found.start[i, axis, 1],
+                    )
+                    held = found.doubted[i, j, axis]
+                    doubted += share * _add_gap(mpc, axis, x, held, u, steep, change, 0.0)
             if not plan.fresh:
                 _deviate(mpc, memory, found, plan, i, axis, distance)
         for stage in range(d):
@@ -328,7 +369,10 @@ def _conclude(
             found.horizons[i, axis, d + stage] = u[stage]
     if compares:
         furthest = np.sqrt(distance.max())
+    for j in range(found.doubt.shape[1]):
+        sure -= found.doubt[i, j]
     plan.error, plan.cost_gap, plan.deviation_m = error, cost, furthest
+    plan.expected_gap = sure * cost + doubted
     for axis in range(axes):
         memory.inputs[GENERATOR, row, axis] = draft.inputs[GENERATOR, at, axis]
         memory.inputs[TRACKER, row, axis] = draft.inputs[TRACKER, at, axis]

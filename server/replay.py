@@ -58,6 +58,9 @@ MARGIN = 2
 """Steps on top of half a round trip, until a horizon has been acknowledged."""
 FOLLOW_S = 0.25
 """Time constant with which the disturbance observer follows the velocity that is reported [s]."""
+LOSS, LEARNED = 0.1, 0.05
+"""Share of lost horizons that is assumed at first, and by how much of itself each horizon that has
+come into force, or is lost, moves it."""
 HOVERS, UNKNOWN = -1, -2
 """In place of the number of a horizon: none, so that it brakes and stands still; one that was sent
 in an earlier life of ours."""
@@ -74,12 +77,13 @@ SEEN = record(
     ("sent", "i8"),
     ("takes", "i8"),
     ("base_takes", "i8"),
+    ("loss", "f8"),
 )
 """What is known of one vehicle: horizon in force, and first step flown with it, of its newest
 observation; step and horizon of the one before, or -1; the horizon last seen to have come into
 force; the step up to which horizons were seen in force, or lost, or overtaken; the number of
-horizons sent so far; and whether it flies those that come, at its newest observation and at the one
-before."""
+horizons sent so far; whether it flies those that come, at its newest observation and at the one
+before; and the share of horizons that were lost lately."""
 STATE = record(
     ("p", "f8"),
     ("v", "f8"),
@@ -190,7 +194,7 @@ class Replay:
         """See `Scheme`."""
         memory = self._memory
         memory.observed[row] = -1
-        memory.seen[row] = (NO_HORIZON, 0, -1, NO_HORIZON, NO_HORIZON, 0, 0, 1, 1)
+        memory.seen[row] = (NO_HORIZON, 0, -1, NO_HORIZON, NO_HORIZON, 0, 0, 1, 1, LOSS)
         memory.state["w"][row] = 0.0
         delay.forget(self.delay_bound, row)
 
@@ -458,10 +462,53 @@ def _listen(
     at_least(bound, row, -(-shortest_ns(clock, row) // settings.dt_ns))
     if seen.in_force == seen.acknowledged or seen.sent == 0:
         return
+    memory.seen[row].loss -= LEARNED * seen.loss
     oldest = max(seen.sent - room, 0)
     if memory.sent[row, oldest % room].step <= seen.in_force:
         acknowledge(bound, row, seen.since - seen.in_force)
     memory.seen[row].acknowledged = seen.in_force
+
+
+@part
+def _doubt(
+    settings: Settings,
+    memory: Memory,
+    row: int,
+    i: int,
+    k: int,
+    flying: int,
+    under_way: range,
+    course: Course,
+    track: Track,
+    found: Foresight,
+) -> None:
+    """Fill in what becomes of vehicle `i` of a block where the newest horizons in flight are lost.
+
+    Args:
+        flying: number of the horizon in force at its newest observation.
+        under_way: numbers of those in flight.
+    """
+    observed, share, speed = memory.observed[row], 1.0, _speed(memory.state[row].u)
+    then, loss = k + found.ahead[i] - observed, memory.seen[row].loss
+    for j in range(found.doubt.shape[1]):
+        found.doubt[i, j] = 0.0
+        left = len(under_way) - j - 1
+        if left < 0:
+            continue
+        share *= loss
+        # Where more may be lost than are reckoned with, or none is left, this case stands for all.
+        last = left == 0 or j + 1 == found.doubt.shape[1]
+        found.doubt[i, j] = share if last else share * (1.0 - loss)
+        some = range(under_way.start, under_way.start + left)
+        legs = _chart(course, memory, row, observed, flying, some)
+        for axis in range(len(settings.rule)):
+            state = memory.state[row, axis]
+            x = (state.p, state.v, state.u, speed)
+            _roll(settings, memory, row, axis, course, legs, observed + then + settings.H, x, track)
+            for n in range(2):
+                found.doubted_start[i, j, axis, n] = track.states[max(then, 0), n]
+            for n in range(settings.H):
+                found.doubted[i, j, axis, n] = track.commands[then + n] if then + n >= 0 else 0.0
 
 
 @kernel
@@ -493,7 +540,10 @@ def _foresee(
         # Those that were due and are not in force have been overtaken, or are lost.
         first = _first_under_way(memory, row, seen.in_force, observed)
         for number in range(_first_after(memory, row, seen.in_force), first):
-            lost += memory.sent[row, number % room].due > seen.judged
+            newly = memory.sent[row, number % room].due > seen.judged
+            lost += newly
+            if newly:
+                memory.seen[row].loss += LEARNED * (1.0 - memory.seen[row].loss)
         memory.seen[row].judged = observed
         flying, under_way = HOVERS, range(0)
         if seen.takes == 1:
@@ -519,6 +569,7 @@ def _foresee(
                 found.feedback[i, axis, 1] = found.estimate[i, axis, 1]
                 found.feedback[i, axis, 2] = state.w
                 found.feedback[i, axis, 3], found.feedback[i, axis, 4] = rule.gain_p, rule.gain_v
+        _doubt(settings, memory, row, i, k, flying, under_way, course, track, found)
     return lost
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from shared.kernel import F2, F3, I1, S1, S3, kernel
+from shared.kernel import F2, F3, F4, I1, S1, S3, kernel
 from shared.model import Flags, Indices
 from shared.protocol import FEEDBACK, Observation
 
@@ -31,6 +31,14 @@ class Foresight(NamedTuple):
     the largest d there may be."""
     held: F3
     """Inputs from k+d on, if nothing more were sent [m/s]; shape (block, axes, H)."""
+    doubt: F2
+    """Probability that the newest 1, 2, … of the horizons in flight are lost, and no older one;
+    shape (block, doubts), with no doubts where no trigger asks for them."""
+    doubted_start: F4
+    """State at k+d in each of these cases [m, m/s]; shape (block, doubts, axes, 2)."""
+    doubted: F4
+    """Inputs from k+d on in each of these cases, if nothing more were sent [m/s]; shape
+    (block, doubts, axes, H)."""
     disturbance: F2
     """Disturbance ŵ, an input that nobody gave [m/s]; shape (block, axes)."""
     horizons: S3
@@ -40,7 +48,11 @@ class Foresight(NamedTuple):
     """What goes with a horizon, see `shared.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
 
 
-def foresight(block: int, axes: int, H: int, most: int) -> Foresight:
+DOUBTS = 4
+"""Number of horizons in flight whose loss is reckoned with."""
+
+
+def foresight(block: int, axes: int, H: int, most: int, doubts: int = 0) -> Foresight:
     """Room for a block of vehicles, whose delay bounds are at most `most`."""
     states = (block, axes, 2)
     return Foresight(
@@ -49,6 +61,9 @@ def foresight(block: int, axes: int, H: int, most: int) -> Foresight:
         start=np.zeros(states),
         committed=np.zeros((block, axes, most)),
         held=np.zeros((block, axes, H)),
+        doubt=np.zeros((block, doubts)),
+        doubted_start=np.zeros((block, doubts, axes, 2)),
+        doubted=np.zeros((block, doubts, axes, H)),
         disturbance=np.zeros((block, axes)),
         horizons=np.zeros((block, axes, most + H), dtype=np.float32),
         feedback=np.zeros((block, axes, FEEDBACK), dtype=np.float32),

@@ -51,6 +51,8 @@ class Trigger(Protocol):
 
     compares: bool
     """Whether it compares a figure with a threshold."""
+    doubts: bool
+    """Whether it looks at what becomes of the vehicle where packets in flight are lost."""
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row."""
@@ -71,6 +73,7 @@ class Always:
     """A packet at every step."""
 
     compares = False
+    doubts = False
 
     def __init__(self, control: ControlConfig, capacity: int) -> None:
         """See `POLICIES`."""
@@ -90,6 +93,7 @@ class Periodic:
     """A packet every `period` steps, counted from the last one that was sent."""
 
     compares = False
+    doubts = False
 
     def __init__(self, control: ControlConfig, capacity: int, period: int) -> None:  # noqa: ARG002
         self._period = period
@@ -134,6 +138,7 @@ class Budget:
     """
 
     compares = False
+    doubts = False
 
     def __init__(
         self, control: ControlConfig, capacity: int, packets_per_s: float, burst: float
@@ -171,6 +176,7 @@ class StateGap:
     """
 
     compares = True
+    doubts = False
 
     def __init__(
         self, control: ControlConfig, capacity: int, epsilon: float, decay_rate: float
@@ -204,7 +210,8 @@ class Above:
 
     compares = True
 
-    def __init__(self, name: str, threshold: float) -> None:
+    def __init__(self, name: str, threshold: float, *, doubts: bool = False) -> None:
+        self.doubts = doubts
         self._name = name
         self._threshold = threshold
 
@@ -241,6 +248,11 @@ def delta(control: ControlConfig, capacity: int, metres: float) -> Above:  # noq
     return Above("moved_m", metres)
 
 
+def expected_gap(control: ControlConfig, capacity: int, c: float) -> Above:  # noqa: ARG001
+    """Flying on is expected to cost more than c, as packets in flight may be lost."""
+    return Above("expected_gap", c, doubts=True)
+
+
 class Combined:
     """Two triggers, of which both (`np.logical_and`) or either (`np.logical_or`) must fire."""
 
@@ -248,6 +260,7 @@ class Combined:
         self, combine: Callable[[Flags, Flags], Flags], left: Trigger, right: Trigger
     ) -> None:
         self.compares = left.compares or right.compares
+        self.doubts = left.doubts or right.doubts
         self._combine = combine
         self._left, self._right = left, right
 
@@ -274,6 +287,7 @@ POLICIES: dict[str, Callable[..., Trigger]] = {
     "periodic": Periodic,
     "state_gap": StateGap,
     "cost_gap": cost_gap,
+    "expected_gap": expected_gap,
     "deviation": deviation,
     "tolerance": tolerance,
     "delta": delta,

@@ -94,6 +94,7 @@ SIGNATURES = {
         schemes=("committed", "predictive", "none"),
     ),
     "cost_gap": Signature((Parameter("c", 0, key="cost_gap"),), schemes=("committed",)),
+    "expected_gap": Signature((Parameter("c", 0, key="cost_gap"),), schemes=("committed",)),
     "deviation": Signature((Parameter("metres", 0, key="deviation_m"),), schemes=("committed",)),
     "tolerance": Signature(
         (Parameter("metres", 0, key="tolerance_m"),), schemes=("dead_reckoning",)

@@ -147,7 +147,7 @@ def test_cost_of_a_change_is_that_of_the_hessian(seed: int, H: int) -> None:
     problem, change = make(control(H, change_weight=0.7)), situation(seed, H)[2]
     cost = 3.0
     for axis in range(2):
-        cost = add_cost(problem.mpc, axis, change[axis], cost)
+        cost = add_cost(problem.mpc, axis, (0.0, 0.0), change[axis], cost)
     expected = np.einsum("ak,akl,al->", change, problem.hessian, change)
     np.testing.assert_allclose(cost - 3.0, expected, rtol=1e-9, atol=1e-9)
 
