@@ -11,7 +11,7 @@ import json
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from lab.keys import flat, lay
@@ -162,6 +162,8 @@ class Case:
     """Name of the case whose weights are flown; empty where the case has its own."""
     contenders: Sequence[str] = ()
     """Names of those who fly it; empty for all."""
+    start: Mapping[str, float] = field(default_factory=dict)
+    """Keys of `control` from whose values searches start here, where a contender has them."""
 
 
 TARGET = {"link.heartbeat_s": 1.0, "link.timeout_s": 5.0, "duration": 40.0}
@@ -176,6 +178,12 @@ AHEAD = ("paper-every-step", "feedback-gap", "reckoning-tolerance")
 def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
     """A case that is flown at the weights of the case `target`."""
     return Case(name, title, "target", {**TARGET, **keys}, weights="target")
+
+
+def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -> Case:
+    """A case that flies the paper's circle, where costs are hundreds of times smaller."""
+    small = {"cost_gap": 1.0, "epsilon": 300.0}
+    return Case(name, title, "paper", keys, effort_mps, contenders=CIRCLE, start=small)
 
 
 def _network(**keys: Any) -> Mapping[str, Any]:
@@ -219,9 +227,9 @@ CASES = (
         0.6,
         contenders=AHEAD,
     ),
-    Case("wind-0.1", "circle, wind 0.1", "paper", {"vehicle.wind": 0.1}, 0.1, contenders=CIRCLE),
-    Case("wind-0.3", "circle, wind 0.3", "paper", {"vehicle.wind": 0.3}, 0.35, contenders=CIRCLE),
-    Case("gusts", "circle, gusts of 1 m/s²", "paper", GUSTS, 0.1, contenders=CIRCLE),
+    _circle("wind-0.1", "circle, wind of 0.1 m/s per √s", {"vehicle.wind": 0.1}, 0.1),
+    _circle("wind-0.3", "circle, wind of 0.3 m/s per √s", {"vehicle.wind": 0.3}, 0.35),
+    _circle("gusts", "circle, gusts of 1 m/s²", GUSTS, 0.1),
 )
 """Every case; the first is the benchmark."""
 
@@ -306,7 +314,8 @@ def quick(scale: Scale) -> Scale:
 def search_start(contender: Contender, case: Case, scale: Scale) -> Scenario:
     """Scenario from which the search for a contender's weights in a case begins."""
     table = config.to_table(config.load(case.plant))
-    lay({f"control.{key}": value for key, value in contender.control.items()}, table)
+    control = {key: case.start.get(key, value) for key, value in contender.control.items()}
+    lay({f"control.{key}": value for key, value in control.items()}, table)
     lay(case.keys, table)
     lay({"duration": scale.search_duration, "seed": SEARCH_SEED}, table)
     return config.check(table, f"{contender.title}, {case.title}")

@@ -53,7 +53,7 @@ def test_the_winds_floor_is_what_it_does_until_an_input_has_done_its_work() -> N
 def test_the_targets_floor_is_how_it_leaves_its_own_velocity() -> None:
     """While the plan grows old and for a step more; what the server sees ahead does not count."""
     free = {"shape": "target", "preview": "none", "agility": 0.3}
-    flown = scenario("target", duration=10.0, reference=free)
+    flown = scenario("target", duration=10.0, settle=0.0, reference=free)
     walk = reference.target(stream(1, "test"), 2, agility=0.3, speed_mps=1e3, radius_m=1e6)
     starts_s = np.arange(0.0, 4000.0, 1.0)
     before, after = walk(starts_s), walk(starts_s + 1.0)
@@ -90,8 +90,9 @@ def test_a_reference_aboard_needs_no_packets() -> None:
 
 def test_feedback_aboard_comes_as_near_as_no_packets_at_all() -> None:
     """In wind, with the same gain: of a trajectory known for ever the network tells nothing."""
-    flown = config.load("compare/feedback-gap-wind-0.1")
-    flown = config.check(config.to_table(flown) | {"duration": 30.0}, "test")
+    tight = {"state_weight": [7.1, 0.001], "terminal_weight": [15.0, 1.5], "input_weight": 1e-4}
+    sent = {"scheme": "committed", "feedback": True, "trigger": "cost_gap(6e-4)"}
+    flown = scenario(duration=30.0, control=tight | sent, vehicle={"wind": 0.1})
     planned = summarise(flown, "planned", fly(flown).client)
     aboard = summarise_aboard(flown, "aboard")
     assert aboard.rmse_xy == pytest.approx(planned.rmse_xy, rel=0.05)
