@@ -64,6 +64,7 @@ CLAIMS = (
     Claim(OURS, "paper-feedback-every-step", SHARE),
     Claim(OURS, "paper-feedback-event"),
     Claim(OURS, "committed-gap"),
+    Claim("feedback-expected", OURS),
     Claim("committed-gap", "paper-every-step", SHARE),
     Claim("committed-gap", "paper-event"),
     Claim("committed-gap", "committed-periodic"),

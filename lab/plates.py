@@ -479,13 +479,15 @@ def trade(
                 )
         if floor:
             panes[0].plot(*zip(*floor, strict=True), color="0.3", linestyle=":", label="floor")
-        for plane, label in zip(panes, SPENT.values(), strict=True):
-            plane.set_xscale("log")
+        for plane, (spent, label) in zip(panes, SPENT.items(), strict=True):
             plane.set_yscale("log")
+            if spent != "effort_mps":
+                plane.set_xscale("log")
+                plane.xaxis.set_minor_formatter("")  # they would lie over each other
             plane.set_xlabel(label)
         panes[0].set_ylabel("RMSE xy [m]")
         handles, labels = panes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=3)
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=7)
     return _picture(figure, name, title, says, csv)
 
 
