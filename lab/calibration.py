@@ -123,6 +123,7 @@ REGULATOR = (WEIGHTS[0], WEIGHTS[3])
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (Free("control.epsilon", 1e-4, 1e8), Free("control.decay_rate", 1e-2, 1e2)),
     "cost_gap": (Free("control.cost_gap", 1e-6, 1e6),),
+    "expected_gap": (Free("control.cost_gap", 1e-6, 1e6),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
     "tolerance": (Free("control.tolerance_m", 1e-4, 1e1),),
     "delta": (Free("control.tolerance_m", 1e-4, 1e1),),

@@ -10,7 +10,7 @@ from scipy import stats
 
 from lab import plates
 from lab.beside import Beside, Floor
-from lab.contenders import ABOARD, CONTENDERS, PACKETS, Case, Flying, Plan
+from lab.contenders import ABOARD, CONTENDERS, PACKETS, Case, Contender, Flying, Plan
 from lab.plates import Picture
 from lab.report import Drawn, Table, as_interval, as_text
 from lab.sweep import Estimate, Results, by_name, interval, rows_csv, to_csv
@@ -64,6 +64,7 @@ CLAIMS = (
     Claim(OURS, "paper-feedback-every-step", SHARE),
     Claim(OURS, "paper-feedback-event"),
     Claim(OURS, "committed-gap"),
+    Claim("feedback-expected", OURS),
     Claim("committed-gap", "paper-every-step", SHARE),
     Claim("committed-gap", "paper-event"),
     Claim("committed-gap", "committed-periodic"),
@@ -426,6 +427,22 @@ def _weights(value: Any) -> str:
     return ", ".join(f"{part:.4g}" for part in parts)
 
 
+COLOURS = ("#c1272d", "#cc79a7", "#e69f00", "#56b4e9", "0.5", "black", "#009e73")
+"""Colours of the schemes, in their order."""
+MARKERS = "sovD^P<*"
+"""Markers of the triggers, in their order, which tell curves apart without colour."""
+
+
+def _style(contender: Contender) -> tuple[str, str]:
+    """Colour and marker of a contender, the same in every figure."""
+    if contender is ABOARD:
+        return "0.3", ""
+    schemes = list(dict.fromkeys(each.scheme for each in CONTENDERS))
+    triggers = list(dict.fromkeys(each.trigger for each in CONTENDERS))
+    colour = COLOURS[schemes.index(contender.scheme)]
+    return colour, MARKERS[triggers.index(contender.trigger)]
+
+
 def curves(compared: Compared) -> Picture:
     """Figure of what a packet buys in a case: RMSE xy over what each contender spends."""
     case, flown = compared.case, compared.flown
@@ -459,7 +476,7 @@ def curves(compared: Compared) -> Picture:
         )
 
     drawn = [
-        plates.Curve(one.scheme, one.trigger, list(map(bought, points)))
+        plates.Curve(one.title, *_style(one), list(map(bought, points)))
         for one in (*CONTENDERS, ABOARD)
         if (points := [each for each in flown if each.what.contender == one])
     ]

@@ -80,7 +80,7 @@ PAPER = {"scheme": "predictive", "feedback": False, "observer_s": 0.0, "horizon"
 """The paper's scheme, with the horizon that reproduces its table."""
 OBSERVED = PAPER | {"observer_s": 4.0}
 LED = OBSERVED | {"feedback": True}
-BLIND = {"scheme": "committed", "feedback": False, "observer_s": 0.0, "horizon": 60} | TIGHT
+BLIND = {"scheme": "committed", "feedback": False, "observer_s": 0.0} | TIGHT
 COMMITTED = BLIND | {"observer_s": 4.0}
 """Committed inputs; the observer's time constant is searched for and may come out very long."""
 FEEDBACK = COMMITTED | {"feedback": True}
@@ -96,7 +96,7 @@ ALWAYS = {"trigger": "always"}
 PERIODIC = {"trigger": "periodic", "period": 10}
 STATE_GAP = {"trigger": "state_gap", "epsilon": 5e4}
 COST_GAP = {"trigger": "cost_gap", "cost_gap": 300.0}
-EXPECTED = {"trigger": "expected_gap", "cost_gap": 300.0}
+EXPECTED_GAP = {"trigger": "expected_gap", "cost_gap": 300.0}
 DEVIATION = {"trigger": "deviation", "deviation_m": 1.0}
 TOLERANCE = {"trigger": "tolerance", "tolerance_m": 0.05}
 DELTA = {"trigger": "delta", "tolerance_m": 0.4}
@@ -131,7 +131,7 @@ def _contenders() -> tuple[Contender, ...]:
         Contender("feedback-every-step", aboard, every, FEEDBACK | ALWAYS),
         Contender("feedback-periodic", aboard, periodic, FEEDBACK | PERIODIC, "period"),
         Contender("feedback-gap", aboard, "cost gap", FEEDBACK | COST_GAP, "cost_gap"),
-        Contender("feedback-expected", aboard, "expected gap", FEEDBACK | EXPECTED, "cost_gap"),
+        Contender("feedback-expected", aboard, "expected gap", FEEDBACK | EXPECTED_GAP, "cost_gap"),
         Contender("reckoning-every-step", state, every, RECKONING | ALWAYS),
         Contender("reckoning-periodic", state, periodic, RECKONING | PERIODIC, "period"),
         Contender("reckoning-tolerance", state, "tolerance", RECKONING | TOLERANCE, "tolerance_m"),

@@ -413,18 +413,12 @@ class Bought:
 class Curve:
     """A curve of `trade`."""
 
-    scheme: str
-    """Name of the scheme, which has a colour."""
-    trigger: str
-    """Name of the trigger, which has a marker."""
+    label: str
+    """Name in the legend."""
+    colour: str
+    marker: str
     points: Sequence[Bought]
     """Points in the order in which they are joined."""
-
-
-COLOURS = ("#c1272d", "#cc79a7", "#e69f00", "#56b4e9", "0.5", "black", "#009e73", "#0072b2")
-"""Colours of the schemes of `trade`, in order."""
-MARKERS = "sovD^P<*"
-"""Markers of the triggers of `trade`, in order, which tell them apart without colour."""
 
 
 def trade(
@@ -441,13 +435,6 @@ def trade(
         floor: points of a floor: packets up per second, and RMSE xy [m].
         csv: the numbers, as `Picture` has them.
     """
-    schemes, triggers = (
-        dict(zip(dict.fromkeys(names), styles, strict=False))
-        for names, styles in (
-            ((curve.scheme for curve in curves), COLOURS),
-            ((curve.trigger for curve in curves), MARKERS),
-        )
-    )
     with _figure(PAGE, 5.0) as figure:
         panes = figure.subplots(1, 3, sharey=True)
         for curve in curves:
@@ -459,11 +446,10 @@ def trade(
             low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic scale has no 0
             if flown and not flown[0].packets_per_s:
                 for plane in panes:
-                    plane.axhline(rmse[0], color="0.3", linestyle="--", label=curve.scheme)
+                    plane.axhline(rmse[0], color=curve.colour, linestyle="--", label=curve.label)
                 continue
-            style: Any = {"color": schemes[curve.scheme], "linestyle": "none"}
-            shape = triggers[curve.trigger]
-            label = f"{curve.scheme}, {curve.trigger}"
+            style: Any = {"color": curve.colour, "linestyle": "none"}
+            shape, label = curve.marker, curve.label
             for plane, spent in zip(panes, SPENT, strict=True):
                 cost = np.array([getattr(point, spent) for point in flown], np.float64)
                 plane.plot(cost, rmse, **style, marker=shape, markersize=2.5)
@@ -479,13 +465,15 @@ def trade(
                 )
         if floor:
             panes[0].plot(*zip(*floor, strict=True), color="0.3", linestyle=":", label="floor")
-        for plane, label in zip(panes, SPENT.values(), strict=True):
-            plane.set_xscale("log")
+        for plane, (spent, label) in zip(panes, SPENT.items(), strict=True):
             plane.set_yscale("log")
+            if spent != "effort_mps":
+                plane.set_xscale("log")
+                plane.xaxis.set_minor_formatter("")  # they would lie over each other
             plane.set_xlabel(label)
         panes[0].set_ylabel("RMSE xy [m]")
         handles, labels = panes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=3)
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=7)
     return _picture(figure, name, title, says, csv)
 
 
