@@ -80,7 +80,7 @@ PAPER = {"scheme": "predictive", "feedback": False, "observer_s": 0.0, "horizon"
 """The paper's scheme, with the horizon that reproduces its table."""
 OBSERVED = PAPER | {"observer_s": 4.0}
 LED = OBSERVED | {"feedback": True}
-BLIND = {"scheme": "committed", "feedback": False, "observer_s": 0.0} | TIGHT
+BLIND = {"scheme": "committed", "feedback": False, "observer_s": 0.0, "horizon": 60} | TIGHT
 COMMITTED = BLIND | {"observer_s": 4.0}
 """Committed inputs; the observer's time constant is searched for and may come out very long."""
 FEEDBACK = COMMITTED | {"feedback": True}

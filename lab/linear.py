@@ -120,9 +120,9 @@ class Past(NamedTuple):
     scratch: F2
     """Inputs that are being planned; shape (H, columns)."""
     disturbance: F1
-    """ŵ; shape (columns,)."""
+    """Disturbance ŵ; shape (columns,)."""
     led: F2
-    """x̄ of the horizon in force; shape (2, columns)."""
+    """State x̄ of the horizon in force; shape (2, columns)."""
     commands: F2
     """Inputs of a roll; shape (longest, columns)."""
     track: F3
