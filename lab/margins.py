@@ -28,12 +28,12 @@ from shared.config import ReferenceConfig, Scenario, SensorConfig
 from shared.model import Array
 from sim.flight import fly_batch
 
-FLIGHT_S = 60.0
+FLIGHT_S = 80.0
 """Length of the flights that timings are taken from [s]."""
 SETTLE_S = 5.0
 """Time until a flight's session and its delay bound are as they stay [s]."""
-FOLLOWED_S = 12.0
-"""Time for which a push is followed [s]: three time constants of a usual disturbance observer."""
+FOLLOWED_S = 24.0
+"""Time for which a push is followed [s]: six time constants of a usual disturbance observer."""
 PUSHES = 64
 """Number of pushes of each source that are followed at a time."""
 WIND_ALONE = 0.1
@@ -239,12 +239,17 @@ class Responses(NamedTuple):
 
 
 def _growth(h: Array) -> float:
-    """Growth at each step in the second half of a response, by least squares of its logarithm."""
-    steps = np.arange(len(h) // 2, len(h))
-    steps = steps[h[steps] > 0.0]
+    """Growth at each step in the later part of a response, by least squares of its logarithm.
+
+    Means over a quarter of the response take away most of the swinging of what swings slowly.
+    """
+    width = max(1, len(h) // 4)
+    means = np.convolve(h, np.full(width, 1.0 / width), "valid")
+    steps = np.arange(len(h) // 3, len(means))
+    steps = steps[means[steps] > 0.0]
     if len(steps) < 2:
         return 0.0
-    return float(np.exp(np.polyfit(steps, np.log(h[steps]), 1)[0]))
+    return float(np.exp(np.polyfit(steps, np.log(means[steps]), 1)[0]))
 
 
 def strengths(scenario: Scenario) -> tuple[float, tuple[float, float]]:

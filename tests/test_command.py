@@ -305,7 +305,7 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
         *("event_ratio", "uplink_packets", "uplink_bytes", "downlink_packets", "downlink_bytes"),
         *("lost", "reordered", "stale", "age_ms_p50", "age_ms_p99", "aoi_s_mean", "aoi_s_peak"),
         *("plan_age_s_mean", "effort_mps", "saturated", "solve_ms_p50", "solve_ms_p99"),
-        *("deadline_misses", "secure"),
+        *("deadline_misses", "estimate_error_m", "secure"),
     ]
     assert (summary["scenario"], summary["seed"], summary["steps"]) == ("paper", 3, 240)
     assert summary["solve_ms_p50"] is None
