@@ -41,7 +41,7 @@ class Options:
     tune: bool = False
     """Only search for the weights of every contender in every case, with the same effort for each,
     and write them to OUT/weights.toml."""
-    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 20
+    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 16
     """Number of generations of each of these searches."""
     weights: Annotated[str, tyro.conf.arg(metavar="FILE")] = config.COMPARED
     """File of the weights, as --tune writes it; those that come with Skytether unless given."""

@@ -297,7 +297,7 @@ def test_a_share_of_the_steps_may_be_the_limit() -> None:
 
 
 def test_what_is_equal_may_be_bytes() -> None:
-    """Of two that send as often, one may send more in each packet."""
+    """Packets of one may be longer than those of another that sends as often."""
     claim = Claim("committed-gap", "committed-periodic", BYTES_UP, {"target": 0.9})
     few = [replace(run, uplink_bytes=50_000) for run in PERIODIC.runs]
     assert judge(claim, TARGET, [*curve((1, 0.1, 0.5)), PERIODIC]).holds
