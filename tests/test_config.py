@@ -145,7 +145,7 @@ WRONG = {
         'control.trigger = "often"',
         (
             "control.trigger: got 'often', expected a policy; there are always, periodic, "
-            "state_gap, cost_gap, deviation, tolerance, delta, silence, budget"
+            "state_gap, cost_gap, expected_gap, deviation, tolerance, delta, silence, budget"
         ),
     ),
     "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),

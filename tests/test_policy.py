@@ -1,6 +1,7 @@
 """`shared.policy`: a text is a trigger, or it is refused in one line; nothing in it is ever run."""
 
 import string
+from typing import Any
 
 import pytest
 from hypothesis import example, given, settings
@@ -130,20 +131,22 @@ def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
         ("deviation", "'committed'", "dead_reckoning"),
         ("tolerance", "'dead_reckoning'", "committed"),
         ("delta", "'dead_reckoning'", "none"),
+        ("expected_gap", "'committed'", "predictive"),
         ("state_gap", "'committed' or 'predictive' or 'none'", "dead_reckoning"),
     ],
 )
 def test_what_is_compared_needs_a_scheme_that_has_it(name: str, needed: str, given: str) -> None:
     """Deep in an expression, too."""
     text = f"silence(1) | {name} & budget(5, 2)"
-    control = {"trigger": text, "scheme": given, "feedback": True}
+    control: dict[str, Any] = {"trigger": text, "scheme": given, "feedback": given != "none"}
     with pytest.raises(config.ConfigError) as caught:
         config.check({"control": control}, "mine")
     assert str(caught.value) == (
         f"mine: control.scheme: got {given!r}, expected {needed} with the trigger {name}"
     )
     for scheme in needed.replace("'", "").split(" or "):
-        config.check({"control": control | {"scheme": scheme}}, "mine")
+        feedback = scheme == "dead_reckoning"
+        config.check({"control": control | {"scheme": scheme, "feedback": feedback}}, "mine")
 
 
 words = st.sampled_from(
