@@ -62,7 +62,7 @@ def test_the_targets_floor_is_how_it_leaves_its_own_velocity() -> None:
     floor = target_floor_m(flown, aged(flown, 30, 19))
     assert floor == pytest.approx(rms, rel=4 / math.sqrt(2 * 8000) + 0.02)
     assert floor == pytest.approx(0.3 * math.sqrt(2 / 3))
-    seen = scenario("target", duration=10.0, reference=free | {"preview": 0.5})
+    seen = scenario("target", duration=10.0, settle=5.0, reference=free | {"preview": 0.5})
     assert target_floor_m(seen, aged(seen, 30, 19)) == pytest.approx(floor * 0.5**1.5)
     known = scenario("target", duration=10.0, reference=free | {"preview": "all"})
     assert target_floor_m(known, aged(known, 30, 19)) == 0.0
