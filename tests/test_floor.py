@@ -53,7 +53,7 @@ def test_the_winds_floor_is_what_it_does_until_an_input_has_done_its_work() -> N
 def test_the_targets_floor_is_how_it_leaves_its_own_velocity() -> None:
     """While the plan grows old and for a step more; what the server sees ahead does not count."""
     free = {"shape": "target", "preview": "none", "agility": 0.3}
-    flown = scenario("target", duration=10.0, settle=0.0, reference=free)
+    flown = scenario("target", duration=10.0, settle=5.0, reference=free)
     walk = reference.target(stream(1, "test"), 2, agility=0.3, speed_mps=1e3, radius_m=1e6)
     starts_s = np.arange(0.0, 4000.0, 1.0)
     before, after = walk(starts_s), walk(starts_s + 1.0)
@@ -62,9 +62,9 @@ def test_the_targets_floor_is_how_it_leaves_its_own_velocity() -> None:
     floor = target_floor_m(flown, aged(flown, 30, 19))
     assert floor == pytest.approx(rms, rel=4 / math.sqrt(2 * 8000) + 0.02)
     assert floor == pytest.approx(0.3 * math.sqrt(2 / 3))
-    seen = scenario("target", duration=10.0, reference=free | {"preview": 0.5})
+    seen = scenario("target", duration=10.0, settle=5.0, reference=free | {"preview": 0.5})
     assert target_floor_m(seen, aged(seen, 30, 19)) == pytest.approx(floor * 0.5**1.5)
-    known = scenario("target", duration=10.0, reference=free | {"preview": "all"})
+    known = scenario("target", duration=10.0, settle=5.0, reference=free | {"preview": "all"})
     assert target_floor_m(known, aged(known, 30, 19)) == 0.0
 
 
