@@ -38,6 +38,8 @@ SUSTAINED = 0.7
 """Share of that in the quarter before, beyond which it does not die away."""
 RUNS = 2
 """Number of flights of each kind at a point, with seeds that count up from the scenario's."""
+TIMINGS, PUSHES = 12, 16
+"""Number of timings that the growth is computed along, and of pushes followed at a time."""
 
 
 class Place(NamedTuple):
@@ -99,6 +101,7 @@ class Box:
             "gain": self.gain,
             "dead_time_s": self.dead_time_s,
             "burst_s": self.burst_s,
+            "trigger": self.trigger,
         }
         return {"name": self.name, "box": box, "files": files, "scenario": table}
 
@@ -128,7 +131,7 @@ class Box:
             seeded = replace(scenario, seed=seed)
             flown.append(summarise(seeded, self.name, flight.client, flight.server))
         control = replace(scenario.control, trigger=self.trigger)
-        growth, _ = growth_of(replace(scenario, control=control), RUNS)
+        growth, _ = growth_of(replace(scenario, control=control), TIMINGS, PUSHES)
         return Point(
             number,
             cycles=any(before * SUSTAINED < last > REST_M for before, last in rests),

@@ -166,10 +166,14 @@ def _known_timings(still: Scenario, runs: int) -> list[Timing]:
     return timings(still, runs)
 
 
-def growth_of(scenario: Scenario, runs: int) -> tuple[float, float | None]:
-    """Growth of a scenario along so many timings, and half the width of its 95 % interval."""
+def growth_of(scenario: Scenario, runs: int, pushes: int = PUSHES) -> tuple[float, float | None]:
+    """Growth of a scenario along so many timings, and half the width of its 95 % interval.
+
+    Args:
+        pushes: see PUSHES.
+    """
     given = _known_timings(calm(scenario), runs)
-    known = _responses_of_axes(scenario, given)
+    known = _responses_of_axes(scenario, given, pushes)
     return max((each.growth() for each in known.values()), key=lambda pair: pair[0])
 
 
@@ -200,12 +204,12 @@ def _taus(scenario: Scenario) -> list[tuple[float, float]]:
 
 
 def _responses_of_axes(
-    scenario: Scenario, given: Sequence[Timing]
+    scenario: Scenario, given: Sequence[Timing], pushes: int = PUSHES
 ) -> "dict[tuple[float, float], Responses]":
     """Responses of each kind of axis, by its time constants."""
     steps = max(len(timing.in_force) for timing in given)
     loops = dict(zip(_taus(scenario), make_loops(scenario, steps), strict=True))
-    return {tau: responses(scenario, loop, given) for tau, loop in loops.items()}
+    return {tau: responses(scenario, loop, given, pushes) for tau, loop in loops.items()}
 
 
 class Responses(NamedTuple):
@@ -260,13 +264,13 @@ def strengths(scenario: Scenario) -> tuple[float, tuple[float, float]]:
     return WIND_ALONE if alone else scenario.vehicle.wind, noises
 
 
-def responses(scenario: Scenario, loop: Loop, given: Sequence[Timing]) -> Responses:
-    """What pushes leave in a loop along each timing."""
+def responses(scenario: Scenario, loop: Loop, given: Sequence[Timing], pushes: int) -> Responses:
+    """What pushes leave in a loop along each timing, with so many of a source at a time."""
     dt = scenario.control.dt
     begin, window = round(SETTLE_S / dt), max(round(FOLLOWED_S / dt), 2)
     each = []
     for timing in given:
         window = max(2, min(window, (len(timing.in_force) - begin) // 2))
-        squares, counts = respond(scenario, loop, timing, begin, window, min(PUSHES, window))
+        squares, counts = respond(scenario, loop, timing, begin, window, min(pushes, window))
         each.append(squares / np.maximum(counts, 1))
     return Responses(np.array(each))

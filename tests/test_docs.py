@@ -45,7 +45,14 @@ def skytether(line: str) -> list[str]:
         line
         for line in dict.fromkeys(COMMANDS)
         if line.startswith(
-            ("skytether fl", "skytether sc", "skytether sw", "skytether ca", "skytether en")
+            (
+                "skytether fl",
+                "skytether sc",
+                "skytether sw",
+                "skytether ca",
+                "skytether en",
+                "skytether ma",
+            )
         )
         and "--control" not in line
     ],
@@ -56,6 +63,10 @@ def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
         line += " --settle 0 --duration 1 --runs 2"
     if "envelope" in line:
         line += " --settle 0 --duration 1 --points 3"
+    if "margins" in line:
+        line += " --runs 1"
+    if "--maps" in line:
+        line += " --tau 1 --gain 1 --dead-time 0 --burst 0 --settle 0 --duration 1"
     if "calibrate" in line:
         line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
     if "--duration 20" in line:
@@ -149,6 +160,7 @@ def test_every_documented_command_is_tested() -> None:
     """Here, or by make docker-test."""
     known = ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
     known += ("skytether scenarios", "skytether calibrate ", "skytether envelope ")
+    known += ("skytether margins ",)
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py
     known += ("skytether keygen ",)  # by test_keys.py

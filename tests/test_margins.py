@@ -1,0 +1,194 @@
+"""Margins: what is computed of a loop is what it flies, and tells which vehicles swing for ever."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from client.plant import white_acceleration
+from lab import maps, margins
+from lab.keys import lay
+from lab.linear import timing_of
+from lab.maps import Box, resting
+from lab.margins import AS_IT_IS, Differing, equivalent_period, looks_at_state, margin, timings
+from server.gain import feedback_gain
+from shared import config
+from shared.config import Scenario
+from shared.model import Array
+from shared.record import Rows, client_columns
+from sim.flight import fly_batch
+from skytether.__main__ import main
+
+
+def changed(**keys: Any) -> Scenario:
+    """The demo with some keys changed."""
+    table = config.to_table(config.load("demo"))
+    lay({key.replace("__", "."): value for key, value in keys.items()}, table)
+    return config.check(table, "test")
+
+
+HOVER = {"reference__shape": "hover", "reference__points_m": [[0.0, 0.0]], "vehicle__wind": 0.01}
+NOISE = {"sensor__position_noise_m": 0.01, "sensor__velocity_noise_mps": 0.02}
+
+
+# -- what is computed ------------------------------------------------------------------------------
+
+
+def test_a_regulator_aboard_has_the_variance_of_its_lyapunov_equation() -> None:
+    """Dead reckoning flies u = -K x whatever arrives: P = F P Fᵀ + W, and ρ(F)² is the growth."""
+    scenario = changed(
+        control__scheme="dead_reckoning", control__feedback=True, control__trigger="tolerance(1)"
+    )
+    assert not looks_at_state(scenario)
+    model, K = scenario.terms().model, feedback_gain(scenario)[0]
+    F = model.A[0] - np.outer(model.B[0], K)
+    L = scenario.vehicle.wind * white_acceleration(scenario.tau_s, scenario.control.dt)[0]
+    P: Array = np.zeros((2, 2))
+    for _ in range(2000):
+        P = F @ P @ F.T + L @ L.T
+    found = margin(scenario, AS_IT_IS, timings(scenario, 1))
+    assert found.rms_m == pytest.approx([np.sqrt(P[0, 0])] * 2, rel=0.01)
+    assert found.rms_input_mps == pytest.approx([np.sqrt(K @ P @ K)] * 2, rel=0.01)
+    assert found.growth == pytest.approx(np.abs(np.linalg.eigvals(F)).max() ** 2, abs=0.01)
+    assert found.stable
+
+
+@pytest.mark.parametrize(
+    ("keys", "runs", "rel"),
+    [
+        ({"control__feedback": True, "control__trigger": "periodic(10)"}, 10, 0.1),
+        ({"control__feedback": True, "control__trigger": "always", **NOISE}, 6, 0.1),
+        ({"control__trigger": "periodic(10)", "vehicle__dead_time_s": 0.08}, 16, 0.1),
+    ],
+    ids=["feedback", "noise and a filter", "committed, with dead time"],
+)
+def test_the_variance_that_is_computed_is_flown(
+    keys: dict[str, Any], runs: int, rel: float
+) -> None:
+    """Along the same timings; the share is what so few flights can tell of a variance."""
+    scenario = changed(**HOVER, **keys, control__input_weight=0.1, duration=30.0)
+    flights = fly_batch(scenario, range(1, 1 + runs))
+    settled = flights[0].client["step"] * scenario.control.dt >= 8.0
+    positions = np.array([flight.client["state"][settled][..., 0] for flight in flights])
+    found = margin(scenario, AS_IT_IS, [timing_of(flight) for flight in flights])
+    assert found.rms_m is not None
+    assert np.square(positions).mean() == pytest.approx(found.rms_m[0] ** 2, rel=rel)
+
+
+def test_only_what_looks_at_the_clock_is_linear() -> None:
+    """For any other trigger the loop is computed at a period that sends as often."""
+    for trigger in ("always", "periodic(7)", "periodic(7) | silence(1)", "always & budget(5, 2)"):
+        assert not looks_at_state(changed(control__trigger=trigger))
+    for trigger in ("cost_gap", "deviation(0.1) | silence(1)", "state_gap(3.6, 1.5)"):
+        assert looks_at_state(changed(control__trigger=trigger))
+    rare = equivalent_period(changed(control__trigger="cost_gap(1e9) | silence(1)", duration=20.0))
+    name, period = rare.control.trigger.rstrip(")").split("(")
+    assert name == "periodic"
+    assert 20 <= int(period) <= 23  # a second, but for what is lost
+
+
+# -- what is flown ---------------------------------------------------------------------------------
+
+
+def at(name: str, scenario: Scenario, **box: tuple[float, ...]) -> Box:
+    """A box with one value each but for those given."""
+    axes = {"tau": (1.0,), "gain": (1.0,), "dead_time_s": (0.0,), "burst_s": (0.0,)}
+    return Box(name, scenario, "periodic(12)", **axes | box)
+
+
+def test_a_loop_that_is_not_stable_ends_in_a_limit_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Committed inputs at tight weights, where the vehicle is twice as quick as the model."""
+    monkeypatch.setattr(maps, "RUNS", 1)
+    tight = changed(control__input_weight=0.01, duration=10.0)
+    swings, rests = (
+        at("tight", each, tau=(0.5,)).fly(0) for each in (tight, changed(**SAFE, duration=10.0))
+    )
+    assert swings.cycles
+    assert swings.growth > 1.0
+    assert swings.rest_m > 0.2
+    assert swings.saturated is not None
+    assert swings.saturated > 0.5
+    assert not rests.cycles
+    assert rests.growth < 1.0
+    assert rests.rest_m < 0.01
+
+
+SAFE = {
+    "control__feedback": True,
+    "control__input_reference": True,
+    "control__input_weight": 1.0,
+    "control__horizon": 80,
+}
+"""Weights with which no vehicle of the box swings, see docs/margins.md."""
+
+
+def test_the_worst_corners_of_the_box_are_stable_at_weights_that_bear_them() -> None:
+    """Quick, too strong and late; slow, too weak and late. The model's own weights do not."""
+    corners = (Differing(0.5, 1.3, 0.3), Differing(2.0, 0.7, 0.3))
+    scenario = changed(**SAFE, control__trigger="periodic(12)")
+    given = timings(scenario, 1)
+    for corner in corners:
+        assert margin(corner.of(scenario), "corner", given).growth < 0.99
+    tight = changed(**SAFE | {"control__input_weight": 0.05}, control__trigger="periodic(12)")
+    assert margin(corners[0].of(tight), "corner", given).growth > 1.05
+
+
+def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
+    """The last quarter of a flight is compared with the one before."""
+    scenario = maps.at_rest(changed())
+    rows: Rows = np.zeros(400, client_columns(2))
+    rows["step"] = np.arange(400)
+    rows["state"][:, 0, 0] = 0.5 * np.sin(0.1 * rows["step"])
+    before, last = resting(scenario, rows)
+    assert before == pytest.approx(0.354, abs=0.05)
+    assert last > maps.REST_M
+    assert last > maps.SUSTAINED * before
+    rows["state"][:, 0, 0] *= np.exp(-0.01 * rows["step"])
+    before, last = resting(scenario, rows)
+    assert last < maps.SUSTAINED * before
+
+
+def test_a_place_of_the_box_differs_as_it_says() -> None:
+    """Without wind, with bursts both ways; numbers count the time constants first."""
+    box = at("demo", changed(), tau=(0.5, 2.0), gain=(0.7,), dead_time_s=(0.1,), burst_s=(2.0,))
+    assert [place.tau for place in box.places] == [0.5, 2.0]
+    scenario = box.scenario_of(1)
+    assert scenario.true_tau_s.tolist() == [1.68, 1.68]
+    assert (scenario.vehicle.gain, scenario.vehicle.dead_time_s) == (0.7, 0.1)
+    assert (scenario.vehicle.wind, scenario.tau_s.tolist()) == (0.0, [0.84, 0.84])
+    assert scenario.network.uplink.burst_s == scenario.network.downlink.burst_s == 2.0
+
+
+# -- the command -----------------------------------------------------------------------------------
+
+
+def test_the_command_says_which_vehicles_are_stable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A row for each vehicle, the figures as JSON, and a map where it is asked for."""
+    monkeypatch.setattr(margins, "FLIGHT_S", 40.0)
+    file, folder = tmp_path / "margins.json", tmp_path / "maps"
+    flags = "--runs 2 --control.trigger always --tau 1 --gain 1 --dead-time 0 --burst 0"
+    argv = ["margins", "demo", *flags.split(), "--duration", "5", "--settle", "1"]
+    assert main([*argv, "--json", str(file), "--maps", str(folder), "--workers", "1"]) == 0
+    shown = capsys.readouterr().out
+    assert "half as quick" in shown
+    found = {each["vehicle"]: each for each in json.loads(file.read_bytes())["margins"]}
+    assert found[AS_IT_IS]["stable"]
+    assert not found["dead time 0.3 s"]["stable"]
+    assert found["dead time 0.3 s"]["rms_m"] is None
+    (point,) = csv.DictReader((folder / "points.csv").read_text().splitlines())
+    assert (point["cycles"], point["tau"]) == ("false", "1.0")
+    assert (folder / "maps.png").stat().st_size > 10_000
+
+
+def test_an_empty_box_is_refused_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A value that no vehicle can have is refused as a scenario's would be."""
+    argv = ["margins", "demo", "--maps", str(tmp_path / "maps"), "--gain", "0", "1"]
+    assert main(argv) == 2
+    assert "vehicle.gain: got 0.0" in capsys.readouterr().err
