@@ -183,7 +183,7 @@ def turning(scale: float) -> Reference:
 
 def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> list[Flight]:
     """Two flights of one seed, after targets that differ from TURN on."""
-    flown = replaced("target", {"duration": 6.0}, preview=preview)
+    flown = replaced("target", {"duration": 6.0, "settle": 0.0}, preview=preview)
     flights = []
     for scale in (0.5, -0.5):
         monkeypatch.setattr(Scenario, "make_reference", lambda _, scale=scale: turning(scale))
@@ -431,7 +431,7 @@ def test_the_desired_position_of_a_live_flight_is_held_where_the_server_has_no_r
 def test_the_record_tells_what_was_known_of_the_reference() -> None:
     """The desired state at the step, whatever the preview."""
     for preview in ("all", "none"):
-        flown = replaced("target", {"duration": 6.0}, preview=preview)
+        flown = replaced("target", {"duration": 6.0, "settle": 0.0}, preview=preview)
         rows = fly(flown).server
         known = flown.make_reference()(rows["step"] * DT_S)
         np.testing.assert_array_equal(rows["reference"], known)

@@ -96,7 +96,8 @@ class Server:
     def __init__(self, flown: Scenario, capacity: int = 1) -> None:
         self.terms = flown.terms()
         self.desired = Moved(flown, self.terms, capacity, capacity)
-        self.scheme = Reckoning(flown.control, self.terms, self.desired, capacity, capacity)
+        gain = stationary_gain(self.terms.model, flown.control)
+        self.scheme = Reckoning(self.terms, gain, self.desired, capacity, capacity)
         self.found: Foresight = foresight(capacity, 2, self.terms.planned, 1)
 
     def observe(self, step: int, *, row: int = 0, takes: int = 1) -> None:
@@ -373,7 +374,7 @@ def test_a_lost_packet_is_made_good_by_the_next_one() -> None:
             duration=10.0, settle=0.0, network={"uplink": lossy}, control={"trigger": trigger}
         )
         covered[trigger] = [
-            flight.client["covered"].mean() for flight in fly_batch(flown, (13, 18, 23))
+            flight.client["covered"].mean() for flight in fly_batch(flown, (5, 14, 23))
         ]
     alone, repeated = covered.values()
     assert max(alone) == 0.0

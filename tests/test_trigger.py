@@ -383,7 +383,7 @@ class Listener:
     """A trigger with a figure of its own, which keeps what it is told."""
 
     def __init__(self, figure: float, *, compares: bool) -> None:
-        self.compares = compares
+        self.compares, self.doubts = compares, False
         self.told: list[int] = []
         self._figure = figure
 
