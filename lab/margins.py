@@ -166,7 +166,7 @@ def _known_timings(still: Scenario, runs: int) -> list[Timing]:
     return timings(still, runs)
 
 
-def growth_of(scenario: Scenario, runs: int, pushes: int = PUSHES) -> tuple[float, float | None]:
+def growth_of(scenario: Scenario, runs: int, pushes: int) -> tuple[float, float | None]:
     """Growth of a scenario along so many timings, and half the width of its 95 % interval.
 
     Args:
@@ -183,7 +183,7 @@ def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
     Args:
         vehicle: name of the scenario's vehicle.
     """
-    known = _responses_of_axes(scenario, given)
+    known = _responses_of_axes(scenario, given, PUSHES)
     growth, half = max((each.growth() for each in known.values()), key=lambda pair: pair[0])
     stable = growth + (half or 0.0) < 1.0
     settled = [known[tau].rms(scenario) for tau in _taus(scenario) if stable]
@@ -204,7 +204,7 @@ def _taus(scenario: Scenario) -> list[tuple[float, float]]:
 
 
 def _responses_of_axes(
-    scenario: Scenario, given: Sequence[Timing], pushes: int = PUSHES
+    scenario: Scenario, given: Sequence[Timing], pushes: int
 ) -> "dict[tuple[float, float], Responses]":
     """Responses of each kind of axis, by its time constants."""
     steps = max(len(timing.in_force) for timing in given)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from client.plant import white_acceleration
-from lab import maps, margins
+from lab import linear, maps, margins
 from lab.keys import lay
 from lab.linear import timing_of
 from lab.maps import Box, resting
@@ -90,6 +90,37 @@ def test_only_what_looks_at_the_clock_is_linear() -> None:
     assert 20 <= int(period) <= 23  # a second, but for what is lost
 
 
+def test_a_slow_swing_does_not_change_the_growth() -> None:
+    """Means over a quarter take it away; the logarithm by itself follows it."""
+    n = np.arange(480)
+    smoothed, plain = [], []
+    for period in range(60, 180, 10):
+        h = 0.98**n * (1.0 + 0.95 * np.sin(2.0 * np.pi * n / period))
+        smoothed.append(margins._growth(h))
+        plain.append(np.exp(np.polyfit(n[240:], np.log(h[240:]), 1)[0]))
+    assert np.abs(np.array(smoothed) - 0.98).max() < 0.002
+    assert np.abs(np.array(plain) - 0.98).max() > 0.005
+
+
+def test_pushes_come_anywhere_between_two_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A position every fourth step: pushes that keep to its time would tell another variance."""
+    monkeypatch.setattr(margins, "FLIGHT_S", 40.0)
+    keys = {"control__feedback": True, "control__trigger": "always", **HOVER, **NOISE}
+    scenario = changed(**keys, sensor__position_every_s=0.2, sensor__velocity_every_s="never")
+    given = timings(scenario, 1)
+
+    def rms(pushes: int) -> float:
+        monkeypatch.setattr(margins, "PUSHES", pushes)
+        found = margin(scenario, AS_IT_IS, given).rms_m
+        assert found is not None
+        return found[0]
+
+    every_step = rms(1000)
+    assert rms(44) == pytest.approx(every_step, rel=0.05)
+    monkeypatch.setattr(linear, "_periods", lambda _: [])
+    assert rms(44) != pytest.approx(every_step, rel=0.05)
+
+
 # -- what is flown ---------------------------------------------------------------------------------
 
 
@@ -102,6 +133,7 @@ def at(name: str, scenario: Scenario, **box: tuple[float, ...]) -> Box:
 def test_a_loop_that_is_not_stable_ends_in_a_limit_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Committed inputs at tight weights, where the vehicle is twice as quick as the model."""
     monkeypatch.setattr(maps, "RUNS", 1)
+    monkeypatch.setattr(maps, "TIMINGS", 2)
     tight = changed(control__input_weight=0.01, duration=10.0)
     swings, rests = (
         at("tight", each, tau=(0.5,)).fly(0) for each in (tight, changed(**SAFE, duration=10.0))
