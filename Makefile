@@ -8,7 +8,7 @@ FUZZ_STAMP := .venv/.ready-to-fuzz
 COMPILE := $(BIN)/pip-compile --quiet --strip-extras --generate-hashes --allow-unsafe --no-header \
 	--no-emit-index-url --no-emit-trusted-host --no-emit-find-links
 
-.PHONY: setup demo reproduce test check format lock docker-test bench fuzz clean
+.PHONY: setup demo reproduce test long-test check format lock docker-test bench fuzz clean
 
 setup: $(STAMP)  ## the environment alone
 
@@ -26,9 +26,13 @@ demo: setup  ## fly the demonstration
 reproduce: setup  ## the paper's table and figures, and more, in results/report.html (15 minutes)
 	$(BIN)/skytether reproduce --out results
 
-test: setup  ## everything but Docker, in five minutes on two cores
+test: setup  ## everything but Docker and what takes long, in five minutes on two cores
 	@$(BIN)/python -c "import server.__main__"  # kernels are compiled once, not by each worker
-	$(BIN)/pytest -q -m "not docker" -n 3 --dist loadfile
+	$(BIN)/pytest -q -m "not docker and not long" -n 3 --dist loadfile
+
+long-test: setup  ## the commands of the documents, benchmarks, and flights of many processes
+	@$(BIN)/python -c "import server.__main__"
+	$(BIN)/pytest -q -m "long and not docker" -n 3 --dist loadfile
 
 check: setup  ## style, types, and who imports whom
 	$(BIN)/ruff format --check .

@@ -23,6 +23,8 @@ from benchmarks.reference import Reference
 from server.controller import BLOCK
 from server.exact import ExactSolver
 
+pytestmark = pytest.mark.long
+
 TINY = MappingProxyType(
     {
         "netem": netem.Options(runs=1, seconds=1, rate=1000),

@@ -15,6 +15,8 @@ from shared.summary import Summary
 from shell import command
 from skytether.set import set_keys
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
 DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))

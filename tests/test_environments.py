@@ -16,6 +16,8 @@ import pytest
 
 from skytether.__main__ import main
 
+pytestmark = pytest.mark.long
+
 SKYTETHER = [sys.executable, "-P", "-m", "skytether"]
 PATIENCE_S = 60.0
 SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)

@@ -20,6 +20,8 @@ from shared.protocol import Hello, Observation, ProtocolError, Welcome, encode
 from shell.udp import admit_only, kernel_drops, open_socket
 from sim.flight import make_keys
 
+pytestmark = pytest.mark.long
+
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the filter is one of Linux")
 
 

@@ -23,6 +23,8 @@ from shared.summary import Summary, summarise
 from sim import flight
 from skytether.__main__ import main
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parent.parent
 PAPER = config.load("paper")
 

@@ -11,6 +11,8 @@ from benchmarks.restarts import CLOSED, KILLED, STOPPED, Counts, Life, Outage, j
 from shared.endpoint import SECOND_NS
 from shared.protocol import Mode
 
+pytestmark = pytest.mark.long
+
 DT_S = 0.05
 TAU_S = 0.84
 GONE = Outage("server", CLOSED, 10 * SECOND_NS, 14 * SECOND_NS)
