@@ -1,9 +1,14 @@
 """What tests need of the machine."""
 
+import signal
 import socket
 from functools import cache
 
 import pytest
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell's job in the background ignores Ctrl-C, and so would every command that a test starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @cache
