@@ -515,6 +515,7 @@ def test_weights_that_nobody_has_searched_for_are_refused(
     assert capsys.readouterr().err.strip() == said
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
     tuned: Path, tmp_path: Path
 ) -> None:

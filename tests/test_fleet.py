@@ -163,6 +163,7 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
     assert figure.stat().st_size > 10_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_fleet_over_udp_is_summed_up(tmp_path: Path, count: int) -> None:
     """Six vehicles in one process; one server, and two workers at one address."""

@@ -89,6 +89,7 @@ def key_file(folder: Path, secret: str = SECRET, *, mode: int = 0o600, name: str
     return path
 
 
+@pytest.mark.long
 def test_a_flight_is_sealed_from_end_to_end(tmp_path: Path) -> None:
     """`fly --secure` makes keys, flies by them over UDP, and says so."""
     file = tmp_path / "summary.json"

@@ -50,6 +50,7 @@ def test_lock_files_carry_hashes_and_no_addresses() -> None:
         assert not any("://" in line or "index" in line for line in lines)
 
 
+@pytest.mark.long
 def test_folders_with_our_names_are_not_taken_for_ours(tmp_path: Path) -> None:
     """Where the user happens to be: by the command, its workers and processes, and `python -P`."""
     for package in PACKAGES:

@@ -389,6 +389,7 @@ def test_a_flight_under_way_does_not_see_edits_of_its_trajectory(tmp_path: Path)
     assert not Path(flown.reference.file).exists()
 
 
+@pytest.mark.long
 def test_a_trajectory_edited_while_a_sweep_runs_ends_the_command_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -509,6 +510,7 @@ def test_two_keys_make_maps(whole: Path) -> None:
         assert (whole / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_a_killed_sweep_goes_on_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
     """SIGKILL half-way: its worker ends with it, and the rest gives the same bytes as ever."""
     broken_off(signal.SIGKILL, tmp_path)
@@ -520,6 +522,7 @@ def test_a_killed_sweep_goes_on_and_loses_nothing(whole: Path, tmp_path: Path) -
     assert tables(tmp_path) == tables(whole)
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path) -> None:
     """Every line is whole, and it says how many runs they are."""
     ended = broken_off(signal.SIGINT, tmp_path)
@@ -577,6 +580,7 @@ def dask(stack: ExitStack, argv: list[str], folder: Path) -> subprocess.Popen[st
     return process
 
 
+@pytest.mark.long
 @needs_dask
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
     """A scheduler and two workers, one of them killed on the way."""

@@ -323,6 +323,7 @@ def run(*argv: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(line, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.long
 def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: Path) -> None:
     """As a table, and as JSON."""
     path = tmp_path / "counts.json"
