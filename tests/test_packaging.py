@@ -7,6 +7,8 @@ import zipfile
 from importlib import metadata, resources
 from pathlib import Path
 
+import pytest
+
 from shared import config
 
 ROOT = Path(__file__).parent.parent
