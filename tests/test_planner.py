@@ -338,6 +338,28 @@ def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
     np.testing.assert_array_equal(made.horizons[:, :, d : d + H], made.tracked)
 
 
+@pytest.mark.parametrize("shares", [(0.0, 0.0), (0.1, 0.05), (0.2, 0.0), (0.3, 0.7)])
+def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
+    shares: tuple[float, float],
+) -> None:
+    """Each case by its probability, and that all arrive by what is left; without doubts the gap."""
+    rng, rows, planner = np.random.default_rng(7), np.array([0]), make()
+    before = plan(planner, rows, np.array([40]), crowd(rng, np.array([0])))
+    found = crowd(rng, np.array([0]))._replace(
+        doubt=np.array([shares]),
+        doubted=rng.uniform(-1.0, 1.0, size=(1, 2, 2, H)),
+        doubted_start=np.zeros((1, 2, 2, 2)),
+    )
+    found.doubted_start[:] = found.start[:, None]
+    made = plan(planner, rows, np.array([41]), found)
+    target, told = made.states[0], shift(before.tracked[0], 1)
+    best = cost_of(found, target, told, made.tracked[0])
+    gaps = [cost_of(found, target, told, inputs) - best for inputs in found.doubted[0]]
+    (figures,) = made.figures
+    expected = (1.0 - sum(shares)) * figures["cost_gap"] + np.dot(shares, gaps)
+    assert figures["expected_gap"] == pytest.approx(expected, rel=1e-4)
+
+
 @pytest.mark.parametrize("first", [True, False])
 def test_figures_that_compare_with_nothing_are_zero(first: bool) -> None:
     """V and deviation at a first step; with "predictive", what compares with what was sent."""
