@@ -4,6 +4,7 @@ import contextlib
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from shared.summary import Summary, summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
-from skytether import processes
+from skytether import processes, recorder
 
 TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused
 """Events that are shown while it flies."""
@@ -52,6 +53,10 @@ class Options:
     """File for the summary of the flight."""
     figure: Path | None = None
     """File for a picture of the flight (.png, .pdf or .svg)."""
+    record: Path | None = None
+    """File for a recording of the flight (.mcap): all that its processes record and say, written
+    while it flies. See `skytether report`, `replay`, `export` and `recover`; Foxglove and
+    Lichtblick show it, too."""
     beside: str | None = None
     """Another scenario to compare with, flown in virtual time with the same duration and seed."""
     config: ScenarioFlags = Scenario()
@@ -67,6 +72,7 @@ def fly(argv: Sequence[str]) -> None:
     scenario = options.config
     if options.figure:
         figures.check(options.figure)
+    recorder.check(options.record)
     if options.control:
         _make_folder(options.control, virtual=options.virtual)
     beside = _beside(options)
@@ -76,7 +82,8 @@ def fly(argv: Sequence[str]) -> None:
         command.interruptible() as interrupted,
         command.progress(f"flying {title}", scenario.duration) as on_second,
     ):
-        flown = (_virtually if options.virtual else _really)(options, on_second, interrupted)
+        fly_ = _virtually if options.virtual else _really
+        flown, unrecorded = fly_(options, on_second, interrupted)
     if flown.failure and not len(flown.client):
         raise CommandError(str(flown.failure))
     if flown.incomplete:
@@ -95,7 +102,7 @@ def fly(argv: Sequence[str]) -> None:
     command.finish(summary, title, options.json)
     if options.figure:
         figures.flights(options.figure, flights)
-    if missing := _missing(scenario, flown):
+    if missing := _missing(scenario, flown) or unrecorded:
         raise CommandError(missing)
     if flown.failure:
         raise CommandError(str(flown.failure))
@@ -135,17 +142,35 @@ def _summarise(
 
 def _virtually(
     options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
-) -> flight.Flight:
-    return flight.fly(
-        options.config, secure=options.secure, on_second=on_second, stopped=interrupted
-    )
+) -> tuple[flight.Flight, str | None]:
+    """Fly in virtual time; returns the flight, and what is wrong with its recording."""
+    scenario, secure = options.config, options.secure
+    flown = flight.fly(scenario, secure=secure, on_second=on_second, stopped=interrupted)
+    if options.record is None:
+        return flown, None
+    name = options.scenario
+    summary = _summarise(scenario, name, flown, secure=secure)
+    return flown, recorder.write(options.record, scenario, name, flown, summary)
 
 
 def _really(
     options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
-) -> flight.Flight:
-    with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
+) -> tuple[flight.Flight, str | None]:
+    """Fly over UDP; returns the flight, and what is missing in its recording."""
+    with tempfile.TemporaryDirectory(prefix="skytether-") as folder, ExitStack() as stack:
         parts, scenario = Path(folder), options.config
+        feeds = parts if options.record else None
+        live = None
+        if options.record:
+            live = recorder.Live(
+                options.record,
+                processes.feeds_in(parts),
+                scenario,
+                options.scenario,
+                secure=options.secure,
+                tell=_tell,
+            )
+            stack.callback(live.finish)
         shortfalls = processes.run(
             scenario,
             parts,
@@ -154,15 +179,20 @@ def _really(
             on_event=_tell,
             secure=options.secure,
             control=options.control,
+            feeds=feeds,
         )
         axes = scenario.model.axes
-        return flight.Flight(
+        flown = flight.Flight(
             client=_rows(parts / "client", record.client_columns(axes)),
             server=_rows(parts / "server", record.server_columns(axes)),
             netem=_rows(parts / "netem", record.PACKET_COLUMNS),
             failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
             incomplete=tuple(each for each in shortfalls if not isinstance(each, NotFlown)),
         )
+        if live is None:
+            return flown, None
+        summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
+        return flown, live.finish(summary if len(flown.client) else None, flown)
 
 
 def _rows(part: Path, columns: np.dtype[np.void]) -> record.Rows:

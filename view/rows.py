@@ -4,7 +4,7 @@ They are what a recording and an exported table hold. A row lies in memory as be
 are others: so it comes back to the last bit.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
