@@ -314,7 +314,8 @@ class Recorded:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
+        """Its file."""
         self._file, size = opened(path)
         self._reader = SeekingReader(self._file, record_size_limit=size)
         try:
@@ -325,7 +326,7 @@ class Recorded:
 
     def _read_ends(self) -> None:
         """Read what stands before and behind the messages."""
-        path = self._path
+        path = self.path
         try:
             if self._reader.get_summary() is None:
                 raise ValueError
@@ -358,9 +359,24 @@ class Recorded:
         Raises:
             RecordingError: the file is damaged.
         """
-        with reading(self._path):
+        with reading(self.path):
             messages = self._reader.iter_messages(log_time_order=False)
             return parts_of((channel, message) for _, channel, message in messages)
+
+    def columns(self) -> dict[str, np.dtype[np.void]]:
+        """Columns of each part of the record that has rows, by its name.
+
+        Raises:
+            RecordingError: the file is damaged.
+        """
+        with reading(self.path):
+            summary = self._reader.get_summary()
+            channels = summary.channels.values() if summary else ()
+            return {
+                channel.metadata["part"]: columns_of(channel.metadata["columns"])
+                for channel in channels
+                if "part" in channel.metadata
+            }
 
     def frames(self) -> Iterator[Timed]:
         """Frames in the order of their times, which are counted from the first one's on [ns].
@@ -368,7 +384,7 @@ class Recorded:
         Raises:
             RecordingError: the file is damaged.
         """
-        with reading(self._path):
+        with reading(self.path):
             own = (
                 (message.log_time, channel, message.data)
                 for _, channel, message in self._reader.iter_messages()
@@ -393,11 +409,12 @@ def summary_of(scenario: Scenario, about: About, parts: Mapping[str, Table]) -> 
 
 def opened(path: Path) -> tuple[BinaryIO, int]:
     """A file that begins as an MCAP file does, and its size [B]."""
-    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
-    status = os.fstat(file.fileno())
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    status = os.fstat(descriptor)
     if not stat.S_ISREG(status.st_mode):
-        file.close()
+        os.close(descriptor)
         raise RecordingError(f"{path}: it is no plain file, expected a recording ({SUFFIX})")
+    file = os.fdopen(descriptor, "rb")
     if file.read(len(MAGIC)) != MAGIC:
         file.close()
         what = "it is no MCAP file" if status.st_size else "it is empty"

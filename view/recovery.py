@@ -45,20 +45,27 @@ class Kept(NamedTuple):
     """Size of the file [B]."""
 
 
-def recover(path: Path, out: BinaryIO) -> Kept:
+def recover(path: Path, out: Path) -> Kept:
     """Write a recording anew from all that is whole of it, with its summary and an index.
 
     Args:
         path: file that has no end, or is damaged.
-        out: where the recording is written.
+        out: file for the recording; may be the same, which is then replaced once all is done.
 
     Raises:
         OSError: a file cannot be read, or written.
         RecordingError: it is no recording, or nothing of one.
     """
-    file, size = opened(path)
-    with file:
-        return _Recovery(path, out).of(file, size)
+    source, size = opened(path)
+    part = out.with_name(f"{out.name}.part")
+    with source:
+        try:
+            with part.open("wb") as file:
+                kept = _Recovery(path, file).of(source, size)
+            part.replace(out)
+        finally:
+            part.unlink(missing_ok=True)
+    return kept
 
 
 class _Recovery:
