@@ -144,7 +144,8 @@ def _drawn(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> Page:
         parts.get("netem", empty),
         epoch_ns,
     )
-    where = f"over UDP, {about.began}" if about.began else "in virtual time"
+    began = f"{about.began[:10]} {about.began[11:16]} UTC"
+    where = f"over UDP, {began}" if about.began else "in virtual time"
     fleet = len(np.unique(client["vehicle"]))
     others = f" Drawn is vehicle {number} of {fleet}." if fleet > 1 else ""
     sent = "–" if recorded.summary.event_ratio is None else f"{recorded.summary.event_ratio:.1%}"
@@ -222,16 +223,17 @@ def timeline(flown: Flown) -> Picture:
                 )
                 below.axvspan(time_s[0], end_s, color=MODES[mode], alpha=0.13, linewidth=0)
             if below.get_legend_handles_labels()[0]:
-                below.legend(loc="upper right", ncols=4)
+                below.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(0.0, flown.time_s[-1] + flown.scenario.control.dt)
         figure.align_ylabels(axes)
         _name_modes(figure, flown)
         says = (
             "From above: position, with the desired one dashed; distance between them; what the "
-            "trigger compares with its threshold, and when a horizon was sent; how old the "
-            "observation behind the input was, and the plan; packets that entered the network in "
-            "each second. The colour behind is what the vehicle did."
+            "trigger compares with its threshold, linear up to there and logarithmic above, and "
+            "when a horizon was sent; how old the observation behind the input was, and the plan; "
+            "packets in each second, by when they entered the network. The colour behind is what "
+            "the vehicle did."
         )
         return Picture("timeline", "What happened", says, _png(figure))
 
@@ -261,24 +263,22 @@ def _trigger(below: "Axes", flown: Flown) -> None:
     time_s = flown.time_of(server)
     below.plot(time_s, server["error"], "k-", linewidth=0.9, label="figure")
     below.plot(time_s, server["threshold"], "r--", linewidth=0.9, label="threshold")
-    sent = time_s[server["event"]]
-    bottom = below.get_xaxis_transform()
-    below.vlines(sent, 0.0, 0.09, color="k", linewidth=0.8, transform=bottom, label="sent")
-    shown = np.concatenate([server["error"], server["threshold"]])
-    shown = shown[np.isfinite(shown)]
-    if len(shown):
-        below.set_ylim(-0.12 * np.quantile(shown, 0.99), 1.15 * max(np.quantile(shown, 0.99), 1e-9))
+    sent, bottom = time_s[server["event"]], below.get_xaxis_transform()
+    style = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
+    below.vlines(sent, 0.0, 0.12, **style)
+    threshold = server["threshold"][np.isfinite(server["threshold"])]
+    # What it compares spans decades while nothing can be sent; the threshold is what counts.
+    below.set_yscale("symlog", linthresh=max(threshold.max(initial=0.0), 1e-6))
+    below.set_ylim(bottom=0.0)
 
 
 def _ages(below: "Axes", flown: Flown) -> None:
     client = flown.client
-    known = client["age_ns"] >= 0
-    below.plot(
-        flown.time_s[known], client["age_ns"][known] / 1e9, "k-", linewidth=0.9, label="observation"
-    )
-    planned = client["in_force"] != NO_HORIZON
-    age_s = (client["step"] - client["in_force"])[planned] * flown.scenario.control.dt
-    below.plot(flown.time_s[planned], age_s, color="#0072b2", linewidth=0.9, label="plan")
+    observed_s = np.where(client["age_ns"] >= 0, client["age_ns"] / SECOND_NS, np.nan)
+    planned_s = (client["step"] - client["in_force"]) * flown.scenario.control.dt
+    planned_s = np.where(client["in_force"] != NO_HORIZON, planned_s, np.nan)
+    below.plot(flown.time_s, observed_s, "k-", linewidth=0.9, label="observation")
+    below.plot(flown.time_s, planned_s, color="#0072b2", linewidth=0.9, label="plan")
     below.set_ylim(bottom=0.0)
     below.set_ylabel("age [s]")
 
