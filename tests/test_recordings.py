@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from shared import config
 from shared.config import Scenario
@@ -36,6 +36,7 @@ from skytether.fly import fly
 from skytether.recorder import Live
 from skytether.recover import recover as recover_command
 from skytether.report import report
+from view import recovery
 from view.frames import of_flight
 from view.recording import VEHICLES_MAX, Recorded, Recording, RecordingError
 from view.recovery import recover
@@ -375,6 +376,26 @@ def test_a_damaged_byte_costs_a_chunk_or_a_line(
         list(recorded.frames())
 
 
+def test_without_its_checksum_a_changed_number_would_be_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A changed digit is a digit, too: only the checksum knows. The chunk is lost instead."""
+    monkeypatch.setattr("view.recording.Writer", partial(Writer, compression=CompressionType.NONE))
+    whole = record(tmp_path / "whole.mcap").read_bytes()
+    path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
+    path.write_bytes(whole.replace(b'"step":7,', b'"step":9,', 1))
+
+    def steps() -> list[int]:
+        recover(path, out)
+        return recorded_steps(out)[:8]
+
+    assert {7, 9}.isdisjoint(steps())
+    monkeypatch.setattr(
+        recovery, "breakup_chunk", lambda chunk, **_: breakup_chunk(chunk, validate_crc=False)
+    )
+    assert steps() == [0, 1, 2, 3, 4, 5, 6, 9]
+
+
 KILLED = """
 import sys, time
 from pathlib import Path
@@ -465,7 +486,8 @@ def row_at(step: int) -> Rows:
 def recorded_steps(path: Path) -> list[int]:
     """Steps of which a recording has rows."""
     with Recorded(path) as recorded:
-        return [int(step) for step in recorded.parts()["client"]["step"]]
+        parts = recorded.parts()
+    return [int(step) for step in parts["client"]["step"]] if "client" in parts else []
 
 
 def test_a_feed_that_begins_anew_is_recorded_once(
@@ -482,6 +504,20 @@ def test_a_feed_that_begins_anew_is_recorded_once(
     assert made.finish() is None
     assert recorded_steps(tmp_path / "live.mcap") == [1, 2, 3]
     assert told == []
+
+
+def test_a_feed_that_begins_anew_would_be_recorded_twice(
+    live: tuple[Live, Feeds, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If what has come before were not known."""
+    monkeypatch.setattr(recorder._Source, "is_new", lambda *_: True)
+    made, feeds, _ = live
+    for _ in range(2):
+        for frame in (opened(client_columns(2)), row_at(1)):
+            feeds.take("client", frame)
+        feeds.lost("client")
+    made.finish()
+    assert recorded_steps(tmp_path / "live.mcap") == [1, 1]
 
 
 def test_a_gap_in_a_feed_is_told_once(live: tuple[Live, Feeds, list[str]], tmp_path: Path) -> None:
