@@ -23,6 +23,7 @@ import struct
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -39,7 +40,7 @@ from shared import config
 from shared.config import Scenario, to_toml
 from shared.events import ChangeRefused, Degraded, Event, Failure, Fault, RecordIncomplete
 from shared.feed import Figures, Frame, Opened, Rows, Said, columns_of
-from shared.model import Array, discretise
+from shared.model import Array, advance, discretise
 from shared.record import Rows as Table
 from shared.summary import Summary, summarise
 from view import foxglove, rows
@@ -283,12 +284,17 @@ def planned(scenario: Scenario, row: np.void) -> Array:
         row: row of the part "plan".
     """
     model = discretise(scenario.tau_s, scenario.control.dt)
-    state = row["state"]
-    path = [state[:, 0]]
-    for each in row["inputs"].T:
-        state = model.step(state, each + row["disturbance"])
-        path.append(state[:, 0])
-    return np.array(path)
+    inputs = row["inputs"] + row["disturbance"][:, np.newaxis]
+    paths = []
+    for axis, (p, v), along in zip(
+        model.axes(), row["state"].tolist(), inputs.tolist(), strict=True
+    ):
+        path = [p]
+        for u in along:
+            p, v = advance(axis, p, v, u)  # noqa: PLW2901 - rolled along
+            path.append(p)
+        paths.append(path)
+    return np.array(paths).T
 
 
 def _schema_of(value: Any) -> dict[str, Any]:
@@ -459,9 +465,13 @@ def parts_of(messages: Iterable[tuple[Channel, Message]]) -> dict[str, Table]:
         if part := channel.metadata.get("part"):
             columns[part] = channel.metadata["columns"]
             rows_of.setdefault(part, []).append(msgspec.json.decode(message.data))
-    return {
-        part: rows.Table(columns_of(columns[part])).rows(each) for part, each in rows_of.items()
-    }
+    return {part: _table(columns[part]).rows(each) for part, each in rows_of.items()}
+
+
+@lru_cache(64)
+def _table(columns: str) -> rows.Table:
+    """What makes rows of messages, by their columns."""
+    return rows.Table(columns_of(columns))
 
 
 def _instant(time_ns: int, channel: Channel) -> tuple[int, str, str]:
@@ -478,7 +488,7 @@ def _frames(
     about = together[0][1].metadata
     if part := about.get("part"):
         decoded = [msgspec.json.decode(data) for _, _, data in together]
-        made = rows.Table(columns_of(about["columns"])).rows(decoded)
+        made = _table(about["columns"]).rows(decoded)
         yield about["process"], Rows(part=part, time_ns=time_ns, rows=made.tobytes())
         return
     for _, channel, data in together:

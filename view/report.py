@@ -264,7 +264,7 @@ def _trigger(below: "Axes", flown: Flown) -> None:
     below.plot(time_s, server["error"], "k-", linewidth=0.9, label="figure")
     below.plot(time_s, server["threshold"], "r--", linewidth=0.9, label="threshold")
     sent, bottom = time_s[server["event"]], below.get_xaxis_transform()
-    style = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
+    style: Any = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
     below.vlines(sent, 0.0, 0.12, **style)
     threshold = server["threshold"][np.isfinite(server["threshold"])]
     # What it compares spans decades while nothing can be sent; the threshold is what counts.
