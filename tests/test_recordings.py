@@ -358,7 +358,7 @@ def test_cut_anywhere_no_whole_chunk_is_lost(
 
 
 @given(at=st.integers(0, 2**20), by=st.integers(1, 255))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_a_damaged_byte_costs_a_chunk_or_a_line(
     at: int, by: int, torn: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -375,6 +375,15 @@ def test_a_damaged_byte_costs_a_chunk_or_a_line(
     assert kept.messages <= chunks(torn)[-1][1]
     with Recorded(out) as recorded:
         list(recorded.frames())
+
+
+def test_a_changed_scenario_is_not_believed(torn: Path, tmp_path: Path) -> None:
+    """Its checksum is held against it as well, and without a scenario there is no recording."""
+    path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
+    path.write_bytes(torn.read_bytes().replace(b"seed = 1\n", b"seed = 2\n", 1))
+    assert path.read_bytes() != torn.read_bytes()
+    with pytest.raises(RecordingError, match="nothing is whole of it"):
+        recover(path, out)
 
 
 def test_without_its_checksum_a_changed_number_would_be_believed(
@@ -445,7 +454,7 @@ def test_a_killed_recorder_loses_less_than_a_second(tmp_path: Path) -> None:
 def test_without_its_flush_a_recorder_would_lose_all(
     flush_s: float, kept: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it was told is in the file soon, though no more comes; else only once a chunk is full."""
+    """What it was told is in the file soon, though no more comes."""
     monkeypatch.setattr(recorder, "Subscriber", Feeds)
     monkeypatch.setattr(recorder, "FLUSH_S", flush_s)
     path, feeds = tmp_path / "live.mcap", {"client": tmp_path / "nobody"}

@@ -37,7 +37,7 @@ from mcap.records import Channel, Message
 from mcap.writer import Writer
 
 from shared import config
-from shared.config import Scenario, to_toml
+from shared.config import ConfigError, Scenario, to_toml
 from shared.events import ChangeRefused, Degraded, Event, Failure, Fault, RecordIncomplete
 from shared.feed import Figures, Frame, Opened, Rows, Said, columns_of
 from shared.model import Array, advance, discretise
@@ -454,7 +454,10 @@ def known_of(
     with reading(path):
         about = msgspec.convert(metadata[OURS], About)
         table = tomllib.loads(attached[SCENARIO].decode())
-        return about, config.check(table, f"{path}: {SCENARIO}")
+        try:
+            return about, config.check(table, f"{path}: {SCENARIO}")
+        except ConfigError as error:  # another version's, or its trajectory's file is elsewhere
+            raise RecordingError(str(error)) from None
 
 
 def parts_of(messages: Iterable[tuple[Channel, Message]]) -> dict[str, Table]:
