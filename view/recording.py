@@ -92,6 +92,7 @@ BROKEN = (
     AttributeError,
     LookupError,
     MemoryError,
+    OSError,  # a place in the file that cannot be
     TypeError,
     ValueError,
 )
@@ -114,16 +115,16 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
 
     scenario: str
     """Name of the scenario."""
-    seed: str
+    seed: int
     """Seed of the flight."""
     version: str
     """Version of Skytether that flew it."""
     began: str
     """Time of day at which it began, ISO 8601; empty in virtual time."""
-    offset_ns: str
+    offset_ns: int
     """Time of a message minus time of the frame that it was made of [ns]."""
-    secure: str
-    """Whether the link was sealed: true or false."""
+    secure: bool
+    """Whether the link was sealed."""
 
 
 class Recording:
@@ -142,7 +143,7 @@ class Recording:
         self._writer = Writer(file, chunk_size=CHUNK_BYTES)
         self._writer.start(profile="", library=f"{OURS} {about.version}")
         self._scenario = scenario
-        self._offset_ns = int(about.offset_ns)
+        self._offset_ns = about.offset_ns
         self._tables: dict[tuple[str, str], rows.Table] = {}
         """Columns of each part, by process and part."""
         self._channels: dict[str, int] = {}
@@ -150,7 +151,8 @@ class Recording:
         self._shown: set[int] = set()
         """Vehicles whose trajectory has been drawn."""
         self._now_ns = 0
-        self._writer.add_metadata(OURS, msgspec.to_builtins(about))
+        said = msgspec.to_builtins(about)
+        self._writer.add_metadata(OURS, {name: _text(value) for name, value in said.items()})
         self._attach(SCENARIO, "application/toml", to_toml(scenario))
         self.flush()
 
@@ -270,6 +272,11 @@ class Recording:
         self._writer.add_message(channel, self._now_ns, data, self._now_ns)
 
 
+def _text(value: str | int) -> str:
+    """A value of metadata, which are texts alone: a number or flag is written as in JSON."""
+    return value if isinstance(value, str) else msgspec.json.encode(value).decode()
+
+
 def trajectory(scenario: Scenario) -> Array:
     """Desired positions of a whole flight [m]; shape (points, axes)."""
     time_s = np.linspace(0.0, scenario.duration, POINTS_MAX)
@@ -323,7 +330,7 @@ class Recorded:
         self.path = path
         """Its file."""
         self._file, size = opened(path)
-        self._reader = SeekingReader(self._file, record_size_limit=size)
+        self._reader = SeekingReader(self._file, validate_crcs=True, record_size_limit=size)
         try:
             self._read_ends()
         except BaseException:
@@ -396,7 +403,7 @@ class Recorded:
                 for _, channel, message in self._reader.iter_messages()
                 if FRAME in channel.metadata
             )
-            offset_ns, begin_ns = int(self.about.offset_ns), None
+            offset_ns, begin_ns = self.about.offset_ns, None
             for (time_ns, *_), group in groupby(own, key=lambda each: _instant(*each[:2])):
                 begin_ns = time_ns if begin_ns is None else begin_ns
                 for process, frame in _frames(time_ns - offset_ns, group):
@@ -410,7 +417,7 @@ def summary_of(scenario: Scenario, about: About, parts: Mapping[str, Table]) -> 
         return None
     client = client[client["vehicle"] == client["vehicle"].min()]
     others = parts.get("server"), parts.get("netem")
-    return summarise(scenario, about.scenario, client, *others, secure=about.secure == "true")
+    return summarise(scenario, about.scenario, client, *others, secure=about.secure)
 
 
 def opened(path: Path) -> tuple[BinaryIO, int]:
@@ -452,7 +459,7 @@ def known_of(
     if OURS not in metadata or SCENARIO not in attached:
         raise RecordingError(f"{path}: it is no recording of Skytether, or nothing is whole of it")
     with reading(path):
-        about = msgspec.convert(metadata[OURS], About)
+        about = msgspec.convert(metadata[OURS], About, strict=False)
         table = tomllib.loads(attached[SCENARIO].decode())
         try:
             return about, config.check(table, f"{path}: {SCENARIO}")
