@@ -270,7 +270,7 @@ def drive(
     """
     running = Running(endpoint, options.config)
     if feed:
-        feed.open(_opened(process, options.scenario, running, feed))
+        feed.open(opened(process, options.scenario, running, feed))
     with ExitStack() as stack:
         served = stack.enter_context(_served(metrics, process, options))
         try:
@@ -358,11 +358,11 @@ def _served(address: Address | None, process: str, options: Options) -> Iterator
         yield metrics
 
 
-def _opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
+def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
     """What makes the first frame of a feed."""
     wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
 
-    def opened() -> Opened:
+    def make() -> Opened:
         return Opened(
             process=process,
             name=name,
@@ -372,7 +372,7 @@ def _opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[
             time_ns=time_ns,
         )
 
-    return opened
+    return make
 
 
 @contextmanager

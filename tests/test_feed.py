@@ -587,7 +587,7 @@ def test_a_process_tells_its_readers_while_it_is_driven(
         recorder.follow(feed.part("netem", PACKET_COLUMNS))
         endpoint = Passing(recorder)
         running = Running(endpoint, DEMO)
-        feed.open(command._opened("netem", "demo", running, feed))
+        feed.open(command.opened("netem", "demo", running, feed))
         driver = Shell(endpoint, ("127.0.0.1", 0), feed=feed)
         run([driver], on_start=start, on_event=feed.say)
     thread.join(PATIENCE_S)

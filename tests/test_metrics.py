@@ -203,7 +203,7 @@ def test_a_client_is_well_while_it_is_flown_or_could_be(mode: Mode) -> None:
 
 
 def test_a_server_is_well_while_it_is_in_time() -> None:
-    """And a netem while it turns."""
+    """A netem is while it turns."""
     assert trouble("server", {"degraded": False}) == trouble("netem", {}) == ""
     assert trouble("server", {"degraded": True}) == "it misses more ticks than it may"
 
