@@ -5,6 +5,7 @@ import re
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from pathlib import Path
 from time import perf_counter_ns
 from typing import Any
 
@@ -27,6 +28,7 @@ from shell import command
 from shell.metrics import CONNECTIONS_MAX, Collected, Metrics, MetricsError, names
 from sim import flight
 
+ROOT = Path(__file__).parent.parent
 DEMO = config.load("demo")
 PROCESS: dict[str, Any] = {
     "cpu_s": 1.5,
@@ -346,3 +348,21 @@ def test_all_names_can_be_listed(figures: dict[str, dict[str, Any]]) -> None:
         name for name, _ in numbers(process, figures[process])
     }
     assert told("server") | told("netem") | told("client") <= names()
+
+
+def test_the_documented_metrics_are_those_there_are() -> None:
+    """Line by line: name, kind and what it is; and the labels that a number has."""
+    text = (ROOT / "docs" / "feed.md").read_text()
+    lines = re.findall(r"^\| `skytether_(\w+)` \| (\w+) \| ([^|]*) \| (.*) \|$", text, re.MULTILINE)
+    documented = {(name, kind, what) for name, kind, _, what in lines}
+    assert documented == {
+        (each.name, "gauge" if each.kind == "modes" else each.kind, each.help.rstrip("."))
+        for table in (*TABLES.values(), metrics.OWN)
+        for each in table
+    }
+    labels = {name: set(filter(None, told.split(", "))) for name, _, told, _ in lines}
+    for table in TABLES.values():
+        for each in table:
+            named = set(re.findall(r"\{(\w+)\}", each.figure)) - {"le"}
+            modes = {"mode"} if each.kind == "modes" else set()
+            assert labels[each.name] == named | {name for name, _ in each.labels} | modes

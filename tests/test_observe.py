@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 import urllib.request
 from collections.abc import Iterator
 from contextlib import AbstractAsyncContextManager
@@ -27,6 +28,7 @@ from skytether.processes import Child, started
 
 ROOT = Path(__file__).parent.parent
 OBSERVE = ROOT / "observe"
+DOCUMENT = ROOT / "docs" / "feed.md"
 DASHBOARD = json.loads((OBSERVE / "grafana" / "dashboards" / "skytether.json").read_text())
 RULES = yaml.safe_load((OBSERVE / "rules.yml").read_text())
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
@@ -44,12 +46,19 @@ EXPRESSIONS = [
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, set[str]], str]:
+    """See `_flown`."""
+    return asyncio.run(_flown(tmp_path_factory.mktemp("feeds")))
+
+
+@pytest.fixture(scope="module")
+def exported(flown: tuple[dict[str, set[str]], str]) -> dict[str, set[str]]:
     """Names of the numbers that processes serve while they fly, and of their labels."""
-    return asyncio.run(_exported(tmp_path_factory.mktemp("feeds")))
+    return flown[0]
 
 
-async def _exported(feeds: Path) -> dict[str, set[str]]:
+async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
+    """What processes serve while they fly, and what the documented reader of a feed prints."""
     told: dict[str, Address] = {}
     flying = asyncio.Event()
 
@@ -63,7 +72,7 @@ async def _exported(feeds: Path) -> dict[str, set[str]]:
         return on_event
 
     def process(name: str, *argv: str) -> AbstractAsyncContextManager[Child]:
-        common = ["demo", "--metrics", "127.0.0.1:0", "--feed", str(feeds / name)]
+        common = ["demo", "--metrics", "127.0.0.1:0", "--feed", str(feeds / f"{name}.feed")]
         return started(name, *common, *argv, on_event=hear(name))
 
     here = ["--bind", "127.0.0.1:0"]
@@ -86,7 +95,13 @@ async def _exported(feeds: Path) -> dict[str, set[str]]:
                         found.setdefault(sample.name, set()).update(sample.labels, {"job"})
                 health = json.loads(await asyncio.to_thread(fetched, address, "/healthz"))
                 assert health == {"process": name, "healthy": True, "trouble": ""}
-    return found
+        (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+        reader = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", example, cwd=feeds, stdout=asyncio.subprocess.PIPE
+        )
+        printed, _ = await reader.communicate()
+        assert reader.returncode == 0
+    return found, printed.decode()
 
 
 def at(address: Address) -> str:
@@ -112,6 +127,13 @@ def test_every_metric_that_is_asked_for_is_served(exported: dict[str, set[str]])
     assert set(exported) <= names()
     assert asked <= names()
     assert len(asked) > 20
+
+
+def test_the_documented_reader_of_a_feed_reads_it(flown: tuple[dict[str, set[str]], str]) -> None:
+    """As it stands in docs/feed.md, beside the flight of three processes."""
+    lines = flown[1].splitlines()
+    assert len(lines) > 20
+    assert all(re.fullmatch(r"vehicle 1 is at \[[^]]*\] m", line) for line in lines)
 
 
 def test_every_label_that_is_asked_for_is_served(exported: dict[str, set[str]]) -> None:
