@@ -3,6 +3,8 @@
 import json
 import re
 import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -21,10 +23,12 @@ from client.vehicle import Client
 from shared import config, metrics
 from shared.chance import stream
 from shared.endpoint import VEHICLES_TOLD_MAX
+from shared.events import Measured
 from shared.metrics import HEALTHY, LEFT_OUT, TABLES, families, trouble
 from shared.protocol import Mode
 from shared.stopwatch import Stopwatch
 from shell import command
+from shell.log import Line
 from shell.metrics import CONNECTIONS_MAX, Collected, Metrics, MetricsError, names
 from sim import flight
 
@@ -366,3 +370,28 @@ def test_the_documented_metrics_are_those_there_are() -> None:
             named = set(re.findall(r"\{(\w+)\}", each.figure)) - {"le"}
             modes = {"mode"} if each.kind == "modes" else set()
             assert labels[each.name] == named | {name for name, _ in each.labels} | modes
+
+
+@pytest.mark.long
+def test_each_worker_of_a_server_has_a_feed_and_metrics_of_its_own(tmp_path: Path) -> None:
+    """Numbered as its other files are; its port follows that of the one before."""
+    with closing(socket.create_server(("127.0.0.1", 0))) as free:
+        port = free.getsockname()[1]
+    argv = ["server", "demo", "--bind", "127.0.0.1:0", "--workers", "2", "--log", "json"]
+    argv += ["--feed", str(tmp_path / "feed"), "--metrics", f"127.0.0.1:{port}"]
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", "skytether", *argv], stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdout is not None
+        told = {}
+        try:
+            while len(told) < 2:
+                line = msgspec.json.decode(server.stdout.readline(), type=Line)
+                if isinstance(line.event, Measured):
+                    told[line.process] = line.event.port
+            assert told == {"server.1": port, "server.2": port + 1}
+            assert sorted(path.name for path in tmp_path.iterdir()) == ["feed.1", "feed.2"]
+        finally:
+            server.terminate()
+            server.communicate()
+    assert not list(tmp_path.iterdir())
