@@ -18,7 +18,7 @@ from errno import EMFILE
 from inspect import cleandoc
 from pathlib import Path
 from socket import socket
-from typing import Annotated, Any, BinaryIO, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Protocol, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -32,14 +32,21 @@ from shared import config
 from shared.change import Running
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint, Form
-from shared.events import Counted, Listening, Plaintext, address_text
+from shared.events import Counted, Listening, Measured, Plaintext, address_text
+from shared.feed import Opened
+from shared.record import Recorder
 from shared.stopwatch import Stopwatch
 from shared.summary import Summary
-from shell.control import ControlError, controlled
+from shell.control import controlled
 from shell.driver import Shell, run
+from shell.feed import Feed
+from shell.local import LocalError
 from shell.log import Log, LogFormat
 from shell.recording import Recording
 from shell.udp import SPARE_FILES, AddressError, allow_sockets, files_max, sockets_max
+
+if TYPE_CHECKING:  # it takes a while to import, and is rarely wanted
+    from shell.metrics import Metrics
 
 CONFIGURATION, RUN, INTERRUPTED = 2, 1, 128 + signal.SIGINT
 """Exit codes: what the command asked for is impossible, something went wrong on the way, or it was
@@ -124,6 +131,11 @@ def address(flag: str, text: str) -> Address:
         expected = "expected HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
         raise CommandError(f"{flag}: got {text!r}, {expected}", CONFIGURATION)
     return host, int(port)
+
+
+def optional_address(flag: str, text: str | None) -> Address | None:
+    """Address that a flag was given, see `address`; None where it was given none."""
+    return None if text is None else address(flag, text)
 
 
 def _is_ipv6(host: str) -> bool:
@@ -220,7 +232,7 @@ def _until_the_end(recording: Recording) -> Iterator[Recording]:
 def drive(
     process: str,
     endpoint: Endpoint,
-    scenario: Scenario,
+    options: Options,
     *,
     bind: Address | socket | None,
     peers: Sequence[Address] = (),
@@ -233,13 +245,15 @@ def drive(
     stopwatch: Stopwatch | None = None,
     recording: Recording | None = None,
     control: Path | None = None,
+    feed: Feed | None = None,
+    metrics: Address | None = None,
 ) -> None:
     """Run one endpoint as a process until it has finished or is told to stop.
 
     Args:
         process: name of the process in its log.
         endpoint: what to run.
-        scenario: what it flies.
+        options: its options: what it flies, and the name of that.
         bind, peers, forms, stopwatch: see `Shell`.
         waiting_for: whose datagrams it waits for, for the operator.
         secure: whether it has keys; None of one that only passes on what others say.
@@ -248,15 +262,21 @@ def drive(
         json: file for its last figures.
         recording: where it records; waited for at the end.
         control: where the socket for changes in flight is made.
+        feed: where it tells what is recorded and said.
+        metrics: where its figures are served over HTTP.
 
     Raises:
         CommandError: it cannot start, must not without keys, or the file cannot be written.
     """
+    running = Running(endpoint, options.config)
+    if feed:
+        feed.open(opened(process, options.scenario, running, feed))
     with ExitStack() as stack:
+        served = stack.enter_context(_served(metrics, process, options))
         try:
-            heeds = stack.enter_context(controlled(control, Running(endpoint, scenario)))
-            shell = Shell(endpoint, bind, peers, stopwatch, forms, heeds)
-        except ControlError as error:
+            heeds = stack.enter_context(controlled(control, running))
+            shell = Shell(endpoint, bind, peers, stopwatch, forms, heeds, feed)
+        except LocalError as error:
             raise CommandError(f"--control: {error}", CONFIGURATION) from None
         except AddressError as error:
             raise CommandError(str(error)) from None
@@ -272,20 +292,33 @@ def drive(
             out.say(Listening(host=host, port=port, waiting_for=waiting_for))
             if secure is False:
                 out.say(Plaintext(local=shell.is_local))
+            if served:
+                host, port = served.address
+                out.say(Measured(host=host, port=port))
 
         def figures() -> dict[str, Any]:
-            return endpoint.figures() | {
+            counted = endpoint.figures() | {
                 "cpu_s": time.process_time() - began_s,
                 "kernel_drops": shell.kernel_drops(),
                 "send_errors": shell.send_errors,
             }
+            return counted | ({"feed": feed.figures()} if feed else {})
 
         def each_second(*, last: bool = False) -> None:
             if recording and (news := recording.news()):
                 out.say(news)
             out.each_second(last=last)
+            if feed or served:
+                snapshot = figures()
+                if feed:
+                    feed.count(snapshot)
+                if served:
+                    served.take(snapshot)
 
-        with _told_once() as told, closing(Log(process, log)) as out:
+        with (
+            _told_once() as told,
+            closing(Log(process, log, feed.say if feed else lambda _: None)) as out,
+        ):
             run(
                 [shell],
                 on_start=start,
@@ -301,6 +334,74 @@ def drive(
             out.say(Counted(figures=last))
             if json:
                 write(json, msgspec.json.encode(last))
+
+
+@contextmanager
+def _served(address: Address | None, process: str, options: Options) -> Iterator["Metrics | None"]:
+    """Serve metrics for as long as the block takes; none without an address.
+
+    Raises:
+        CommandError: nothing can listen there.
+    """
+    if address is None:
+        yield None
+        return
+    from shell.metrics import Collected, Metrics, MetricsError
+
+    collected = Collected(process, options.scenario, options.config.control.dt)
+    try:
+        metrics = Metrics(address, collected)
+    except MetricsError as error:
+        at = address_text(*address)
+        raise CommandError(f"--metrics: cannot listen at {at}: {error}", CONFIGURATION) from None
+    with closing(metrics):
+        yield metrics
+
+
+def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
+    """What makes the first frame of a feed."""
+    wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
+
+    def make() -> Opened:
+        return Opened(
+            process=process,
+            name=name,
+            scenario=config.to_toml(running.scenario).decode(),
+            parts=feed.parts,
+            wall_ns=wall_ns,
+            time_ns=time_ns,
+        )
+
+    return make
+
+
+@contextmanager
+def fed(path: Path | None) -> Iterator[Feed | None]:
+    """Have a feed for as long as the block takes; none without a path.
+
+    Raises:
+        CommandError: its socket cannot be made.
+    """
+    if path is None:
+        yield None
+        return
+    try:
+        feed = Feed(path)
+    except LocalError as error:
+        raise CommandError(f"--feed: {error}", CONFIGURATION) from None
+    with closing(feed):
+        yield feed
+
+
+def recorder(
+    part: str, columns: np.dtype[np.void], recording: Recording | None, feed: Feed | None
+) -> Recorder | None:
+    """Recorder of a part of the record, for a file, a feed or both; None where there is neither."""
+    if feed is None:
+        return recording.recorder if recording else None
+    both = recording.recorder if recording else Recorder(columns)
+    both.follow(feed.part(part, columns))
+    return both
 
 
 @contextmanager
