@@ -39,6 +39,16 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"listening on {address}, waiting for {self.waiting_for}"
 
 
+class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process serves its figures over HTTP, as metrics."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"metrics at http://{address_text(self.host, self.port)}/metrics"
+
+
 class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """A process has no keys: what it hears may be anybody's, and anybody may read what it says."""
 
@@ -345,6 +355,7 @@ Failure = SessionRefused | NoSession | NoAnswer | NotFlown
 
 Event = (
     Listening
+    | Measured
     | Plaintext
     | Counted
     | Omitted
