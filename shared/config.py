@@ -91,7 +91,7 @@ class ControlConfig(Section, frozen=True):
     on."""
     feedback: bool = True
     """Whether horizons say also where they lead, and how the vehicle comes back to there. A vehicle
-    that can only play inputs back has none, and wants a firmer `input_weight`: 3, as in the scenario
+    that can only play inputs back has none, and wants a larger `input_weight`: 3, as in the scenario
     `playback`."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """Longest time from making a horizon to its being in force [s]; auto: as was seen."""
