@@ -91,8 +91,8 @@ class ControlConfig(Section, frozen=True):
     on."""
     feedback: bool = True
     """Whether horizons say also where they lead, and how the vehicle comes back to there. A vehicle
-    that can only play inputs back has none, and wants a larger `input_weight`: 3, as in the scenario
-    `playback`."""
+    that can only play inputs back goes without, and wants an `input_weight` of 3, as in the
+    scenario `playback`."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """Longest time from making a horizon to its being in force [s]; auto: as was seen."""
     observer_s: Duration = 4.0

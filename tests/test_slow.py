@@ -41,7 +41,7 @@ OUTSIDE_M = 3.2
 def scenario(
     uplink_s: float = 0.05, downlink_s: float = 0.05, *, duration: float = 60.0, **sections: Any
 ) -> Scenario:
-    """A figure eight in calm air, with tight weights, over constant delays; sections are laid over."""
+    """A figure eight in calm air at TIGHT weights over constant delays; sections are laid over."""
     table = config.to_table(config.load("demo")) | {"duration": duration}
     table["control"] |= TIGHT
     table["vehicle"]["wind"] = 0.0
