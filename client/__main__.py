@@ -63,6 +63,8 @@ class Options:
     what was counted, and the CPU time it took."""
     control: Path | None = None
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
+    feed: Path | None = None
+    """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     config: ScenarioFlags = Scenario()
 
 
@@ -90,10 +92,14 @@ def fly(argv: Sequence[str]) -> None:
 
     columns = client_columns(scenario.model.axes)
     with (
-        command.recorded(options.record, columns)
-        if options.record
-        else command.recorded_meanwhile(columns)
-    ) as recording:
+        (
+            command.recorded(options.record, columns)
+            if options.record
+            else command.recorded_meanwhile(columns)
+        ) as recording,
+        command.fed(options.feed) as feed,
+    ):
+        recorder = command.recorder("client", columns, recording, feed)
         clients = [
             Client(
                 scenario,
@@ -103,7 +109,7 @@ def fly(argv: Sequence[str]) -> None:
                 boot_id=secrets.randbits(64),
                 link=link(number),
                 navigation=navigation(scenario, stream(scenario.seed, "sensor", number)),
-                recorder=recording.recorder,
+                recorder=recorder,
             )
             for number in numbers
         ]
@@ -112,7 +118,7 @@ def fly(argv: Sequence[str]) -> None:
         command.drive(
             "client",
             Steady(endpoint),
-            scenario,
+            options,
             bind=None,
             peers=[server],
             waiting_for=f"the server at {options.server}",
@@ -122,6 +128,7 @@ def fly(argv: Sequence[str]) -> None:
             json=None if alone else options.json,
             recording=recording,
             control=options.control,
+            feed=feed,
         )
         if alone and len(rows := recording.rows()):
             summary = summarise(scenario, options.scenario, rows, secure=keyring is not None)

@@ -47,6 +47,8 @@ class Options:
     """File for what was counted, and the CPU time it took."""
     control: Path | None = None
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
+    feed: Path | None = None
+    """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     config: ScenarioFlags = Scenario()
 
 
@@ -60,13 +62,16 @@ def emulate(argv: Sequence[str]) -> None:
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
     record = options.record
-    with command.recorded(record, PACKET_COLUMNS) if record else nullcontext() as recording:
-        recorder = recording.recorder if recording else None
+    with (
+        command.recorded(record, PACKET_COLUMNS) if record else nullcontext() as recording,
+        command.fed(options.feed) as feed,
+    ):
+        recorder = command.recorder("netem", PACKET_COLUMNS, recording, feed)
         endpoint = Proxy(options.config, server=server, flows=flows, recorder=recorder)
         command.drive(
             "netem",
             endpoint,
-            options.config,
+            options,
             bind=bind,
             peers=[server],
             waiting_for=f"clients of {options.server}",
@@ -75,6 +80,7 @@ def emulate(argv: Sequence[str]) -> None:
             json=options.json,
             recording=recording,
             control=options.control,
+            feed=feed,
         )
 
 

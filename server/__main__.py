@@ -24,7 +24,7 @@ from server.secure import FORMS, Secure
 from shared import keys
 from shared.config import Scenario
 from shared.endpoint import Address
-from shared.record import server_columns
+from shared.record import plan_columns, server_columns
 from shared.steady import Steady
 from shared.stopwatch import Stopwatch
 from shell import command, workers
@@ -61,6 +61,8 @@ class Options:
     """Do without keys even where other machines can reach it: anybody there can fly vehicles."""
     control: Path | None = None
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
+    feed: Path | None = None
+    """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     config: ScenarioFlags = Scenario()
 
 
@@ -99,22 +101,27 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
     # Each worker knows sessions of its own.
     keyring = keys.load(options.keys) if options.keys else None
     gate = Secure(keyring, entropy=secrets.token_bytes) if keyring else Plain()
-    record, columns = own(options.record), server_columns(options.config.model.axes)
+    axes, planned = options.config.model.axes, options.config.terms().planned
+    record, columns = own(options.record), server_columns(axes)
     stopwatch = Stopwatch(time.perf_counter_ns)
-    with command.recorded(record, columns) if record else nullcontext() as recording:
+    with (
+        command.recorded(record, columns) if record else nullcontext() as recording,
+        command.fed(own(options.feed)) as feed,
+    ):
         endpoint = Server(
             options.config,
             boot_id=secrets.randbits(64),
             entropy=secrets.token_bytes,
             gate=gate,
             room=options.vehicles,
-            recorder=recording.recorder if recording else None,
+            recorder=command.recorder("server", columns, recording, feed),
+            plans=command.recorder("plan", plan_columns(axes, planned), None, feed),
             stopwatch=stopwatch,
         )
         command.drive(
             f"server{suffix}",
             Steady(endpoint),
-            options.config,
+            options,
             bind=bind,
             forms=FORMS if keyring else (),
             waiting_for="vehicles",
@@ -125,4 +132,5 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
             stopwatch=stopwatch,
             recording=recording,
             control=own(options.control),
+            feed=feed,
         )

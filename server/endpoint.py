@@ -94,6 +94,7 @@ class Server(Endpoint):
         gate: who may speak, and how.
         room: for how many vehicles at once.
         recorder: takes one row a tick and vehicle.
+        plans: takes one row for each horizon that is sent, see `shared.record.plan_columns`.
         stopwatch: measures the parts of a tick; the core has no clock of its own.
         references: desired trajectory of each vehicle, by its number, where they differ; left out:
             the scenario's for all.
@@ -108,6 +109,7 @@ class Server(Endpoint):
         gate: Gate | None = None,
         room: int = VEHICLES_MAX,
         recorder: Recorder | None = None,
+        plans: Recorder | None = None,
         stopwatch: Stopwatch | None = None,
         references: Callable[[int], Reference] | None = None,
     ) -> None:
@@ -117,7 +119,7 @@ class Server(Endpoint):
         self._heartbeat_ns = seconds_to_ns(self._terms.heartbeat_s)
         self._boot_id = boot_id
         self._gate = gate or Plain()
-        self._recorder = recorder
+        self._recorder, self._plans = recorder, plans
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, self._terms.dt_ns)
         self._plausibility = Plausibility(self._terms, room)
@@ -391,6 +393,8 @@ class Server(Endpoint):
                 self._say(session, Close(session.vehicle, session.number))
 
     def _record(self, decisions: Decisions) -> None:
+        if self._plans is not None and len(decisions.sent):
+            self._record_plans(self._plans, decisions)
         if self._recorder is None:
             return
         rows, found, figures = decisions.rows, decisions.found, decisions.figures
@@ -414,6 +418,22 @@ class Server(Endpoint):
             missed=self.missed,
         )
         self.stopwatch.lap("record")
+
+    def _record_plans(self, plans: Recorder, decisions: Decisions) -> None:
+        sent, found = decisions.sent, decisions.found
+        step, ahead = decisions.step[sent], found.ahead[sent]
+        # Behind d committed inputs, another d of each vehicle.
+        stages = ahead[:, None] + np.arange(self._terms.planned)
+        reckons = self._terms.reckons
+        plans.append(
+            len(sent),
+            vehicle=self.sessions.vehicle[decisions.rows[sent]],
+            step=step,
+            begins=step + ahead,
+            state=found.feedback[sent][:, :, :2] if reckons else found.start[sent],
+            inputs=np.take_along_axis(found.horizons[sent], stages[:, None], axis=2),
+            disturbance=found.disturbance[sent],
+        )
 
     @property
     def counts(self) -> Counter[str]:

@@ -49,6 +49,11 @@ class Running:
         self._scenario = scenario
 
     @property
+    def scenario(self) -> Scenario:
+        """The scenario with all that was changed so far."""
+        return self._scenario
+
+    @property
     def changeable(self) -> frozenset[str]:
         """Keys that may change."""
         return self._endpoint.changeable

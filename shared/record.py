@@ -108,6 +108,27 @@ def server_columns(axes: int) -> np.dtype[np.void]:
     )
 
 
+def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
+    """Columns of the server's plans: one row for each horizon that it sends.
+
+    With dead reckoning there is no plan: the state is where the target is told to be, and the one
+    input the velocity at which it goes on from there.
+
+    Args:
+        planned: number of its inputs on each axis, see `shared.terms.Terms.planned`.
+    """
+    return np.dtype(
+        [
+            ("vehicle", "<u2"),
+            ("step", "<i8"),  # k, at which it was made
+            ("begins", "<i8"),  # step of the first of the inputs, k + d
+            ("state", "<f8", (axes, 2)),  # x̂(k+d), where they lead on from [m, m/s]
+            ("inputs", "<f4", (axes, planned)),  # desired velocities, one a step [m/s]
+            ("disturbance", "<f8", (axes,)),  # input that is reckoned with besides [m/s]
+        ]
+    )
+
+
 UPLINK, DOWNLINK = 0, 1
 
 PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
@@ -133,29 +154,44 @@ class Sink(Protocol):
 
 
 class Recorder:
-    """Appends rows to a sink."""
+    """Appends rows to sinks.
 
-    def __init__(self, columns: np.dtype[np.void], sink: Sink) -> None:
+    Args:
+        columns: those of the rows.
+        sink: takes the header first; None for a recorder whose rows only go to those that follow.
+    """
+
+    def __init__(self, columns: np.dtype[np.void], sink: Sink | None = None) -> None:
         self.columns = columns
-        self._sink = sink
+        self._sinks: list[Sink] = []
         self._row = _row(columns)
-        sink.write(json.dumps(columns.descr).encode() + b"\n")
+        if sink is not None:
+            sink.write(json.dumps(columns.descr).encode() + b"\n")
+            self._sinks.append(sink)
+
+    def follow(self, sink: Sink) -> None:
+        """Have another sink take the rows from now on, and no header."""
+        self._sinks.append(sink)
 
     def append(self, count: int, **values: Any) -> None:
         """Append `count` rows; a value is one for all of them, or an array with the rows first."""
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value
-        self._sink.write(rows.tobytes())
+        self._write(rows.tobytes())
 
     def append_row(self, *values: float) -> None:
         """Append one row, faster: a value for every column in order, arrays number by number."""
-        self._sink.write(self._row.pack(*values))
+        self._write(self._row.pack(*values))
+
+    def _write(self, rows: bytes) -> None:
+        for sink in self._sinks:
+            sink.write(rows)
 
 
 def _row(columns: np.dtype[np.void]) -> Struct:
     """Layout of a row in memory."""
-    formats = {"u1": "B", "u2": "H", "u4": "I", "i8": "q", "f8": "d", "b1": "?"}
+    formats = {"u1": "B", "u2": "H", "u4": "I", "i8": "q", "f4": "f", "f8": "d", "b1": "?"}
     row = "<"
     for name in columns.names or ():
         kind = columns[name]

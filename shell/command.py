@@ -33,10 +33,14 @@ from shared.change import Running
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint, Form
 from shared.events import Counted, Listening, Plaintext, address_text
+from shared.feed import Opened
+from shared.record import Recorder
 from shared.stopwatch import Stopwatch
 from shared.summary import Summary
-from shell.control import ControlError, controlled
+from shell.control import controlled
 from shell.driver import Shell, run
+from shell.feed import Feed
+from shell.local import LocalError
 from shell.log import Log, LogFormat
 from shell.recording import Recording
 from shell.udp import SPARE_FILES, AddressError, allow_sockets, files_max, sockets_max
@@ -220,7 +224,7 @@ def _until_the_end(recording: Recording) -> Iterator[Recording]:
 def drive(
     process: str,
     endpoint: Endpoint,
-    scenario: Scenario,
+    options: Options,
     *,
     bind: Address | socket | None,
     peers: Sequence[Address] = (),
@@ -233,13 +237,14 @@ def drive(
     stopwatch: Stopwatch | None = None,
     recording: Recording | None = None,
     control: Path | None = None,
+    feed: Feed | None = None,
 ) -> None:
     """Run one endpoint as a process until it has finished or is told to stop.
 
     Args:
         process: name of the process in its log.
         endpoint: what to run.
-        scenario: what it flies.
+        options: its options: what it flies, and the name of that.
         bind, peers, forms, stopwatch: see `Shell`.
         waiting_for: whose datagrams it waits for, for the operator.
         secure: whether it has keys; None of one that only passes on what others say.
@@ -248,15 +253,19 @@ def drive(
         json: file for its last figures.
         recording: where it records; waited for at the end.
         control: where the socket for changes in flight is made.
+        feed: where it tells what is recorded and said.
 
     Raises:
         CommandError: it cannot start, must not without keys, or the file cannot be written.
     """
+    running = Running(endpoint, options.config)
+    if feed:
+        feed.open(_opened(process, options.scenario, running, feed))
     with ExitStack() as stack:
         try:
-            heeds = stack.enter_context(controlled(control, Running(endpoint, scenario)))
-            shell = Shell(endpoint, bind, peers, stopwatch, forms, heeds)
-        except ControlError as error:
+            heeds = stack.enter_context(controlled(control, running))
+            shell = Shell(endpoint, bind, peers, stopwatch, forms, heeds, feed)
+        except LocalError as error:
             raise CommandError(f"--control: {error}", CONFIGURATION) from None
         except AddressError as error:
             raise CommandError(str(error)) from None
@@ -274,18 +283,24 @@ def drive(
                 out.say(Plaintext(local=shell.is_local))
 
         def figures() -> dict[str, Any]:
-            return endpoint.figures() | {
+            counted = endpoint.figures() | {
                 "cpu_s": time.process_time() - began_s,
                 "kernel_drops": shell.kernel_drops(),
                 "send_errors": shell.send_errors,
             }
+            return counted | ({"feed": feed.figures()} if feed else {})
 
         def each_second(*, last: bool = False) -> None:
             if recording and (news := recording.news()):
                 out.say(news)
             out.each_second(last=last)
+            if feed:
+                feed.count(figures())
 
-        with _told_once() as told, closing(Log(process, log)) as out:
+        with (
+            _told_once() as told,
+            closing(Log(process, log, feed.say if feed else lambda _: None)) as out,
+        ):
             run(
                 [shell],
                 on_start=start,
@@ -301,6 +316,52 @@ def drive(
             out.say(Counted(figures=last))
             if json:
                 write(json, msgspec.json.encode(last))
+
+
+def _opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
+    """What makes the first frame of a feed."""
+    wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
+
+    def opened() -> Opened:
+        return Opened(
+            process=process,
+            name=name,
+            scenario=config.to_toml(running.scenario).decode(),
+            parts=feed.parts,
+            wall_ns=wall_ns,
+            time_ns=time_ns,
+        )
+
+    return opened
+
+
+@contextmanager
+def fed(path: Path | None) -> Iterator[Feed | None]:
+    """Have a feed for as long as the block takes; none without a path.
+
+    Raises:
+        CommandError: its socket cannot be made.
+    """
+    if path is None:
+        yield None
+        return
+    try:
+        feed = Feed(path)
+    except LocalError as error:
+        raise CommandError(f"--feed: {error}", CONFIGURATION) from None
+    with closing(feed):
+        yield feed
+
+
+def recorder(
+    part: str, columns: np.dtype[np.void], recording: Recording | None, feed: Feed | None
+) -> Recorder | None:
+    """Recorder of a part of the record, for a file, a feed or both; None where there is neither."""
+    if feed is None:
+        return recording.recorder if recording else None
+    both = recording.recorder if recording else Recorder(columns)
+    both.follow(feed.part(part, columns))
+    return both
 
 
 @contextmanager

@@ -6,20 +6,18 @@ nobody takes is not kept.
 """
 
 import asyncio
-import os
 import socket
-import stat
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from errno import EADDRINUSE, ECONNREFUSED
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from shared.change import REQUEST_BYTES_MAX, Answer, Running
+from shell.local import Local
 
 REST_S = 0.01
 """Least time from a request to the next that is read [s]."""
@@ -33,7 +31,7 @@ ANSWER_BYTES_MAX = 65_536
 
 
 class ControlError(OSError):
-    """Error: the socket cannot be made, or nobody answers at it; the message says why."""
+    """Error: nobody answers at the socket; the message says why."""
 
 
 class Control:
@@ -44,15 +42,13 @@ class Control:
         running: what may be changed.
 
     Raises:
-        ControlError: it cannot be made there.
+        LocalError: it cannot be made there.
     """
 
     def __init__(self, path: Path, running: Running) -> None:
-        self._path = path
         self._running = running
-        self._socket = _listening(path)
-        made = path.lstat()
-        self._made = made.st_dev, made.st_ino
+        self._local = Local(path, socket.SOCK_DGRAM)
+        self._socket = self._local.socket
         self._loop: asyncio.AbstractEventLoop | None = None
         self._after: Callable[[], None] = lambda: None
 
@@ -94,50 +90,7 @@ class Control:
 
     def close(self) -> None:
         """Remove the socket, if it is still ours."""
-        self._socket.close()
-        with suppress(OSError):
-            found = self._path.lstat()
-            if (found.st_dev, found.st_ino) == self._made:
-                self._path.unlink()
-
-
-def _listening(path: Path) -> socket.socket:
-    """A socket bound to a path that only its owner can send to.
-
-    Raises:
-        ControlError: it cannot be.
-    """
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    try:
-        sock.setblocking(False)
-        _clear(path)
-        before = os.umask(0o177)
-        try:
-            sock.bind(str(path))
-        finally:
-            os.umask(before)
-    except OSError as error:
-        sock.close()
-        taken = "somebody listens there" if error.errno == EADDRINUSE else error.strerror or error
-        raise ControlError(f"{path}: no socket can be made: {taken}") from None
-    return sock
-
-
-def _clear(path: Path) -> None:
-    """Remove a socket of ours that nobody listens at; where anything else is, nothing happens.
-
-    Raises:
-        OSError: it cannot be removed, or another reason not to listen there.
-    """
-    try:
-        found = path.lstat()
-    except FileNotFoundError:
-        return
-    if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
-        raise OSError("expected a path where nothing is, or a socket that was left behind")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as caller:
-        if caller.connect_ex(str(path)) == ECONNREFUSED:
-            path.unlink()
+        self._local.close()
 
 
 class Caller:
@@ -194,7 +147,7 @@ def controlled(path: Path | None, running: Running) -> Iterator[Control | None]:
     """A socket at a path for as long as the block takes; none without a path.
 
     Raises:
-        ControlError: it cannot be made.
+        LocalError: it cannot be made.
     """
     if path is None:
         yield None

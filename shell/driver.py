@@ -20,6 +20,7 @@ from shared.endpoint import Address, Datagram, Endpoint, Form
 from shared.events import Event, Fault
 from shared.stopwatch import Stopwatch
 from shell.control import Control
+from shell.feed import Feed
 from shell.timer import make_timer
 from shell.udp import (
     Names,
@@ -61,6 +62,7 @@ class Shell:
         stopwatch: measures receiving and sending.
         forms: forms of the datagrams that may come to socket 0; without any, all may.
         control: heeds changes in flight.
+        feed: tells readers what is recorded and said.
 
     Raises:
         AddressError: the address cannot be bound, or a name cannot be found.
@@ -74,10 +76,11 @@ class Shell:
         stopwatch: Stopwatch | None = None,
         forms: Sequence[Form] = (),
         control: Control | None = None,
+        feed: Feed | None = None,
     ) -> None:
         self.endpoint = endpoint
         self._stopwatch = stopwatch or Stopwatch()
-        self._control = control
+        self._control, self._feed = control, feed
         self.send_errors = 0
         """Number of datagrams that could not be sent."""
         self._drops = 0
@@ -109,6 +112,8 @@ class Shell:
             self._listen(number)
         if self._control:
             self._control.begin(self._loop, self._after)
+        if self._feed:
+            self._feed.begin(self._loop)
         resolver = self._loop.create_task(self._keep_resolving())
         try:
             self._after()
@@ -117,6 +122,8 @@ class Shell:
             resolver.cancel()
             if self._control:
                 self._control.end()
+            if self._feed:
+                self._feed.end()
             self._timer.close()
             self.endpoint.close(now_ns=time.monotonic_ns())
             for datagram in self.endpoint.outbox():
@@ -163,7 +170,7 @@ class Shell:
             self._after()
 
     def _after(self) -> None:
-        """Send what the endpoint wants sent, arm its timer, hand on its events."""
+        """Send what the endpoint wants sent, arm its timer, hand on its events and its rows."""
         endpoint = self.endpoint
         self._stopwatch.start()
         for datagram in endpoint.outbox():
@@ -177,6 +184,8 @@ class Shell:
             self._done.set_result(None)
         for event in endpoint.events():
             self._on_event(event)
+        if self._feed:
+            self._feed.take()
 
     def _send(self, datagram: Datagram) -> None:
         payload, peer, number = datagram

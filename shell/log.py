@@ -7,7 +7,7 @@ standard output that is closed or full is silence, and no fault.
 import errno
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import msgspec
@@ -42,11 +42,15 @@ class Log:
     Args:
         process: name of the process.
         form: form of its lines.
+        beside: called with each event that is said.
     """
 
-    def __init__(self, process: str, form: LogFormat) -> None:
+    def __init__(
+        self, process: str, form: LogFormat, beside: Callable[[Event], None] = lambda _: None
+    ) -> None:
         self._process = process
         self._form = form
+        self._beside = beside
         closed = OSError(errno.EBADF, "the standard output is closed")
         self._writer = Writer(sys.stdout or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
         self._limit = Limit()
@@ -60,6 +64,7 @@ class Log:
 
     def say(self, event: Event) -> None:
         """Print an event, whole lines in one write: several workers may share the output."""
+        self._beside(event)
         for line in self._lines(event):
             if not self._writer.write(line):
                 self._unread += 1

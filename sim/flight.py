@@ -15,11 +15,12 @@ import io
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from client import secure as client_secure
 from client.link import Link
@@ -42,6 +43,7 @@ from shared.record import (
     Rows,
     client_columns,
     parse,
+    plan_columns,
     server_columns,
 )
 from shared.stopwatch import Stopwatch
@@ -70,7 +72,7 @@ class FlightEvent(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """A flight: its record in three parts (see `shared.record`), and what was said of it."""
+    """A flight: its record in parts (see `shared.record`), and what was said of it."""
 
     client: Rows
     server: Rows
@@ -85,6 +87,8 @@ class Flight:
     order; empty for a flight over real UDP."""
     incomplete: tuple[RecordIncomplete, ...] = ()
     """What is missing in the record of a flight over real UDP, one for a part."""
+    plan: Rows = field(default_factory=lambda: np.empty(0, plan_columns(2, 1)))
+    """Plans that the server has sent; none of a flight in a batch, or over real UDP."""
 
     def trace_hash(self) -> str:
         """Hash of the record, equal for two flights that went the same to the last bit."""
@@ -119,10 +123,12 @@ def fly(
         stopped: asked often; once it says so, the flight is broken off.
     """
     keyring = make_keys(scenario.seed, vehicles) if secure else None
+    columns, sink = plan_columns(scenario.model.axes, scenario.terms().planned), io.BytesIO()
+    plans = Recorder(columns, sink)
     (flight,) = _fly(
-        scenario, (scenario.seed,), on_second, stopped, vehicles, stopwatch, keyring, changes
+        scenario, (scenario.seed,), on_second, stopped, vehicles, stopwatch, keyring, changes, plans
     )
-    return flight
+    return replace(flight, plan=parse(sink.getvalue()))
 
 
 def fly_batch(
@@ -275,6 +281,7 @@ def _fly(
     stopwatch: Stopwatch | None = None,
     keyring: Keyring | None = None,
     changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
+    plans: Recorder | None = None,
 ) -> list[Flight]:
     def on_event(time_ns: int, host: str, event: Event) -> None:
         if host == SERVER[0]:
@@ -297,6 +304,7 @@ def _fly(
         gate=server_secure.Secure(keyring, entropy=entropy) if keyring else None,
         room=len(seeds) * vehicles,
         recorder=Recorder(server_columns(scenario.model.axes), sink),
+        plans=plans,
         stopwatch=stopwatch,
         references=(lambda vehicle: targets[(vehicle - 1) // vehicles]) if targets else None,
     )

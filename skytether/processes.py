@@ -179,6 +179,7 @@ def run(
     watched: bool = True,
     secure: bool = False,
     control: Path | None = None,
+    feeds: Path | None = None,
 ) -> list[Shortfall]:
     """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
 
@@ -196,6 +197,8 @@ def run(
         watched: whether server and netem record, too.
         secure: whether the link is sealed, with keys that are made for this flight.
         control: folder for a socket of each process, through which keys change in flight.
+        feeds: folder for the feed of each process, called as in `server.feed`; of several workers,
+            as in `server.feed.1`.
 
     Raises:
         CommandError: one of the processes failed, the folder cannot be written to, or it was
@@ -215,7 +218,8 @@ def run(
     def common(name: str, *, recorded: bool) -> list[str]:
         part = ["--record", str(parts / name)] if recorded else []
         heeds = ["--control", str(control / name)] if control else []
-        return [name, str(file), "--json", str(parts / f"{name}.json"), *part, *heeds]
+        tells = ["--feed", str(feeds / f"{name}.feed")] if feeds else []
+        return [name, str(file), "--json", str(parts / f"{name}.json"), *part, *heeds, *tells]
 
     fleet = ["--vehicles", str(vehicles)]
     server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]

@@ -18,8 +18,9 @@ from shared import config
 from shared.change import Running
 from shared.events import Changed, ChangeRefused, Event
 from shell import command
-from shell.control import REST_S, RESTS, Caller, Control, ControlError, controlled
+from shell.control import REST_S, RESTS, Caller, Control, controlled
 from shell.driver import Shell, run
+from shell.local import LocalError
 from skytether.set import set_keys, value
 
 DEMO = config.load("demo")
@@ -213,7 +214,7 @@ def test_nothing_else_gives_way(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "netem"
     occupied(path, kind)
     before = path.lstat()
-    with pytest.raises(ControlError) as refused:
+    with pytest.raises(LocalError) as refused:
         Control(path, running())
     assert str(refused.value) == (
         f"{path}: no socket can be made: expected a path where nothing is, or a socket that was "
@@ -230,7 +231,7 @@ def test_a_socket_at_which_somebody_listens_stays(kind: int, tmp_path: Path) -> 
         other.bind(str(path))
         if kind == socket.SOCK_STREAM:
             other.listen()
-        with pytest.raises(ControlError, match="somebody listens there"):
+        with pytest.raises(LocalError, match="somebody listens there"):
             Control(path, running())
         assert path.is_socket()
 

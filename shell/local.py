@@ -1,0 +1,69 @@
+"""Unix sockets that their owner alone can use, and that are gone when whoever made them ends."""
+
+import os
+import socket
+import stat
+from contextlib import suppress
+from errno import EADDRINUSE, ECONNREFUSED
+from pathlib import Path
+
+
+class LocalError(OSError):
+    """Error: a socket cannot be made; the message says where and why."""
+
+
+class Local:
+    """A Unix socket that does not block, bound to a path with mode 0600.
+
+    Args:
+        path: where it is made, in place of one that nobody listens at.
+        kind: SOCK_DGRAM or SOCK_STREAM.
+
+    Raises:
+        LocalError: it cannot be made there.
+    """
+
+    def __init__(self, path: Path, kind: socket.SocketKind) -> None:
+        self._path = path
+        self.socket = socket.socket(socket.AF_UNIX, kind)
+        """The socket."""
+        try:
+            self.socket.setblocking(False)
+            _clear(path, kind)
+            before = os.umask(0o177)
+            try:
+                self.socket.bind(str(path))
+            finally:
+                os.umask(before)
+            made = path.lstat()
+        except OSError as error:
+            self.socket.close()
+            taken = "somebody listens there" if error.errno == EADDRINUSE else error.strerror
+            raise LocalError(f"{path}: no socket can be made: {taken or error}") from None
+        self._made = made.st_dev, made.st_ino
+
+    def close(self) -> None:
+        """Remove the socket, if it is still ours."""
+        self.socket.close()
+        with suppress(OSError):
+            found = self._path.lstat()
+            if (found.st_dev, found.st_ino) == self._made:
+                self._path.unlink()
+
+
+def _clear(path: Path, kind: socket.SocketKind) -> None:
+    """Remove a socket of ours that nobody listens at; where anything else is, nothing happens.
+
+    Raises:
+        OSError: it cannot be removed, or another reason not to listen there.
+    """
+    try:
+        found = path.lstat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
+        raise OSError("expected a path where nothing is, or a socket that was left behind")
+    with socket.socket(socket.AF_UNIX, kind) as caller:
+        caller.setblocking(False)  # somebody who listens may have no time
+        if caller.connect_ex(str(path)) == ECONNREFUSED:
+            path.unlink()
