@@ -39,6 +39,18 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"listening on {address}, waiting for {self.waiting_for}"
 
 
+class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A page can be looked at."""
+
+    address: str
+    """Address for a browser; with a token in it where that may change what flies."""
+    taken: str = ""
+    """HOST:PORT that it was to have, where somebody else has that."""
+
+    def __str__(self) -> str:
+        return f"page: {self.address}{f' ({self.taken} is taken)' if self.taken else ''}"
+
+
 class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """A process has no keys: what it hears may be anybody's, and anybody may read what it says."""
 
@@ -345,6 +357,7 @@ Failure = SessionRefused | NoSession | NoAnswer | NotFlown
 
 Event = (
     Listening
+    | PageServed
     | Plaintext
     | Counted
     | Omitted

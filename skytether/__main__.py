@@ -19,6 +19,7 @@ reorders and loses their packets.
   reproduce             the paper's table and figures, and more, as a report
   compare               schemes and triggers on the same seeds, each at its best weights
   calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
+  page FOLDER...        the page of flights in a browser; `fly` serves one by itself
   set PATH KEY=VALUE    change something while it flies, at a process with --control
   scenarios             what can be flown
   keygen FILE           keys for vehicles, so that nobody else can fly them
@@ -52,6 +53,7 @@ COMMANDS = {
     "reproduce": "skytether.reproduce:reproduce",
     "compare": "skytether.compare:compare",
     "calibrate": "skytether.calibrate:calibrate",
+    "page": "view.__main__:show",
     "set": "skytether.set:set_keys",
     "scenarios": "skytether.__main__:list_scenarios",
     "keygen": "skytether.keygen:keygen",

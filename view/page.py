@@ -37,7 +37,7 @@ class Page:
     Args:
         host, port: where it listens.
         flights: what is shown.
-        now_ns: tells the time of the frames [ns].
+        now_ns: tells the time of the frames [ns]; the clock of this machine unless given.
         token: who knows it may change what flies from anywhere; empty for nobody.
         more: adds what else the page has to a browser.
     """
@@ -48,15 +48,14 @@ class Page:
         port: int,
         flights: Sequence[Flight],
         *,
-        now_ns: Callable[[], int] = time.monotonic_ns,
+        now_ns: Callable[[], int] | None = None,
         token: str = "",
         more: Callable[[viser.GuiApi], None] | None = None,
     ) -> None:
-        self._flights, self._now_ns, self._token, self._more = flights, now_ns, token, more
+        self._flights, self._token, self._more = flights, token, more
+        self._now_ns = now_ns or time.monotonic_ns
         self._server = Server(host, port, verbose=False)
-        self._server.gui.configure_theme(
-            dark_mode=True, show_logo=False, show_share_button=False
-        )
+        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.gui.set_panel_label("Skytether")
         self._panels: dict[int, Panel] = {}
         self._scene: Scene | None = None
@@ -141,7 +140,7 @@ class Page:
         """How a browser has connected; a stranger where viser does not tell."""
         try:
             # viser keeps what it knows of this to itself.
-            connection = self._server._websock_server._live_connections[client.client_id]  # noqa: SLF001
+            connection = self._server._websock_server._live_connections[client.client_id]
             request = connection.request
             assert request is not None
             host = str(connection.remote_address[0])

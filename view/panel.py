@@ -72,9 +72,7 @@ class Panel:
 
         @light.on_update
         def _(_: Any) -> None:
-            gui.configure_theme(
-                dark_mode=not light.value, show_logo=False, show_share_button=False
-            )
+            gui.configure_theme(dark_mode=not light.value, show_logo=False, show_share_button=False)
 
         titles = [each.title for each in flights]
         axes = max(each.state.scenario.model.axes for each in flights)
@@ -85,16 +83,17 @@ class Panel:
             self._said = gui.add_html("")
         panel.dock_left()
         panel.set_width(400)
-        aspect = client.camera.aspect
-        if aspect < 1.0:
-            client.camera.position = scene.camera(aspect)
-            client.camera.look_at = scene.middle
+        self._scene = scene
+        self._aimed = np.array(scene.camera(1.5))
+        """Where the camera was put."""
 
     def _let_look(self) -> None:
         """Say why nothing can be changed here, and what would help."""
         with self._play:
             said = "This page can only be looked at: it may be played with on the machine itself"
-            self._client.gui.add_html(words.note(said + (", or with its token." if self._unlock else ".")))
+            self._client.gui.add_html(
+                words.note(said + (", or with its token." if self._unlock else "."))
+            )
             if self._unlock is None:
                 return
             unlock, field = self._unlock, self._client.gui.add_text("Token", "")
@@ -109,8 +108,19 @@ class Panel:
         with self._play:
             self._controls = [Controls(self._client, self._flights)]
 
+    def _aim(self) -> None:
+        """Show all there is in a window that changes, unless somebody has moved the camera."""
+        camera = self._client.camera
+        aim = np.array(self._scene.camera(camera.aspect))
+        is_ours = np.abs(camera.position - self._aimed).max() < 0.05 * self._scene.reach_m
+        if is_ours and np.abs(aim - self._aimed).max() > 0.05 * self._scene.reach_m:
+            self._aimed = aim
+            camera.position = tuple(aim)
+            camera.look_at = tuple(self._scene.middle)
+
     def show(self, now_ns: int) -> None:
         """Show flights as they are now."""
+        self._aim()
         numbers = sorted({number for each in self._flights for number in each.state.vehicles})
         if numbers and tuple(map(str, numbers)) != tuple(self._vehicle.options):
             self._vehicle.options = tuple(map(str, numbers))
@@ -131,6 +141,11 @@ class Panel:
             )
         for controls in self._controls:
             controls.show()
+
+
+def _set(handle: Any, value: Any) -> None:
+    """Set the value of a handle; mypy takes viser's property for one that cannot be."""
+    handle.value = value
 
 
 class _Slider:
@@ -158,7 +173,7 @@ class _Slider:
         self._slider.max = max(self._slider.max, number)
         self._slider.min = min(self._slider.min, number)
         if abs(self._slider.value - number) > self.knob.step / 2:
-            self._slider.value = number
+            _set(self._slider, number)
 
 
 class Controls:
@@ -174,8 +189,10 @@ class Controls:
         self._answer = gui.add_html("")
         self._sliders = [_Slider(gui, knob, self._ask) for knob in knobs(scenario.model.axes)]
         self._trigger = gui.add_dropdown(
-            "Trigger", triggers(scenario.control.scheme, scenario.control.trigger),
-            initial_value=scenario.control.trigger, hint="Rule for sending a plan",
+            "Trigger",
+            triggers(scenario.control.scheme, scenario.control.trigger),
+            initial_value=scenario.control.trigger,
+            hint="Rule for sending a plan",
         )
         self._thresholds = [_Slider(gui, knob, self._ask) for knob in THRESHOLDS]
         self._armed = gui.add_checkbox("Armed", True, hint="Whether plans are flown at all")
@@ -220,7 +237,7 @@ class Controls:
         if trigger != self._trigger.value:
             scheme = flight.state.scenario.control.scheme
             self._trigger.options = triggers(scheme, trigger)
-            self._trigger.value = trigger
+            _set(self._trigger, trigger)
         keys = compared(trigger)
         for slider in self._sliders:
             slider.show(flight.values.get(slider.knob.process, {}), visible=True)
@@ -228,7 +245,7 @@ class Controls:
             slider.show(server, visible=slider.knob.key in keys)
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
         if armed != self._armed.value:
-            self._armed.value = armed
+            _set(self._armed, armed)
         self._cut.disabled, self._heal.disabled = flight.is_cut, not flight.is_cut
         self._answer.content = "".join(
             words.answer(flight.answer, refused=flight.refused) for flight in self._flights

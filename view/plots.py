@@ -20,7 +20,7 @@ POINTS = 400
 HEIGHT = 150
 """Height of a plot [pixels]."""
 GREY = "#868e96"
-RED = "#f03e3e"
+MARK = "rgba(240, 62, 62, 0.6)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +45,8 @@ class Line:
     """Its colour; that of the flight unless given."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
-    dots: bool = False
-    """Whether it is dots, and no line."""
+    marks: bool = False
+    """Whether it is 1 where a mark across the whole plot stands, and 0 elsewhere."""
     once: bool = False
     """Whether it is the same of all flights."""
     steps: bool = False
@@ -109,7 +109,7 @@ def plots(axes: int) -> tuple[Plot, ...]:
             (
                 Line("threshold", lambda look: look.curves.threshold, GREY, dash=(4, 4)),
                 Line("figure", lambda look: look.curves.figure),
-                Line("sent", lambda look: look.curves.event, RED, dots=True),
+                Line("sent", lambda look: look.curves.event, MARK, marks=True, width=1.0),
             ),
         ),
         Plot(
@@ -131,8 +131,13 @@ def plots(axes: int) -> tuple[Plot, ...]:
         Plot(
             "Packets up in a second",
             (
-                Line("every step", lambda look: np.full(int(SPAN_S), look.state.every_step), GREY,
-                     dash=(4, 4), once=True),
+                Line(
+                    "every step",
+                    lambda look: np.full(int(SPAN_S), look.state.every_step),
+                    GREY,
+                    dash=(4, 4),
+                    once=True,
+                ),
                 Line("up", lambda look: look.state.network.rates(UPLINK, look.now_ns), steps=True),
             ),
             grid=_seconds,
@@ -140,9 +145,13 @@ def plots(axes: int) -> tuple[Plot, ...]:
         Plot(
             "Solving, against the deadline [ms]",
             (
-                Line("deadline",
-                     lambda look: np.full(POINTS, 1e3 * look.state.scenario.control.dt), GREY,
-                     dash=(4, 4), once=True),
+                Line(
+                    "deadline",
+                    lambda look: np.full(POINTS, 1e3 * look.state.scenario.control.dt),
+                    GREY,
+                    dash=(4, 4),
+                    once=True,
+                ),
                 Line("solve", lambda look: look.curves.solve_ms),
             ),
             log=True,
@@ -175,13 +184,15 @@ class Plots:
                 shown: uplot.Series = {
                     "label": label or "flown",
                     "stroke": rgb,
-                    "width": 0 if line.dots else line.width,
-                    "dash": list(line.dash),
-                    "points": {"show": line.dots, "size": 5, "fill": rgb},
-                    "spanGaps": False,
+                    "width": line.width,
+                    "dash": line.dash,
+                    "points": {"show": False},
+                    "scale": "marks" if line.marks else "y",
                 }
                 series.append(shown)
-        scales: dict[str, uplot.Scale] = {"x": {"time": False}}
+        # What is no mark lies below the scale, and is not seen.
+        marks: uplot.Scale = {"auto": False, "range": (0.5, 1.0)}
+        scales: dict[str, uplot.Scale] = {"x": {"time": False}, "marks": marks}
         if plot.log:
             scales["y"] = {"distr": 3}
         nothing = (np.array([0.0, 1.0]),) * len(series)
@@ -201,7 +212,22 @@ class Plots:
         for plot, handle in zip(self._plots, self._handles, strict=True):
             data = [plot.grid(looks[0])]
             for place, look in enumerate(looks):
-                data.extend(
-                    line.values(look) for line in plot.lines if not (line.once and place)
-                )
-            handle.data = tuple(data)
+                data.extend(line.values(look) for line in plot.lines if not (line.once and place))
+            handle.data = known(data)
+
+
+def known(data: Sequence[Array]) -> tuple[Array, ...]:
+    """Data from where on anything is known: uPlot draws no line that has a NaN in it.
+
+    A line that begins later, or of which nothing is known, is drawn with its first number, or 0,
+    until then.
+    """
+    missing = [np.isnan(values) for values in data[1:]]
+    begins = int(min((int(np.argmin(gone)) for gone in missing if not gone.all()), default=0))
+    begins = min(begins, len(data[0]) - 2)
+    filled = [data[0][begins:]]
+    for values, gone in zip(data[1:], missing, strict=True):
+        rest, nothing = values[begins:], gone[begins:]
+        first = rest[int(np.argmin(nothing))] if not nothing.all() else 0.0
+        filled.append(np.where(nothing, first, rest))
+    return tuple(filled)

@@ -200,7 +200,9 @@ class _Flight:
         tracks = list(state.vehicles.values())
         most = max(2, min(TRAIL_POINTS, TRAIL_POINTS_ALL // max(1, len(tracks))))
         trails = [each.trail(TRAIL_S) for each in tracks]
-        self._set(self._trail, [segments(trail[:: -(-len(trail) // most) or 1]) for trail in trails])
+        self._set(
+            self._trail, [segments(trail[:: -(-len(trail) // most) or 1]) for trail in trails]
+        )
         self._set(self._plan, [segments(each.ahead(), dashed=True) for each in tracks])
         goals = tracks[0].goals(TRAIL_S) if tracks else np.empty((0, 2))
         if len(goals):

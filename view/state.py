@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
-from shared.events import DOES, Event
+from shared.events import DOES, Counted, Event, Listening, Plaintext
 from shared.feed import FeedError, Figures, Frame, Opened, Rows, Said, columns_of, table
 from shared.model import discretise
 from shared.protocol import Mode
@@ -78,7 +78,10 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """The last minute of a vehicle on a grid of times; NaN where nothing is known."""
+    """The last minute of a vehicle on a grid of times; NaN where nothing is known yet.
+
+    Where nothing has been heard of it for a while, the newest value goes on.
+    """
 
     time_s: Array
     """Time of flight [s]; shape (n,)."""
@@ -91,7 +94,7 @@ class Curves:
     threshold: Array
     """What it compares that with; shape (n,)."""
     event: Array
-    """The figure where a horizon was sent, NaN elsewhere; shape (n,)."""
+    """1 where a horizon was sent, 0 elsewhere; shape (n,)."""
     age_s: Array
     """Age of the observation behind what is flown [s]; shape (n,)."""
     solve_ms: Array
@@ -253,30 +256,33 @@ class Track:
         if not len(kept):
             kept = self._empty
         times_s = kept["slot"] * self._slot_s
-        found = np.searchsorted(times_s, grid_s, "right") - 1
-        nearest = kept[np.maximum(found, 0)].copy()
-        # A value holds until the next; a gap of more than two is shown as one.
-        apart_s = max(2.5 * self._slot_s, 1.5 * SPAN_S / points)
-        gone = (found < 0) | (grid_s - times_s[np.maximum(found, 0)] > apart_s)
-        nearest[gone] = self._empty
-        event = np.full(points, np.nan)
-        sent = kept[kept["event"]]
-        at = np.searchsorted(grid_s, sent["slot"] * self._slot_s)
-        inside = (at > 0) & (at < points)
-        event[at[inside]] = sent["figure"][inside]
+
+        def held(values: Array) -> Array:
+            """Values on the grid, each held until the next that is known."""
+            known = ~np.isnan(values if values.ndim == 1 else values[:, 0])
+            if not known.any():
+                return np.full((points, *values.shape[1:]), np.nan)
+            found = np.searchsorted(times_s[known], grid_s, "right") - 1
+            on_grid = values[known][np.maximum(found, 0)]
+            on_grid[found < 0] = np.nan
+            return on_grid
+
+        event = np.zeros(points)
+        at = np.searchsorted(grid_s, times_s[kept["event"]])
+        event[at[at < points]] = 1.0
         return Curves(
             time_s=grid_s,
-            position=nearest["position"],
-            reference=nearest["reference"],
-            figure=nearest["figure"],
-            threshold=nearest["threshold"],
+            position=held(kept["position"]),
+            reference=held(kept["reference"]),
+            figure=held(kept["figure"]),
+            threshold=held(kept["threshold"]),
             event=event,
-            age_s=nearest["age_s"],
-            solve_ms=nearest["solve_ms"],
+            age_s=held(kept["age_s"]),
+            solve_ms=held(kept["solve_ms"]),
         )
 
     def error_m(self, seconds: float) -> float:
-        """Root mean square of the distance to the reference in the last seconds [m]; NaN of none."""
+        """Root mean square of the distance to the reference in the last seconds [m], or NaN."""
         kept = self._kept(seconds)
         away = kept["position"] - kept["reference"]
         squares = (away**2).sum(axis=1)
@@ -530,6 +536,8 @@ class State:
         return track
 
     def _said(self, event: Event, time_ns: int) -> None:
+        if isinstance(event, Counted | Listening | Plaintext):
+            return
         self.said.append((self.time_s(time_ns), str(event).splitlines()[0]))
 
     # -- what is shown -----------------------------------------------------------------------
@@ -537,6 +545,11 @@ class State:
     def time_s(self, time_ns: int) -> float:
         """Time of flight [s] at a time [ns]; 0 before it has begun."""
         return 0.0 if self.begin_ns is None else (time_ns - self.begin_ns) / SECOND_NS
+
+    @property
+    def title(self) -> str:
+        """What the scenario shows, or else its name."""
+        return self.scenario.title or self.name
 
     @property
     def lost(self) -> tuple[str, ...]:

@@ -43,10 +43,10 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     if not state.name:
         return f'<div style="{_BODY}">{escape(title)} Nothing has been heard of a flight yet.</div>'
     track = state.vehicles.get(vehicle)
-    head = f"<b>{escape(title or state.name)}</b>"
+    head = f"<b>{escape(title or state.title)}</b>"
     if track is None:
         return f'<div style="{_BODY}">{head}: no vehicle {vehicle} has been heard of yet.</div>'
-    rows = [("time", f"{track.time_s:.0f} s of {state.scenario.duration:g} s")]
+    rows = [("time of flight", f"{track.time_s:.0f} s of {state.scenario.duration:g} s")]
     rows.append(("off the reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
     rows.append(("age of what is flown by", number(track.age_s, ".2f", " s")))
     rows += _network(state, now_ns)
@@ -108,7 +108,9 @@ def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
 def said(states: Sequence[tuple[str, State]]) -> str:
     """The newest events, newest first, a line each."""
     events = [
-        (time_s, f"{title} {text}".strip()) for title, state in states for time_s, text in state.said
+        (time_s, f"{title} {text}".strip())
+        for title, state in states
+        for time_s, text in state.said
     ]
     events.sort(key=lambda each: each[0], reverse=True)
     lines = "".join(
