@@ -36,7 +36,7 @@ def beside(folders: Sequence[Path], at: str, say: Callable[[str], None]) -> Iter
         stderr=subprocess.STDOUT,
         stdin=subprocess.DEVNULL,
         start_new_session=True,
-        preexec_fn=die_with_parent,
+        preexec_fn=die_with_parent,  # noqa: PLW1509 - no thread of ours runs yet
     )
     ended = threading.Event()
 

@@ -1,12 +1,14 @@
 """A flight as a page has it: what is known of it, and the way to change it."""
 
+import contextlib
 import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from shared.change import Answer
-from shared.feed import FeedError, Frame
+from shared.events import Changed
+from shared.feed import FeedError, Frame, Opened, Said
 from view.controls import CUT, WAYS
 from view.play import PROCESSES, Operator
 from view.state import State
@@ -37,11 +39,11 @@ class Flight:
 
     def take(self, process: str, frame: Frame) -> None:
         """Take a frame; one that makes no sense is left out."""
-        try:
-            with self.lock:
-                self.state.take(process, frame)
-        except (FeedError, ValueError, KeyError):
-            return
+        with self.lock, contextlib.suppress(FeedError, ValueError, KeyError):
+            self.state.take(process, frame)
+        changed = isinstance(frame, Said) and isinstance(frame.event, Changed)
+        if process in PROCESSES and (changed or isinstance(frame, Opened)):
+            self.ask(process, {})
 
     def lose(self, process: str) -> None:
         """Note that a process is not heard any more."""
@@ -50,25 +52,20 @@ class Flight:
 
     # -- changes -----------------------------------------------------------------------------
 
-    def refresh(self) -> None:
-        """Ask every process what may change, and what it is."""
-        for process in PROCESSES:
-            self.ask(process, {})
-
     def ask(self, process: str, values: Mapping[str, Any]) -> None:
         """Ask a process for other values."""
         if self.operator:
             self.operator.ask(process, values)
 
-    def _answered(self, process: str, answer: Answer | str) -> None:
-        if isinstance(answer, str):
-            self.answer, self.refused = answer, True
-        elif answer.values:
+    def _answered(self, process: str, asked: Mapping[str, Any], answer: Answer | None) -> None:
+        if answer and answer.values:
             self.values[process] = answer.values
-        else:
+        elif answer:
             self.refused = bool(answer.refused)
             self.answer = answer.refused or "; ".join(map(str, answer.changed))
-            self.ask(process, {})
+        elif asked:
+            self.refused = True
+            self.answer = f"{process} does not answer: the flight is over, or it takes no changes"
 
     @property
     def is_cut(self) -> bool:

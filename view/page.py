@@ -125,8 +125,6 @@ class Page:
 
     def _panel(self, client: viser.ClientHandle) -> Panel:
         assert self._scene is not None
-        for flight in self._flights:
-            flight.refresh()
         return Panel(
             client,
             self._flights,

@@ -13,8 +13,8 @@ import viser
 from view import words
 from view.controls import THRESHOLDS, Knob, Values, compared, knobs, triggers
 from view.flight import Flight
-from view.plots import POINTS, Look, Plots
-from view.scene import Scene, in_space
+from view.plots import POINTS, Look, Plots, of_flight, of_network
+from view.scene import WIDE, Scene, in_space
 
 HELD_S = 1.5
 """Time for which a slider that was moved is left where it is [s]."""
@@ -22,6 +22,8 @@ FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
 )
+NARROW = 800
+"""Width up to which panels lie over the scene, and not beside it [pixels]."""
 MOVED_M = 0.05
 """Distance from which on the handle of the target follows it [m]."""
 
@@ -53,7 +55,8 @@ class Panel:
         gui = client.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("Skytether")
-        gui.main_panel.dock_right()
+        if client.camera.image_width > NARROW:
+            gui.main_panel.dock_right()
         gui.main_panel.set_width(340)
         self._status = [gui.add_html("") for _ in flights]
         if more:
@@ -67,8 +70,7 @@ class Panel:
             self._let_play()
         else:
             self._let_look()
-        with gui.add_folder("Page", expand_by_default=False):
-            light = gui.add_checkbox("Light", initial_value=False)
+        light = gui.add_checkbox("Light page", initial_value=False)
 
         @light.on_update
         def _(_: Any) -> None:
@@ -77,14 +79,17 @@ class Panel:
         titles = [each.title for each in flights]
         axes = max(each.state.scenario.model.axes for each in flights)
         panel = gui.add_panel()
-        with panel.add_tab("Plots"):
-            self._plots = Plots(gui, titles, axes)
+        with panel.add_tab("Flight"):
+            self._plots = [Plots(gui, titles, of_flight(axes))]
+        with panel.add_tab("Network"):
+            self._plots.append(Plots(gui, titles, of_network()))
         with panel.add_tab("Events"):
             self._said = gui.add_html("")
-        panel.dock_left()
+        if client.camera.image_width > NARROW:
+            panel.dock_left()
         panel.set_width(400)
         self._scene = scene
-        self._aimed = np.array(scene.camera(1.5))
+        self._aimed, _ = scene.camera(WIDE)
         """Where the camera was put."""
 
     def _let_look(self) -> None:
@@ -111,12 +116,11 @@ class Panel:
     def _aim(self) -> None:
         """Show all there is in a window that changes, unless somebody has moved the camera."""
         camera = self._client.camera
-        aim = np.array(self._scene.camera(camera.aspect))
+        aim, target = self._scene.camera(camera.aspect)
         is_ours = np.abs(camera.position - self._aimed).max() < 0.05 * self._scene.reach_m
         if is_ours and np.abs(aim - self._aimed).max() > 0.05 * self._scene.reach_m:
             self._aimed = aim
-            camera.position = tuple(aim)
-            camera.look_at = tuple(self._scene.middle)
+            camera.position, camera.look_at = aim, target
 
     def show(self, now_ns: int) -> None:
         """Show flights as they are now."""
@@ -133,12 +137,12 @@ class Panel:
         known = [track for track in tracks if track]
         if len(known) == len(tracks):
             end_s = max(track.time_s for track in known)
-            self._plots.draw(
-                [
-                    Look(flight.state, track.curves(POINTS, end_s), now_ns)
-                    for flight, track in zip(self._flights, known, strict=True)
-                ]
-            )
+            looks = [
+                Look(flight.state, track.curves(POINTS, end_s), now_ns)
+                for flight, track in zip(self._flights, known, strict=True)
+            ]
+            for plots in self._plots:
+                plots.draw(looks)
         for controls in self._controls:
             controls.show()
 
@@ -246,7 +250,8 @@ class Controls:
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
         if armed != self._armed.value:
             _set(self._armed, armed)
-        self._cut.disabled, self._heal.disabled = flight.is_cut, not flight.is_cut
+        self._cut.disabled = flight.is_cut or "netem" not in flight.values
+        self._heal.disabled = not flight.is_cut
         self._answer.content = "".join(
             words.answer(flight.answer, refused=flight.refused) for flight in self._flights
         )

@@ -16,17 +16,19 @@ from shell.control import Caller, ControlError
 PROCESSES = ("server", "netem", "client")
 """Names of the processes, and of their sockets in a flight's folder."""
 
+Answered = Callable[[str, Mapping[str, Any], Answer | None], None]
+
 
 class Operator:
     """Asks the processes of a flight for changes, in a thread of its own.
 
     Args:
         folder: where their sockets are.
-        answered: called in the thread with the name of a process and its answer, or a reason why
-            there is none.
+        answered: called in the thread with the name of a process, what it was asked for, and its
+            answer, or None where there is none.
     """
 
-    def __init__(self, folder: Path, answered: Callable[[str, Answer | str], None]) -> None:
+    def __init__(self, folder: Path, answered: Answered) -> None:
         self._folder = folder
         self._answered = answered
         self._callers: dict[str, Caller] = {}
@@ -55,11 +57,11 @@ class Operator:
                 if self._closed:
                     break
                 process, values = self._wanted.popitem()
-            self._answered(process, self._ask(process, values))
+            self._answered(process, values, self._ask(process, values))
         for caller in self._callers.values():
             caller.close()
 
-    def _ask(self, process: str, values: Mapping[str, Any]) -> Answer | str:
+    def _ask(self, process: str, values: Mapping[str, Any]) -> Answer | None:
         try:
             caller = self._callers.pop(process, None) or Caller(self._folder / process)
             try:
@@ -68,6 +70,6 @@ class Operator:
                 caller.close()  # an answer that comes yet is not that to the next request
                 raise
         except ControlError:
-            return f"{process} does not answer: the flight is over, or it takes no changes"
+            return None
         self._callers[process] = caller
         return answer

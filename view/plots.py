@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 
 POINTS = 400
 """Number of points of a line."""
+SEEN = 4.0
+"""Thresholds above which what the trigger compares is cut off."""
+SPARE = 6
+"""Number of zeros that are left at the end where they are cropped."""
 HEIGHT = 150
 """Height of a plot [pixels]."""
 GREY = "#868e96"
@@ -49,7 +53,6 @@ class Line:
     """Whether it is 1 where a mark across the whole plot stands, and 0 elsewhere."""
     once: bool = False
     """Whether it is the same of all flights."""
-    steps: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,8 @@ class Plot:
     lines: tuple[Line, ...]
     grid: Values = lambda look: look.curves.time_s
     log: bool = False
+    crop: bool = False
+    """Whether it ends where nothing but zeros follows."""
 
 
 def hex_of(rgb: Rgb) -> str:
@@ -100,15 +105,29 @@ def _share(direction: int) -> Values:
     return values
 
 
-def plots(axes: int) -> tuple[Plot, ...]:
-    """Every plot of a flight with so many axes."""
+def _every_step(look: Look) -> Array:
+    return np.full(int(SPAN_S), look.state.every_step)
+
+
+def _deadline_ms(look: Look) -> Array:
+    return np.full(POINTS, look.state.scenario.dt_ns / MILLISECOND_NS)
+
+
+def _compared(look: Look) -> Array:
+    """What the trigger compares, as far as it can be seen beside its threshold."""
+    most = np.where(look.curves.threshold > 0, SEEN * look.curves.threshold, np.inf)
+    return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
+
+
+def of_flight(axes: int) -> tuple[Plot, ...]:
+    """Plots of a vehicle with so many axes."""
     return (
         *(Plot(f"{name} [m]", _axis(axis)) for axis, name in enumerate("xyz"[:axes])),
         Plot(
             "What the trigger compares, and packets",
             (
                 Line("threshold", lambda look: look.curves.threshold, GREY, dash=(4, 4)),
-                Line("figure", lambda look: look.curves.figure),
+                Line("compared", _compared),
                 Line("sent", lambda look: look.curves.event, MARK, marks=True, width=1.0),
             ),
         ),
@@ -120,39 +139,31 @@ def plots(axes: int) -> tuple[Plot, ...]:
                 Line("delay down", _delays(DOWNLINK), GREY, dash=(2, 3), once=True, width=1.0),
             ),
         ),
-        Plot(
-            "Packets by their delay [ms], %",
-            (
-                Line("up", _share(UPLINK), steps=True),
-                Line("down", _share(DOWNLINK), GREY, dash=(2, 3), steps=True),
-            ),
-            grid=_bins_ms,
-        ),
+    )
+
+
+def of_network() -> tuple[Plot, ...]:
+    """Plots of packets, and of what plans cost."""
+    return (
         Plot(
             "Packets up in a second",
             (
-                Line(
-                    "every step",
-                    lambda look: np.full(int(SPAN_S), look.state.every_step),
-                    GREY,
-                    dash=(4, 4),
-                    once=True,
-                ),
-                Line("up", lambda look: look.state.network.rates(UPLINK, look.now_ns), steps=True),
+                Line("every step", _every_step, GREY, dash=(4, 4), once=True),
+                Line("up", lambda look: look.state.network.rates(UPLINK, look.now_ns)),
             ),
             grid=_seconds,
         ),
         Plot(
+            "Packets by their delay [ms], %",
+            (Line("up", _share(UPLINK)), Line("down", _share(DOWNLINK), GREY, dash=(2, 3))),
+            grid=_bins_ms,
+            crop=True,
+        ),
+        Plot(
             "Solving, against the deadline [ms]",
             (
-                Line(
-                    "deadline",
-                    lambda look: np.full(POINTS, 1e3 * look.state.scenario.control.dt),
-                    GREY,
-                    dash=(4, 4),
-                    once=True,
-                ),
-                Line("solve", lambda look: look.curves.solve_ms),
+                Line("deadline", _deadline_ms, GREY, dash=(4, 4), once=True),
+                Line("solving", lambda look: look.curves.solve_ms),
             ),
             log=True,
         ),
@@ -165,11 +176,11 @@ class Plots:
     Args:
         gui: where they are made.
         titles: what the flights are called; empty for a flight that is alone.
-        axes: number of axes that are plotted.
+        plots: what is plotted.
     """
 
-    def __init__(self, gui: viser.GuiApi, titles: Sequence[str], axes: int) -> None:
-        self._plots = plots(axes)
+    def __init__(self, gui: viser.GuiApi, titles: Sequence[str], plots: Sequence[Plot]) -> None:
+        self._plots = plots
         self._handles = [self._make(gui, plot, titles) for plot in self._plots]
 
     @staticmethod
@@ -213,7 +224,13 @@ class Plots:
             data = [plot.grid(looks[0])]
             for place, look in enumerate(looks):
                 data.extend(line.values(look) for line in plot.lines if not (line.once and place))
-            handle.data = known(data)
+            handle.data = known(cropped(data) if plot.crop else data)
+
+
+def cropped(data: Sequence[Array]) -> list[Array]:
+    """Data without the zeros that end all of it, but for a few."""
+    used = [int(np.flatnonzero(values).max(initial=0)) for values in data[1:]]
+    return [values[: max(used) + SPARE] for values in data]
 
 
 def known(data: Sequence[Array]) -> tuple[Array, ...]:
@@ -223,8 +240,8 @@ def known(data: Sequence[Array]) -> tuple[Array, ...]:
     until then.
     """
     missing = [np.isnan(values) for values in data[1:]]
-    begins = int(min((int(np.argmin(gone)) for gone in missing if not gone.all()), default=0))
-    begins = min(begins, len(data[0]) - 2)
+    begin = [int(np.argmin(gone)) for gone in missing if gone.any() and not gone.all()]
+    begins = min(min(begin, default=0), len(data[0]) - 2)
     filled = [data[0][begins:]]
     for values, gone in zip(data[1:], missing, strict=True):
         rest, nothing = values[begins:], gone[begins:]

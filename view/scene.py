@@ -38,6 +38,8 @@ ROUND_S = 600.0
 """Longest time of which the desired trajectory is drawn [s]."""
 SIZE = 0.05
 """Size of a vehicle over that of what is shown."""
+WIDE, NARROW = 1.5, 0.65
+"""Width over height of a window that is wide, and of one up to which it is narrow."""
 FOV_RAD = 0.7
 """Vertical field of view [rad]."""
 
@@ -145,7 +147,7 @@ class _Vehicle:
         assert track.row is not None
         self._frame.position = in_space(track.row["state"][None, :, 0])[0]
         does = track.does
-        text = f"{title} {does.word}"
+        text = f"{title} {does.word}".strip()
         if text != self._shown:
             self._shown = text
             self._label.text = text
@@ -247,20 +249,23 @@ class Scene:
         )
         camera = server.initial_camera
         camera.fov = FOV_RAD
-        camera.look_at = tuple(self.middle)
-        camera.position = self.camera(1.5)
+        camera.position, camera.look_at = self.camera(WIDE)
         self._flights = [
             _Flight(scene, place, state.scenario, self.reach_m, title)
             for place, (state, title) in enumerate(zip(states, titles, strict=True))
         ]
 
-    def camera(self, aspect: float) -> tuple[float, float, float]:
-        """Position of a camera that sees all, in a window of this width over height."""
+    def camera(self, aspect: float) -> tuple[Array, Array]:
+        """Position of a camera that sees all, and where it looks, in a window of this aspect.
+
+        In a narrow one the flight is in the upper half, for words lie over the lower.
+        """
         away_m = self.reach_m / np.tan(FOV_RAD / 2) / min(1.0, aspect)
-        x, y, z = self.middle.tolist()
+        down_m = 0.5 * self.reach_m / aspect if aspect < NARROW else 0.0
+        target = self.middle - np.array([0.0, down_m, 0.0])
         if self.flat:
-            return x, y - 0.01 * away_m, z + away_m
-        return x - 0.5 * away_m, y - 0.7 * away_m, z + 0.6 * away_m
+            return target + np.array([0.0, -0.01, 1.0]) * away_m, target
+        return target + np.array([-0.5, -0.7, 0.6]) * away_m, target
 
     def move(self, states: Sequence[State]) -> None:
         """Put vehicles where they are."""

@@ -230,9 +230,12 @@ class Track:
         return reference[~np.isnan(reference[:, 0])]
 
     def ahead(self) -> Array:
-        """Positions along the newest plan from the present step on [m]; shape (n, axes)."""
+        """Positions along the newest plan from the present step on [m]; shape (n, axes).
+
+        None where no plan is flown.
+        """
         axes = self._scenario.model.axes
-        if self._plan is None:
+        if self._plan is None or (self.row is not None and not self.row["covered"]):
             return np.empty((0, axes))
         model = discretise(self._scenario.tau_s, self._scenario.control.dt)
         state = np.array(self._plan["state"], dtype=np.float64)

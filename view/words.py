@@ -17,6 +17,8 @@ CSS = {
     "blue": "var(--mantine-color-blue-7)",
 }
 """Colours of words, by name."""
+NEWEST = 3
+"""Number of events that stand beside the state of a vehicle."""
 SAID_SHOWN = 50
 """Most events that are shown."""
 
@@ -68,7 +70,15 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
         f'<div style="{_BODY}" class="skytether-status">{head}'
         f"<div>{badge(track.does)}</div>"
         f'<div style="margin:0.3em 0">{badge(_link(state, vehicle, now_ns))}</div>{gone}'
-        f'<table style="border-spacing:0">{lines}</table></div>'
+        f'<table style="border-spacing:0">{lines}</table>'
+        f'<div style="{_DIM};margin-top:0.3em">{_newest(state)}</div></div>'
+    )
+
+
+def _newest(state: State) -> str:
+    """The last few events, newest first."""
+    return "".join(
+        f"<div>{time_s:.1f} s {escape(text)}</div>" for time_s, text in list(state.said)[: -NEWEST - 1 : -1]
     )
 
 
