@@ -278,9 +278,24 @@ def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -
         scenario: what the report is about.
         calls: facts of each call of the command that made it, the last one last.
     """
-    from jinja2 import Environment, StrictUndefined  # takes a tenth of a second to import
+    return rendered("lab/report.html.jinja", drawn=drawn, scenario=scenario, calls=calls)
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+
+def rendered(template: str, **values: Any) -> str:
+    """A page made from a template.
+
+    Args:
+        template: its package and file; it may extend another one.
+        values: what it is given.
+    """
+    from jinja2 import Environment, FunctionLoader, StrictUndefined  # takes a tenth of a second
+
+    def source(name: str) -> str:
+        package, _, file = name.partition("/")
+        return resources.files(package).joinpath(file).read_text(encoding="utf-8")
+
+    environment = Environment(
+        loader=FunctionLoader(source), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
     environment.filters["base64"] = lambda content: base64.b64encode(content).decode()
-    source = resources.files("lab").joinpath("report.html.jinja").read_text(encoding="utf-8")
-    return environment.from_string(source).render(drawn=drawn, scenario=scenario, calls=calls)
+    return environment.get_template(template).render(**values)

@@ -74,6 +74,8 @@ Frame = Opened | Rows | Said | Figures
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Frame)
+_UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
+"""Errors that the decoder has for what is no frame."""
 
 
 def encode(frame: Frame) -> bytes:
@@ -106,8 +108,8 @@ class Reader:
                 break
             try:
                 frames.append(_DECODER.decode(self._bytes[body : body + size]))
-            except msgspec.DecodeError as error:
-                raise FeedError(str(error)) from None
+            except _UNDECODABLE as error:
+                raise FeedError(f"got no frame: {error}") from None
             begin = body + size
         del self._bytes[:begin]
         return frames

@@ -481,7 +481,7 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
     if json is not None:  # first: whoever was to read the table may be gone
         write(json, msgspec.json.encode(summary))
     table = Table(title=title, title_justify="left", show_header=False)
-    for row in _rows(summary):
+    for row in summary_rows(summary):
         table.add_row(*map(Text, row))  # as text: "[m]" would be markup
     Console().print(table)
 
@@ -498,8 +498,8 @@ def write(path: Path, json: bytes) -> None:
         raise CommandError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def _rows(summary: Summary) -> list[tuple[str, str]]:
-    """Rows of the table: names and values of what the summary knows."""
+def summary_rows(summary: Summary) -> list[tuple[str, str]]:
+    """Names and values of what a summary knows, as a table shows them."""
     s = summary
     ages = _values(".3f", s.aoi_s_mean, s.aoi_s_peak, s.plan_age_s_mean)
     rows = [

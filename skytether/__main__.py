@@ -20,6 +20,9 @@ reorders and loses their packets.
   compare               schemes and triggers on the same seeds, each at its best weights
   calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
   page FOLDER...        the page of flights in a browser; `fly` serves one by itself
+  report FILE           a recording as a page with figures, for the browser
+  export FILE           a recording as tables, CSV or Parquet
+  recover FILE          a recording whose flight was killed, mended
   set PATH KEY=VALUE    change something while it flies, at a process with --control
   scenarios             what can be flown
   keygen FILE           keys for vehicles, so that nobody else can fly them
@@ -54,6 +57,9 @@ COMMANDS = {
     "compare": "skytether.compare:compare",
     "calibrate": "skytether.calibrate:calibrate",
     "page": "view.__main__:show",
+    "report": "skytether.report:report",
+    "export": "skytether.export:export",
+    "recover": "skytether.recover:recover",
     "set": "skytether.set:set_keys",
     "scenarios": "skytether.__main__:list_scenarios",
     "keygen": "skytether.keygen:keygen",

@@ -6,6 +6,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from shared.summary import Summary, summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
-from skytether import pages, processes
+from skytether import pages, processes, recorder
 from view.serve import HOST_PORT
 
 TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused
@@ -65,6 +66,10 @@ class Options:
     """File for the summary of the flight."""
     figure: Path | None = None
     """File for a picture of the flight (.png, .pdf or .svg)."""
+    record: Path | None = None
+    """File for a recording of the flight (.mcap): all that its processes record and say, written
+    while it flies. See `skytether report`, `replay`, `export` and `recover`; Foxglove and
+    Lichtblick show it, too."""
     beside: str | None = None
     """Another scenario to compare with, flown in virtual time with the same duration and seed."""
     config: ScenarioFlags = Scenario()
@@ -80,6 +85,7 @@ def fly(argv: Sequence[str]) -> None:
     scenario = options.config
     if options.figure:
         figures.check(options.figure)
+    recorder.check(options.record)
     if options.control:
         _make_folder(options.control, virtual=options.virtual)
     beside = _beside(options)
@@ -91,17 +97,23 @@ def fly(argv: Sequence[str]) -> None:
             command.progress(f"flying {title}", scenario.duration) as on_second,
         ):
             if options.virtual:
-                flown = _virtually(options, on_second, interrupted)
+                flown, unrecorded = _virtually(options, on_second, interrupted)
             else:
-                flown = _really(options, sockets, on_second, interrupted)
-        _show(options, title, flown, beside)
+                flown, unrecorded = _really(options, sockets, on_second, interrupted)
+        _show(options, title, flown, unrecorded, beside)
         if options.linger and sockets:
             with command.interruptible() as interrupted:
                 while not interrupted():
                     time.sleep(POLL_S)
 
 
-def _show(options: Options, title: str, flown: flight.Flight, beside: Scenario | None) -> None:
+def _show(
+    options: Options,
+    title: str,
+    flown: flight.Flight,
+    unrecorded: str | None,
+    beside: Scenario | None,
+) -> None:
     """Show what was flown, in words and as a picture.
 
     Raises:
@@ -126,7 +138,7 @@ def _show(options: Options, title: str, flown: flight.Flight, beside: Scenario |
     command.finish(summary, title, options.json)
     if options.figure:
         figures.flights(options.figure, flights)
-    if missing := _missing(scenario, flown):
+    if missing := _missing(scenario, flown) or unrecorded:
         raise CommandError(missing)
     if flown.failure:
         raise CommandError(str(flown.failure))
@@ -139,7 +151,7 @@ def _paged(options: Options) -> Iterator[Path | None]:
         yield options.control
         return
     command.address("--page", options.page)
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         temporary = tempfile.TemporaryDirectory(prefix="skytether-")
         folder = options.control or Path(stack.enter_context(temporary))
         stack.enter_context(pages.beside([folder], options.page, _print))
@@ -180,10 +192,15 @@ def _summarise(
 
 def _virtually(
     options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
-) -> flight.Flight:
-    return flight.fly(
-        options.config, secure=options.secure, on_second=on_second, stopped=interrupted
-    )
+) -> tuple[flight.Flight, str | None]:
+    """Fly in virtual time; returns the flight, and what is wrong with its recording."""
+    scenario, secure = options.config, options.secure
+    flown = flight.fly(scenario, secure=secure, on_second=on_second, stopped=interrupted)
+    if options.record is None:
+        return flown, None
+    name = options.scenario
+    summary = _summarise(scenario, name, flown, secure=secure)
+    return flown, recorder.write(options.record, scenario, name, flown, summary)
 
 
 def _really(
@@ -191,9 +208,22 @@ def _really(
     sockets: Path | None,
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
-) -> flight.Flight:
-    with tempfile.TemporaryDirectory(prefix="skytether-") as folder:
+) -> tuple[flight.Flight, str | None]:
+    """Fly over UDP; returns the flight, and what is missing in its recording."""
+    with tempfile.TemporaryDirectory(prefix="skytether-") as folder, ExitStack() as stack:
         parts, scenario = Path(folder), options.config
+        feeds = sockets or (parts if options.record else None)
+        live = None
+        if options.record and feeds:
+            live = recorder.Live(
+                options.record,
+                processes.feeds_in(feeds),
+                scenario,
+                options.scenario,
+                secure=options.secure,
+                tell=_tell,
+            )
+            stack.callback(live.finish)
         shortfalls = processes.run(
             scenario,
             parts,
@@ -202,16 +232,20 @@ def _really(
             on_event=_tell,
             secure=options.secure,
             control=sockets,
-            feeds=sockets,
+            feeds=feeds,
         )
         axes = scenario.model.axes
-        return flight.Flight(
+        flown = flight.Flight(
             client=_rows(parts / "client", record.client_columns(axes)),
             server=_rows(parts / "server", record.server_columns(axes)),
             netem=_rows(parts / "netem", record.PACKET_COLUMNS),
             failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
             incomplete=tuple(each for each in shortfalls if not isinstance(each, NotFlown)),
         )
+        if live is None:
+            return flown, None
+        summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
+        return flown, live.finish(summary if len(flown.client) else None, flown)
 
 
 def _rows(part: Path, columns: np.dtype[np.void]) -> record.Rows:

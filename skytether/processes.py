@@ -167,6 +167,11 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
         on_event(said.event)
 
 
+def feeds_in(folder: Path) -> dict[str, Path]:
+    """Sockets of the feeds in a folder, by the names of the processes, see `run`."""
+    return {name: folder / f"{name}.feed" for name in NAMES}
+
+
 def run(
     scenario: Scenario,
     parts: Path,
@@ -218,7 +223,7 @@ def run(
     def common(name: str, *, recorded: bool) -> list[str]:
         part = ["--record", str(parts / name)] if recorded else []
         heeds = ["--control", str(control / name)] if control else []
-        tells = ["--feed", str(feeds / f"{name}.feed")] if feeds else []
+        tells = ["--feed", str(feeds_in(feeds)[name])] if feeds else []
         return [name, str(file), "--json", str(parts / f"{name}.json"), *part, *heeds, *tells]
 
     fleet = ["--vehicles", str(vehicles)]

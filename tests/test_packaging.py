@@ -12,7 +12,8 @@ import pytest
 from shared import config
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ["shared", "shell", "server", "client", "netem", "sim", "lab", "skytether", "scenarios"]
+PACKAGES = ["shared", "shell", "server", "client", "netem", "sim", "lab", "view", "skytether"]
+PACKAGES += ["scenarios"]
 
 
 def test_each_top_level_name_belongs_to_our_distribution_alone() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 CORES = ("shared", "server", "client", "netem", "sim", "lab")
-OTHERS = ("shell", "skytether", "scenarios")
+OTHERS = ("shell", "view", "skytether", "scenarios")
 
 
 @pytest.fixture

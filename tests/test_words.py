@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("shared", "shell", "server", "client", "netem", "sim", "lab", "skytether")
+PACKAGES = ("shared", "shell", "server", "client", "netem", "sim", "lab", "view", "skytether")
 FILES = [
     file.relative_to(ROOT).as_posix()
     for package in (*PACKAGES, "fuzz", "benchmarks", "tests")

@@ -78,7 +78,8 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
 def _newest(state: State) -> str:
     """The last few events, newest first."""
     return "".join(
-        f"<div>{time_s:.1f} s {escape(text)}</div>" for time_s, text in list(state.said)[: -NEWEST - 1 : -1]
+        f"<div>{time_s:.1f} s {escape(text)}</div>"
+        for time_s, text in list(state.said)[: -NEWEST - 1 : -1]
     )
 
 

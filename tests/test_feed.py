@@ -1,0 +1,691 @@
+"""The feed of a process: what its readers get, and what none of them can do to it."""
+
+import asyncio
+import io
+import os
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import shell.feed
+from netem.proxy import Proxy
+from shared import config
+from shared.change import Running
+from shared.events import Changed, Degraded, Event, Finished
+from shared.feed import (
+    FRAME_BYTES_MAX,
+    FeedError,
+    Figures,
+    Frame,
+    Opened,
+    Reader,
+    Rows,
+    Said,
+    columns_of,
+    described,
+    encode,
+    table,
+)
+from shared.record import PACKET_COLUMNS, Recorder, parse, plan_columns
+from shell import command
+from shell.driver import Shell, run
+from shell.feed import (
+    BACKLOG_BYTES_MAX,
+    READERS_MAX,
+    ROWS_BYTES_MAX,
+    WAITING_BYTES_MAX,
+    Feed,
+    Subscriber,
+)
+from shell.local import LocalError
+from sim import flight
+
+DEMO = config.load("demo")
+OPENED = Opened(process="netem", name="demo", scenario="", parts={}, wall_ns=2, time_ns=1)
+PATIENCE_S = 30.0
+
+
+def rows(number: int, part: str = "netem", size: int = 28) -> Rows:
+    """A frame that can be told from others."""
+    return Rows(part=part, time_ns=number, rows=bytes([number % 256]) * size)
+
+
+# -- the frames ------------------------------------------------------------------------------------
+
+FIGURES = {"vehicles": 1, "each": {"vehicle 1": {"step": 7}}, "mode": "track", "share": 0.5}
+FRAMES: list[Frame] = [
+    OPENED,
+    rows(1),
+    Said(time_ns=3, event=Finished(vehicle=1, steps=9, missed=0)),
+    Figures(time_ns=4, figures=FIGURES),
+    rows(2, size=0),
+]
+
+
+@given(st.lists(st.sampled_from(FRAMES), max_size=12), st.data())
+def test_frames_are_read_however_they_are_cut(frames: list[Frame], data: st.DataObject) -> None:
+    """Bytes come from a socket in pieces of any size."""
+    stream, reader, read = b"".join(map(encode, frames)), Reader(), []
+    while stream:
+        size = data.draw(st.integers(1, len(stream)))
+        read += reader.read(stream[:size])
+        stream = stream[size:]
+    assert read == frames
+
+
+@given(st.binary(max_size=200), st.booleans())
+@settings(max_examples=300)
+def test_garbage_is_a_feed_error_or_waits_for_more(garbage: bytes, framed: bool) -> None:
+    """Whatever is at the other end of a socket, a reader meets nothing else."""
+    head = len(garbage).to_bytes(4, "big") if framed else b""
+    try:
+        Reader().read(head + garbage)
+    except FeedError:
+        return
+    assert not framed or not garbage
+
+
+@given(st.sampled_from(FRAMES), st.data())
+@settings(max_examples=300)
+def test_a_damaged_frame_is_another_one_or_a_feed_error(frame: Frame, data: st.DataObject) -> None:
+    """One byte of it is another."""
+    damaged = bytearray(encode(frame))
+    damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    reader = Reader()
+    try:
+        reader.read(bytes(damaged))
+        reader.read(bytes(1000))
+    except FeedError:
+        pass
+
+
+def test_a_frame_longer_than_any_is_refused_before_it_has_come() -> None:
+    """A reader would else gather 4 GiB of a stream that is none."""
+    head = (FRAME_BYTES_MAX + 1).to_bytes(4, "big")
+    with pytest.raises(FeedError, match="got a frame of 4194305 B, expected at most 4194304 B"):
+        Reader().read(head)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [b"\x81\x80\x01", b"\x91" * 100_000 + b"\x01", b"\xa1\x80"],
+    ids=["key", "depth", "text"],
+)
+def test_figures_that_are_none_are_a_feed_error(value: bytes) -> None:
+    """Where anything may stand, there are things that Python cannot make."""
+    whole = encode(Figures(time_ns=4, figures={"x": 7}))[4:]
+    body = whole[:-1] + value
+    with pytest.raises(FeedError, match="got no frame"):
+        Reader().read(len(body).to_bytes(4, "big") + body)
+
+
+def test_columns_survive_the_round_trip() -> None:
+    """Those of every part, with their shapes; and rows are read by them."""
+    columns = {"netem": PACKET_COLUMNS, "plan": plan_columns(3, 40)}
+    assert {part: columns_of(text) for part, text in described(columns).items()} == columns
+    row = np.zeros(2, PACKET_COLUMNS)
+    row["bytes"] = 7, 9
+    assert table(row.tobytes(), PACKET_COLUMNS)["bytes"].tolist() == [7, 9]
+    with pytest.raises(FeedError, match="got 1 B, expected rows of 29 B"):
+        table(b"x", PACKET_COLUMNS)
+
+
+@pytest.mark.parametrize("text", ["", "3", "null", "[]", '[["a","zzz"]]', '[["a"]]', '{"a":"b"}'])
+def test_columns_that_are_none_are_a_feed_error(text: str) -> None:
+    """As `columns_of` promises."""
+    with pytest.raises(FeedError, match="no columns"):
+        columns_of(text)
+
+
+# -- the socket ------------------------------------------------------------------------------------
+
+
+class Loop:
+    """A loop in which everything happens when it is told to."""
+
+    def __init__(self) -> None:
+        self.reads: Callable[[], None] | None = None
+        self.writes: dict[socket.socket, Callable[[], None]] = {}
+        self.later: list[Callable[[], None]] = []
+
+    def add_reader(self, _: socket.socket, read: Callable[[], None]) -> None:
+        """See asyncio."""
+        self.reads = read
+
+    def remove_reader(self, _: socket.socket) -> None:
+        """See asyncio."""
+        self.reads = None
+
+    def add_writer(self, sock: socket.socket, write: Callable[[Any], None], reader: Any) -> None:
+        """See asyncio."""
+        self.writes[sock] = lambda: write(reader)
+
+    def remove_writer(self, sock: socket.socket) -> None:
+        """See asyncio."""
+        del self.writes[sock]
+
+    def call_later(self, _: float, then: Callable[[], None]) -> "Loop":
+        """See asyncio; time passes in `turn`."""
+        self.later.append(then)
+        return self
+
+    def cancel(self) -> None:
+        """See asyncio's `TimerHandle`."""
+
+    def turn(self) -> None:
+        """Let time pass, and let happen what can."""
+        later, self.later = self.later, []
+        for then in later:
+            then()
+        if self.reads is not None:
+            self.reads()
+        for write in tuple(self.writes.values()):
+            write()
+
+
+class Driven:
+    """A feed in a loop, and its readers."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.loop = Loop()
+        self.feed = Feed(path)
+        self.part = self.feed.part("netem", PACKET_COLUMNS)
+        self.feed.open(lambda: OPENED)
+        self.feed.begin(self.loop)  # type: ignore[arg-type]
+        self.opened: list[Looker] = []
+
+    def look(self) -> "Looker":
+        """Somebody who looks on from now on."""
+        self.opened.append(Looker(self.path))
+        self.loop.turn()
+        return self.opened[-1]
+
+    def tell(self, *numbers: int, size: int = 28) -> None:
+        """Make rows, each in a call of its own, and let them be sent."""
+        for number in numbers:
+            self.part.write(bytes([number % 256]) * size)
+            self.feed.take()
+            self.loop.turn()
+
+
+class Looker:
+    """Somebody who connects, and reads when told to."""
+
+    def __init__(self, path: Path) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.socket.connect(str(path))
+        self.socket.setblocking(False)
+        self._reader = Reader()
+        self.gone = False
+
+    def read(self) -> list[Frame]:
+        """Frames that have come since; notes whether the feed has hung up."""
+        frames = []
+        try:
+            while piece := self.socket.recv(1 << 20):
+                frames += self._reader.read(piece)
+            self.gone = True
+        except BlockingIOError:
+            pass
+        except ConnectionResetError:
+            self.gone = True
+        return frames
+
+
+def numbers(frames: list[Frame]) -> list[int]:
+    """First byte of the rows of each frame that has rows."""
+    return [frame.rows[0] for frame in frames if isinstance(frame, Rows)]
+
+
+@pytest.fixture
+def driven(tmp_path: Path) -> Iterator[Driven]:
+    """A feed and its loop."""
+    one = Driven(tmp_path / "netem.feed")
+    yield one
+    one.feed.close()
+    for looker in one.opened:
+        looker.socket.close()
+
+
+def test_a_reader_gets_the_scenario_then_what_was_then_what_comes(driven: Driven) -> None:
+    """In the order in which it was made, none missing and none twice, whenever they come."""
+    driven.tell(1, 2, 3)
+    first = driven.look()
+    driven.tell(4)
+    second = driven.look()
+    driven.feed.say(Degraded(degraded=True))
+    driven.feed.count({"flows": 1})
+    driven.tell(5)
+    for looker in (first, second):
+        frames = looker.read()
+        assert frames[0] == OPENED
+        assert numbers(frames) == [1, 2, 3, 4, 5]
+        said, counted = frames[5:7]
+        assert isinstance(said, Said)
+        assert said.event == Degraded(degraded=True)
+        assert isinstance(counted, Figures)
+        assert counted.figures == {"flows": 1}
+    assert driven.feed.figures() == {"readers": 2, "dropped": 0, "refused": 0}
+
+
+def test_rows_of_one_call_are_one_frame_of_each_part(driven: Driven) -> None:
+    """However many they are, unless that would be a very long frame; no row is torn."""
+    looker, plans = driven.look(), driven.feed.part("plan", plan_columns(2, 40))
+    for _ in range(100):
+        driven.part.write(b"a" * 36)
+    plans.write(b"b" * 400)
+    driven.feed.take()
+    driven.loop.turn()
+    _, netem, plan = looker.read()
+    assert isinstance(netem, Rows)
+    assert isinstance(plan, Rows)
+    assert (netem.part, len(netem.rows)) == ("netem", 3600)
+    assert (plan.part, len(plan.rows)) == ("plan", 400)
+    for _ in range(300):
+        driven.part.write(b"c" * 3600)
+    driven.feed.take()
+    sizes: list[int] = []
+    while sum(sizes) < 300 * 3600:
+        driven.loop.turn()
+        sizes += [len(frame.rows) for frame in looker.read() if isinstance(frame, Rows)]
+    longest = (ROWS_BYTES_MAX // 3600 + 1) * 3600
+    assert sizes == [longest] * 4 + [300 * 3600 - 4 * longest]
+
+
+def test_what_is_kept_for_readers_to_come_is_bounded(driven: Driven) -> None:
+    """The oldest gives way, in whole frames."""
+    size = 10_000
+    driven.tell(*range(250), size=size)
+    looker, frames = driven.look(), list[Frame]()
+    for _ in range(30):
+        driven.loop.turn()
+        frames += looker.read()
+    assert frames[0] == OPENED
+    kept = numbers(frames)
+    assert kept == list(range(250 - len(kept), 250))
+    assert BACKLOG_BYTES_MAX - 2 * size < len(kept) * size <= BACKLOG_BYTES_MAX
+
+
+def flooded(driven: Driven) -> tuple[int, int]:
+    """Tell 8 MiB to one who reads and one who does not.
+
+    Returns:
+        How many were dropped, and the most bytes that waited for one of them.
+    """
+    slow, quick = driven.look(), driven.look()
+    got, waiting = list[Frame](), 0
+    for number in range(128):
+        driven.tell(number, size=65536)
+        for _ in range(2):
+            driven.loop.turn()
+        got += quick.read()
+        waiting = max([waiting, *(reader._bytes for reader in driven.feed._readers)])
+    assert numbers(got) == list(range(128))
+    frames = slow.read()
+    assert frames[0] == OPENED
+    assert numbers(frames) == list(range(len(frames) - 1))
+    assert not quick.gone
+    return driven.feed.figures()["dropped"], waiting
+
+
+def test_who_does_not_read_is_dropped_and_all_else_goes_on(driven: Driven) -> None:
+    """No more waits for him than may; others miss nothing."""
+    dropped, waiting = flooded(driven)
+    assert dropped == 1
+    assert waiting <= WAITING_BYTES_MAX
+    assert driven.feed.figures() == {"readers": 1, "dropped": 1, "refused": 0}
+    assert driven.opened[0].gone
+
+
+def test_without_the_bound_memory_grows_for_who_does_not_read(
+    driven: Driven, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody is dropped then, and all that was told waits."""
+    monkeypatch.setattr(shell.feed, "WAITING_BYTES_MAX", 1 << 60)
+    dropped, waiting = flooded(driven)
+    assert dropped == 0
+    assert waiting > 1.5 * WAITING_BYTES_MAX
+
+
+def test_readers_beyond_the_last_place_are_turned_away(driven: Driven) -> None:
+    """Those who read are not disturbed, and a place that becomes free is given away again."""
+    lookers = [driven.look() for _ in range(READERS_MAX + 2)]
+    driven.tell(1)
+    assert [numbers(looker.read()) for looker in lookers] == [[1]] * READERS_MAX + [[], []]
+    assert [looker.gone for looker in lookers] == [False] * READERS_MAX + [True, True]
+    lookers[0].socket.close()
+    driven.tell(2)
+    assert driven.feed.figures() == {"readers": READERS_MAX - 1, "dropped": 0, "refused": 2}
+    assert numbers(driven.look().read()) == [1, 2]
+
+
+def test_a_reader_that_is_killed_is_forgotten(driven: Driven) -> None:
+    """In the middle of a frame, with much that waits; what the kernel says of it hurts nobody."""
+    driven.tell(*range(100), size=10_000)
+    gone, stays = driven.look(), driven.look()
+    gone.socket.recv(1000)
+    gone.socket.close()
+    frames = stays.read()
+    for number in range(100, 200):
+        driven.tell(number)
+        frames += stays.read()
+    assert numbers(frames)[-100:] == list(range(100, 200))
+    assert driven.feed.figures() == {"readers": 1, "dropped": 0, "refused": 0}
+
+
+def test_what_a_reader_sends_is_never_read(driven: Driven) -> None:
+    """His own buffer is full then, and no more."""
+    hostile, other = driven.look(), driven.look()
+    with suppress(BlockingIOError):
+        while True:
+            hostile.socket.send(b"\xff" * 65536)
+    driven.tell(1, 2)
+    assert numbers(hostile.read()) == numbers(other.read()) == [1, 2]
+
+
+def test_one_reader_is_let_in_at_a_time_with_a_rest_after_each(driven: Driven) -> None:
+    """Who comes again and again costs the process little."""
+    waiting = [Looker(driven.path) for _ in range(4)]
+    driven.opened += waiting
+    for count in range(1, 5):
+        assert driven.loop.reads is not None
+        driven.loop.reads()
+        assert driven.loop.reads is None
+        assert driven.feed.figures()["readers"] == count
+        later, driven.loop.later = driven.loop.later, []
+        for then in later:
+            then()
+
+
+def test_with_nobody_reading_nothing_is_sent_or_timed(driven: Driven) -> None:
+    """Frames are kept for those to come, and that is all."""
+    driven.loop.turn()
+    driven.loop.later.clear()
+    driven.part.write(b"x" * 36)
+    driven.feed.take()
+    driven.feed.count({})
+    assert driven.loop.later == []
+    assert not driven.feed._fresh
+
+
+def test_at_the_end_readers_get_the_rest(driven: Driven) -> None:
+    """Also what was said after the loop had ended; then the feed hangs up and is gone."""
+    looker = driven.look()
+    driven.part.write(b"\x07" * 36)
+    driven.feed.take()
+    driven.feed.end()
+    driven.feed.say(Degraded(degraded=False))
+    driven.feed.close()
+    frames = looker.read()
+    assert [type(frame) for frame in frames] == [Opened, Rows, Said]
+    assert looker.gone
+    assert not driven.path.exists()
+
+
+def test_the_end_does_not_wait_long_for_who_does_not_read(
+    driven: Driven, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of them share the time."""
+    monkeypatch.setattr(shell.feed, "PATIENCE_S", 0.01)
+    for _ in range(READERS_MAX):
+        driven.look()
+    driven.tell(*range(16), size=65536)
+    driven.feed.close()
+    assert driven.feed.figures()["readers"] == 0
+
+
+def test_nobody_but_the_owner_can_look(driven: Driven) -> None:
+    """The socket's mode says so from its first moment on."""
+    assert stat.S_IMODE(driven.path.lstat().st_mode) == 0o600
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
+def test_another_user_is_refused_by_the_system() -> None:
+    """He sees the socket, and cannot connect."""
+    nobody = 65534
+    code = (
+        f"import os, socket, sys; os.setgid({nobody}); os.setuid({nobody})\n"
+        "socket.socket(socket.AF_UNIX, socket.SOCK_STREAM).connect(sys.argv[1])"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        one = Driven(Path(folder) / "netem.feed")
+        with closing(one.feed):
+            done = subprocess.run(
+                [sys.executable, "-I", "-S", "-c", code, str(one.path)],
+                capture_output=True,
+                check=False,
+                text=True,
+            )
+    assert "PermissionError" in done.stderr
+
+
+def test_a_feed_that_cannot_be_made_is_said_before_anything_flies(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the flag, the path and the reason."""
+    from netem.__main__ import emulate
+
+    path = tmp_path / "none" / "feed"
+    code = command.main(emulate, ["--bind", "127.0.0.1:0", "--feed", str(path)], "netem")
+    said = f"netem: --feed: {path}: no socket can be made: No such file or directory\n"
+    assert (code, capsys.readouterr().err) == (command.CONFIGURATION, said)
+
+
+def test_a_feed_takes_the_place_of_one_that_nobody_tells(tmp_path: Path) -> None:
+    """A process that was killed leaves one; that of a process that lives stays."""
+    path = tmp_path / "feed"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as killed:
+        killed.bind(str(path))
+    with closing(Feed(path)), pytest.raises(LocalError, match="somebody listens there"):
+        Feed(path)
+
+
+# -- processes -------------------------------------------------------------------------------------
+
+
+class Passing(Proxy):
+    """A netem that makes a row whenever it is changed, and ends with the last of the changes."""
+
+    finished = False
+
+    def __init__(self, recorder: Recorder) -> None:
+        super().__init__(DEMO, server=("127.0.0.1", 1), recorder=recorder)
+        self.recorder = recorder
+
+    def change(self, scenario: config.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        """Change, and perhaps end."""
+        super().change(scenario, keys, now_ns=now_ns)
+        self.recorder.append(1, number=round(100 * scenario.network.uplink.loss))
+        self.finished = scenario.network.uplink.loss == 1.0
+
+
+class Seen:
+    """What a subscriber has seen, by process."""
+
+    def __init__(self) -> None:
+        self.frames: dict[str, list[Frame]] = defaultdict(list)
+        self.lost: Counter[str] = Counter()
+        self.came = threading.Condition()
+
+    def take(self, name: str, frame: Frame) -> None:
+        """Take a frame."""
+        with self.came:
+            self.frames[name].append(frame)
+            self.came.notify_all()
+
+    def lose(self, name: str) -> None:
+        """Note that a feed has ended."""
+        with self.came:
+            self.lost[name] += 1
+            self.came.notify_all()
+
+    def wait(self, done: Callable[[], bool]) -> None:
+        """Wait until something has come."""
+        with self.came:
+            assert self.came.wait_for(done, PATIENCE_S)
+
+
+def test_a_process_tells_its_readers_while_it_is_driven(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows go to file and feed alike; a reader that comes later is told the scenario as it is then.
+
+    The feed ends with the process, its last words included.
+    """
+    monkeypatch.setattr(shell.feed, "AGAIN_S", 0.05)
+    path, seen, late, sink = tmp_path / "feed", Seen(), Seen(), io.BytesIO()
+    recorder = Recorder(PACKET_COLUMNS, sink)
+    loop: list[asyncio.AbstractEventLoop] = []
+
+    def losses() -> list[float]:
+        return [
+            float(frame.event.after)
+            for frame in seen.frames["netem"]
+            if isinstance(frame, Said) and isinstance(frame.event, Changed)
+        ]
+
+    def change(loss: float) -> None:
+        def now() -> None:
+            running.change({"network.uplink.loss": loss}, now_ns=0)
+            driver._after()
+
+        loop[0].call_soon_threadsafe(now)
+
+    def operate() -> None:
+        with closing(Subscriber({"netem": path, "none": path / "x"}, seen.take, seen.lose)):
+            seen.wait(lambda: bool(seen.frames["netem"]))
+            change(0.25)
+            seen.wait(lambda: 0.25 in losses())
+            with closing(Subscriber({"netem": path}, late.take)):
+                late.wait(lambda: len(late.frames["netem"]) >= 3)
+                change(1.0)
+                seen.wait(lambda: seen.lost["netem"] > 0)
+
+    thread = threading.Thread(target=operate)
+
+    def start() -> None:
+        loop.append(asyncio.get_running_loop())
+        thread.start()
+
+    with closing(Feed(path)) as feed:
+        recorder.follow(feed.part("netem", PACKET_COLUMNS))
+        endpoint = Passing(recorder)
+        running = Running(endpoint, DEMO)
+        feed.open(command._opened("netem", "demo", running, feed))
+        driver = Shell(endpoint, ("127.0.0.1", 0), feed=feed)
+        run([driver], on_start=start, on_event=feed.say)
+    thread.join(PATIENCE_S)
+    assert seen.lost == {"netem": 1}
+    assert seen.frames.keys() == {"netem"}
+    before, after = seen.frames["netem"][0], late.frames["netem"][0]
+    for opened, loss in ((before, 0.1), (after, 0.25)):
+        assert isinstance(opened, Opened)
+        assert (opened.process, opened.name) == ("netem", "demo")
+        scenario = msgspec.toml.decode(opened.scenario, type=config.Scenario)
+        assert scenario.network.uplink.loss == loss
+    assert isinstance(before, Opened)
+    columns = columns_of(before.parts["netem"])
+    told = [table(frame.rows, columns) for frame in seen.frames["netem"] if type(frame) is Rows]
+    np.testing.assert_array_equal(np.concatenate(told), parse(sink.getvalue()))
+    assert np.concatenate(told)["number"].tolist() == [25, 100]
+    assert losses() == [0.25, 1.0]
+
+
+def test_a_subscriber_begins_anew_where_a_process_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also after one that told garbage; once closed it calls nobody any more."""
+    monkeypatch.setattr(shell.feed, "AGAIN_S", 0.02)
+    path, seen = tmp_path / "feed", Seen()
+    with closing(Subscriber({"netem": path}, seen.take, seen.lose)):
+        for life, words in enumerate((encode(OPENED), b"\xff" * 99, encode(OPENED)), start=1):
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as process:
+                process.bind(str(path))
+                process.listen()
+                connection, _ = process.accept()
+                with connection:
+                    connection.sendall(words)
+            path.unlink()
+            seen.wait(lambda life=life: seen.lost["netem"] == life)  # type: ignore[misc]
+    assert seen.frames["netem"] == [OPENED, OPENED]
+
+
+# -- plans -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["committed", "predictive", "none", "dead_reckoning"])
+def test_the_plans_told_are_those_that_are_sent(
+    scheme: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each horizon has a row: its inputs behind the committed ones, and where they begin."""
+    sent, encode_horizon = [], flight.Server.__init__.__globals__["encode_horizon"]
+
+    def spied(vehicle: int, session: int, step: int, *rest: Any) -> bytes:
+        sent.append((vehicle, step, np.frombuffer(rest[2], np.float32).reshape(2, -1).copy()))
+        return bytes(encode_horizon(vehicle, session, step, *rest))
+
+    monkeypatch.setitem(flight.Server.__init__.__globals__, "encode_horizon", spied)
+    raw = config.to_table(DEMO) | {"duration": 6.0, "settle": 2.0}
+    raw["control"] |= {"scheme": scheme, "trigger": "always"}
+    raw["control"] |= {"feedback": scheme == "dead_reckoning", "observer_s": 0.0}
+    raw["vehicle"]["wind"] = 0.0
+    flown = config.check(raw, "test")
+    terms = flown.terms()
+    flight_ = flight.fly(flown, vehicles=2)
+    plans = flight_.plan
+    assert plans.dtype == plan_columns(2, terms.planned)
+    assert len(plans) == len(sent) > 80
+    for plan, (vehicle, step, inputs) in zip(plans, sent, strict=True):
+        d = inputs.shape[1] - terms.planned
+        assert (plan["vehicle"], plan["step"], plan["begins"]) == (vehicle, step, step + d)
+        np.testing.assert_array_equal(plan["inputs"], inputs[:, d:])
+    ahead = plans["begins"] - plans["step"]
+    assert (ahead.max() > 0) == terms.commits
+    assert not plans["disturbance"].any()
+    one = plans[plans["vehicle"] == 1]
+    own = flight_.server[flight_.server["vehicle"] == 1]
+    made = own[np.isin(own["step"], one["step"])]
+    if scheme in ("predictive", "none"):
+        np.testing.assert_array_equal(one["state"], made["estimate"])
+    elif scheme == "dead_reckoning":
+        np.testing.assert_allclose(one["state"], made["reference"], atol=1e-5)
+    else:  # where it was to be, it has come to be, but for what it never heard of
+        steps = flight_.client[flight_.client["vehicle"] == 1]
+        late = one[(one["step"] > 60) & (one["begins"] < len(steps))]
+        off = late["state"][..., 0] - steps["state"][late["begins"], :, 0]
+        assert np.median(np.abs(off)) < 0.01
+
+
+def test_flights_of_a_batch_keep_no_plans() -> None:
+    """Thousands of them would fill the memory."""
+    flown = msgspec.structs.replace(DEMO, duration=6.0)
+    (one,) = flight.fly_batch(flown, [1])
+    assert len(one.plan) == 0
+
+
+def test_events_are_of_the_log_and_limited() -> None:
+    """What a reader is told is what the log has, and no more."""
+    from shell.log import Log
+
+    told: list[Event] = []
+    with closing(Log("netem", "json", told.append)) as log:
+        for _ in range(100):
+            log.hear(Degraded(degraded=True))
+        log.each_second(last=True)
+    assert [type(event).__name__ for event in told] == ["Degraded"] * 5 + ["Omitted"]
