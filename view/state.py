@@ -131,8 +131,9 @@ class Track:
                 ("solve_ms", "f8"),
             ],
         )
-        self._empty = np.full(1, np.nan, self._ring.dtype)
-        self._empty["event"] = False
+        self._empty = np.zeros(1, self._ring.dtype)
+        for name in ("position", "reference", "figure", "threshold", "age_s", "solve_ms"):
+            self._empty[name] = np.nan
         self._ring["slot"] = -1
         self.row: np.void | None = None
         """Newest row of the client's part; None without any."""
@@ -179,11 +180,11 @@ class Track:
         """Index in the ring of each step, emptied where it is new; -1 where it is not kept."""
         slots = steps // self._stride
         at = slots % self._slots
-        there = self._ring["slot"][at]
+        there = np.maximum(self._ring["slot"][at], self._ring["slot"].max() - self._slots)
         new = slots > there
         self._ring[at[new]] = self._empty
         self._ring["slot"][at[new]] = slots[new]
-        return np.where(slots >= there, at, -1)
+        return np.where(slots == self._ring["slot"][at], at, -1)
 
     # -- what is shown -----------------------------------------------------------------------
 
