@@ -48,7 +48,8 @@ class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """HOST:PORT that it was to have, where somebody else has that."""
 
     def __str__(self) -> str:
-        return f"page: {self.address}{f' ({self.taken} is taken)' if self.taken else ''}"
+        taken = f", for {self.taken} is taken" if self.taken else ""
+        return f"the page is at {self.address}{taken}"
 
 
 class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):

@@ -9,6 +9,7 @@ if __name__ == "__main__":  # before the imports below, which take a while
 
 import os
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +19,7 @@ import tyro
 from shell import command
 from shell.command import CONFIGURATION, CommandError
 from shell.log import LogFormat
-from view.serve import HOST_PORT, serve
+from view.serve import HOST_PORT, followed, until_told
 
 NICE = 5
 """How far the page stands back behind the processes that fly."""
@@ -50,4 +51,9 @@ def show(argv: Sequence[str]) -> None:
     at = command.address("--page", options.page)
     alone = len(options.folders) == 1
     os.nice(NICE)
-    serve([("" if alone else each.name, each) for each in options.folders], at, options.log)
+    with ExitStack() as stack:
+        flights = [
+            stack.enter_context(followed(each, "" if alone else each.name))
+            for each in options.folders
+        ]
+        until_told(at, flights, options.log)

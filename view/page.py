@@ -4,6 +4,7 @@ One thread draws for all browsers, as often as an eye needs and only while someb
 """
 
 import contextlib
+import io
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +13,7 @@ import viser
 
 from view.access import Visitor, knows, may_play
 from view.flight import Flight
-from view.panel import Panel
+from view.panel import More, Panel
 from view.scene import Scene
 
 MOVES_HZ = 25
@@ -29,6 +30,11 @@ class Server(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002 - viser's
         """Refuse: a browser could put the page on the internet by it."""
         return None
+
+
+def _silence() -> contextlib.redirect_stdout[io.StringIO]:
+    """Keep what viser prints, even where it is told not to, off the standard output."""
+    return contextlib.redirect_stdout(io.StringIO())
 
 
 class Page:
@@ -50,11 +56,12 @@ class Page:
         *,
         now_ns: Callable[[], int] | None = None,
         token: str = "",
-        more: Callable[[viser.GuiApi], None] | None = None,
+        more: More | None = None,
     ) -> None:
         self._flights, self._token, self._more = flights, token, more
         self._now_ns = now_ns or time.monotonic_ns
-        self._server = Server(host, port, verbose=False)
+        with _silence():
+            self._server = Server(host, port, verbose=False)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.gui.set_panel_label("Skytether")
         self._panels: dict[int, Panel] = {}
@@ -74,7 +81,8 @@ class Page:
         """Show nothing more."""
         self._closed.set()
         self._thread.join()
-        self._server.stop()
+        with _silence():
+            self._server.stop()
 
     def _work(self) -> None:
         moves = 0

@@ -27,6 +27,8 @@ NARROW = 800
 MOVED_M = 0.05
 """Distance from which on the handle of the target follows it [m]."""
 
+More = Callable[[viser.GuiApi], Callable[[], None]]
+
 
 class Panel:
     """What one browser is shown.
@@ -37,7 +39,8 @@ class Panel:
         scene: the scene.
         may_play: whether it may change what flies.
         unlock: takes a token; whether it is the right one. None where there is no token.
-        more: adds what else a page has to a browser.
+        more: adds what else a page has to a browser that may play; what it returns is called
+            whenever the panel is shown.
     """
 
     def __init__(
@@ -48,7 +51,7 @@ class Panel:
         *,
         may_play: bool,
         unlock: Callable[[str], bool] | None,
-        more: Callable[[viser.GuiApi], None] | None,
+        more: More | None,
     ) -> None:
         self._client, self._flights, self._unlock = client, flights, unlock
         self._controls: list[Controls] = []
@@ -59,17 +62,16 @@ class Panel:
             gui.main_panel.dock_right()
         gui.main_panel.set_width(340)
         self._status = [gui.add_html("") for _ in flights]
-        if more:
-            more(gui)
+        self._more = more(gui) if more and may_play else None
         numbers = sorted({number for each in flights for number in each.state.vehicles} or {1})
         self._vehicle = gui.add_dropdown(
             "Vehicle", tuple(map(str, numbers)), visible=len(numbers) > 1
         )
         self._play = gui.add_folder("Play", visible=any(each.operator for each in flights))
-        if may_play:
-            self._let_play()
-        else:
+        if not may_play:
             self._let_look()
+        elif any(each.operator for each in flights):
+            self._let_play()
         light = gui.add_checkbox("Light page", initial_value=False)
 
         @light.on_update
@@ -89,7 +91,7 @@ class Panel:
             panel.dock_left()
         panel.set_width(400)
         self._scene = scene
-        self._aimed, _ = scene.camera(WIDE)
+        self._aimed = scene.camera(WIDE)[0]
         """Where the camera was put."""
 
     def _let_look(self) -> None:
@@ -145,9 +147,11 @@ class Panel:
                 plots.draw(looks)
         for controls in self._controls:
             controls.show()
+        if self._more:
+            self._more()
 
 
-def _set(handle: Any, value: Any) -> None:
+def assign(handle: Any, value: Any) -> None:
     """Set the value of a handle; mypy takes viser's property for one that cannot be."""
     handle.value = value
 
@@ -177,7 +181,7 @@ class _Slider:
         self._slider.max = max(self._slider.max, number)
         self._slider.min = min(self._slider.min, number)
         if abs(self._slider.value - number) > self.knob.step / 2:
-            _set(self._slider, number)
+            assign(self._slider, number)
 
 
 class Controls:
@@ -241,7 +245,7 @@ class Controls:
         if trigger != self._trigger.value:
             scheme = flight.state.scenario.control.scheme
             self._trigger.options = triggers(scheme, trigger)
-            _set(self._trigger, trigger)
+            assign(self._trigger, trigger)
         keys = compared(trigger)
         for slider in self._sliders:
             slider.show(flight.values.get(slider.knob.process, {}), visible=True)
@@ -249,7 +253,7 @@ class Controls:
             slider.show(server, visible=slider.knob.key in keys)
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
         if armed != self._armed.value:
-            _set(self._armed, armed)
+            assign(self._armed, armed)
         self._cut.disabled = flight.is_cut or "netem" not in flight.values
         self._heal.disabled = not flight.is_cut
         self._answer.content = "".join(

@@ -1,38 +1,40 @@
 """Serving a page: where it listens, who may change what, and how it ends."""
 
 import secrets
-import signal
 import socket
-import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-
-import viser
 
 from shared.endpoint import Address
 from shared.events import PageServed, address_text
-from shell.command import RUN, CommandError
+from shell.command import RUN, CommandError, interruptible
 from shell.feed import Subscriber
 from shell.log import Log, LogFormat
 from view.access import is_loopback
 from view.flight import Flight
 from view.page import Page
+from view.panel import More
 from view.play import PROCESSES
 
 HOST_PORT = "127.0.0.1:8080"
 """Address of a page unless another is given."""
 TOKEN_BYTES = 16
+POLL_S = 0.1
+"""Time after which Ctrl-C is noticed [s]."""
 ANYWHERE = ("0.0.0.0", "::")
 """Hosts that are none to connect to."""
 
 
-def followed(folder: Path, title: str = "") -> tuple[Flight, Subscriber]:
-    """A flight whose processes have their feeds and control sockets in a folder."""
+@contextmanager
+def followed(folder: Path, title: str = "") -> Iterator[Flight]:
+    """Follow a flight whose processes have their feeds and control sockets in a folder."""
     flight = Flight(title, folder)
     paths = {name: folder / f"{name}.feed" for name in PROCESSES}
     paths |= {each.name.replace(".feed", ""): each for each in folder.glob("*.feed.*")}
-    return flight, Subscriber(paths, flight.take, flight.lose)
+    with closing(flight), closing(Subscriber(paths, flight.take, flight.lose)):
+        yield flight
 
 
 @contextmanager
@@ -41,7 +43,7 @@ def page(
     flights: Sequence[Flight],
     *,
     now_ns: Callable[[], int] | None = None,
-    more: Callable[[viser.GuiApi], None] | None = None,
+    more: More | None = None,
 ) -> Iterator[PageServed]:
     """Serve a page for as long as the block takes; yields its address.
 
@@ -85,27 +87,28 @@ def _is_taken(host: str, port: int) -> bool:
     return False
 
 
-def serve(folders: Sequence[tuple[str, Path]], at: Address, log: LogFormat) -> None:
-    """Serve a page of the flights in folders until SIGINT or SIGTERM.
+def until_told(
+    at: Address,
+    flights: Sequence[Flight],
+    log: LogFormat = "text",
+    *,
+    now_ns: Callable[[], int] | None = None,
+    more: More | None = None,
+) -> None:
+    """Serve a page until SIGINT or SIGTERM, and say where.
 
     Args:
-        folders: flights, by title.
-        at: where it listens.
-        log: form of its log.
+        at, flights, now_ns, more: see `page`.
+        log: form of the log.
 
     Raises:
         CommandError: it cannot listen there.
     """
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
-    with ExitStack() as stack:
-        flights = []
-        for title, folder in folders:
-            flight, subscriber = followed(folder, title)
-            stack.callback(flight.close)
-            stack.callback(subscriber.close)
-            flights.append(flight)
-        out = stack.enter_context(closing(Log("page", log)))
-        out.say(stack.enter_context(page(at, flights)))
-        ended.wait()
+    with (
+        interruptible() as interrupted,
+        page(at, flights, now_ns=now_ns, more=more) as served,
+        closing(Log("page", log)) as out,
+    ):
+        out.say(served)
+        while not interrupted():
+            time.sleep(POLL_S)
