@@ -111,6 +111,7 @@ class Page:
         for number, client in clients.items():
             if number not in self._panels and len(self._panels) < BROWSERS_MAX:
                 self._panels[number] = self._panel(client)
+                draws = True
         with self._server.atomic():
             self._scene.move(states)
             if draws:

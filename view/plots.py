@@ -128,7 +128,9 @@ def of_flight(axes: int) -> tuple[Plot, ...]:
             (
                 Line("threshold", lambda look: look.curves.threshold, GREY, dash=(4, 4)),
                 Line("compared", _compared),
-                Line("sent", lambda look: look.curves.event, MARK, marks=True, width=1.0),
+                Line(
+                    "sent", lambda look: look.curves.event, MARK, marks=True, width=1.0, once=True
+                ),
             ),
         ),
         Plot(
@@ -155,7 +157,10 @@ def of_network() -> tuple[Plot, ...]:
         ),
         Plot(
             "Packets by their delay [ms], %",
-            (Line("up", _share(UPLINK)), Line("down", _share(DOWNLINK), GREY, dash=(2, 3))),
+            (
+                Line("up", _share(UPLINK)),
+                Line("down", _share(DOWNLINK), GREY, dash=(2, 3), once=True),
+            ),
             grid=_bins_ms,
             crop=True,
         ),

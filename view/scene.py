@@ -28,6 +28,12 @@ COLOUR_RGB: dict[str, Rgb] = {
 GOAL_RGB: Rgb = (134, 142, 150)
 """Colour of what is desired."""
 
+GRID_RGB: Rgb = (100, 104, 108)
+"""Colour of the lines on the ground."""
+GRID_REACH = 3.0
+"""How far the lines on the ground reach over what is shown."""
+BELOW = 1e-3
+"""How far below everything else they are, over what is shown."""
 TRAIL_S = 20.0
 """Time of which the trail is drawn [s]."""
 TRAIL_POINTS = 240
@@ -56,6 +62,20 @@ def segments(points: Array, *, dashed: bool = False) -> NDArray[np.float32]:
     placed = in_space(points)
     pieces = np.stack([placed[:-1], placed[1:]], axis=1)
     return pieces[::2] if dashed else pieces
+
+
+def grid(middle: Array, reach_m: float) -> NDArray[np.float32]:
+    """Lines on the ground around a middle, a round number of metres apart; shape (n, 2, 3)."""
+    cell_m = 10.0 ** np.floor(np.log10(reach_m))
+    most_m = cell_m * np.ceil(GRID_REACH * reach_m / cell_m)
+    at_m = np.arange(-most_m, most_m + cell_m / 2, cell_m)
+    lines = np.zeros((2 * len(at_m), 2, 3), np.float32)
+    along, across = lines[: len(at_m)], lines[len(at_m) :]
+    along[:, :, 0] = across[:, :, 1] = at_m[:, None]
+    along[:, :, 1] = across[:, :, 0] = -most_m, most_m
+    lines[:, :, :2] += np.round(middle[:2] / cell_m) * cell_m
+    lines[:, :, 2] = -BELOW * reach_m
+    return lines
 
 
 def extent(scenarios: Sequence[Scenario]) -> tuple[Array, float]:
@@ -234,18 +254,13 @@ class Scene:
         self.flat = all(state.scenario.model.axes == 2 for state in states)
         scene = server.scene
         scene.set_up_direction("+z")
-        scene.add_grid(
+        # viser's own grid costs a computer without a GPU a second to draw, lines nearly nothing.
+        scene.add_line_segments(
             "/grid",
-            infinite_grid=True,
-            cell_size=0.5 if self.reach_m < 10 else self.reach_m / 20,
-            section_size=1.0 if self.reach_m < 10 else self.reach_m / 4,
-            cell_color=(128, 128, 128),
-            section_color=(128, 128, 128),
-            cell_thickness=0.4,
-            section_thickness=0.8,
-            fade_distance=12 * self.reach_m,
-            shadow_opacity=0.0,
-            position=(0.0, 0.0, -0.01),
+            grid(self.middle, self.reach_m),
+            GRID_RGB,
+            thickness=1.0,
+            thickness_units="screen",
         )
         camera = server.initial_camera
         camera.fov = FOV_RAD
