@@ -14,7 +14,7 @@ from view import words
 from view.controls import THRESHOLDS, Knob, Values, compared, knobs, triggers
 from view.flight import Flight
 from view.plots import POINTS, Look, Plots, of_flight, of_network
-from view.scene import WIDE, Scene, in_space
+from view.scene import GROUND_RGB, WIDE, Scene, in_space
 
 HELD_S = 1.5
 """Time for which a slider that was moved is left where it is [s]."""
@@ -56,7 +56,7 @@ class Panel:
         self._client, self._flights, self._unlock = client, flights, unlock
         self._controls: list[Controls] = []
         gui = client.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._dress(light=False)
         gui.set_panel_label("Skytether")
         if client.camera.image_width > NARROW:
             gui.main_panel.dock_right()
@@ -74,9 +74,15 @@ class Panel:
             self._let_play()
         light = gui.add_checkbox("Light page", initial_value=False)
 
+        # viser's own grid costs a computer without a GPU a second to draw, lines nearly nothing.
+        ground = client.scene.add_line_segments(
+            "/ground", scene.ground, GROUND_RGB[False], thickness=1.0, thickness_units="screen"
+        )
+
         @light.on_update
         def _(_: Any) -> None:
-            gui.configure_theme(dark_mode=not light.value, show_logo=False, show_share_button=False)
+            self._dress(light=light.value)
+            ground.colors = np.array(GROUND_RGB[light.value], np.uint8)
 
         titles = [each.title for each in flights]
         axes = max(each.state.scenario.model.axes for each in flights)
@@ -93,6 +99,11 @@ class Panel:
         self._scene = scene
         self._aimed = scene.camera(WIDE)[0]
         """Where the camera was put."""
+
+    def _dress(self, *, light: bool) -> None:
+        self._client.gui.configure_theme(
+            dark_mode=not light, show_logo=False, show_share_button=False
+        )
 
     def _let_look(self) -> None:
         """Say why nothing can be changed here, and what would help."""

@@ -28,8 +28,8 @@ COLOUR_RGB: dict[str, Rgb] = {
 GOAL_RGB: Rgb = (134, 142, 150)
 """Colour of what is desired."""
 
-GRID_RGB: Rgb = (100, 104, 108)
-"""Colour of the lines on the ground."""
+GROUND_RGB: dict[bool, Rgb] = {False: (52, 55, 60), True: (222, 226, 230)}
+"""Colour of the lines on the ground, by whether the page is light."""
 GRID_REACH = 3.0
 """How far the lines on the ground reach over what is shown."""
 BELOW = 1e-3
@@ -254,14 +254,8 @@ class Scene:
         self.flat = all(state.scenario.model.axes == 2 for state in states)
         scene = server.scene
         scene.set_up_direction("+z")
-        # viser's own grid costs a computer without a GPU a second to draw, lines nearly nothing.
-        scene.add_line_segments(
-            "/grid",
-            grid(self.middle, self.reach_m),
-            GRID_RGB,
-            thickness=1.0,
-            thickness_units="screen",
-        )
+        self.ground = grid(self.middle, self.reach_m)
+        """Lines on the ground, see `grid`."""
         camera = server.initial_camera
         camera.fov = FOV_RAD
         camera.position, camera.look_at = self.camera(WIDE)
