@@ -65,6 +65,8 @@ class Options:
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
     feed: Path | None = None
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
+    metrics: str | None = None
+    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
     config: ScenarioFlags = Scenario()
 
 
@@ -129,6 +131,7 @@ def fly(argv: Sequence[str]) -> None:
             recording=recording,
             control=options.control,
             feed=feed,
+            metrics=command.optional_address("--metrics", options.metrics),
         )
         if alone and len(rows := recording.rows()):
             summary = summarise(scenario, options.scenario, rows, secure=keyring is not None)

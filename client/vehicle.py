@@ -20,7 +20,14 @@ from client.link import AGAIN_NS, Link, Plain
 from client.navigation import Navigation
 from client.plant import Plant
 from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint, seconds_to_ns
+from shared.endpoint import (
+    MILLISECOND_NS,
+    SECOND_NS,
+    Address,
+    Datagram,
+    Endpoint,
+    seconds_to_ns,
+)
 from shared.events import (
     Failure,
     Finished,
@@ -536,11 +543,19 @@ class Client(Endpoint):
                 self._send(Close(self.vehicle, self._session))
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
-        return {
+        """See `Endpoint`; ages are there while a horizon is in force."""
+        figures = {
+            "vehicle": self.vehicle,
             "mode": str(self._failsafe.mode),
             "step": self._step,
             "steps": self._steps,
             "missed": self.missed,
             "counts": dict(self.counts),
         }
+        compensator, observed_ns = self._compensator, self._compensator.observed_ns
+        if self._epoch_ns is not None and observed_ns >= 0:
+            now_ns = self._epoch_ns + self._flown * self._dt_ns
+            planned_ns = self._epoch_ns + compensator.in_force * self._dt_ns
+            figures["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
+            figures["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
+        return figures

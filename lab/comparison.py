@@ -55,8 +55,8 @@ OURS = "feedback-gap"
 CLAIMS = (
     Claim(OURS, "paper-every-step", SHARE, {"target": 0.5}),
     Claim(OURS, "paper-event", at_most={"target": 0.25}),
-    Claim(OURS, "feedback-periodic", at_most={"target": 0.7}),
-    Claim(OURS, "reckoning-tolerance", at_most={"target": 0.9}),
+    Claim(OURS, "feedback-periodic", at_most={"target": 0.7, "turns": 0.7}),
+    Claim(OURS, "reckoning-tolerance", at_most={"target": 0.9, "turns": 0.9}),
     Claim(OURS, "reckoning-tolerance", BYTES_UP),
     Claim(OURS, "reckoning-periodic"),
     Claim(OURS, "reckoning-delta"),

@@ -175,6 +175,17 @@ CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap")
 """Contenders on a trajectory that is known for ever, for which no network is needed."""
 AHEAD = ("paper-every-step", "feedback-gap", "reckoning-tolerance")
 """Contenders where a plan may say more than a target's state."""
+TURNING = (
+    "paper-every-step",
+    "paper-event",
+    "feedback-every-step",
+    "feedback-periodic",
+    "feedback-gap",
+    "feedback-expected",
+    "reckoning-periodic",
+    "reckoning-tolerance",
+)
+"""Contenders where a trigger may earn its packets."""
 
 
 def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
@@ -206,6 +217,14 @@ def _noise(position_m: float) -> Mapping[str, Any]:
 GUSTS = {"vehicle.gust_mps2": 1.0, "vehicle.gust_every_s": 10.0, "vehicle.gust_s": 1.0}
 CASES = (
     Case("target", "a target that only the server sees", "target", TARGET, 0.3),
+    Case(
+        "turns",
+        "a target that turns every 4 s on average",
+        "target",
+        {**TARGET, "reference.turn_every_s": 4.0},
+        0.3,
+        contenders=TURNING,
+    ),
     _unsearched("loss-0.3", "loss of 0.3 each way", _network(loss=0.3)),
     _unsearched("loss-0.5", "loss of 0.5 each way", _network(loss=0.5)),
     _unsearched("jitter", "jitter doubled", _network(minimum_s=0.36, slot_s=0.04, slots_mean=2.0)),

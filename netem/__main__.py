@@ -49,6 +49,8 @@ class Options:
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
     feed: Path | None = None
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
+    metrics: str | None = None
+    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
     config: ScenarioFlags = Scenario()
 
 
@@ -81,6 +83,7 @@ def emulate(argv: Sequence[str]) -> None:
             recording=recording,
             control=options.control,
             feed=feed,
+            metrics=command.optional_address("--metrics", options.metrics),
         )
 
 

@@ -17,6 +17,8 @@ directions full, and what Python takes for each packet, netem stays below 256 Mi
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
 """Width of the bins in which delays are counted [ns]: the lattice of the paper's delay."""
+DELAY_EDGES_MS = (20, 40, 60, 80, 100, 140, 200, 300, 400, 500, 600, 800, 1000, 2000)
+"""Edges between which delays are counted for those who draw them over time [ms]."""
 ERROR_BIN_NS = MILLISECOND_NS // 50
 """Width of the bins in which errors of delays are counted [ns]."""
 
@@ -164,6 +166,7 @@ class Link:
             "queue": self.depth(),
             "queue_max": counts.depth_max,
             "delays": counts.delay.by_bin(),
+            "delays_within": counts.delay.within(DELAY_EDGES_MS),
             "error_ms_p50": counts.error.quantile_ms(0.5),
             "error_ms_p99": counts.error.quantile_ms(0.99),
             "error_ms_max": counts.error.largest_ns / MILLISECOND_NS,

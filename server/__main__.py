@@ -63,6 +63,9 @@ class Options:
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
     feed: Path | None = None
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
+    metrics: str | None = None
+    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz. Worker N
+    listens at PORT + N - 1."""
     config: ScenarioFlags = Scenario()
 
 
@@ -76,13 +79,15 @@ def serve(argv: Sequence[str]) -> None:
     command.check_count("--workers", options.workers, 64)
     command.check_sockets("--workers", options.workers)
     bind = command.address("--bind", options.bind)
+    metrics = command.optional_address("--metrics", options.metrics)
     if options.workers == 1:
-        _work(options, bind, "")
+        _work(options, bind, "", metrics)
         return
 
     def work(number: int, sock: socket) -> None:
         suffix = f".{number}"
-        sys.exit(command.main(lambda _: _work(options, sock, suffix), (), f"server{suffix}"))
+        own = metrics and (metrics[0], metrics[1] and metrics[1] + number - 1)
+        sys.exit(command.main(lambda _: _work(options, sock, suffix, own), (), f"server{suffix}"))
 
     try:
         worst = workers.run(options.workers, bind, work)
@@ -92,7 +97,7 @@ def serve(argv: Sequence[str]) -> None:
         raise CommandError("a worker has failed", worst)
 
 
-def _work(options: Options, bind: Address | socket, suffix: str) -> None:
+def _work(options: Options, bind: Address | socket, suffix: str, metrics: Address | None) -> None:
     """Run one worker, whose files have names that end in `suffix`."""
 
     def own(path: Path | None) -> Path | None:
@@ -133,4 +138,5 @@ def _work(options: Options, bind: Address | socket, suffix: str) -> None:
             recording=recording,
             control=own(options.control),
             feed=feed,
+            metrics=metrics,
         )

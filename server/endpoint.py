@@ -76,6 +76,8 @@ MISSES_MAX = 5
 """Number of ticks that may be missed in a second before the server calls itself degraded."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
+TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
+"""Edges between which ticks are counted for those who draw them over time [ms]."""
 
 
 TRIGGER = keys_of("the server's: when it sends")
@@ -452,10 +454,12 @@ class Server(Endpoint):
             each["and more"] = len(self.sessions) - VEHICLES_TOLD_MAX
         return {
             "vehicles": len(self.sessions),
+            "degraded": self._degraded,
             "missed": self.missed,
             "observations": self.observations,
             "tick_ms_p50": self.ticks.quantile_ms(0.5),
             "tick_ms_p99": self.ticks.quantile_ms(0.99),
+            "ticks_within": self.ticks.within(TICK_EDGES_MS),
             "spent_ns": dict(self.stopwatch.spent_ns),
             "counts": dict(self.counts),
             "each": each,

@@ -143,6 +143,9 @@ class ReferenceConfig(Section, frozen=True):
     more than the present."""
     agility: Strength = 0.3
     """Strength of the white acceleration that moves a target [m/s per √s]."""
+    turn_every_s: Duration = 0.0
+    """Mean time between the turns of a target [s], at which alone its velocity then changes, by as
+    much as `agility` makes of that time; 0: it changes all the time."""
     radius_m: Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)] = 1.55
     """Half the width of circle, figure-eight and square, and of where a target moves [m]."""
     period_s: Annotated[float, Meta(ge=0.1, le=86400)] = 27.5
@@ -383,6 +386,7 @@ class Scenario(Section, frozen=True):
                     agility=config.agility,
                     speed_mps=config.speed_mps,
                     radius_m=config.radius_m,
+                    turn_every_s=config.turn_every_s,
                 )
             case "live":
                 return shapes.hover(points[0] if len(points) else np.zeros(axes))

@@ -52,6 +52,16 @@ class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"the page is at {self.address}{taken}"
 
 
+class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process serves its figures over HTTP, as metrics."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"metrics at http://{address_text(self.host, self.port)}/metrics"
+
+
 class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """A process has no keys: what it hears may be anybody's, and anybody may read what it says."""
 
@@ -359,6 +369,7 @@ Failure = SessionRefused | NoSession | NoAnswer | NotFlown
 Event = (
     Listening
     | PageServed
+    | Measured
     | Plaintext
     | Counted
     | Omitted

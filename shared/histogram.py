@@ -1,5 +1,7 @@
 """Histograms of durations, which take as much memory for many as for few."""
 
+from collections.abc import Sequence
+
 from shared.endpoint import MILLISECOND_NS
 
 BINS = 500
@@ -34,6 +36,21 @@ class Histogram:
             if count and seen >= wanted and index < BINS - 1:
                 return min((index + 1) * self.bin_ns, self.largest_ns) / MILLISECOND_NS
         return self.largest_ns / MILLISECOND_NS
+
+    def within(self, edges_ms: Sequence[float]) -> dict[str, int]:
+        """Number of durations below each of these edges, as in `20 ms`, and of all, `inf ms`.
+
+        A bin that an edge cuts is counted above it.
+
+        Args:
+            edges_ms: rising edges [ms].
+        """
+        told, seen, index = {}, 0, 0
+        for edge_ms in edges_ms:
+            end = min(round(edge_ms * MILLISECOND_NS) // self.bin_ns, BINS - 1)
+            seen += sum(self.counts[index:end])
+            told[f"{edge_ms:g} ms"], index = seen, end
+        return {**told, "inf ms": seen + sum(self.counts[index:])}
 
     def by_bin(self) -> dict[str, int]:
         """Counts by the lower edge of the bin, as in `20 ms`; bins without any are left out."""

@@ -141,9 +141,15 @@ def hover(point_m: Array) -> Reference:
 
 
 def target(
-    rng: np.random.Generator, axes: int, *, agility: float, speed_mps: float, radius_m: float
+    rng: np.random.Generator,
+    axes: int,
+    *,
+    agility: float,
+    speed_mps: float,
+    radius_m: float,
+    turn_every_s: float = 0.0,
 ) -> Reference:
-    """Random walk from the origin: white acceleration, which nobody can foresee.
+    """Random walk from the origin: white acceleration, or turns, which nobody can foresee.
 
     The velocity is reflected where it would become too large, and the position where it would leave
     its bounds. Before time 0 the target rests at the origin, and after TURN_S it comes back the way
@@ -154,8 +160,10 @@ def target(
         agility: strength of the acceleration [m/s per √s].
         speed_mps: largest velocity along an axis [m/s].
         radius_m: largest coordinate [m].
+        turn_every_s: mean time between two turns [s], at which alone the velocity changes, by as
+            much as it would have in that time; 0: it changes all the time.
     """
-    walk = _Walk(rng, axes)
+    walk = _Walk(rng, axes, turn_every_s)
 
     def sample(t: Array) -> Array:
         t = np.maximum(np.asarray(t, dtype=np.float64), 0.0)
@@ -179,8 +187,10 @@ def target(
 class _Walk:
     """Velocity and position of a target on a grid of GRID_S, drawn as far as they are asked for."""
 
-    def __init__(self, rng: np.random.Generator, axes: int) -> None:
+    def __init__(self, rng: np.random.Generator, axes: int, turn_every_s: float) -> None:
         self._rng = rng
+        self._turns = min(GRID_S / turn_every_s, 1.0) if turn_every_s else 1.0
+        """Share of the points of the grid at which the velocity changes."""
         self._free = np.zeros((1, axes))
         self._velocities = np.zeros((1, axes))
         self._positions = np.zeros((1, axes))
@@ -189,6 +199,9 @@ class _Walk:
         """Velocities [m/s] and positions [m] up to a point of the grid; each (points, axes)."""
         while len(self._free) <= last:
             kicks = self._rng.standard_normal((GRID_BLOCK, self._free.shape[1]))
+            if self._turns < 1.0:
+                turned = self._rng.random((GRID_BLOCK, 1)) < self._turns
+                kicks *= turned / np.sqrt(self._turns)
             free = self._free[-1] + np.cumsum(agility * np.sqrt(GRID_S) * kicks, axis=0)
             v, _ = _folded(np.concatenate([self._free[-1:], free]), speed_mps)
             p = self._positions[-1] + np.cumsum(0.5 * GRID_S * (v[:-1] + v[1:]), axis=0)

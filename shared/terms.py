@@ -148,7 +148,7 @@ _OWNERS = {
         control.deviation_m control.tolerance_m
     """,
     "the server's: what only it knows": """
-        reference.preview reference.agility reference.velocity_mps
+        reference.preview reference.agility reference.turn_every_s reference.velocity_mps
     """,
     "the server's: how it plans": """
         model.dead_time_s control.solver control.state_weight control.terminal_weight

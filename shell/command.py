@@ -18,7 +18,7 @@ from errno import EMFILE
 from inspect import cleandoc
 from pathlib import Path
 from socket import socket
-from typing import Annotated, Any, BinaryIO, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Protocol, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -32,7 +32,7 @@ from shared import config
 from shared.change import Running
 from shared.config import ConfigError, Scenario
 from shared.endpoint import Address, Endpoint, Form
-from shared.events import Counted, Listening, Plaintext, address_text
+from shared.events import Counted, Listening, Measured, Plaintext, address_text
 from shared.feed import Opened
 from shared.record import Recorder
 from shared.stopwatch import Stopwatch
@@ -44,6 +44,9 @@ from shell.local import LocalError
 from shell.log import Log, LogFormat
 from shell.recording import Recording
 from shell.udp import SPARE_FILES, AddressError, allow_sockets, files_max, sockets_max
+
+if TYPE_CHECKING:  # it takes a while to import, and is rarely wanted
+    from shell.metrics import Metrics
 
 CONFIGURATION, RUN, INTERRUPTED = 2, 1, 128 + signal.SIGINT
 """Exit codes: what the command asked for is impossible, something went wrong on the way, or it was
@@ -128,6 +131,11 @@ def address(flag: str, text: str) -> Address:
         expected = "expected HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
         raise CommandError(f"{flag}: got {text!r}, {expected}", CONFIGURATION)
     return host, int(port)
+
+
+def optional_address(flag: str, text: str | None) -> Address | None:
+    """Address that a flag was given, see `address`; None where it was given none."""
+    return None if text is None else address(flag, text)
 
 
 def _is_ipv6(host: str) -> bool:
@@ -238,6 +246,7 @@ def drive(
     recording: Recording | None = None,
     control: Path | None = None,
     feed: Feed | None = None,
+    metrics: Address | None = None,
 ) -> None:
     """Run one endpoint as a process until it has finished or is told to stop.
 
@@ -254,14 +263,16 @@ def drive(
         recording: where it records; waited for at the end.
         control: where the socket for changes in flight is made.
         feed: where it tells what is recorded and said.
+        metrics: where its figures are served over HTTP.
 
     Raises:
         CommandError: it cannot start, must not without keys, or the file cannot be written.
     """
     running = Running(endpoint, options.config)
     if feed:
-        feed.open(_opened(process, options.scenario, running, feed))
+        feed.open(opened(process, options.scenario, running, feed))
     with ExitStack() as stack:
+        served = stack.enter_context(_served(metrics, process, options))
         try:
             heeds = stack.enter_context(controlled(control, running))
             shell = Shell(endpoint, bind, peers, stopwatch, forms, heeds, feed)
@@ -281,6 +292,9 @@ def drive(
             out.say(Listening(host=host, port=port, waiting_for=waiting_for))
             if secure is False:
                 out.say(Plaintext(local=shell.is_local))
+            if served:
+                host, port = served.address
+                out.say(Measured(host=host, port=port))
 
         def figures() -> dict[str, Any]:
             counted = endpoint.figures() | {
@@ -294,8 +308,12 @@ def drive(
             if recording and (news := recording.news()):
                 out.say(news)
             out.each_second(last=last)
-            if feed:
-                feed.count(figures())
+            if feed or served:
+                snapshot = figures()
+                if feed:
+                    feed.count(snapshot)
+                if served:
+                    served.take(snapshot)
 
         with (
             _told_once() as told,
@@ -318,11 +336,33 @@ def drive(
                 write(json, msgspec.json.encode(last))
 
 
-def _opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
+@contextmanager
+def _served(address: Address | None, process: str, options: Options) -> Iterator["Metrics | None"]:
+    """Serve metrics for as long as the block takes; none without an address.
+
+    Raises:
+        CommandError: nothing can listen there.
+    """
+    if address is None:
+        yield None
+        return
+    from shell.metrics import Collected, Metrics, MetricsError
+
+    collected = Collected(process, options.scenario, options.config.control.dt)
+    try:
+        metrics = Metrics(address, collected)
+    except MetricsError as error:
+        at = address_text(*address)
+        raise CommandError(f"--metrics: cannot listen at {at}: {error}", CONFIGURATION) from None
+    with closing(metrics):
+        yield metrics
+
+
+def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
     """What makes the first frame of a feed."""
     wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
 
-    def opened() -> Opened:
+    def make() -> Opened:
         return Opened(
             process=process,
             name=name,
@@ -332,7 +372,7 @@ def _opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[
             time_ns=time_ns,
         )
 
-    return opened
+    return make
 
 
 @contextmanager

@@ -25,8 +25,8 @@ FLOODED_BYTES = 16 * 1024 * 1024
 """Size of the receive buffer of a socket that may be flooded [B]: at 50 000 packets a second that
 come through, what a process can read that waits for a core for half a second."""
 
-SPARE_FILES = 32
-"""Number of open files that a process may need beside its sockets."""
+SPARE_FILES = 48
+"""Number of open files that a process may need beside its sockets, with all who look on."""
 
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 _SO_ATTACH_FILTER, _UDP_HEADER_BYTES = 26, 8

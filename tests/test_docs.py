@@ -169,6 +169,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether torture",)  # by test_torture.py
     known += ("skytether set ",)
     known += ("docker compose up",)
+    known += ("docker compose --profile observe up",)  # by test_observe.py, as far as it can be
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     for line in COMMANDS:
         assert line.startswith((*known, *by_hand)), line

@@ -145,7 +145,7 @@ def test_too_few_open_files_are_told_before_anything_flies(argv: list[str], flag
     """How many are needed, how many there may be, and what to do."""
     done = run(argv, "64 open files")
     assert done.returncode in (1, 2)
-    said = f"{flag}: got 200, which takes 232 open files; expected at most 32, for 64 may be open"
+    said = f"{flag}: got 200, which takes 248 open files; expected at most 16, for 64 may be open"
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
@@ -160,7 +160,7 @@ def test_netem_takes_as_many_clients_as_files_may_be_open() -> None:
         assert "listening" in netem.stdout.readline()
         netem.terminate()
         _, said = netem.communicate(timeout=PATIENCE_S)
-    room = "netem: room for 32 clients and not 512: 64 files may be open here (ulimit -n)\n"
+    room = "netem: room for 16 clients and not 512: 64 files may be open here (ulimit -n)\n"
     assert (netem.returncode, said) == (0, room)
 
 

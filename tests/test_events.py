@@ -24,6 +24,7 @@ from shared.events import (
     FlowOpened,
     Flying,
     Listening,
+    Measured,
     ModeChanged,
     NoAnswer,
     NoSession,
@@ -48,6 +49,7 @@ SENTENCES = [
         Listening(host="::1", port=47001, waiting_for="vehicles"),
         "listening on [::1]:47001, waiting for vehicles",
     ),
+    (Measured(host="::1", port=9464), "metrics at http://[::1]:9464/metrics"),
     (
         Plaintext(local=True),
         "PLAINTEXT, no keys: anybody on this machine can fly the vehicle; see skytether keygen",

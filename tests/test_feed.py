@@ -456,23 +456,23 @@ def test_nobody_but_the_owner_can_look(driven: Driven) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
 def test_another_user_is_refused_by_the_system() -> None:
-    """He sees the socket, and cannot connect."""
+    """He sees the socket, and cannot connect; it is its mode that keeps him out."""
     nobody = 65534
     code = (
         f"import os, socket, sys; os.setgid({nobody}); os.setuid({nobody})\n"
         "socket.socket(socket.AF_UNIX, socket.SOCK_STREAM).connect(sys.argv[1])"
     )
+    said = []
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         one = Driven(Path(folder) / "netem.feed")
         with closing(one.feed):
-            done = subprocess.run(
-                [sys.executable, "-I", "-S", "-c", code, str(one.path)],
-                capture_output=True,
-                check=False,
-                text=True,
-            )
-    assert "PermissionError" in done.stderr
+            argv = [sys.executable, "-I", "-S", "-c", code, str(one.path)]
+            said.append(subprocess.run(argv, capture_output=True, check=False).stderr)
+            one.path.chmod(0o666)
+            said.append(subprocess.run(argv, capture_output=True, check=False).stderr)
+    assert b"PermissionError" in said[0]
+    assert said[1] == b""
 
 
 def test_a_feed_that_cannot_be_made_is_said_before_anything_flies(
@@ -587,7 +587,7 @@ def test_a_process_tells_its_readers_while_it_is_driven(
         recorder.follow(feed.part("netem", PACKET_COLUMNS))
         endpoint = Passing(recorder)
         running = Running(endpoint, DEMO)
-        feed.open(command._opened("netem", "demo", running, feed))
+        feed.open(command.opened("netem", "demo", running, feed))
         driver = Shell(endpoint, ("127.0.0.1", 0), feed=feed)
         run([driver], on_start=start, on_event=feed.say)
     thread.join(PATIENCE_S)

@@ -117,6 +117,7 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
     fleet.receive(Datagram(b"?", ("server", 1), 1), now_ns=0)
     assert [client.counts.total() for client in vehicles] == [0, 1]
     assert fleet.figures()["each"]["vehicle 2"] == {
+        "vehicle": 2,
         "mode": "init",
         "step": 0,
         "steps": 200,

@@ -42,3 +42,18 @@ def test_bins_without_any_are_left_out() -> None:
     """Named by their lower edges; an empty histogram has none."""
     assert filled(0, 1, 20).by_bin() == {"0 ms": 2, "2e-05 ms": 1}
     assert filled().by_bin() == {}
+
+
+def test_durations_below_edges_are_counted() -> None:
+    """Each number with those before it; what is beyond the last bin is among all alone."""
+    histogram = Histogram(MILLISECOND_NS)
+    for value_ms in (0.0, 0.9, 1.0, 2.5, 499.0, 10_000.0):
+        histogram.add(round(value_ms * MILLISECOND_NS))
+    assert histogram.within((1, 2.5, 3, 499, 600)) == {
+        "1 ms": 2,
+        "2.5 ms": 3,
+        "3 ms": 4,
+        "499 ms": 4,
+        "600 ms": 4,
+        "inf ms": 6,
+    }

@@ -342,6 +342,10 @@ def test_the_figures_name_every_statistic() -> None:
     proxy.wake(now_ns=21 * ms)
     nothing = dict.fromkeys(("forwarded", "lost", "reordered", "oversized", "overflowed"), 0)
     errors = ("error_ms_p50", "error_ms_p99", "error_ms_max")
+
+    def within(count: int) -> dict[str, int]:
+        return dict.fromkeys([f"{edge} ms" for edge in (*link_module.DELAY_EDGES_MS, "inf")], count)
+
     assert proxy.figures() == {
         "flows": 1,
         "refused": 1,
@@ -353,6 +357,7 @@ def test_the_figures_name_every_statistic() -> None:
             "queue": 0,
             "queue_max": 0,
             "delays": {},
+            "delays_within": within(0),
             **dict.fromkeys(errors, 0.0),
         },
         "downlink": {
@@ -363,6 +368,7 @@ def test_the_figures_name_every_statistic() -> None:
             "queue": 1,
             "queue_max": 2,
             "delays": {"20 ms": 1},
+            "delays_within": {**within(1), "20 ms": 0},
             **dict.fromkeys(errors, 1.0),
         },
     }

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -204,6 +205,18 @@ def test_a_target_stays_within_its_bounds_and_comes_back_the_way_it_went() -> No
     again = desired(times + 1e6 * reference.TURN_S)
     np.testing.assert_allclose(again[..., 0], states[..., 0], atol=1e-5)
     assert desired(np.array(9e9)).shape == (2, 2)  # and no memory is asked for
+
+
+def test_a_target_that_turns_now_and_then_flies_straight_in_between() -> None:
+    """In the mean square its velocity changes as much as that of one that turns all the time."""
+    far: dict[str, Any] = {"agility": 0.3, "speed_mps": 1e3, "radius_m": 1e6}
+    desired = reference.target(np.random.default_rng(1), 2, **far, turn_every_s=4.0)
+    grid_s = np.arange(0.0, 3000.0, reference.GRID_S)
+    changes = np.diff(desired(grid_s)[..., 1], axis=0)
+    turned = (changes != 0.0).any(axis=1)
+    assert turned.sum() == pytest.approx(3000.0 / 4.0, rel=0.1)
+    assert (changes[turned] != 0.0).all()  # on both axes at once
+    assert (changes**2).sum() / (2 * 3000.0) == pytest.approx(0.3**2, rel=0.1)
 
 
 def test_file_is_flown_in_straight_lines(tmp_path: Path) -> None:
