@@ -1,29 +1,35 @@
-"""The page in a real browser: Chromium, which `CHROMIUM` names or PATH has.
+"""The page in a real browser: Chromium, which `CHROMIUM` or PATH names.
 
 Pictures of it lie in `page-test/` afterwards, light and dark, wide and narrow.
 """
 
 import os
 import re
-import shutil
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from benchmarks.browser import (
+    CHROMIUM,
+    chromium,
+    flown_s,
+    opened,
+    picture,
+    pictures,
+    plotted_s,
+    put,
+    served,
+    status,
+    until,
+)
+
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
-FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader")
-SOFTWARE = "--enable-unsafe-swiftshader"
 PICTURES = Path("page-test")
-SIZES = {"wide": (1400, 900), "narrow": (420, 860)}
-PATIENCE_S = 90.0
 
 pytestmark = [
     pytest.mark.browser,
@@ -36,77 +42,8 @@ pytestmark = [
 def browser() -> Iterator["sync_api.Browser"]:
     """Chromium, drawing in software."""
     PICTURES.mkdir(exist_ok=True)
-    with sync_api.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, SOFTWARE])
+    with chromium() as launched:
         yield launched
-        launched.close()
-
-
-@contextmanager
-def served(*arguments: str) -> Iterator[str]:
-    """Run a command that serves a page; yields its address."""
-    command = [sys.executable, "-P", "-m", "skytether", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert process.stdout is not None
-    try:
-        said = []
-        for line in process.stdout:
-            said.append(line)
-            if found := re.search(r"the page is at (\S+?),?\s", line):
-                yield found[1]
-                return
-        pytest.fail(f"no page: {''.join(said)}")
-    finally:
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
-
-
-def until(true: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> float:
-    """Wait until something is true; returns how long it took [s]."""
-    began_s = time.monotonic()
-    while not true():
-        if time.monotonic() - began_s > patience_s:
-            pytest.fail(f"not in {patience_s:g} s: {what}")
-        time.sleep(0.05)
-    return time.monotonic() - began_s
-
-
-def status(page: "sync_api.Page", place: int = 0) -> str:
-    """What is said of a flight."""
-    words = page.locator(".skytether-status")
-    return words.nth(place).inner_text() if words.count() > place else ""
-
-
-def flown_s(page: "sync_api.Page", place: int = 0) -> float:
-    """Time of flight that is shown [s]; 0 before any."""
-    found = re.search(r"time of flight\s+(\d+) s", status(page, place))
-    return float(found[1]) if found else 0.0
-
-
-def plotted_s(page: "sync_api.Page") -> float:
-    """Newest time that the first plot has [s]; 0 before any."""
-    newest = """() => {
-        const plots = Object.values((window.__viserTestpoints || {}).uplots || {});
-        return plots.length ? plots[0].chart.data[0].at(-1) : 0;
-    }"""
-    return float(page.evaluate(newest))
-
-
-def picture(page: "sync_api.Page", name: str) -> None:
-    """Keep a picture, without the browser's remark on how it draws."""
-    remark = page.locator(".mantine-Notification-closeButton")
-    for _ in range(remark.count()):
-        remark.first.click()
-    page.wait_for_timeout(500)
-    page.screenshot(path=PICTURES / f"{name}.png")
-
-
-def put(page: "sync_api.Page", label: str, number: float) -> None:
-    """Type a number beside a slider."""
-    nearest = f"xpath=//*[text()='{label}']/ancestor::*[.//input][1]//input"
-    field = page.locator(nearest).last
-    field.fill(f"{number:g}")
-    field.press("Enter")
 
 
 @pytest.fixture(scope="module")
@@ -118,18 +55,6 @@ def flight(browser: "sync_api.Browser") -> Iterator[str]:
         until(lambda: flown_s(page) > 6, "the flight begins")
         page.close()
         yield address
-
-
-@contextmanager
-def opened(
-    browser: "sync_api.Browser", address: str, size: str = "wide"
-) -> Iterator["sync_api.Page"]:
-    """A page, of a size."""
-    width, height = SIZES[size]
-    page = browser.new_page(viewport={"width": width, "height": height})
-    page.goto(address)
-    yield page
-    page.close()
 
 
 def test_moving_data_is_drawn_within_three_seconds_and_nobody_outside_is_asked(
@@ -184,32 +109,23 @@ def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(
         assert "HOVER" in words
         assert "link cut" in words
         assert words.index("vehicle 1 hovers") < words.index("vehicle 1 brakes"), words
-        picture(page, "cut-dark-wide")
+        picture(page, PICTURES / "cut-dark-wide.png")
         page.get_by_role("button", name="Heal it").click()
         until(lambda: "TRACK" in status(page), "it flies a plan once the link is healed")
         until(lambda: "link good" in status(page), "the link is good again")
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_it_can_be_read_in_light_and_dark(
-    browser: "sync_api.Browser", flight: str, size: str
-) -> None:
+def test_it_is_light_and_dark_wide_and_narrow(browser: "sync_api.Browser", flight: str) -> None:
     """Pictures are taken; and the page is as light as it is asked to be."""
-    with opened(browser, flight, size) as page:
+    pictures(browser, flight, PICTURES)
+    with opened(browser, flight) as page:
         until(lambda: "TRACK" in status(page), "it flies a plan")
         scheme = page.locator("html")
         assert scheme.get_attribute("data-mantine-color-scheme") == "dark"
-        picture(page, f"flight-dark-{size}")
         page.get_by_label("Light page").click()
         until(
             lambda: scheme.get_attribute("data-mantine-color-scheme") == "light", "it becomes light"
         )
-        page.wait_for_timeout(1000)
-        picture(page, f"flight-light-{size}")
-        if size == "wide":
-            page.get_by_role("tab", name="Network").click()
-            page.wait_for_timeout(2000)
-            picture(page, f"network-light-{size}")
 
 
 def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
@@ -248,7 +164,7 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
         paused_s = flown_s(page)
         page.wait_for_timeout(1500)
         assert flown_s(page) == paused_s
-        picture(page, "replay-dark-wide")
+        picture(page, PICTURES / "replay-dark-wide.png")
         page.close()
 
 
@@ -262,5 +178,5 @@ def test_a_duel_shows_both(browser: "sync_api.Browser") -> None:
         for place, name in enumerate(names):
             assert status(page, place).startswith(name)
             assert page.locator(".u-legend").first.get_by_text(name, exact=True).count() == 1
-        picture(page, "duel-dark-wide")
+        picture(page, PICTURES / "duel-dark-wide.png")
         page.close()
