@@ -115,11 +115,11 @@ def plotted_s(page: "Page") -> float:
     return float(page.evaluate(newest))
 
 
-def put(page: "Page", label: str, number: float) -> None:
-    """Type a number beside a slider."""
+def put(page: "Page", label: str, value: float | str) -> None:
+    """Type a number beside a slider, or a text into a field."""
     nearest = f"xpath=//*[text()='{label}']/ancestor::*[.//input][1]//input"
     field = page.locator(nearest).last
-    field.fill(f"{number:g}")
+    field.fill(value if isinstance(value, str) else f"{value:g}")
     field.press("Enter")
 
 

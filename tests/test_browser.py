@@ -136,10 +136,10 @@ def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
         page.goto(f"http://0.0.0.0:{port}/")
         until(lambda: flown_s(page) > 0, "it can be looked at")
         assert page.get_by_role("button", name="Cut the link").count() == 0
-        page.get_by_label("Token").fill("guessed")
+        put(page, "Token", "guessed")
         page.wait_for_timeout(500)
         assert page.get_by_role("button", name="Cut the link").count() == 0
-        page.get_by_label("Token").fill(token)
+        put(page, "Token", token)
         until(lambda: page.get_by_role("button", name="Cut the link").count(), "it can be played")
         page.close()
         page = browser.new_page()
@@ -158,6 +158,8 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
         page.goto(address)
         until(lambda: flown_s(page) > 0, "it plays")
         page.get_by_role("button", name="Pause").click()
+        until(lambda: page.get_by_role("button", name="Go on").count(), "it is paused")
+        page.wait_for_timeout(1000)  # until what the slider was told before has come
         for at_s in (30, 12, 20):
             put(page, "Time [s]", at_s)
             until(lambda at_s=at_s: abs(flown_s(page) - at_s) <= 2, f"{at_s} s is shown")

@@ -1,6 +1,9 @@
 """The page without a browser: who may play, what a slider asks for, and what is answered."""
 
+import re
+import socket
 import time
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ from shared import config, policy
 from shared.change import Answer, Running
 from shared.events import PageServed
 from sim import flight as virtual
+from skytether import pages
 from skytether.duel import Options, both, titles
 from view import plots
 from view.access import Visitor, is_loopback, may_play
@@ -225,3 +229,33 @@ def test_a_port_that_is_taken_is_said() -> None:
     """With the one that was asked for."""
     event = PageServed(address="http://127.0.0.1:8081", taken="127.0.0.1:8080")
     assert str(event) == "the page is at http://127.0.0.1:8081, for 127.0.0.1:8080 is taken"
+
+
+def heard(at: str, folder: Path, seconds: float = 30.0) -> list[str]:
+    """What is said of a page that is served at an address for as long as it takes to be said."""
+    said: list[str] = []
+    with pages.beside([folder], at, said.append):
+        ends_s = time.monotonic() + seconds
+        while not said and time.monotonic() < ends_s:
+            time.sleep(0.05)
+        if said and (found := re.search(r"http://[^ ,]*", said[0])):
+            with urllib.request.urlopen(found[0]) as page:
+                said.append(page.read().decode())
+    return said
+
+
+def test_a_page_is_served_elsewhere_where_its_port_is_taken(tmp_path: Path) -> None:
+    """On a port that is free, as it says; and it has nothing in it that is loaded from outside."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        at = f"127.0.0.1:{taken.getsockname()[1]}"
+        address, page = heard(at, tmp_path)
+    assert address.endswith(f", for {at} is taken")
+    assert "<html" in page
+    assert not re.search(r"<(?:script|link|img)[^>]*(?:src|href)=[\"']?(?:https?:)?//", page)
+
+
+def test_a_flight_goes_on_without_a_page(tmp_path: Path) -> None:
+    """Where it cannot be served that is said, and nothing is raised."""
+    (line,) = heard("192.0.2.1:8080", tmp_path)
+    assert "cannot be listened on" in line
+    assert line.endswith("the flight goes on without a page")

@@ -168,7 +168,11 @@ def assign(handle: Any, value: Any) -> None:
 
 
 class _Slider:
-    """A number that this browser can change."""
+    """A number that this browser can change.
+
+    What it calls back is a coroutine, here and below: viser calls these in their order, and others
+    in any.
+    """
 
     def __init__(self, gui: viser.GuiApi, knob: Knob, ask: Callable[[Knob, float], None]) -> None:
         self.knob = knob
@@ -178,7 +182,7 @@ class _Slider:
         self._moved_s = -np.inf
 
         @self._slider.on_update
-        def _(event: Any) -> None:
+        async def _(event: Any) -> None:
             if event.client is not None:  # else it was we who moved it
                 self._moved_s = time.monotonic()
                 ask(knob, float(self._slider.value))
@@ -229,12 +233,12 @@ class Controls:
                 flight.heal()
 
         @self._trigger.on_update
-        def _(event: Any) -> None:
+        async def _(event: Any) -> None:
             if event.client is not None:
                 self._all("server", {"control.trigger": self._trigger.value})
 
         @self._armed.on_update
-        def _(event: Any) -> None:
+        async def _(event: Any) -> None:
             if event.client is not None:
                 self._all("client", {"armed": self._armed.value})
 
@@ -292,7 +296,7 @@ class _Lead:
         client.gui.add_html(words.note("Drag the target, or click where it shall be."))
 
         @self._handle.on_update
-        def _(event: Any) -> None:
+        async def _(event: Any) -> None:
             if event.client is not None:
                 self._move(np.asarray(self._handle.position))
 

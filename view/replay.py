@@ -58,6 +58,8 @@ class Player:
         """Speed over that of the flight."""
         self.plays = True
         """Whether time goes on."""
+        self._wanted_ns: int | None = None
+        """Time that somebody wants to see; None where it is shown already."""
         self.seek(0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -99,7 +101,10 @@ class Player:
         before_s = time.monotonic()
         while not self._closed.wait(TICK_S):
             now_s = time.monotonic()
-            if self.plays:
+            wanted_ns, self._wanted_ns = self._wanted_ns, None
+            if wanted_ns is not None:
+                self.seek(wanted_ns)
+            elif self.plays:
                 self.advance(round(self.speed * (now_s - before_s) * SECOND_NS))
             before_s = now_s
 
@@ -118,11 +123,11 @@ class Player:
         moved_s = 0.0
 
         @at.on_update
-        def _(event: Any) -> None:
+        async def _(event: Any) -> None:
             nonlocal moved_s
             if event.client is not None:
                 moved_s = time.monotonic()
-                self.seek(seconds_to_ns(float(at.value)))
+                self._wanted_ns = seconds_to_ns(float(at.value))
 
         @speed.on_update
         def _(_: Any) -> None:
