@@ -35,7 +35,7 @@ ENV PATH=/opt/skytether/bin:$PATH \
     OPENBLAS_NUM_THREADS=1 \
     NUMBA_CACHE_DIR=/tmp/kernels
 COPY --from=build /opt/skytether /opt/skytether
-RUN install --directory --owner 10001 --group 10001 /results /keys
+RUN install --directory --owner 10001 --group 10001 /results /keys /flying
 USER 10001:10001
 WORKDIR /results
 STOPSIGNAL SIGTERM

@@ -8,7 +8,7 @@ FUZZ_STAMP := .venv/.ready-to-fuzz
 COMPILE := $(BIN)/pip-compile --quiet --strip-extras --generate-hashes --allow-unsafe --no-header \
 	--no-emit-index-url --no-emit-trusted-host --no-emit-find-links
 
-.PHONY: setup demo reproduce test long-test check format lock docker-test bench fuzz clean
+.PHONY: setup demo reproduce test long-test check format lock docker-test page-test bench fuzz clean
 
 setup: $(STAMP)  ## the environment alone
 
@@ -28,11 +28,11 @@ reproduce: setup  ## the paper's table and figures, and more, in results/report.
 
 test: setup  ## everything but Docker and what takes long, in five minutes on two cores
 	@$(BIN)/python -c "import server.__main__"  # kernels are compiled once, not by each worker
-	$(BIN)/pytest -q -m "not docker and not long" -n 3 --dist loadfile
+	$(BIN)/pytest -q -m "not docker and not long and not browser" -n 3 --dist loadfile
 
 long-test: setup  ## the commands of the documents, benchmarks, and flights of many processes
 	@$(BIN)/python -c "import server.__main__"
-	$(BIN)/pytest -q -m "long and not docker" -n 3 --dist loadfile
+	$(BIN)/pytest -q -m "long and not docker and not browser" -n 3 --dist loadfile
 
 check: setup  ## style, types, and who imports whom
 	$(BIN)/ruff format --check .
@@ -46,6 +46,10 @@ format: setup  ## as `check` wants it
 
 docker-test: setup  ## the three containers, and what they survive; needs a Docker engine
 	$(BIN)/pytest -q -rs -m docker
+
+page-test: setup  ## the page in a real browser; needs Chromium, says so where there is none
+	@$(BIN)/python -c "import server.__main__"
+	$(BIN)/pytest -q -rs -m browser
 
 bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew
 	$(BIN)/python -m benchmarks

@@ -39,6 +39,19 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"listening on {address}, waiting for {self.waiting_for}"
 
 
+class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A page can be looked at."""
+
+    address: str
+    """Address for a browser; with a token in it where that may change what flies."""
+    taken: str = ""
+    """HOST:PORT that it was to have, where somebody else has that."""
+
+    def __str__(self) -> str:
+        taken = f", for {self.taken} is taken" if self.taken else ""
+        return f"the page is at {self.address}{taken}"
+
+
 class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """A process serves its figures over HTTP, as metrics."""
 
@@ -355,6 +368,7 @@ Failure = SessionRefused | NoSession | NoAnswer | NotFlown
 
 Event = (
     Listening
+    | PageServed
     | Measured
     | Plaintext
     | Counted

@@ -1,9 +1,11 @@
 """`skytether fly`: one flight, over real UDP or in virtual time, and its summary."""
 
 import contextlib
+import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +30,13 @@ from shared.summary import Summary, summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
-from skytether import processes, recorder
+from skytether import pages, processes, recorder
+from view.serve import HOST_PORT
 
 TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused
 """Events that are shown while it flies."""
+POLL_S = 0.2
+"""Time after which Ctrl-C ends a page that lingers [s]."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 """Names of the modes before the first plan is flown, which are not worth a word."""
 
@@ -49,6 +54,14 @@ class Options:
     control: Path | None = None
     """Folder for sockets called server, netem and client, through which keys change in flight, see
     `skytether set`; it is made where there is none. Not in virtual time."""
+    page: str = os.environ.get(pages.VARIABLE, HOST_PORT)
+    """HOST:PORT of the page on which the flight can be watched, and played with; on another port
+    where that is taken. Where other machines can reach it, they need the token that is printed to
+    do more than look. Not in virtual time."""
+    no_page: bool = False
+    """Fly without a page."""
+    linger: bool = False
+    """Keep the page when the flight is over, until Ctrl-C."""
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
@@ -78,12 +91,35 @@ def fly(argv: Sequence[str]) -> None:
     beside = _beside(options)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{options.scenario}, {where}, seed {scenario.seed}"
-    with (
-        command.interruptible() as interrupted,
-        command.progress(f"flying {title}", scenario.duration) as on_second,
-    ):
-        fly_ = _virtually if options.virtual else _really
-        flown, unrecorded = fly_(options, on_second, interrupted)
+    with _paged(options) as sockets:
+        with (
+            command.interruptible() as interrupted,
+            command.progress(f"flying {title}", scenario.duration) as on_second,
+        ):
+            if options.virtual:
+                flown, unrecorded = _virtually(options, on_second, interrupted)
+            else:
+                flown, unrecorded = _really(options, sockets, on_second, interrupted)
+        _show(options, title, flown, unrecorded, beside)
+        if options.linger and sockets:
+            with command.interruptible() as interrupted:
+                while not interrupted():
+                    time.sleep(POLL_S)
+
+
+def _show(
+    options: Options,
+    title: str,
+    flown: flight.Flight,
+    unrecorded: str | None,
+    beside: Scenario | None,
+) -> None:
+    """Show what was flown, in words and as a picture.
+
+    Raises:
+        CommandError: it was nothing, or not all of what was to be.
+    """
+    scenario = options.config
     if flown.failure and not len(flown.client):
         raise CommandError(str(flown.failure))
     if flown.incomplete:
@@ -106,6 +142,20 @@ def fly(argv: Sequence[str]) -> None:
         raise CommandError(missing)
     if flown.failure:
         raise CommandError(str(flown.failure))
+
+
+@contextlib.contextmanager
+def _paged(options: Options) -> Iterator[Path | None]:
+    """Serve a page of the flight, unless there is to be none; yields the folder of its sockets."""
+    if options.virtual or options.no_page or options.page == pages.NONE:
+        yield options.control
+        return
+    command.address("--page", options.page)
+    with ExitStack() as stack:
+        temporary = tempfile.TemporaryDirectory(prefix="skytether-")
+        folder = options.control or Path(stack.enter_context(temporary))
+        stack.enter_context(pages.beside([folder], options.page, _print))
+        yield folder
 
 
 def _make_folder(folder: Path, *, virtual: bool) -> None:
@@ -154,17 +204,20 @@ def _virtually(
 
 
 def _really(
-    options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+    options: Options,
+    sockets: Path | None,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
 ) -> tuple[flight.Flight, str | None]:
     """Fly over UDP; returns the flight, and what is missing in its recording."""
     with tempfile.TemporaryDirectory(prefix="skytether-") as folder, ExitStack() as stack:
         parts, scenario = Path(folder), options.config
-        feeds = parts if options.record else None
+        feeds = sockets or (parts if options.record else None)
         live = None
-        if options.record:
+        if options.record and feeds:
             live = recorder.Live(
                 options.record,
-                processes.feeds_in(parts),
+                processes.feeds_in(feeds),
                 scenario,
                 options.scenario,
                 secure=options.secure,
@@ -178,7 +231,7 @@ def _really(
             interrupted=interrupted,
             on_event=_tell,
             secure=options.secure,
-            control=options.control,
+            control=sockets,
             feeds=feeds,
         )
         axes = scenario.model.axes
@@ -217,5 +270,9 @@ def _tell(event: Event) -> None:
     """Show what may happen to the link and the record in flight, above the progress bar."""
     begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
     if isinstance(event, TOLD) and not begins:
-        with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
-            print(event, file=sys.stderr)
+        _print(event)
+
+
+def _print(line: object) -> None:
+    with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
+        print(line, file=sys.stderr)

@@ -1,5 +1,6 @@
 """What tests need of the machine."""
 
+import os
 import signal
 import socket
 from functools import cache
@@ -9,6 +10,9 @@ import pytest
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell's job in the background ignores Ctrl-C, and so would every command that a test starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# No flight of a test serves a page, unless the test asks for one.
+os.environ.setdefault("SKYTETHER_PAGE", "none")
 
 
 @cache

@@ -31,6 +31,7 @@ from shared.events import (
     NotFlown,
     NumberTaken,
     Omitted,
+    PageServed,
     Plaintext,
     PlanningResumed,
     PlanningStopped,
@@ -49,6 +50,7 @@ SENTENCES = [
         Listening(host="::1", port=47001, waiting_for="vehicles"),
         "listening on [::1]:47001, waiting for vehicles",
     ),
+    (PageServed(address="http://127.0.0.1:80"), "the page is at http://127.0.0.1:80"),
     (Measured(host="::1", port=9464), "metrics at http://[::1]:9464/metrics"),
     (
         Plaintext(local=True),

@@ -1,0 +1,184 @@
+"""The page in a real browser: Chromium, which `CHROMIUM` or PATH names.
+
+Pictures of it lie in `page-test/` afterwards, light and dark, wide and narrow.
+"""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.browser import (
+    CHROMIUM,
+    chromium,
+    flown_s,
+    opened,
+    picture,
+    pictures,
+    plotted_s,
+    put,
+    served,
+    status,
+    until,
+)
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+
+PICTURES = Path("page-test")
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not CHROMIUM, reason="no Chromium: neither CHROMIUM nor PATH names one"),
+    pytest.mark.timeout(300),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator["sync_api.Browser"]:
+    """Chromium, drawing in software."""
+    PICTURES.mkdir(exist_ok=True)
+    with chromium() as launched:
+        yield launched
+
+
+@pytest.fixture(scope="module")
+def flight(browser: "sync_api.Browser") -> Iterator[str]:
+    """Address of the page of a flight that has begun."""
+    with served("fly", "demo", "--duration", "600", "--page", "127.0.0.1:0") as address:
+        page = browser.new_page()
+        page.goto(address)
+        until(lambda: flown_s(page) > 6, "the flight begins")
+        page.close()
+        yield address
+
+
+def test_moving_data_is_drawn_within_three_seconds_and_nobody_outside_is_asked(
+    browser: "sync_api.Browser", flight: str
+) -> None:
+    """The quickest of three times, on a machine that is not busy with others."""
+    took_s, asked = [], []
+    for _ in range(3):
+        page = browser.new_page(viewport={"width": 1400, "height": 900})
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("websocket", lambda socket: asked.append(socket.url))
+        began_s = time.monotonic()
+        page.goto(flight)
+        until(lambda page=page: plotted_s(page) > 1, "a plot is drawn")
+        first_s = plotted_s(page)
+        until(lambda page=page, first_s=first_s: plotted_s(page) > first_s, "it moves")
+        took_s.append(time.monotonic() - began_s)
+        page.close()
+    own = flight.removeprefix("http://")
+    assert not [url for url in asked if own not in url and not url.startswith("data:")]
+    assert any(url.startswith("ws://") for url in asked)
+    share = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))  # of a core that others take
+    assert min(took_s) < 3.0 * share, (took_s, share)
+
+
+def test_the_loss_slider_changes_the_measured_loss(
+    browser: "sync_api.Browser", flight: str
+) -> None:
+    """Both ways, as netem counts it."""
+
+    def measured() -> list[int]:
+        return [int(each) for each in re.findall(r"(\d+) % (?:up|down)", status(page))]
+
+    with opened(browser, flight) as page:
+        until(lambda: "TRACK" in status(page), "it flies a plan")
+        assert max(measured()) < 35
+        put(page, "Loss [%]", 60)
+        until(lambda: min(measured()) > 40, "the measured loss follows")
+        put(page, "Loss [%]", 10)
+        until(lambda: max(measured()) < 35, "the measured loss follows back")
+
+
+def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(
+    browser: "sync_api.Browser", flight: str
+) -> None:
+    """In words, in this order; and the vehicle flies its plans again."""
+    with opened(browser, flight) as page:
+        until(lambda: "TRACK" in status(page), "it flies a plan")
+        page.get_by_role("button", name="Cut the link").click()
+        until(lambda: "vehicle 1 hovers: the server is silent" in status(page), "it hovers")
+        words = status(page)
+        assert "HOVER" in words
+        assert "link cut" in words
+        assert words.index("vehicle 1 hovers") < words.index("vehicle 1 brakes"), words
+        picture(page, PICTURES / "cut-dark-wide.png")
+        page.get_by_role("button", name="Heal it").click()
+        until(lambda: "TRACK" in status(page), "it flies a plan once the link is healed")
+        until(lambda: "link good" in status(page), "the link is good again")
+
+
+def test_it_is_light_and_dark_wide_and_narrow(browser: "sync_api.Browser", flight: str) -> None:
+    """Pictures are taken; and the page is as light as it is asked to be."""
+    pictures(browser, flight, PICTURES)
+    with opened(browser, flight) as page:
+        until(lambda: "TRACK" in status(page), "it flies a plan")
+        scheme = page.locator("html")
+        assert scheme.get_attribute("data-mantine-color-scheme") == "dark"
+        page.get_by_label("Light page").click()
+        until(
+            lambda: scheme.get_attribute("data-mantine-color-scheme") == "light", "it becomes light"
+        )
+
+
+def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
+    """Under a name that is not this machine's alone there are no buttons before the token."""
+    with served("fly", "demo", "--duration", "120", "--page", "0.0.0.0:0") as address:
+        port, token = re.search(r":(\d+)/.*token=(\S+)", address).groups()  # type: ignore[union-attr]
+        page = browser.new_page()
+        page.goto(f"http://0.0.0.0:{port}/")
+        until(lambda: flown_s(page) > 0, "it can be looked at")
+        assert page.get_by_role("button", name="Cut the link").count() == 0
+        put(page, "Token", "guessed")
+        page.wait_for_timeout(500)
+        assert page.get_by_role("button", name="Cut the link").count() == 0
+        put(page, "Token", token)
+        until(lambda: page.get_by_role("button", name="Cut the link").count(), "it can be played")
+        page.close()
+        page = browser.new_page()
+        page.goto(address.replace("127.0.0.1", "0.0.0.0"))
+        until(lambda: page.get_by_role("button", name="Cut the link").count(), "the link suffices")
+        page.close()
+
+
+def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path) -> None:
+    """Forwards, backwards, and paused."""
+    file = tmp_path / "demo.mcap"
+    record = [sys.executable, "-P", "-m", "skytether", "fly", "demo", "--virtual"]
+    subprocess.run([*record, "--record", str(file)], check=True, capture_output=True)
+    with served("replay", str(file), "--page", "127.0.0.1:0") as address:
+        page = browser.new_page(viewport={"width": 1400, "height": 900})
+        page.goto(address)
+        until(lambda: flown_s(page) > 0, "it plays")
+        page.get_by_role("button", name="Pause").click()
+        until(lambda: page.get_by_role("button", name="Go on").count(), "it is paused")
+        page.wait_for_timeout(1000)  # until what the slider was told before has come
+        for at_s in (30, 12, 20):
+            put(page, "Time [s]", at_s)
+            until(lambda at_s=at_s: abs(flown_s(page) - at_s) <= 2, f"{at_s} s is shown")
+        paused_s = flown_s(page)
+        page.wait_for_timeout(1500)
+        assert flown_s(page) == paused_s
+        picture(page, PICTURES / "replay-dark-wide.png")
+        page.close()
+
+
+def test_a_duel_shows_both(browser: "sync_api.Browser") -> None:
+    """Words, plots and vehicles of both, by name."""
+    names = "demo", "demo-no-compensation"
+    with served("duel", *names, "--virtual", "--page", "127.0.0.1:0") as address:
+        page = browser.new_page(viewport={"width": 1400, "height": 900})
+        page.goto(address)
+        until(lambda: min(flown_s(page, 0), flown_s(page, 1)) > 15, "both fly")
+        for place, name in enumerate(names):
+            assert status(page, place).startswith(name)
+            assert page.locator(".u-legend").first.get_by_text(name, exact=True).count() == 1
+        picture(page, PICTURES / "duel-dark-wide.png")
+        page.close()

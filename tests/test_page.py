@@ -1,0 +1,261 @@
+"""The page without a browser: who may play, what a slider asks for, and what is answered."""
+
+import re
+import socket
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from shared import config, policy
+from shared.change import Answer, Running
+from shared.events import PageServed
+from sim import flight as virtual
+from skytether import pages
+from skytether.duel import Options, both, titles
+from view import plots
+from view.access import Visitor, is_loopback, may_play
+from view.controls import CUT, THRESHOLDS, TRIGGERS, compared, knobs, triggers
+from view.flight import Flight
+from view.frames import of_flight
+from view.replay import Player
+from view.scene import extent, grid, quadrotor, segments
+from view.state import Curves
+
+HERE = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}
+
+
+@pytest.mark.parametrize(
+    ("host", "path", "headers", "token", "may"),
+    [
+        ("127.0.0.1", "/", HERE, "", True),
+        ("127.0.0.1", "/", {"host": "localhost:8080", "origin": "http://localhost:8080"}, "", True),
+        ("::1", "/", {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}, "", True),
+        ("::ffff:127.0.0.1", "/", HERE, "", True),
+        ("127.0.0.1", "/", {"Host": "127.0.0.1:8080"}, "", True),  # no browser
+        # A page of a stranger, in a browser on this machine.
+        ("127.0.0.1", "/", HERE | {"Origin": "http://evil.example"}, "", False),
+        ("127.0.0.1", "/", HERE | {"Origin": "null"}, "", False),
+        # The same under a name that the stranger lets mean this machine.
+        (
+            "127.0.0.1",
+            "/",
+            {"Host": "evil.example:8080", "Origin": "http://evil.example:8080"},
+            "",
+            False,
+        ),
+        ("127.0.0.1", "/", {"Host": "[", "Origin": "http://["}, "", False),
+        ("127.0.0.1", "/", {}, "", False),
+        ("192.0.2.7", "/", HERE, "", False),
+        ("192.0.2.7", "/?token=", HERE, "", False),
+        ("192.0.2.7", "/?token=secret", HERE, "secret", True),
+        ("192.0.2.7", "/?token=Secret", HERE, "secret", False),
+        ("192.0.2.7", "/", HERE, "secret", False),
+        ("127.0.0.1", "/", HERE, "secret", True),
+        ("", "", {}, "", False),  # viser has not told
+    ],
+)
+def test_only_this_machine_and_who_knows_the_token_may_play(
+    host: str, path: str, headers: dict[str, str], token: str, *, may: bool
+) -> None:
+    """Neither strangers, nor their pages in a browser of this machine."""
+    assert may_play(Visitor(host, path, headers), token) is may
+
+
+def test_a_name_that_only_looks_like_this_machine_is_none() -> None:
+    """Names are compared whole, and looked up by nobody."""
+    for host in ("localhost.evil.example", "127.0.0.1.evil.example", "0.0.0.0", "::", ""):
+        assert not is_loopback(host), host
+
+
+def running(process: str, scenario: config.Scenario) -> tuple[Running, dict[str, Any]]:
+    """An endpoint of a process that can be changed, and the values that it has."""
+    from client.plant import FirstOrderPlant
+    from client.vehicle import Client
+    from netem.proxy import Proxy
+    from server.endpoint import Server
+    from shared.chance import stream
+
+    match process:
+        case "server":
+            endpoint: Any = Server(scenario, boot_id=1, entropy=bytes)
+        case "netem":
+            endpoint = Proxy(scenario, server=("server", 0), flows=1)
+        case _:
+            plant = FirstOrderPlant(scenario, stream(scenario.seed, "wind", 1))
+            endpoint = Client(scenario, plant, server=("server", 0), vehicle=1, boot_id=1)
+    runs = Running(endpoint, scenario)
+    answer = msgspec.json.decode(runs.answer(b"{}", now_ns=0), type=Answer)
+    return runs, answer.values
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_every_slider_asks_for_what_the_processes_take(axes: int) -> None:
+    """Its lowest, highest and some number in between are accepted, and read back as they are."""
+    scenario = config.load("demo")
+    model = msgspec.structs.replace(scenario.model, axes=axes)
+    scenario = msgspec.structs.replace(scenario, model=model)
+    for knob in (*knobs(axes), *THRESHOLDS):
+        runs, values = running(knob.process, scenario)
+        assert knob.key in values, knob.label
+        for number in (knob.low, knob.high, knob.low + 3 * knob.step):
+            asked = msgspec.json.encode(knob.write(values, number))
+            answer = msgspec.json.decode(runs.answer(asked, now_ns=0), type=Answer)
+            assert not answer.refused, (knob.label, answer.refused)
+            _, values = "", msgspec.json.decode(runs.answer(b"{}", now_ns=0), type=Answer).values
+            assert knob.read(values) == pytest.approx(number), knob.label
+
+
+def test_every_trigger_that_is_offered_can_be_flown() -> None:
+    """With the scheme for which it is offered."""
+    demo = config.load("demo")
+    for scheme in ("committed", "predictive", "none", "dead_reckoning"):
+        offered = triggers(scheme, "always")
+        assert "always" in offered
+        for trigger in offered:
+            control = msgspec.structs.replace(
+                demo.control,
+                scheme=scheme,
+                trigger=trigger,
+                feedback=scheme == "dead_reckoning",
+            )
+            config.check(config.to_table(msgspec.structs.replace(demo, control=control)))
+    assert triggers("committed", "periodic(7)")[0] == "periodic(7)"
+    assert {name for each in TRIGGERS for name in [each.split(" ")[0]]} <= set(policy.SIGNATURES)
+
+
+def test_only_the_thresholds_of_the_trigger_are_shown() -> None:
+    """Those that it compares with, unless they stand in it."""
+    assert compared("cost_gap | silence(1)") == {"control.cost_gap"}
+    assert compared("cost_gap(2) & budget(5, 2) | periodic") == {"control.period"}
+    assert compared("state_gap") == {"control.epsilon", "control.decay_rate"}
+    assert compared("no trigger") == frozenset()
+
+
+def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) -> None:
+    """Each direction its own loss; a link that is cut is not cut again."""
+    asked: list[tuple[str, Any]] = []
+    flight = Flight("", tmp_path)
+    flight.ask = lambda process, values: asked.append((process, dict(values)))  # type: ignore[method-assign]
+    flight.cut()
+    assert not asked, "nothing is known of the network yet"
+    before = {"network.uplink.loss": 0.1, "network.downlink.loss": 0.3}
+    flight.values["netem"] = dict(before)
+    flight.cut()
+    flight.values["netem"] = dict(CUT)
+    assert flight.is_cut
+    flight.cut()
+    flight.heal()
+    assert asked == [("netem", CUT), ("netem", before)]
+    flight.close()
+
+
+def test_that_nobody_answers_is_said_in_words(tmp_path: Path) -> None:
+    """Once somebody has asked for a change; not where the page itself asks what may change."""
+    flight = Flight("", tmp_path)
+    flight.ask("netem", {})
+    flight.ask("client", {"armed": False})
+    ends_s = time.monotonic() + 10
+    while not flight.answer and time.monotonic() < ends_s:
+        time.sleep(0.01)
+    assert flight.refused
+    assert flight.answer.startswith("client does not answer")
+    flight.close()
+
+
+def test_a_player_shows_any_time_of_a_flight() -> None:
+    """Forwards as it comes, and the same when it is sought, backwards too."""
+    scenario = msgspec.structs.replace(config.load("demo"), duration=10.0)
+    frames = list(of_flight(scenario, "demo", virtual.fly(scenario)))
+    flight = Flight()
+    player = Player([flight], [frames])
+    player.plays = False
+    second_ns = 1_000_000_000
+    player.seek(0)
+    player.advance(6 * second_ns)
+    forwards = flight.state.vehicles[1].trail()
+    player.seek(9 * second_ns)
+    assert len(flight.state.vehicles[1].trail()) > len(forwards)
+    player.seek(6 * second_ns)
+    assert np.array_equal(flight.state.vehicles[1].trail(), forwards)
+    player.advance(60 * second_ns)
+    assert player.at_ns == player.end_ns
+    player.close()
+
+
+def test_a_duel_is_on_the_same_network_and_seed() -> None:
+    """Those of the first, whatever the second one says."""
+    one, other = both(Options("demo", "paper-no-compensation", duration=12.0, seed=7))
+    assert one.network == other.network
+    assert (one.seed, other.seed, one.duration, other.duration) == (7, 7, 12.0, 12.0)
+    assert other.control.scheme == "none"
+    assert titles("demo", "a/paper.toml") == ("demo", "paper")
+    assert len(set(titles("a/demo.toml", "demo"))) == 2
+
+
+def test_no_line_of_a_plot_has_a_gap() -> None:
+    """The browser would draw nothing at all of it."""
+    nan = np.nan
+    x, late, never = np.arange(4.0), np.array([nan, nan, 5.0, 6.0]), np.full(4, nan)
+    early = np.array([nan, 1.0, 2.0, 3.0])
+    drawn = plots.known([x, late, early, never])
+    assert [each.tolist() for each in drawn] == [
+        [1.0, 2.0, 3.0],
+        [5.0, 5.0, 6.0],
+        [1.0, 2.0, 3.0],
+        [0.0, 0.0, 0.0],
+    ]
+    assert Curves.__doc__
+
+
+def test_a_scene_has_room_for_all_that_is_flown() -> None:
+    """Lines on the ground reach further than what is shown, in steps that are round."""
+    middle, reach_m = extent([config.load("demo")])
+    assert middle == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
+    assert 2.0 < reach_m < 3.0
+    lines = grid(middle, reach_m)
+    assert lines[..., 0].max() >= 3 * reach_m
+    assert np.unique(np.round(np.diff(np.unique(lines[..., 0])), 3)).tolist() == [1.0]
+    vertices, faces = quadrotor(1.0)
+    assert faces.max() < len(vertices)
+    assert segments(np.zeros((5, 2)), dashed=True).shape == (2, 2, 3)
+
+
+def test_a_port_that_is_taken_is_said() -> None:
+    """With the one that was asked for."""
+    event = PageServed(address="http://127.0.0.1:8081", taken="127.0.0.1:8080")
+    assert str(event) == "the page is at http://127.0.0.1:8081, for 127.0.0.1:8080 is taken"
+
+
+def heard(at: str, folder: Path, seconds: float = 30.0) -> list[str]:
+    """What is said of a page that is served at an address for as long as it takes to be said."""
+    said: list[str] = []
+    with pages.beside([folder], at, said.append):
+        ends_s = time.monotonic() + seconds
+        while not said and time.monotonic() < ends_s:
+            time.sleep(0.05)
+        if said and (found := re.search(r"http://[^ ,]*", said[0])):
+            with urllib.request.urlopen(found[0]) as page:
+                said.append(page.read().decode())
+    return said
+
+
+def test_a_page_is_served_elsewhere_where_its_port_is_taken(tmp_path: Path) -> None:
+    """On a port that is free, as it says; and it has nothing in it that is loaded from outside."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        at = f"127.0.0.1:{taken.getsockname()[1]}"
+        address, page = heard(at, tmp_path)
+    assert address.endswith(f", for {at} is taken")
+    assert "<html" in page
+    assert not re.search(r"<(?:script|link|img)[^>]*(?:src|href)=[\"']?(?:https?:)?//", page)
+
+
+def test_a_flight_goes_on_without_a_page(tmp_path: Path) -> None:
+    """Where it cannot be served that is said, and nothing is raised."""
+    (line,) = heard("192.0.2.1:8080", tmp_path)
+    assert "cannot be listened on" in line
+    assert line.endswith("the flight goes on without a page")

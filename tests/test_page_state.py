@@ -1,0 +1,254 @@
+"""What a page shows of a flight: values of a flight in virtual time, and bounds."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from shared import config
+from shared.config import Scenario, to_toml
+from shared.endpoint import SECOND_NS
+from shared.events import ModeChanged
+from shared.feed import Frame, Opened, Rows, Said, described
+from shared.protocol import Mode
+from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Reason, client_columns
+from sim import flight
+from view import words
+from view.frames import of_flight
+from view.state import BINS, DELAY_BINS, SAID_MAX, SLOTS_MAX, SPAN_S, VEHICLES_MAX, State
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A flight, and what is shown at its end."""
+
+    scenario: Scenario
+    flown: flight.Flight
+    frames: tuple[tuple[int, str, Frame], ...]
+    state: State
+
+    @property
+    def now_ns(self) -> int:
+        """Time of its last frame, and a bin of the network later."""
+        return self.state.newest_ns + SECOND_NS // 4
+
+
+@cache
+def demo(cut_s: float = 0.0, vehicles: int = 1) -> Shown:
+    """Twelve seconds of the demonstration, the link of which may be cut."""
+    scenario = msgspec.structs.replace(config.load("demo"), duration=12.0)
+    lost = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
+    changes = [(cut_s, lost)] if cut_s else []
+    flown = flight.fly(scenario, vehicles=vehicles, changes=changes)
+    frames = tuple(of_flight(scenario, "demo", flown))
+    return Shown(scenario, flown, frames, state_of(frames))
+
+
+def state_of(frames: tuple[tuple[int, str, Frame], ...]) -> State:
+    """What is shown once all of these frames have come."""
+    state = State()
+    for _, process, frame in frames:
+        state.take(process, frame)
+    return state
+
+
+def test_the_curves_of_a_vehicle_are_its_record() -> None:
+    """Step by step, on a grid of the steps themselves."""
+    shown = demo()
+    track, client, server = shown.state.vehicles[1], shown.flown.client, shown.flown.server
+    dt = shown.scenario.control.dt
+    points = 1201  # a grid of the steps themselves
+    curves = track.curves(points)
+    assert track.time_s == pytest.approx(client["step"][-1] * dt, abs=dt)
+    steps = np.round(curves.time_s / dt).astype(int)
+    flown = {int(row["step"]): row for row in client}
+    planned = {int(row["step"]): row for row in server}
+    checked = 0
+    for index, step in enumerate(steps.tolist()):
+        if step in flown and step in planned and step >= 100:
+            assert curves.position[index] == pytest.approx(flown[step]["state"][:, 0])
+            assert curves.reference[index] == pytest.approx(planned[step]["reference"][:, 0])
+            assert curves.figure[index] == planned[step]["error"]
+            assert curves.threshold[index] == planned[step]["threshold"]
+            if flown[step]["age_ns"] >= 0:
+                assert curves.age_s[index] == flown[step]["age_ns"] / SECOND_NS
+            checked += 1
+    assert checked > 100
+    assert curves.event.sum() == server["event"].sum() == track.sent
+
+
+def test_the_error_is_that_of_the_record() -> None:
+    """The root mean square over the last seconds."""
+    shown = demo()
+    away = (
+        shown.flown.client["state"][-100:, :, 0]
+        - shown.scenario.make_reference()(
+            shown.flown.client["step"][-100:] * shown.scenario.control.dt
+        )[..., 0]
+    )
+    assert shown.state.vehicles[1].error_m(5.0) == pytest.approx(
+        float(np.sqrt((away**2).sum(axis=1).mean())), rel=0.05
+    )
+
+
+def test_the_plan_leads_on_from_where_the_vehicle_is() -> None:
+    """No step of it is longer than the fastest that can be flown."""
+    shown = demo()
+    track = shown.state.vehicles[1]
+    ahead = track.ahead()
+    assert len(ahead) > 20
+    steps = np.linalg.norm(np.diff(ahead, axis=0), axis=1)
+    fastest = np.linalg.norm(shown.scenario.u_max) * shown.scenario.control.dt
+    assert steps.max() <= fastest * 1.001
+    assert np.linalg.norm(ahead[0] - track.trail()[-1]) < 1.0
+
+
+def test_loss_and_rates_are_those_of_the_packets() -> None:
+    """Counted in bins, they are what netem recorded."""
+    shown = demo()
+    packets, network = shown.flown.netem, shown.state.network
+    for direction in (UPLINK, DOWNLINK):
+        own = packets[packets["direction"] == direction]
+        assert network.rates(direction, shown.now_ns).sum() == len(own)
+        assert network.histogram(direction, shown.now_ns).sum() == (~own["lost"]).sum()
+        last = own[
+            np.maximum.accumulate(packets["arrived_ns"])[packets["direction"] == direction]
+            >= (shown.now_ns // (SECOND_NS // 4) - 40) * SECOND_NS // 4
+        ]
+        traffic = network.traffic(direction, 10.0, shown.now_ns)
+        assert traffic.loss == pytest.approx(last["lost"].mean())
+        assert traffic.bytes_per_s == pytest.approx(last["bytes"].sum() / 10.0)
+        through_ms = own["delay_ns"][~own["lost"]] / 1e6
+        assert network.traffic(direction, 60.0, shown.now_ns).delay_ms_p50 == pytest.approx(
+            float(np.median(through_ms)), abs=20.0
+        )
+    up = packets[(packets["direction"] == UPLINK) & (packets["bytes"] >= 320)]
+    assert network.horizon_bytes(shown.now_ns) == pytest.approx(up["bytes"].mean())
+    assert shown.state.every_step == 20.0
+
+
+def test_a_cut_link_is_said_in_words_and_colour() -> None:
+    """Brakes, then hovers; and no plan is drawn."""
+    shown = demo(cut_s=5.0)
+    state, number = shown.state, 1
+    assert state.link(number, shown.now_ns).word == "CUT"
+    assert state.link(number, shown.now_ns).colour == "red"
+    does = state.vehicles[number].does
+    assert (does.word, does.colour) == ("HOVER", "blue")
+    assert does.text == f"hovers: {Reason.LOST}"
+    said = [text for _, text in state.said]
+    assert f"vehicle 1 brakes: {Reason.LOST}" in said
+    assert said.index(f"vehicle 1 brakes: {Reason.LOST}") < said.index(
+        f"vehicle 1 hovers: {Reason.LOST}"
+    )
+    assert len(state.vehicles[number].ahead()) == 0, "a plan is drawn that nobody flies"
+    page = words.status(state, number, shown.now_ns)
+    assert "HOVER" in page
+    assert "link cut" in page
+    good = demo()
+    assert good.state.link(1, good.now_ns).word == "GOOD"
+    assert good.state.vehicles[1].mode is Mode.TRACK
+
+
+def test_what_comes_again_counts_once() -> None:
+    """A feed tells its newest frames to whoever connects anew."""
+    shown = demo()
+    state = state_of(shown.frames)
+    for _, process, frame in shown.frames:  # a feed tells its newest to whoever comes anew
+        state.take(process, frame)
+    assert state.network.rates(UPLINK, shown.now_ns).sum() == (
+        shown.state.network.rates(UPLINK, shown.now_ns).sum()
+    )
+    assert list(state.said) == list(shown.state.said)
+    assert state.flights == 1
+
+
+def test_another_flight_of_the_same_processes_begins_anew() -> None:
+    """Nothing of the flight before is left."""
+    shown = demo()
+    state = state_of(shown.frames)
+    opened = next(frame for _, process, frame in shown.frames if process == "client")
+    assert isinstance(opened, Opened)
+    state.take("client", msgspec.structs.replace(opened, time_ns=opened.time_ns + 1))
+    assert state.flights == 2
+    assert not state.vehicles
+    assert not state.said
+
+
+def test_several_vehicles_are_shown_and_no_more_than_a_bound() -> None:
+    """Those beyond it are counted."""
+    assert sorted(demo(vehicles=3).state.vehicles) == [1, 2, 3]
+    state = State()
+    columns = client_columns(2)
+    rows = np.zeros(100, columns)
+    rows["vehicle"] = np.arange(100)
+    state.take("client", opened("client", {"client": columns}))
+    state.take("client", Rows(part="client", time_ns=1, rows=rows.tobytes()))
+    assert len(state.vehicles) == VEHICLES_MAX
+    assert state.omitted == 100 - VEHICLES_MAX
+
+
+def opened(
+    process: str, parts: dict[str, np.dtype[np.void]], scenario: Scenario | None = None
+) -> Opened:
+    """First frame of a process with these parts."""
+    return Opened(
+        process=process,
+        name="demo",
+        scenario=to_toml(scenario or config.load("demo")).decode(),
+        parts=described(parts),
+        wall_ns=0,
+        time_ns=0,
+    )
+
+
+def test_a_day_takes_no_more_memory_than_a_minute() -> None:
+    """Rings, events and histograms keep their sizes."""
+    scenario = config.load("demo")
+    fast = msgspec.structs.replace(
+        scenario, control=msgspec.structs.replace(scenario.control, dt=0.001)
+    )
+    state = State()
+    columns = client_columns(2)
+    state.take("client", opened("client", {"client": columns}, fast))
+    state.take("netem", opened("netem", {"netem": PACKET_COLUMNS}, fast))
+    for second in range(0, 86_400, 600):
+        rows = np.zeros(1000, columns)
+        rows["vehicle"], rows["step"] = 1, second * 1000 + np.arange(1000)
+        time_ns = (second + 1) * SECOND_NS
+        state.take("client", Rows(part="client", time_ns=time_ns, rows=rows.tobytes()))
+        packets = np.zeros(50, PACKET_COLUMNS)
+        state.take("netem", Rows(part="netem", time_ns=time_ns, rows=packets.tobytes()))
+        changed = ModeChanged(vehicle=1, before="track", after="brake", reason=str(second))
+        state.take("client", Said(time_ns=time_ns, event=changed))
+    track = state.vehicles[1]
+    assert len(track.trail(86_400.0)) <= SLOTS_MAX
+    assert len(state.said) == SAID_MAX
+    assert state.network.histogram(UPLINK, state.newest_ns).shape == (DELAY_BINS,)
+    assert state.network.rates(UPLINK, state.newest_ns).shape == (int(SPAN_S),)
+    assert BINS == 240
+
+
+def test_rows_of_an_hour_ago_change_nothing() -> None:
+    """The ring has room for a minute, and the newest of it wins."""
+    state = State()
+    columns = client_columns(2)
+    state.take("client", opened("client", {"client": columns}))
+    for step in (100_000, 5):
+        rows = np.zeros(1, columns)
+        rows["vehicle"], rows["step"], rows["state"] = 1, step, step
+        state.take("client", Rows(part="client", time_ns=step + 1, rows=rows.tobytes()))
+    assert state.vehicles[1].trail(86_400.0).tolist() == [[100_000.0, 100_000.0]]
+
+
+def test_what_is_said_cannot_become_part_of_the_page() -> None:
+    """Texts of events and titles are escaped."""
+    shown = demo()
+    state = state_of(shown.frames)
+    evil = ModeChanged(vehicle=1, before="track", after="brake", reason="<script>alert(1)</script>")
+    state.take("client", Said(time_ns=state.newest_ns + 1, event=evil))
+    assert "<script>" not in words.said([("<b>", state)])
+    assert "&lt;script&gt;" in words.said([("", state)])
+    assert "<script>" not in words.status(state, 1, shown.now_ns, "<script>")

@@ -1,0 +1,59 @@
+"""`python -m view`: the page as a process."""
+
+import sys
+
+from shell.start import run
+
+if __name__ == "__main__":  # before the imports below, which take a while
+    sys.exit(run("view.__main__:show", "page"))
+
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from shell import command
+from shell.command import CONFIGURATION, CommandError
+from shell.log import LogFormat
+from view.serve import HOST_PORT, followed, until_told
+
+NICE = 5
+"""How far the page stands back behind the processes that fly."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `skytether page`."""
+
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
+    """Folders of flights, each with the feeds and control sockets of its processes."""
+    page: str = HOST_PORT
+    """HOST:PORT to serve the page on; where that is taken, a free port. Where other machines can
+    reach it, they may only look, unless they know the token that is printed."""
+    log: LogFormat = "text"
+    """What is printed for each event: a sentence, or a line of JSON for a program."""
+
+
+def show(argv: Sequence[str]) -> None:
+    """Show flights in a browser while they fly, until SIGINT or SIGTERM.
+
+    A flight's folder is one that `fly --control` was given, or in which server, netem and client
+    have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on. Flights may
+    begin later, or anew.
+    """
+    options = command.read(Options(tyro.MISSING), argv, "skytether page", show.__doc__)
+    if not options.folders:
+        raise CommandError("got no folder, expected at least one", CONFIGURATION)
+    at = command.address("--page", options.page)
+    alone = len(options.folders) == 1
+    os.nice(NICE)
+    with ExitStack() as stack:
+        flights = [
+            stack.enter_context(followed(each, "" if alone else each.name))
+            for each in options.folders
+        ]
+        until_told(at, flights, options.log)
