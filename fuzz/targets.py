@@ -19,7 +19,7 @@ Target = Callable[[bytes], None]
 """Takes a payload, and raises where something is wrong with what happens to it."""
 
 SCENARIOS = (
-    config.load("demo"),
+    config.load("playback"),
     config.check(
         {
             "model": {"axes": 3, "tau_s": [0.5, 0.5, 0.4], "u_max": [3.0, 3.0, 2.0]},

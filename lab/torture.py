@@ -75,6 +75,8 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
             "horizon": round(2.0 / dt_s),
             "scheme": scheme,
             "feedback": bool(kind == 1),
+            "input_weight": 0.01,  # tight: inputs change as fast as they may
+            "input_reference": False,
             "trigger": f"{'state_gap' if scheme == 'predictive' else 'cost_gap'} | silence(1)",
         },
         "reference": {

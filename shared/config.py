@@ -83,14 +83,16 @@ class ControlConfig(Section, frozen=True):
 
     dt: Annotated[float, Meta(ge=0.001, le=1)] = 0.05
     """Length of a step, Δt [s]."""
-    horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 40
+    horizon: Annotated[int, Meta(ge=1, le=INPUTS_MAX)] = 80
     """Number of steps planned ahead, H."""
     scheme: Literal["committed", "predictive", "dead_reckoning", "none"] = "committed"
     """Delay compensation: committed inputs, eq. (11) and (13), or none; with dead reckoning the
     server sends no plan, but the state of the desired trajectory, along which the vehicle goes
     on."""
-    feedback: bool = False
-    """Whether horizons say also where they lead, and how the vehicle comes back to there."""
+    feedback: bool = True
+    """Whether horizons say also where they lead, and how the vehicle comes back to there. A vehicle
+    that can only play inputs back goes without, and wants an `input_weight` of 3, as in the
+    scenario `playback`."""
     delay_bound: Duration | Literal["auto"] = "auto"
     """Longest time from making a horizon to its being in force [s]; auto: as was seen."""
     observer_s: Duration = 4.0
@@ -117,11 +119,11 @@ class ControlConfig(Section, frozen=True):
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: tuple[Amount, Amount] = (50.0, 20.0)
     """Weight P of eq. (5) and (16) on the final position [1/m²] and velocity [s²/m²]."""
-    input_weight: Annotated[float, Meta(ge=1e-9, le=1e9)] = 0.01
+    input_weight: Annotated[float, Meta(ge=1e-9, le=1e9)] = 1.0
     """Weight R of eq. (5) on the input [s²/m²]."""
     change_weight: Amount = 0.0
     """Weight S of eq. (9) on the change against the horizon before [s²/m²]."""
-    input_reference: bool = False
+    input_reference: bool = True
     """Whether R weighs u - v_ref instead of u, so that it does not ask for standing still."""
 
     @property

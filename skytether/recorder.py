@@ -57,11 +57,11 @@ def _about(
 ) -> About:
     return About(
         scenario=name,
-        seed=str(scenario.seed),
+        seed=scenario.seed,
         version=metadata.version("skytether"),
         began=began.isoformat(timespec="seconds") if began else "",
-        offset_ns=str(offset_ns),
-        secure=str(secure).lower(),
+        offset_ns=offset_ns,
+        secure=secure,
     )
 
 

@@ -283,8 +283,8 @@ def test_a_threshold_changes_without_its_trigger() -> None:
 
 
 def test_wind_blows_from_the_next_step_on_and_changes_nothing_before() -> None:
-    """To the last bit; and gusts begin, and end."""
-    flown = scenario(vehicle={"wind": 0.0})
+    """To the last bit; and gusts begin, and end. No feedback answers them aboard."""
+    flown = scenario(vehicle={"wind": 0.0}, control={"feedback": False})
     calm = fly(flown).client
     for values in ({"vehicle.steady_wind_mps": [0.5, 0.0]}, {"vehicle.wind": 0.2}):
         windy = fly(flown, changes=[(5.0, values)]).client

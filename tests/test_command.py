@@ -414,7 +414,7 @@ def test_a_client_that_is_refused_names_each_key_and_both_values(
     assert run.returncode == 2
     assert run.stderr == (
         "client: vehicle 1 is refused, it flies another scenario: control.dt is 0.02 here and 0.05 "
-        "at the other end; control.horizon is 50 here and 40 at the other end\n"
+        "at the other end; control.horizon is 50 here and 80 at the other end\n"
     )
     server.wait_for("vehicle 1 is refused, .* control.dt is 0.05 here and 0.02 at the other end")
     assert server.end() == 0

@@ -265,7 +265,7 @@ WRONG = {
         "link.age_max_s: got 5.0, expected at least 5.58 s, a round trip and two steps",
     ),
     "a delay bound beyond the age bound": (
-        "control.delay_bound = 6.0\ncontrol.dt = 0.1",
+        "control.delay_bound = 6.0\ncontrol.dt = 0.1\ncontrol.horizon = 40",
         "link.age_max_s: got 5.0, expected at least 6.64 s, a round trip and two steps",
     ),
     "an age bound of none": (
@@ -685,8 +685,8 @@ def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> Non
 def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
     """With one number an axis, and the step in nanoseconds."""
     terms = Scenario().terms()
-    assert terms[:5] == (50_000_000, 40, 2, (0.84, 0.84), (1.6, 1.6))
-    assert terms[5:10] == ("committed", False, "brake", 2.0, 0.1)
+    assert terms[:5] == (50_000_000, 80, 2, (0.84, 0.84), (1.6, 1.6))
+    assert terms[5:10] == ("committed", True, "brake", 2.0, 0.1)
     assert terms[10:] == (5.0, "circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
 
 

@@ -57,6 +57,7 @@ def skytether(line: str) -> list[str]:
             )
         )
         and "--control" not in line
+        and "--record" not in line
     ],
 )
 def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
@@ -149,6 +150,21 @@ def test_the_documented_changes_are_made_in_flight(
     assert sorted(made) == sorted(line for line in told.splitlines() if "from now on" in line)
 
 
+@pytest.mark.parametrize("document", ["README.md", "docs/recordings.md"])
+def test_the_documented_recordings_are_made_and_read(document: str, tmp_path: Path) -> None:
+    """Those of a document, one after the other."""
+    reads = ("skytether report ", "skytether export ", "skytether recover ")
+    lines = [line for block in blocks(ROOT / document) for line in block]
+    lines = [line for line in lines if line.startswith(reads) or "--record" in line]
+    assert any(line.startswith(reads) for line in lines)
+    for line in lines:
+        short = "--duration 20" if "--virtual" in line else "--duration 5 --settle 0"
+        argv = skytether(line.replace("--duration 20", short))
+        made = subprocess.run(argv, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (made.returncode, made.stderr) == (0, "")
+        assert made.stdout.strip()
+
+
 @pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
 def test_documented_targets_exist(line: str) -> None:
     """`make -n` knows each."""
@@ -167,7 +183,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether compare",)  # by test_compare.py
     known += ("skytether keygen ",)  # by test_keys.py
     known += ("skytether torture",)  # by test_torture.py
-    known += ("skytether set ",)
+    known += ("skytether set ", "skytether report ", "skytether export ", "skytether recover ")
     known += ("docker compose up",)
     known += ("docker compose --profile observe up",)  # by test_observe.py, as far as it can be
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")

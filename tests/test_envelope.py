@@ -315,12 +315,20 @@ def test_wind_may_carry_a_vehicle_that_brakes() -> None:
 
 # -- real flights --------------------------------------------------------------------------------
 
+BLIND = {
+    "control__feedback": False,
+    "control__horizon": 40,
+    "control__input_weight": 0.01,
+    "control__input_reference": False,
+}
+"""Committed inputs alone, at weights that answer all at once."""
+
 
 def test_a_vehicle_that_does_not_brake_is_caught_and_one_that_does_is_not() -> None:
-    """Four of five horizons lost: they run out, and their last input is held, or braked."""
+    """Four of five horizons of 2 s lost: they run out, and their last input is held, or braked."""
 
     def outcome(exhausted: str) -> str:
-        keys = {"vehicle__exhausted": exhausted, "network__uplink__loss": 0.8}
+        keys = {"vehicle__exhausted": exhausted, "network__uplink__loss": 0.8} | BLIND
         scenario = changed(**keys, duration=40.0)
         return judge(scenario, flight.fly(scenario).client).outcome
 
@@ -339,6 +347,7 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
     for direction, delay_s in (("uplink", 0.05), ("downlink", 1.4)):
         network = f"network.{direction}"
         lay({f"{network}.delay": "constant", f"{network}.minimum_s": delay_s}, table)
+    lay({key.replace("__", "."): value for key, value in BLIND.items()}, table)
     lay({"duration": 40.0, "control.dt": 0.02, "control.horizon": 20}, table)
     scenario = msgspec.convert(table, Scenario)  # unchecked: it would be refused
     verdict = judge(scenario, flight.fly(scenario).client)

@@ -49,6 +49,7 @@ def scenario(scheme: str, **control: Any) -> Scenario:
         "control": {
             "dt": DT,
             "scheme": scheme,
+            "feedback": False,
             "observer_s": 0.0,
             "trigger": "always",
             **control,
@@ -346,11 +347,12 @@ def test_without_compensation_nothing_is_learned() -> None:
 
 def test_feedback_leads_on_from_where_the_vehicle_is_now() -> None:
     """From x̂(k), with the disturbance and the gain."""
-    estimator, found = learning(feedback=True), foresight(1, 2, H, 1)
+    firm: dict[str, Any] = {"feedback": True, "input_weight": 0.01}
+    estimator, found = learning(**firm), foresight(1, 2, H, 1)
     w = watch(estimator, WIND)
     estimator.observe(0, told(199, np.ones((2, 2)), np.zeros(2)))
     estimator.foresee(ROW, np.array([203]), found)
-    gain = feedback_gain(scenario("predictive", feedback=True))
+    gain = feedback_gain(scenario("predictive", **firm))
     expected = np.column_stack([found.estimate[0], w, gain])
     np.testing.assert_array_equal(found.feedback[0], expected.astype(np.float32))
     assert (gain > 1.0).all()

@@ -171,7 +171,7 @@ class Hand:
 def scenario(**sections: Any) -> Scenario:
     """A long flight of the demo at 50 Hz in calm air; sections are laid over."""
     table = config.to_table(config.load("demo")) | {"duration": 100.0}
-    table["control"] |= {"dt": 0.02, "horizon": H}
+    table["control"] |= {"dt": 0.02, "horizon": H, "feedback": False}
     table["vehicle"] |= {"wind": 0.0}
     for section, values in sections.items():
         table[section] |= values

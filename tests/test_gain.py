@@ -173,9 +173,9 @@ def test_noise_of_the_measurements_is_not_worth_another_gain(dead_time_s: float)
 
 
 def scenario(**sections: Any) -> Scenario:
-    """The demo with feedback aboard in calm air, its inputs 0.3 s late; sections are laid over."""
+    """The demo at firm weights in calm air, its inputs 0.3 s late; sections are laid over."""
     table = config.to_table(config.load("demo")) | {"duration": 20.0, "settle": 5.0}
-    table["control"]["feedback"] = True
+    table["control"] |= {"input_weight": 0.01, "input_reference": False}
     table["vehicle"] |= {"wind": 0.0, "dead_time_s": 0.3}
     for section, values in sections.items():
         table[section] |= values

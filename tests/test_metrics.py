@@ -200,7 +200,7 @@ def test_figures_of_a_client_in_flight_have_ages() -> None:
 
 @pytest.mark.parametrize("mode", list(Mode))
 def test_a_client_is_well_while_it_is_flown_or_could_be(mode: Mode) -> None:
-    """Of a vehicle alone, and of any among several."""
+    """The metrics of a vehicle that is alone, and of any among several."""
     alone = {"vehicle": 1, "mode": str(mode), "missed": 0}
     several = {"missed": 0, "each": {"vehicle 3": {"mode": "track"}, "vehicle 1": alone}}
     why = "" if mode in (Mode.READY, Mode.TRACK, Mode.COAST) else f"vehicle 1 is in mode {mode}"

@@ -39,6 +39,7 @@ WEIGHTS = {
     "state_weight": (7.1, 14.0),
     "terminal_weight": (73.0, 555.0),
     "input_weight": 1.8,
+    "input_reference": False,
     "change_weight": 0.03,
 }
 

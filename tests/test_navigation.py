@@ -241,10 +241,20 @@ def test_wind_that_stays_and_a_wrong_gain_leave_no_offset(monkeypatch: Any) -> N
 # -- flights -----------------------------------------------------------------------------------
 
 
+ALONE = {
+    "feedback": False,
+    "horizon": 40,
+    "input_weight": 0.01,
+    "input_reference": False,
+    "cost_gap": 2.0,
+}
+"""Committed inputs alone, at tight weights: whatever is measured is for the server to answer."""
+
+
 def test_the_filter_keeps_noise_from_being_sent_and_flown() -> None:
-    """Ablation: without it the cost gap sends three times as much."""
+    """Ablation: without it the cost gap sends three times as much, where it is all in its hands."""
     quiet, with_filter, without = (
-        fly(scenario(sensor=sensor, duration=30.0, seed=3))
+        fly(scenario(sensor=sensor, control=ALONE, duration=30.0, seed=3))
         for sensor in ({}, NOISE, NOISE | {"filter": "none"})
     )
     shares = [float(flight.server["event"].mean()) for flight in (quiet, with_filter, without)]
@@ -254,7 +264,7 @@ def test_the_filter_keeps_noise_from_being_sent_and_flown() -> None:
     noise = without.client["measured"] - without.client["state"]
     np.testing.assert_allclose(noise.std(axis=(0, 1)), [0.02, 0.05], rtol=0.1)
     np.testing.assert_array_equal(without.client["measured"], without.client["estimate"])
-    flown = scenario(sensor=NOISE, duration=30.0, seed=3)
+    flown = scenario(sensor=NOISE, control=ALONE, duration=30.0, seed=3)
     error = summarise(flown, "demo", with_filter.client).estimate_error_m
     assert error is not None
     assert 0.007 < error < 0.011
@@ -262,9 +272,10 @@ def test_the_filter_keeps_noise_from_being_sent_and_flown() -> None:
 
 def test_the_server_does_not_learn_noise_for_wind(monkeypatch: Any) -> None:
     """Ablation: an observer that follows each velocity at once sends a tenth more."""
+    flown = scenario(sensor=NOISE, control=ALONE, duration=30.0)
 
     def share() -> float:
-        flights = fly_batch(scenario(sensor=NOISE, duration=30.0), range(1, 7))
+        flights = fly_batch(flown, range(1, 7))
         return float(np.mean([flight.server["event"].mean() for flight in flights]))
 
     with_it = share()

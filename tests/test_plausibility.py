@@ -323,7 +323,9 @@ def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
     assert rmse([flipped(monkeypatch, 0.01, seed) for seed in SEEDS]) > 2.0 * good
 
 
-def oddly(monkeypatch: pytest.MonkeyPatch, number: int, field: str, value: int) -> Flight:
+def oddly(
+    monkeypatch: pytest.MonkeyPatch, number: int, field: str, value: int, *, feedback: bool = True
+) -> Flight:
     """A flight of which one observation, by its number from 0, has a field changed."""
     send, said = vehicle.Client._send, iter(range(10**9))
 
@@ -333,7 +335,9 @@ def oddly(monkeypatch: pytest.MonkeyPatch, number: int, field: str, value: int) 
         send(self, message)
 
     monkeypatch.setattr(vehicle.Client, "_send", lie)
-    return fly(scenario(network={"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}))
+    control = config.to_table(config.load("demo"))["control"] | {"feedback": feedback}
+    network = {"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}
+    return fly(scenario(control=control, network=network))
 
 
 @pytest.mark.parametrize("number", [0, 300])
@@ -359,9 +363,13 @@ def test_one_odd_observation_costs_a_few_steps_at_most(
 def test_believed_one_odd_observation_leaves_the_vehicle_alone(
     field: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ablation: no observation is newer than step 2^36, no horizon is for a step of now."""
+    """Ablation: no observation is newer than step 2^36, no horizon is for a step of now.
+
+    Without feedback: with it the server would go 2^36 steps along where its plan leads.
+    """
     monkeypatch.setattr(Plausibility, "judge", believe)
-    flight = oddly(monkeypatch, 300, field, 2**36 if field == "step" else HOUR)
+    value = 2**36 if field == "step" else HOUR
+    flight = oddly(monkeypatch, 300, field, value, feedback=False)
     error = summarise(scenario(), "test", flight.client).error_max
     assert flight.failure is not None or (error or 0.0) > 0.5
 

@@ -32,6 +32,8 @@ from sim.flight import Flight, fly
 Delay = Callable[[float], float]
 """Delay of a packet [s], by the time since the first [s]."""
 
+TIGHT = {"feedback": False, "input_weight": 0.01, "input_reference": False}
+"""Keys of committed inputs alone, at weights that answer all at once."""
 OUTSIDE_M = 3.2
 """How far from the centre of the figure eight, of 2 m, a vehicle may get."""
 
@@ -39,8 +41,9 @@ OUTSIDE_M = 3.2
 def scenario(
     uplink_s: float = 0.05, downlink_s: float = 0.05, *, duration: float = 60.0, **sections: Any
 ) -> Scenario:
-    """A figure eight in calm air, over constant delays; sections are laid over."""
+    """A figure eight in calm air at TIGHT weights over constant delays; sections are laid over."""
     table = config.to_table(config.load("demo")) | {"duration": duration}
+    table["control"] |= TIGHT
     table["vehicle"]["wind"] = 0.0
     for direction, delay_s in (("uplink", uplink_s), ("downlink", downlink_s)):
         table["network"][direction] |= {"delay": "constant", "minimum_s": delay_s}
@@ -132,7 +135,8 @@ def test_a_delay_that_grows_in_flight_ends_in_hover_or_is_flown(
     feedback: bool,
 ) -> None:
     """Nothing flies away; where a flight ends without a plan, both ends have said why."""
-    flown = scenario(control={"feedback": feedback, "dt": dt, "horizon": horizon})
+    keys = {"feedback": True, "input_weight": 1.0, "input_reference": True} if feedback else TIGHT
+    flown = scenario(control={**keys, "dt": dt, "horizon": horizon})
     flight = fly_over(monkeypatch, flown, *ways(side, GROWING[growing]))
     assert far_m(flight) < OUTSIDE_M
     if flight.failure is None:

@@ -16,7 +16,7 @@ quick = settings(max_examples=40, deadline=None)
 H = 20
 SCENARIO = Scenario(
     model=ModelConfig(tau_s=(0.81, 0.3), u_max=(1.8, 0.6)),
-    control=ControlConfig(horizon=H, change_weight=0.033),
+    control=ControlConfig(horizon=H, input_weight=0.01, input_reference=False, change_weight=0.033),
 )
 TERMS = SCENARIO.terms()
 PROBLEM = pose(TERMS.model, make_mpc(TERMS, SCENARIO.control), LATER)

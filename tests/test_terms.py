@@ -32,7 +32,7 @@ HERE = config.check(
 OTHER: dict[str, Any] = {
     "model.axes": 3,
     "control.scheme": "predictive",
-    "control.feedback": True,
+    "control.feedback": False,
     "reference.preview": 1.0,
     "sensor.filter": "none",
     "sensor.position_bias_m": [0.1, 0.1],
@@ -41,7 +41,7 @@ OTHER: dict[str, Any] = {
     "control.delay_bound": 0.5,
     "control.trigger": "always",
     "control.solver": "osqp",
-    "control.input_reference": True,
+    "control.input_reference": False,
     "reference.shape": "square",
     "reference.velocity_mps": [0.1, 0.1],
     "reference.points_m": [[0.0, 0.0], [2.0, 0.0]],

@@ -71,7 +71,8 @@ def _times_ns(scenario: Scenario, part: str, rows: Rows, begins: Indices) -> Ind
 def _rows(part: str, rows: Rows, times_ns: Indices) -> Iterator[Timed]:
     """Frames of a part: one for all rows of an instant."""
     starts = np.flatnonzero(np.diff(times_ns, prepend=-1))
-    for begin, end in zip(starts, [*starts[1:], len(rows)], strict=True):
+    ends = np.append(starts[1:], len(rows))[: len(starts)]
+    for begin, end in zip(starts, ends, strict=True):
         time_ns = int(times_ns[begin])
         piece = rows[begin:end].tobytes()
         yield time_ns, PROCESSES[part], RowsFrame(part=part, time_ns=time_ns, rows=piece)

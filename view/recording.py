@@ -23,6 +23,7 @@ import struct
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -36,10 +37,10 @@ from mcap.records import Channel, Message
 from mcap.writer import Writer
 
 from shared import config
-from shared.config import Scenario, to_toml
+from shared.config import ConfigError, Scenario, to_toml
 from shared.events import ChangeRefused, Degraded, Event, Failure, Fault, RecordIncomplete
 from shared.feed import Figures, Frame, Opened, Rows, Said, columns_of
-from shared.model import Array, discretise
+from shared.model import Array, advance, discretise
 from shared.record import Rows as Table
 from shared.summary import Summary, summarise
 from view import foxglove, rows
@@ -91,6 +92,7 @@ BROKEN = (
     AttributeError,
     LookupError,
     MemoryError,
+    OSError,  # a place in the file that cannot be
     TypeError,
     ValueError,
 )
@@ -113,16 +115,16 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
 
     scenario: str
     """Name of the scenario."""
-    seed: str
+    seed: int
     """Seed of the flight."""
     version: str
     """Version of Skytether that flew it."""
     began: str
     """Time of day at which it began, ISO 8601; empty in virtual time."""
-    offset_ns: str
+    offset_ns: int
     """Time of a message minus time of the frame that it was made of [ns]."""
-    secure: str
-    """Whether the link was sealed: true or false."""
+    secure: bool
+    """Whether the link was sealed."""
 
 
 class Recording:
@@ -141,7 +143,7 @@ class Recording:
         self._writer = Writer(file, chunk_size=CHUNK_BYTES)
         self._writer.start(profile="", library=f"{OURS} {about.version}")
         self._scenario = scenario
-        self._offset_ns = int(about.offset_ns)
+        self._offset_ns = about.offset_ns
         self._tables: dict[tuple[str, str], rows.Table] = {}
         """Columns of each part, by process and part."""
         self._channels: dict[str, int] = {}
@@ -149,7 +151,8 @@ class Recording:
         self._shown: set[int] = set()
         """Vehicles whose trajectory has been drawn."""
         self._now_ns = 0
-        self._writer.add_metadata(OURS, msgspec.to_builtins(about))
+        said = msgspec.to_builtins(about)
+        self._writer.add_metadata(OURS, {name: _text(value) for name, value in said.items()})
         self._attach(SCENARIO, "application/toml", to_toml(scenario))
         self.flush()
 
@@ -269,6 +272,11 @@ class Recording:
         self._writer.add_message(channel, self._now_ns, data, self._now_ns)
 
 
+def _text(value: str | int) -> str:
+    """A value of metadata, which are texts alone: a number or flag is written as in JSON."""
+    return value if isinstance(value, str) else msgspec.json.encode(value).decode()
+
+
 def trajectory(scenario: Scenario) -> Array:
     """Desired positions of a whole flight [m]; shape (points, axes)."""
     time_s = np.linspace(0.0, scenario.duration, POINTS_MAX)
@@ -283,12 +291,17 @@ def planned(scenario: Scenario, row: np.void) -> Array:
         row: row of the part "plan".
     """
     model = discretise(scenario.tau_s, scenario.control.dt)
-    state = row["state"]
-    path = [state[:, 0]]
-    for each in row["inputs"].T:
-        state = model.step(state, each + row["disturbance"])
-        path.append(state[:, 0])
-    return np.array(path)
+    inputs = row["inputs"] + row["disturbance"][:, np.newaxis]
+    paths = []
+    for axis, (p, v), along in zip(
+        model.axes(), row["state"].tolist(), inputs.tolist(), strict=True
+    ):
+        path = [p]
+        for u in along:
+            p, v = advance(axis, p, v, u)  # noqa: PLW2901 - rolled along
+            path.append(p)
+        paths.append(path)
+    return np.array(paths).T
 
 
 def _schema_of(value: Any) -> dict[str, Any]:
@@ -317,7 +330,7 @@ class Recorded:
         self.path = path
         """Its file."""
         self._file, size = opened(path)
-        self._reader = SeekingReader(self._file, record_size_limit=size)
+        self._reader = SeekingReader(self._file, validate_crcs=True, record_size_limit=size)
         try:
             self._read_ends()
         except BaseException:
@@ -390,7 +403,7 @@ class Recorded:
                 for _, channel, message in self._reader.iter_messages()
                 if FRAME in channel.metadata
             )
-            offset_ns, begin_ns = int(self.about.offset_ns), None
+            offset_ns, begin_ns = self.about.offset_ns, None
             for (time_ns, *_), group in groupby(own, key=lambda each: _instant(*each[:2])):
                 begin_ns = time_ns if begin_ns is None else begin_ns
                 for process, frame in _frames(time_ns - offset_ns, group):
@@ -404,7 +417,7 @@ def summary_of(scenario: Scenario, about: About, parts: Mapping[str, Table]) -> 
         return None
     client = client[client["vehicle"] == client["vehicle"].min()]
     others = parts.get("server"), parts.get("netem")
-    return summarise(scenario, about.scenario, client, *others, secure=about.secure == "true")
+    return summarise(scenario, about.scenario, client, *others, secure=about.secure)
 
 
 def opened(path: Path) -> tuple[BinaryIO, int]:
@@ -446,9 +459,12 @@ def known_of(
     if OURS not in metadata or SCENARIO not in attached:
         raise RecordingError(f"{path}: it is no recording of Skytether, or nothing is whole of it")
     with reading(path):
-        about = msgspec.convert(metadata[OURS], About)
+        about = msgspec.convert(metadata[OURS], About, strict=False)
         table = tomllib.loads(attached[SCENARIO].decode())
-        return about, config.check(table, f"{path}: {SCENARIO}")
+        try:
+            return about, config.check(table, f"{path}: {SCENARIO}")
+        except ConfigError as error:  # another version's, or its trajectory's file is elsewhere
+            raise RecordingError(str(error)) from None
 
 
 def parts_of(messages: Iterable[tuple[Channel, Message]]) -> dict[str, Table]:
@@ -459,9 +475,13 @@ def parts_of(messages: Iterable[tuple[Channel, Message]]) -> dict[str, Table]:
         if part := channel.metadata.get("part"):
             columns[part] = channel.metadata["columns"]
             rows_of.setdefault(part, []).append(msgspec.json.decode(message.data))
-    return {
-        part: rows.Table(columns_of(columns[part])).rows(each) for part, each in rows_of.items()
-    }
+    return {part: _table(columns[part]).rows(each) for part, each in rows_of.items()}
+
+
+@lru_cache(64)
+def _table(columns: str) -> rows.Table:
+    """What makes rows of messages, by their columns."""
+    return rows.Table(columns_of(columns))
 
 
 def _instant(time_ns: int, channel: Channel) -> tuple[int, str, str]:
@@ -478,7 +498,7 @@ def _frames(
     about = together[0][1].metadata
     if part := about.get("part"):
         decoded = [msgspec.json.decode(data) for _, _, data in together]
-        made = rows.Table(columns_of(about["columns"])).rows(decoded)
+        made = _table(about["columns"]).rows(decoded)
         yield about["process"], Rows(part=part, time_ns=time_ns, rows=made.tobytes())
         return
     for _, channel, data in together:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from struct import Struct
 from typing import BinaryIO, NamedTuple
+from zlib import crc32
 
 import msgspec
 from mcap.opcode import Opcode
@@ -152,7 +153,10 @@ def _whole(file: BinaryIO, size: int) -> Iterator[tuple[int, list[McapRecord]]]:
         end = file.tell() + length
         if end > size or opcode in {Opcode.DATA_END, Opcode.FOOTER}:
             return
-        piece = io.BytesIO(head + file.read(length))
+        body = file.read(length)
+        if opcode == Opcode.ATTACHMENT and crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
+            continue
+        piece = io.BytesIO(head + body)
         try:
             record = next(StreamReader(piece, skip_magic=True, emit_chunks=True).records)
             if isinstance(record, Chunk):

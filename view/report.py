@@ -186,7 +186,7 @@ def _events(recorded: Recorded) -> tuple[int, list[tuple[str, str, str]]]:
             epoch_ns = frame.time_ns - int(first["step"]) * dt_ns
     begin_ns = epoch_ns or 0
     return begin_ns, [
-        (f"{(time_ns - begin_ns) / SECOND_NS:.2f}", process, text)
+        (f"{round((time_ns - begin_ns) / SECOND_NS, 2) + 0.0:.2f}", process, text)
         for time_ns, process, text in said
     ]
 
@@ -232,8 +232,8 @@ def timeline(flown: Flown) -> Picture:
             "From above: position, with the desired one dashed; distance between them; what the "
             "trigger compares with its threshold, linear up to there and logarithmic above, and "
             "when a horizon was sent; how old the observation behind the input was, and the plan; "
-            "packets in each second, by when they entered the network. The colour behind is what "
-            "the vehicle did."
+            "packets in each second, by when they entered the network, but for those still under "
+            "way at the end. The colour behind is what the vehicle did."
         )
         return Picture("timeline", "What happened", says, _png(figure))
 
@@ -264,7 +264,7 @@ def _trigger(below: "Axes", flown: Flown) -> None:
     below.plot(time_s, server["error"], "k-", linewidth=0.9, label="figure")
     below.plot(time_s, server["threshold"], "r--", linewidth=0.9, label="threshold")
     sent, bottom = time_s[server["event"]], below.get_xaxis_transform()
-    style = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
+    style: Any = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
     below.vlines(sent, 0.0, 0.12, **style)
     threshold = server["threshold"][np.isfinite(server["threshold"])]
     # What it compares spans decades while nothing can be sent; the threshold is what counts.

@@ -5,6 +5,7 @@ are others: so it comes back to the last bit.
 """
 
 from collections.abc import Iterable, Mapping
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -75,8 +76,9 @@ class Table:
         """Plain columns."""
         self.names: tuple[str, ...] = self.plain.names or ()
         """Names of the plain columns."""
-        self._numbers = [name for name in self.names if self.plain[name].base.kind == "f"]
-        self._lists = [name for name in self.names if self.plain[name].shape]
+        kinds = {name: self.plain[name] for name in self.names if self.plain[name].base.kind == "f"}
+        self._numbers = [name for name, kind in kinds.items() if not kind.shape]
+        self._lists = [name for name, kind in kinds.items() if kind.shape]
 
     def schema(self) -> dict[str, Any]:
         """JSON schema of a message."""
@@ -95,15 +97,14 @@ class Table:
         flat = np.ascontiguousarray(rows).view(self.plain)
         values = [flat[name].tolist() for name in self.names]
         messages = [dict(zip(self.names, each, strict=True)) for each in zip(*values, strict=True)]
-        for name in self._numbers:
-            finite = np.isfinite(flat[name])
-            if finite.all():
-                continue
-            for i in np.flatnonzero(~finite.reshape(len(flat), -1).all(axis=1)).tolist():
-                del messages[i][name]
+        for i, message in enumerate(messages):
+            odd = [name for name in self._numbers if not isfinite(message[name])]
+            odd += [name for name in self._lists if not all(map(isfinite, message[name]))]
+            for name in odd:
+                del message[name]
                 bits = flat[name][i].tobytes()
                 if bits != NAN.astype(self.plain[name].base).tobytes():
-                    messages[i].setdefault(NOT_FINITE, []).append(f"{name}={bits.hex()}")
+                    message.setdefault(NOT_FINITE, []).append(f"{name}={bits.hex()}")
         return messages
 
     def rows(self, messages: Iterable[Mapping[str, Any]]) -> Rows:
@@ -113,21 +114,18 @@ class Table:
             ValueError: these are no messages of such rows.
         """
         given = list(messages)
-        flat = np.empty(len(given), self.plain)
-        for name in self.names:
-            default = NAN if name in self._numbers else None
-            column = [message.get(name, default) for message in given]
-            if name in self._lists:
-                empty = np.full(self.plain[name].shape, NAN)
-                column = [empty if value is default else value for value in column]
-            try:
-                flat[name] = np.array(column).reshape(flat[name].shape)
-            except (TypeError, ValueError, OverflowError):
-                raise ValueError(f"a row has no right {name}") from None
+        lists = {name: np.full(self.plain[name].shape, NAN) for name in self._lists}
+        absent = dict.fromkeys(self._numbers, NAN) | lists
+        names = [(name, absent.get(name)) for name in self.names]
+        try:
+            values = [tuple(each.get(name, default) for name, default in names) for each in given]
+            flat = np.array(values, self.plain)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"a row is none: {error}") from None
         for i, message in enumerate(given):
             for each in message.get(NOT_FINITE, ()):
                 name, _, bits = each.partition("=")
-                kind = self.plain[name] if name in self._numbers else None
+                kind = self.plain[name] if name in absent else None
                 if kind is None or len(bits) != 2 * kind.itemsize:
                     raise ValueError(f"a row has {each[:40]!r} for a number")
                 flat[name][i] = np.frombuffer(bytes.fromhex(bits), kind)[0]
