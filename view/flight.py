@@ -11,7 +11,7 @@ from shared.events import Changed
 from shared.feed import FeedError, Frame, Opened, Said
 from view.controls import CUT, WAYS
 from view.play import PROCESSES, Operator
-from view.state import State
+from view.state import LED, State
 
 
 class Flight:
@@ -41,7 +41,9 @@ class Flight:
         """Take a frame; one that makes no sense is left out."""
         with self.lock, contextlib.suppress(FeedError, ValueError, KeyError):
             self.state.take(process, frame)
-        changed = isinstance(frame, Said) and isinstance(frame.event, Changed)
+        changed = (
+            isinstance(frame, Said) and isinstance(frame.event, Changed) and frame.event.key != LED
+        )
         if process in PROCESSES and (changed or isinstance(frame, Opened)):
             self.ask(process, {})
 
@@ -60,10 +62,10 @@ class Flight:
     def _answered(self, process: str, asked: Mapping[str, Any], answer: Answer | None) -> None:
         if answer and answer.values:
             self.values[process] = answer.values
-        elif answer:
+        elif answer and (answer.refused or LED not in asked):
             self.refused = bool(answer.refused)
             self.answer = answer.refused or "; ".join(map(str, answer.changed))
-        elif asked:
+        elif asked and not answer:
             self.refused = True
             self.answer = f"{process} does not answer: the flight is over, or it takes no changes"
 

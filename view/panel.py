@@ -15,6 +15,7 @@ from view.controls import THRESHOLDS, Knob, Values, compared, knobs, triggers
 from view.flight import Flight
 from view.plots import POINTS, Look, Plots, of_flight, of_network
 from view.scene import GROUND_RGB, WIDE, Scene, in_space
+from view.state import LED
 
 HELD_S = 1.5
 """Time for which a slider that was moved is left where it is [s]."""
@@ -312,8 +313,7 @@ class _Lead:
     def _move(self, point: Any) -> None:
         self._held_s = time.monotonic()
         for flight in self._flights:
-            values = {"reference.points_m": [point[: self._axes].tolist()]}
-            flight.ask("server", values)
+            flight.ask("server", {LED: [np.round(point[: self._axes], 3).tolist()]})
 
     def show(self) -> None:
         """Put it where the target is, unless it is being dragged."""

@@ -274,7 +274,7 @@ class Scene:
         target = self.middle - np.array([0.0, down_m, 0.0])
         if self.flat:
             return target + np.array([0.0, -0.01, 1.0]) * away_m, target
-        return target + np.array([-0.5, -0.7, 0.6]) * away_m, target
+        return target + np.array([-0.4, -0.55, 0.45]) * away_m, target
 
     def move(self, states: Sequence[State]) -> None:
         """Put vehicles where they are."""

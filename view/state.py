@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shared.config import Scenario
 from shared.endpoint import MILLISECOND_NS, SECOND_NS
-from shared.events import DOES, Counted, Event, Listening, Plaintext
+from shared.events import DOES, Changed, Counted, Event, Listening, Plaintext
 from shared.feed import FeedError, Figures, Frame, Opened, Rows, Said, columns_of, table
 from shared.model import discretise
 from shared.protocol import Mode
@@ -41,6 +41,8 @@ DELAY_BIN_NS = 20 * MILLISECOND_NS
 """Width of a bin of a histogram of delays [ns]."""
 DELAY_BINS = 100
 """Number of bins of a histogram of delays; the last takes all that is longer."""
+LED = "reference.points_m"
+"""Key that changes many times a second where a target is led: not worth a sentence each time."""
 LOSS_S = 10.0
 """Time over which loss is measured [s]."""
 LOSS_HIGH = 0.3
@@ -540,7 +542,8 @@ class State:
         return track
 
     def _said(self, event: Event, time_ns: int) -> None:
-        if isinstance(event, Counted | Listening | Plaintext):
+        moves = isinstance(event, Changed) and event.key == LED
+        if moves or isinstance(event, Counted | Listening | Plaintext):
             return
         self.said.append((self.time_s(time_ns), str(event).splitlines()[0]))
 
