@@ -19,8 +19,8 @@ $(STAMP): requirements.lock requirements-dev.lock pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	touch $@
 
-demo: setup  ## fly the demonstration
-	$(BIN)/skytether fly demo --beside demo-no-compensation --figure demo.png
+demo: setup  ## fly the demonstration for three minutes, with a page to play with
+	$(BIN)/skytether fly demo --duration 180 --beside demo-no-compensation --figure demo.png
 	@echo "The flight is drawn in demo.png."
 
 reproduce: setup  ## the paper's table and figures, and more, in results/report.html (15 minutes)

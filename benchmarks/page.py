@@ -11,7 +11,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -27,7 +26,7 @@ from shared.feed import Frame, Opened, Rows, columns_of, table
 from shell.feed import Subscriber
 
 if TYPE_CHECKING:
-    from playwright.sync_api import CDPSession, Page
+    from playwright.sync_api import Browser, Page
 
 LATENCY_S = 30.0
 """Time for which positions are taken [s]."""
@@ -116,11 +115,11 @@ def process_mb(pid: int) -> float:
     return int(found[1]) / 1000
 
 
-def tab_mb(session: "CDPSession") -> float:
-    """Memory of the heap of a tab after its garbage is collected [MB]."""
-    session.send("HeapProfiler.collectGarbage")
-    used: Mapping[str, float] = session.send("Runtime.getHeapUsage")
-    return (used["usedSize"] + used.get("embedderHeapUsedSize", 0.0)) / 1e6
+def tab_pid(browser: "Browser") -> int:
+    """Process of the browser that shows the one page there is: of several, the largest."""
+    told = browser.new_browser_cdp_session().send("SystemInfo.getProcessInfo")
+    pids = [each["id"] for each in told["processInfo"] if each["type"] == "renderer"]
+    return max(pids, key=process_mb)
 
 
 def replaying() -> int:
@@ -131,13 +130,14 @@ def replaying() -> int:
     return int(found.stdout)
 
 
-def weigh(page: "Page", weighed: list[tuple[float, float, float]]) -> None:
-    """Weigh process and tab until an hour has been shown."""
+def weigh(browser: "Browser", page: "Page", weighed: list[tuple[float, float, float]]) -> None:
+    """Weigh the page's process and the tab's until an hour has been shown."""
     session = page.context.new_cdp_session(page)
-    pid = replaying()
+    ours, theirs = replaying(), tab_pid(browser)
     while True:
         shown_s = flown_s(page)
-        weighed.append((shown_s, process_mb(pid), tab_mb(session)))
+        session.send("HeapProfiler.collectGarbage")
+        weighed.append((shown_s, process_mb(ours), process_mb(theirs)))
         CONSOLE.print("{:6.0f} s flown: page {:.1f} MB, tab {:.1f} MB".format(*weighed[-1]))
         if shown_s >= HOUR_S - 60.0:
             return
@@ -158,13 +158,13 @@ def memory() -> int:
             until(lambda: flown_s(page) > 1.0, "it is shown")
             page.get_by_label("Speed").click()
             page.get_by_role("option", name=str(SPEED), exact=True).click()
-            weigh(page, weighed)
+            weigh(browser, page, weighed)
     settled = np.array([each[1:] for each in weighed if each[0] >= SETTLED_S])
     few = max(1, len(settled) // 5)
     growth = settled[-few:].mean(axis=0) / settled[:few].mean(axis=0)
     CONSOLE.print(
         f"from {SETTLED_S:g} s to the end of the hour the page's process has grown to "
-        f"{growth[0]:.3f} of what it was, the tab's heap to {growth[1]:.3f}"
+        f"{growth[0]:.3f} of what it was, the tab's to {growth[1]:.3f}"
     )
     return int(growth.max() > WITHIN)
 
