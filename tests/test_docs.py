@@ -150,7 +150,31 @@ def test_the_documented_changes_are_made_in_flight(
     assert sorted(made) == sorted(line for line in told.splitlines() if "from now on" in line)
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/recordings.md"])
+@pytest.mark.parametrize("document", ["docs/page.md", "docs/tour.md"])
+def test_the_documented_pages_are_served(document: str, tmp_path: Path) -> None:
+    """Replays and duels of a document, until Ctrl-C; what they show is recorded before."""
+    lines = [line for block in blocks(ROOT / document) for line in block]
+    served = [line for line in lines if line.startswith(("skytether replay ", "skytether duel "))]
+    assert served
+    records = next(line for line in lines if "--record" in line)
+    subprocess.run(skytether(records), cwd=tmp_path, capture_output=True, check=True)
+    for line in served:
+        argv = [*skytether(line), "--page", "127.0.0.1:0"]
+        said = []
+        with subprocess.Popen(
+            argv, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ) as page:
+            assert page.stdout is not None
+            for word in page.stdout:
+                said.append(word)
+                if "the page is at http://127.0.0.1:" in word:
+                    page.send_signal(signal.SIGINT)
+                    break
+            said.append(page.stdout.read())
+        assert page.returncode in (0, command.INTERRUPTED), said
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/recordings.md", "docs/tour.md"])
 def test_the_documented_recordings_are_made_and_read(document: str, tmp_path: Path) -> None:
     """Those of a document, one after the other."""
     reads = ("skytether report ", "skytether export ", "skytether recover ")
@@ -184,6 +208,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether keygen ",)  # by test_keys.py
     known += ("skytether torture",)  # by test_torture.py
     known += ("skytether set ", "skytether report ", "skytether export ", "skytether recover ")
+    known += ("skytether replay ", "skytether duel ")
     known += ("docker compose up",)
     known += ("docker compose --profile observe up",)  # by test_observe.py, as far as it can be
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
