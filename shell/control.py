@@ -10,7 +10,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -105,11 +105,13 @@ class Caller:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._folder = tempfile.TemporaryDirectory(prefix="skytether-")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
-            # Answers come to an address: this one is nobody else's.
-            self._socket.bind(str(Path(self._folder.name) / "answers"))
+            self._folder = _answers(self._socket, path)
+        except OSError as error:
+            self._socket.close()
+            raise self._failed(error) from None
+        try:
             self._socket.settimeout(PATIENCE_S)
             self._socket.connect(str(path))
         except OSError as error:
@@ -137,6 +139,27 @@ class Caller:
     def _failed(self, error: OSError) -> ControlError:
         late = f"no answer in {PATIENCE_S:g} s" if isinstance(error, TimeoutError) else None
         return ControlError(f"{self._path}: {late or error.strerror or error}")
+
+
+def _answers(sock: socket.socket, path: Path) -> "tempfile.TemporaryDirectory[str]":
+    """Bind a socket to an address for answers that is nobody else's; returns its folder.
+
+    It lies beside the socket that is asked: in another container whoever answers may see no other
+    folder of ours. Where nothing can be made there, it is a temporary one.
+
+    Raises:
+        OSError: there is no place for it.
+    """
+    for beside in (path.parent.absolute(), None):
+        with suppress(OSError):
+            folder = tempfile.TemporaryDirectory(prefix=".skytether-", dir=beside)
+            try:
+                sock.bind(str(Path(folder.name) / "answers"))
+            except OSError:
+                folder.cleanup()
+            else:
+                return folder
+    raise OSError("no address for answers can be made")
 
 
 _DECODER = msgspec.json.Decoder(Answer)

@@ -322,6 +322,22 @@ def test_where_nobody_listens_is_said_in_a_line(
     assert capsys.readouterr().err == f"set: {path}: Connection refused\n"
 
 
+def test_answers_come_to_beside_the_socket_that_was_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In another container there is no other folder of ours; where that is too deep, elsewhere."""
+    deep = tmp_path / ("d" * 90)
+    deep.mkdir()
+    monkeypatch.chdir(deep)
+    for path, beside in ((tmp_path / "netem", True), (Path("netem"), False)):
+        with controlled(path, running()) as control, closing(Caller(path)) as caller:
+            assert control is not None
+            address = Path(caller._socket.getsockname())
+            assert (address.parent.parent == tmp_path) == beside
+            assert address.is_socket()
+        assert not address.parent.exists()
+
+
 def test_one_that_listens_and_does_not_answer_is_not_waited_for_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
