@@ -5,7 +5,8 @@ Readers come and go every few seconds, in an order that is drawn anew each round
 else the machine does hits all alike. Of each tick three times are taken: the CPU time of this
 thread, the wall-clock time, and how long after its deadline the last packet was out.
 
-`python -m benchmarks.feed` takes three minutes; docs/feed.md has what it said.
+`python -m benchmarks.feed` takes three minutes; docs/feed.md has what it said. With `--pages` each
+reader is a page in a browser: a process that serves it, and a tab of Chromium on this machine.
 """
 
 import os
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from benchmarks.browser import chromium
 from benchmarks.children import Child
 from benchmarks.harness import CONSOLE, Durations, Table, us
 from benchmarks.problems import derive
@@ -35,6 +37,8 @@ from shared.stopwatch import Stopwatch
 from shell.command import opened
 from shell.driver import Shell, run
 from shell.feed import Feed, Subscriber
+from view.flight import Flight
+from view.page import Page
 
 READERS = (0, 1, 3)
 """Numbers of readers that are compared."""
@@ -54,6 +58,8 @@ class Options:
     """Length of a turn [s], of which the first does not count."""
     vehicles: int = 10
     """Number of vehicles, which are sent a horizon at each of 50 steps a second."""
+    pages: bool = False
+    """Whether readers are pages, each open in a browser."""
 
 
 @dataclass
@@ -100,13 +106,15 @@ class Looker:
 
     Args:
         stack: ends it.
-        path: socket of the feed.
+        folder: where the feeds are.
+        pages: whether it shows them in a browser.
     """
 
-    def __init__(self, stack: ExitStack, path: Path) -> None:
-        code = "import sys; from benchmarks.feed import look; look(sys.argv[1])"
+    def __init__(self, stack: ExitStack, folder: Path, *, pages: bool) -> None:
+        does = "show" if pages else "look"
+        code = f"import sys; from benchmarks.feed import {does}; {does}(sys.argv[1])"
         self._process = stack.enter_context(
-            subprocess.Popen([sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE)
+            subprocess.Popen([sys.executable, "-c", code, str(folder)], stdin=subprocess.PIPE)
         )
         assert self._process.stdin is not None
         self._pipe = self._process.stdin
@@ -118,8 +126,8 @@ class Looker:
         self._pipe.flush()
 
 
-def look(path: str) -> None:
-    """Read every frame of a feed between the words "come" and "go" on the standard input."""
+def look(folder: str) -> None:
+    """Read each frame of the server, between the words "come" and "go" on the standard input."""
 
     def take(_: str, frame: Frame) -> None:
         assert frame
@@ -128,7 +136,22 @@ def look(path: str) -> None:
     for word in sys.stdin:
         if subscriber is not None:
             subscriber.close()
-        subscriber = Subscriber({"server": Path(path)}, take) if word.strip() == "come" else None
+        feed = Path(folder) / "server.feed"
+        subscriber = Subscriber({"server": feed}, take) if word.strip() == "come" else None
+
+
+def show(folder: str) -> None:
+    """Show the flight in a browser between the words "come" and "go" on the standard input."""
+    os.nice(10)  # browsers are on other machines
+    flight = Flight()
+    feeds = {name: Path(folder) / f"{name}.feed" for name in ("server", "client")}
+    with closing(Page("127.0.0.1", 0, [flight])) as page, chromium() as browser, ExitStack() as now:
+        for word in sys.stdin:
+            now.close()
+            if word.strip() == "come":
+                now.enter_context(closing(Subscriber(feeds, flight.take)))
+                tab = now.enter_context(closing(browser.new_page()))
+                tab.goto(f"http://127.0.0.1:{page.port}")
 
 
 class Turns:
@@ -179,9 +202,10 @@ def measure(options: Options) -> dict[str, Any]:
         feed = stack.enter_context(closing(Feed(folder / "server.feed")))
         server = _server(scenario, options.vehicles, feed)
         shell = Timed(server, ("127.0.0.1", 0), feed=feed)
-        lookers = [Looker(stack, folder / "server.feed") for _ in range(max(READERS))]
+        lookers = [Looker(stack, folder, pages=options.pages) for _ in range(max(READERS))]
         (folder / "scenario.toml").write_bytes(to_toml(scenario))
         more = ("--vehicles", str(options.vehicles), "--server", address_text(*shell.address))
+        more += ("--feed", str(folder / "client.feed"))
         vehicles = Child(
             stack, "client", str(folder / "scenario.toml"), "--duration", "86400", *more
         )

@@ -309,7 +309,8 @@ def cost_of(found: Foresight, target: Array, told: Array, inputs: Array) -> floa
     """Cost (9) of the tracker's inputs, twice; of the states 1 … H, and of both axes."""
     weights, wind = make_mpc(TERMS, SCENARIO.control).weights, found.disturbance[0][:, None]
     off = fly(found.start[0], inputs + wind)[:, 1:] - target[:, 1:]
-    cost = (off**2 * weights.states).sum() + weights.input * ((inputs + wind) ** 2).sum()
+    fast = inputs + wind - target[:, :-1, 1]
+    cost = (off**2 * weights.states).sum() + weights.input * (fast**2).sum()
     return float(cost + (weights.changes[LATER] * (inputs - told) ** 2).sum())
 
 
