@@ -595,6 +595,7 @@ def test_a_disk_that_fills_up_costs_the_recording_alone(
     assert len(told) == 1
 
 
+@pytest.mark.long
 def test_a_flight_over_udp_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
     """All rows of all parts; the recording ends with the summary that is shown."""
     path, summary = tmp_path / "flight.mcap", tmp_path / "summary.json"
