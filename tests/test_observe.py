@@ -26,6 +26,8 @@ from shared.metrics import TABLES
 from shell.metrics import names
 from skytether.processes import Child, started
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parent.parent
 OBSERVE = ROOT / "observe"
 DOCUMENT = ROOT / "docs" / "feed.md"
