@@ -4,7 +4,8 @@ import json
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -27,7 +28,7 @@ from shared.summary import summarise
 from shell import command
 from shell.command import CommandError, ScenarioFlags, ScenarioName
 from sim import flight
-from skytether import processes
+from skytether import pages, processes
 
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
 """Stages of the server's work, in their order; `record`, the price of watching, is left out."""
@@ -47,6 +48,9 @@ class Options:
     """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
     virtual: bool = False
     """Fly in virtual time: everything in this process, as fast as it can."""
+    page: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """HOST:PORT of a page with all of the vehicles, as `skytether fly` has one; none unless given,
+    for what is measured here is what the flight costs. Not in virtual time."""
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
@@ -136,6 +140,10 @@ def fleet(argv: Sequence[str]) -> None:
     command.check_count("--workers", options.workers, 64)
     if options.virtual and options.workers > 1:
         raise CommandError("--workers: got --virtual as well, where there is but one", 2)
+    if options.page:
+        command.address("--page", options.page)
+        if options.virtual:
+            raise CommandError("--page: got --virtual as well, which nobody can follow", 2)
     if options.figure:
         figures.check(options.figure)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
@@ -182,10 +190,27 @@ def _virtually(
     )
 
 
+@contextmanager
+def _paged(options: Options) -> Iterator[Path | None]:
+    """Serve a page, if there is to be one; yields the folder of its sockets."""
+    if options.page is None:
+        yield None
+        return
+    with (
+        tempfile.TemporaryDirectory(prefix="skytether-") as folder,
+        pages.beside([Path(folder)], options.page, pages.say),
+    ):
+        yield Path(folder)
+
+
 def _really(
     options: Options, on_second: Callable[[float], None], interrupted: Callable[[], bool]
 ) -> Flown:
-    with tempfile.TemporaryDirectory(prefix="skytether-") as folder, Metronome(options) as machine:
+    with (
+        tempfile.TemporaryDirectory(prefix="skytether-") as folder,
+        _paged(options) as sockets,
+        Metronome(options) as machine,
+    ):
         parts = Path(folder)
         shortfalls = processes.run(
             options.config,
@@ -196,6 +221,8 @@ def _really(
             workers=options.workers,
             watched=False,
             secure=options.secure,
+            control=sockets,
+            feeds=sockets,
         )
         incomplete = [each for each in shortfalls if not isinstance(each, NotFlown)]
         if incomplete:

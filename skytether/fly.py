@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -154,7 +153,7 @@ def _paged(options: Options) -> Iterator[Path | None]:
     with ExitStack() as stack:
         temporary = tempfile.TemporaryDirectory(prefix="skytether-")
         folder = options.control or Path(stack.enter_context(temporary))
-        stack.enter_context(pages.beside([folder], options.page, _print))
+        stack.enter_context(pages.beside([folder], options.page, pages.say))
         yield folder
 
 
@@ -270,9 +269,4 @@ def _tell(event: Event) -> None:
     """Show what may happen to the link and the record in flight, above the progress bar."""
     begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
     if isinstance(event, TOLD) and not begins:
-        _print(event)
-
-
-def _print(line: object) -> None:
-    with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
-        print(line, file=sys.stderr)
+        pages.say(event)

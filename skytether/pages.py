@@ -66,3 +66,9 @@ def beside(folders: Sequence[Path], at: str, say: Callable[[str], None]) -> Iter
         reader.join(STOP_S)
         if child.stdout:
             child.stdout.close()
+
+
+def say(line: object) -> None:
+    """Tell somebody who may be gone, on stderr."""
+    with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
+        print(line, file=sys.stderr)

@@ -179,6 +179,22 @@ def test_a_fleet_over_udp_is_summed_up(tmp_path: Path, count: int) -> None:
     assert 6 * 40 < summary["downlink_packets_per_s"] <= 6 * 51
 
 
+@pytest.mark.long
+def test_a_fleet_has_a_page_where_one_is_asked_for() -> None:
+    """Its address is said, and the page is gone with the flight."""
+    argv = ["fleet", "--vehicles", "3", "--duration", "4", "--page", "127.0.0.1:0"]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "skytether", *argv],
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert "the page is at http://127.0.0.1:" in done.stderr
+    assert "without a page" not in done.stderr
+
+
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
@@ -187,6 +203,10 @@ def test_a_fleet_over_udp_is_summed_up(tmp_path: Path, count: int) -> None:
         (
             ["fleet", "--virtual", "--workers", "2"],
             "fleet: --workers: got --virtual as well, where there is but one",
+        ),
+        (
+            ["fleet", "--virtual", "--page", "127.0.0.1:0"],
+            "fleet: --page: got --virtual as well, which nobody can follow",
         ),
         (["server", "--vehicles", "-1"], "server: --vehicles: got -1, expected 1 to 65536"),
         (["netem", "--flows", "0"], "netem: --flows: got 0, expected 1 to 65536"),
