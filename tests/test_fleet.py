@@ -182,7 +182,7 @@ def test_a_fleet_over_udp_is_summed_up(tmp_path: Path, count: int) -> None:
 @pytest.mark.long
 def test_a_fleet_has_a_page_where_one_is_asked_for() -> None:
     """Its address is said, and the page is gone with the flight."""
-    argv = ["fleet", "--vehicles", "3", "--duration", "4", "--page", "127.0.0.1:0"]
+    argv = ["fleet", "--vehicles", "3", "--duration", "6", "--page", "127.0.0.1:0"]
     done = subprocess.run(
         [sys.executable, "-P", "-m", "skytether", *argv],
         capture_output=True,
