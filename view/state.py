@@ -139,8 +139,6 @@ class Track:
         self._ring["slot"] = -1
         self.row: np.void | None = None
         """Newest row of the client's part; None without any."""
-        self.row_ns = 0
-        """Time of that row [ns]."""
         self.planned = 0
         """Number of steps that the server has planned for, as far as they were seen."""
         self.sent = 0
@@ -149,15 +147,15 @@ class Track:
 
     # -- what comes in -----------------------------------------------------------------------
 
-    def fly(self, rows: Table, *, time_ns: int) -> None:
+    def fly(self, rows: Table) -> None:
         """Take rows of the client's part."""
         at = self._at(rows["step"])
-        taken, rows_taken = at >= 0, rows
+        taken = at >= 0
         ring, at = self._ring, at[taken]
-        ring["position"][at] = rows_taken["state"][taken, :, 0]
+        ring["position"][at] = rows["state"][taken, :, 0]
         age_ns = rows["age_ns"][taken]
         ring["age_s"][at] = np.where(age_ns >= 0, age_ns / SECOND_NS, np.nan)
-        self.row, self.row_ns = rows[-1].copy(), time_ns
+        self.row = rows[-1].copy()
 
     def plan(self, rows: Table) -> None:
         """Take rows of the server's part."""
@@ -529,7 +527,7 @@ class State:
             own = rows[rows["vehicle"] == number]
             match frame.part:
                 case "client":
-                    track.fly(own, time_ns=frame.time_ns)
+                    track.fly(own)
                 case "server":
                     track.plan(own)
                 case "plan":
