@@ -1,44 +1,74 @@
-# The one image that server, netem and client run from: what requirements.lock pins, and our wheel.
+# Three images, each with what it runs and no more: `client` (netem and keygen as well), `page` and
+# `server`. What a lock file pins, and our wheel.
 # BASE_IMAGE may be any with Python 3.11 or later and its venv; either builder of Docker will do.
 ARG BASE_IMAGE=python:3.12-slim
 
-FROM ${BASE_IMAGE} AS build
-ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+FROM ${BASE_IMAGE} AS tools
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 \
+    INSTALL="/build/bin/pip --python /opt/skytether/bin/python install --quiet --only-binary :all:" \
+    TRIM="find /opt/skytether -type d -name tests -prune -exec rm -r {} +"
 WORKDIR /source
 RUN python3 -m venv /build && python3 -m venv --without-pip /opt/skytether
 
-COPY requirements.lock ./
-RUN /build/bin/pip --python /opt/skytether/bin/python install --quiet \
-        --require-hashes --only-binary :all: -r requirements.lock \
-    && find /opt/skytether -type d -name tests -prune -exec rm -r {} +
 
-# What makes the wheel stays behind; it has the version that developers have.
-COPY requirements-dev.lock ./
-RUN sed -n 's/^\([a-z0-9-]*==[^ ;]*\).*/\1/p' requirements-dev.lock >/build/pins \
-    && /build/bin/pip install --quiet --only-binary :all: --constraint /build/pins hatchling
-
+# What makes the wheel stays behind.
+FROM tools AS wheel
+COPY requirements-setup.lock ./
+RUN /build/bin/pip install --quiet --only-binary :all: --require-hashes -r requirements-setup.lock
 COPY . ./
-RUN /build/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /build/wheel . \
-    && /build/bin/pip --python /opt/skytether/bin/python install --quiet \
-        --no-deps --no-index /build/wheel/*.whl
-# What importing the server compiles; a machine of another kind compiles it anew when it starts.
-RUN NUMBA_CACHE_DIR=/opt/skytether/kernels /opt/skytether/bin/python -P -c "import server.endpoint"
+RUN /build/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /wheel .
 
 
-FROM ${BASE_IMAGE}
+FROM tools AS client-packages
+COPY requirements-client.lock ./
+RUN $INSTALL --require-hashes -r requirements-client.lock && $TRIM
+COPY --from=wheel /wheel /wheel
+RUN $INSTALL --no-deps --no-index /wheel/*.whl
+
+
+FROM tools AS page-packages
+COPY requirements-page.lock ./
+RUN $INSTALL --require-hashes -r requirements-page.lock && $TRIM
+COPY --from=wheel /wheel /wheel
+RUN $INSTALL --no-deps --no-index /wheel/*.whl
+
+
+FROM tools AS server-packages
+COPY requirements-server.lock ./
+RUN $INSTALL --require-hashes -r requirements-server.lock && $TRIM
+COPY --from=wheel /wheel /wheel
+RUN $INSTALL --no-deps --no-index /wheel/*.whl
+# The server's kernels; a machine of another kind compiles it anew when it starts.
+RUN NUMBA_CACHE_DIR=/opt/skytether/kernels /opt/skytether/bin/python -P -c \
+    "import skytether.server.endpoint; from skytether.shared.base import kernel; kernel.load()"
+
+
+FROM ${BASE_IMAGE} AS bare
 # One thread each: BLAS would start one a core, for matrices that are 40 wide.
 ENV PATH=/opt/skytether/bin:$PATH \
     HOME=/tmp \
     LANG=C.UTF-8 \
     PYTHONUNBUFFERED=1 \
     OMP_NUM_THREADS=1 \
-    OPENBLAS_NUM_THREADS=1 \
-    NUMBA_CACHE_DIR=/tmp/kernels
-COPY --from=build /opt/skytether /opt/skytether
+    OPENBLAS_NUM_THREADS=1
 RUN install --directory --owner 10001 --group 10001 /results /keys /flying
 USER 10001:10001
 WORKDIR /results
 STOPSIGNAL SIGTERM
+ENTRYPOINT ["skytether"]
+CMD ["--help"]
+
+
+FROM bare AS client
+COPY --from=client-packages /opt/skytether /opt/skytether
+
+
+FROM bare AS page
+COPY --from=page-packages /opt/skytether /opt/skytether
+
+
+FROM bare AS server
+ENV NUMBA_CACHE_DIR=/tmp/kernels
+COPY --from=server-packages /opt/skytether /opt/skytether
 # The compiled kernels move to where they can be written to, or nobody would look at them.
 ENTRYPOINT ["/bin/sh", "-c", "cp -r /opt/skytether/kernels /tmp; exec skytether \"$@\"", "skytether"]
-CMD ["--help"]

@@ -1,38 +1,62 @@
-# Everything runs in .venv, made from requirements.lock; only python3 with venv, make and a compiler
-# need to be there.
+# Everything runs in .venv, made from lock files by uv, which pip brings; only python3 with venv, make
+# and a compiler need to be there.
 PYTHON ?= python3
 BIN := .venv/bin
+UV := .venv/.uv
+FLY := .venv/.ready-to-fly
 STAMP := .venv/.ready
 BENCH_STAMP := .venv/.ready-to-bench
 FUZZ_STAMP := .venv/.ready-to-fuzz
-COMPILE := $(BIN)/pip-compile --quiet --strip-extras --generate-hashes --allow-unsafe --no-header \
-	--no-emit-index-url --no-emit-trusted-host --no-emit-find-links
+COMPILE := $(BIN)/uv pip compile --quiet --upgrade --universal --fork-strategy fewest \
+	--python-version 3.11 --generate-hashes --no-header --no-annotate --no-emit-index-url
+# From pip's index, where pip is told of another one. Where uv can reach none, pip may know more.
+INDEX = $${PIP_INDEX_URL:-$$($(BIN)/pip config get global.index-url 2>/dev/null)}
+INSTALL = install() { \
+	index="$(INDEX)"; \
+	$(BIN)/uv pip install --quiet --python .venv $${index:+--default-index "$$index"} "$$@" || \
+	$(BIN)/pip install --quiet --disable-pip-version-check "$$@"; \
+	}; install
 
-.PHONY: setup demo reproduce test long-test check format lock docker-test page-test bench fuzz clean
+# Tests start hundreds of processes; none shall compile anew what another has.
+unexport PYTHONDONTWRITEBYTECODE
+
+# Kernels are compiled once, the server's beside the laboratory's, and not by each worker of pytest.
+LOAD = from skytether.shared.base import kernel; kernel.load()
+KERNELS = $(BIN)/python -c "import skytether.lab.linear, skytether.quadrotor.loops; $(LOAD)" & \
+	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
+
+.PHONY: setup demo reproduce test long-test check format lock keys docker-test page-test autopilot-test bench fuzz clean
 
 setup: $(STAMP)  ## the environment alone
 
-$(STAMP): requirements.lock requirements-dev.lock pyproject.toml
+$(UV): requirements-setup.lock
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes \
-		-r requirements.lock -r requirements-dev.lock
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r $<
 	touch $@
 
-demo: setup  ## fly the demonstration for three minutes, with a page to play with
+$(FLY): $(UV) requirements.lock pyproject.toml
+	$(INSTALL) --require-hashes -r requirements.lock
+	$(INSTALL) --no-deps --no-build-isolation --editable .
+	touch $@
+
+$(STAMP): $(FLY) requirements-dev.lock
+	$(INSTALL) --require-hashes -r requirements-dev.lock
+	touch $@
+
+demo: $(FLY)  ## fly the demonstration for three minutes, with a page to play with
 	$(BIN)/skytether fly demo --duration 180 --beside demo-no-compensation --figure demo.png
 	@echo "The flight is drawn in demo.png."
 
 reproduce: setup  ## the paper's table and figures, and more, in results/report.html (15 minutes)
 	$(BIN)/skytether reproduce --out results
 
-test: setup  ## everything but Docker and what takes long, in five minutes on two cores
-	@$(BIN)/python -c "import server.__main__"  # kernels are compiled once, not by each worker
-	$(BIN)/pytest -q -m "not docker and not long and not browser" -n 3 --dist loadfile
+test: setup  ## everything but Docker and what takes long, in four minutes on two cores
+	@$(KERNELS)
+	$(BIN)/pytest -q -m "not docker and not long and not browser and not autopilot" -n 3 --dist loadfile
 
 long-test: setup  ## the commands of the documents, benchmarks, and flights of many processes
-	@$(BIN)/python -c "import server.__main__"
-	$(BIN)/pytest -q -m "long and not docker and not browser" -n 3 --dist loadfile
+	@$(KERNELS)
+	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 3 --dist loadfile
 
 check: setup  ## style, types, and who imports whom
 	$(BIN)/ruff format --check .
@@ -44,38 +68,48 @@ format: setup  ## as `check` wants it
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+keys: setup  ## docs/keys.md, from the keys in shared/scenario/schema.py
+	$(BIN)/python -m skytether.lab.keys_document > docs/keys.md
+
 docker-test: setup  ## the three containers, and what they survive; needs a Docker engine
 	$(BIN)/pytest -q -rs -m docker
 
 page-test: setup  ## the page in a real browser; needs Chromium, says so where there is none
-	@$(BIN)/python -c "import server.__main__"
+	@$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"
 	$(BIN)/pytest -q -rs -m browser
 
+autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= name their programs
+	@$(KERNELS)
+	$(BIN)/pytest -q -rs -m autopilot
+
 bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m skytether.lab.benchmarks
 
 $(BENCH_STAMP): $(STAMP) requirements-bench.lock
-	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-bench.lock
+	$(INSTALL) --require-hashes -r requirements-bench.lock
 	touch $@
 
-SECONDS ?= 30
-fuzz: $(FUZZ_STAMP)  ## hostile datagrams, guided by what they reach, for SECONDS=30
-	$(BIN)/python -m fuzz --seconds $(SECONDS)
+SECONDS ?= 60
+fuzz: $(FUZZ_STAMP)  ## hostile inputs of every kind, guided by what they reach, for SECONDS=60
+	$(BIN)/python -m skytether.lab.fuzz --seconds $(SECONDS)
 
 $(FUZZ_STAMP): $(STAMP) requirements-fuzz.lock
-	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-fuzz.lock || \
-		echo "atheris cannot be installed here: datagrams are random, and not guided"
+	$(INSTALL) --require-hashes -r requirements-fuzz.lock || \
+		echo "atheris cannot be installed here: inputs are random, and not guided"
 	touch $@
 
-lock:  ## pin what pyproject.toml asks for
-	$(BIN)/pip install --quiet pip-tools
-	$(COMPILE) --upgrade --output-file requirements.lock pyproject.toml
-	$(COMPILE) --upgrade --extra dev --constraint requirements.lock \
-		--output-file requirements-dev.lock pyproject.toml
-	$(COMPILE) --upgrade --extra bench --constraint requirements.lock \
-		--output-file requirements-bench.lock pyproject.toml
-	$(COMPILE) --upgrade --extra fuzz --constraint requirements.lock \
-		--output-file requirements-fuzz.lock pyproject.toml
+lock: $(UV)  ## pin what pyproject.toml asks for: one version of each package, whoever needs it
+	$(COMPILE) --extra dev pyproject.toml -o requirements-dev.lock
+	$(COMPILE) --group setup -o requirements-setup.lock
+	for need in "" client page server bench fuzz; do \
+		case "$$need" in \
+			"") extras="--extra server --extra page --extra plot";; \
+			client) extras="";; \
+			*) extras="--extra $$need";; \
+		esac; \
+		$(COMPILE) $$extras --constraint requirements-dev.lock pyproject.toml \
+			-o requirements$${need:+-$$need}.lock || exit; \
+	done
 
 clean:
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,11 +1,11 @@
-"""`python -m client`: one simulated UAV as a process."""
+"""`python -m skytether.client`: one simulated UAV as a process."""
 
 import sys
 
-from shell.start import run
+from skytether.shell.start import run
 
 if __name__ == "__main__":  # before the imports below, which take a while
-    sys.exit(run("client.__main__:fly", "client"))
+    sys.exit(run("skytether.client.__main__:fly", "client"))
 
 import secrets
 from collections.abc import Sequence
@@ -14,50 +14,53 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import tyro
 
-from client.fleet import Fleet
-from client.link import Link, Plain
-from client.navigation import navigation
-from client.plant import FirstOrderPlant
-from client.secure import Secure
-from client.vehicle import Client
-from shared import keys
-from shared.chance import stream
-from shared.config import Scenario
-from shared.events import NoSession, SessionRefused
-from shared.record import client_columns
-from shared.steady import Steady
-from shared.summary import summarise
-from shell import command
-from shell.command import CommandError, ScenarioFlags, ScenarioName
-from shell.log import LogFormat
+from skytether.client import vehicles
+from skytether.client.endpoint import Client
+from skytether.client.fleet import Fleet
+from skytether.client.link import ClientLink, PlainLink
+from skytether.shared.core.aboard import ParametersUnsafe
+from skytether.shared.core.events import NoSession, SessionRefused
+from skytether.shared.core.line import parse_line
+from skytether.shared.core.steady import Steady
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import client_columns
+from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire import keys
+from skytether.shell import command
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.log import LogFormat
+from skytether.shell.options import Argument
 
 
 @dataclass(frozen=True)
-class Options:
+class ClientOptions:
     """Options of `skytether client`."""
 
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file; the same as the server's."""
     server: str = "127.0.0.1:47000"
     """HOST:PORT of netem, or of the server itself; an IPv6 host in brackets, as in [::1]:47000."""
-    number: Annotated[int, tyro.conf.arg(name="id")] = 1
+    number: Annotated[int, Argument(name="id")] = 1
     """Number of this vehicle (0 to 65535); no two vehicles of a server may have the same."""
-    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    vehicles: Annotated[int, Argument(metavar="N")] = 1
     """Number of vehicles to fly in this process, numbered from --id on."""
     keys: Path | None = None
     """File with the vehicle's key, made by `skytether keygen`. Without it the link is plaintext,
     which is refused where another machine is the server."""
-    key_id: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    key_id: Annotated[int | None, Argument(metavar="N")] = None
     """Number of the key to use, of a vehicle that has two; the highest unless given."""
+    set_parameters: bool = False
+    """Set the autopilot's parameters that decide what it does in silence, where they are not safe;
+    without it, they are told, and nothing is armed."""
     insecure: bool = False
     """Do without keys even where the server is another machine: anybody on the way can fly the
     vehicle."""
     log: LogFormat = "text"
     """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
-    """File for the client's part of the record."""
+    """File for the client's part of the record; one that ends in .mcap becomes a recording with
+    all that the client says, see `skytether join`."""
     json: Path | None = None
     """File for the summary of the flight, as far as the vehicle knows it; of several vehicles, for
     what was counted, and the CPU time it took."""
@@ -67,6 +70,7 @@ class Options:
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     metrics: str | None = None
     """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
+    plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
 
@@ -77,7 +81,7 @@ def fly(argv: Sequence[str]) -> None:
     was never a plan to fly, or none at the end, and where the record is incomplete; 2 where the
     server flies another scenario, is full, or has another client under this number.
     """
-    options = command.parse(Options(), argv, "skytether client", fly.__doc__)
+    options = command.parse(ClientOptions(), argv, "skytether client", fly.__doc__)
     scenario, server = options.config, command.address("--server", options.server)
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
@@ -87,33 +91,48 @@ def fly(argv: Sequence[str]) -> None:
     command.check_sockets("--vehicles", len(numbers))
     keyring = keys.load(options.keys) if options.keys else None
 
-    def link(number: int) -> Link:
+    def link(number: int) -> ClientLink:
         if keyring is None:
-            return Plain()
-        return Secure(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
+            return PlainLink()
+
+        from skytether.client.secure import SecureLink  # its ciphers take a while, and 6 MB
+
+        return SecureLink(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
 
     columns = client_columns(scenario.model.axes)
     with (
         (
-            command.recorded(options.record, columns)
-            if options.record
+            command.recorded(part, columns)
+            if (part := command.part_of(options.record))
             else command.recorded_meanwhile(columns)
         ) as recording,
-        command.fed(options.feed) as feed,
+        command.fed(
+            options.feed, options.record, "client", options, secure=keyring is not None
+        ) as feed,
     ):
         recorder = command.recorder("client", columns, recording, feed)
+        flying = [vehicles.make(scenario, number) for number in numbers]
+        if kernel := sys.modules.get("skytether.shared.base.kernel"):  # what flies has some
+            command.prepare(kernel.missing())
+            kernel.load()
+        line = None
+        if flying[0].port:
+            line = parse_line("vehicle.address", scenario.vehicle.address)
+            command.check_count(f"--vehicles with {scenario.vehicle.kind}", len(numbers), 1)
+        if options.set_parameters and not flying[0].set_parameters():
+            said = f"--set-parameters: a vehicle of the kind {scenario.vehicle.kind} has none"
+            raise CommandError(said, command.CONFIGURATION)
         clients = [
             Client(
                 scenario,
-                FirstOrderPlant(scenario, stream(scenario.seed, "wind", number)),
+                flies,
                 server=server,
                 vehicle=number,
                 boot_id=secrets.randbits(64),
                 link=link(number),
-                navigation=navigation(scenario, stream(scenario.seed, "sensor", number)),
                 recorder=recorder,
             )
-            for number in numbers
+            for number, flies in zip(numbers, flying, strict=True)
         ]
         alone = len(clients) == 1
         endpoint = clients[0] if alone else Fleet(clients)
@@ -132,6 +151,8 @@ def fly(argv: Sequence[str]) -> None:
             control=options.control,
             feed=feed,
             metrics=command.optional_address("--metrics", options.metrics),
+            line=line,
+            warnings=command.flight_warnings(scenario),
         )
         if alone and len(rows := recording.rows()):
             summary = summarise(scenario, options.scenario, rows, secure=keyring is not None)
@@ -141,5 +162,5 @@ def fly(argv: Sequence[str]) -> None:
             elif options.json:
                 command.write(options.json, msgspec.json.encode(summary))
         if failure := endpoint.failure:
-            refused = isinstance(failure, SessionRefused | NoSession)
+            refused = isinstance(failure, SessionRefused | NoSession | ParametersUnsafe)
             raise CommandError(str(failure), command.CONFIGURATION if refused else command.RUN)

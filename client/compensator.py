@@ -1,29 +1,30 @@
 """Uplink delay compensator, eq. (11): which input to fly now, from a horizon made earlier.
 
-The rule itself is `shared.rule`, which the server's replay flies by as well. Here is what it needs
-aboard: the newest horizon, where its first inputs have led so far, and the step it came into force.
-The horizon of the newest generation wins, in whatever order they arrive (E11). Without a horizon
-the input that was flown last is braked along, and from a standstill that is hovering.
+The rule itself is `shared.law.rule`, which the server's replay flies by as well. Here is what it
+needs aboard: the newest horizon, where its first inputs have led so far, and the step it came into
+force. The horizon of the newest generation wins, in whatever order they arrive (E11). Without a
+horizon the input that was flown last is braked along, and from a standstill that is hovering.
 """
 
 import math
+from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from shared.model import Array, advance
-from shared.protocol import NO_HORIZON, Horizon, ProtocolError
-from shared.rule import (
-    bounded,
-    entry,
-    flown,
-    lasting,
-    late_max,
-    leading,
-    led_back,
-    remaining,
+from skytether.shared.law import rule
+from skytether.shared.law.model import Array
+from skytether.shared.law.rule import Held, bounded, lasting, late_max
+from skytether.shared.law.terms import Terms
+from skytether.shared.wire.protocol import (
+    DISTURBANCE,
+    FEEDBACK,
+    GAIN_P,
+    GAIN_V,
+    LED_P,
+    LED_V,
+    NO_HORIZON,
+    Drop,
+    Horizon,
+    ProtocolError,
 )
-from shared.terms import Terms
 
 
 class Compensator:
@@ -38,20 +39,15 @@ class Compensator:
         self._brake = terms.brake
         self._bounds = terms.u_max
         self._model = terms.model.axes()
-        self._nothing = [0.0] * terms.axes
-        self._inputs: Array | NDArray[np.float32] = np.zeros((terms.axes, 1))
-        """The horizon's inputs that may be flown [m/s], shape (axes, at most d + H); without one
-        the input that was flown when it was dropped, shape (axes, 1)."""
-        self._dropped = 0
-        """Step that this input was flown at."""
-        self._speed = 0.0
-        """Magnitude of its last input [m/s]."""
-        self._feedback: list[list[float]] = []
-        """The horizon's feedback of each axis, see `shared.protocol.Horizon`; empty without."""
-        self._led: list[tuple[float, float]] = []
-        """State x̄ that the horizon leads to, of each axis at stage `_led_stage` [m, m/s]."""
-        self._led_stage = 0
-        self.told = self._nothing
+        self._begins = 0
+        """Step of stage 0: that which the horizon was made for, or that at which it was dropped."""
+        self._held: list[Held] = []
+        """The horizon on each axis; without one the input that was flown when it was dropped."""
+        self._lead: list[tuple[float, float]] = []
+        """State x̄ that the horizon leads to, of each axis at stage `_lead_stage` [m, m/s]."""
+        self._lead_stage = 0
+        self._hold([[0.0]] * terms.axes, 1)
+        self.told = [0.0] * terms.axes
         """What is flown at the step chosen for last but for the feedback, of each axis [m/s]."""
         self.in_force = NO_HORIZON
         """Step that the horizon was made for, k_h, or NO_HORIZON."""
@@ -85,28 +81,27 @@ class Compensator:
                 or so long after its committed steps that other inputs were flown meanwhile.
         """
         if horizon.step > step + self._H:
-            raise ProtocolError("from the future")
+            raise ProtocolError(Drop.FROM_THE_FUTURE)
         if horizon.step <= self.newest:
             self.stale += 1
             return False
         given = horizon.inputs.shape[1] if self._indexed else self._age_max + self._H
         length = lasting(given, horizon.step, observed, self._age_max)
         if not 0 <= observed < step:
-            raise ProtocolError("observation")
+            raise ProtocolError(Drop.OBSERVATION)
         if length < 1:
-            raise ProtocolError("too old")
+            raise ProtocolError(Drop.TOO_OLD)
         if self._comes_too_late(step - horizon.step, given - self._H, length):
-            raise ProtocolError("too late")
+            raise ProtocolError(Drop.TOO_LATE)
         self.in_force = self.newest = horizon.step
         self._new = True
         self.observed_ns = horizon.observed_ns
-        self._inputs = horizon.inputs[:, :length]
-        if not self._indexed:
-            self._inputs = np.broadcast_to(horizon.inputs[:, :1], (len(self._bounds), length))
-        self._speed = math.sqrt(sum(u * u for u in self._input(-1)))
-        self._feedback = horizon.feedback.tolist() if horizon.feedback.size else []
-        self._led = [(p, v) for p, v, *_ in self._feedback]
-        self._led_stage = 0
+        self._begins = horizon.step
+        self._hold(
+            horizon.inputs.tolist(),
+            length,
+            horizon.feedback.tolist() if horizon.feedback.size else (),
+        )
         return True
 
     def drop(self, step: int, flown_last: Array) -> None:
@@ -118,9 +113,43 @@ class Compensator:
         """
         self.in_force, self.observed_ns = NO_HORIZON, -1
         self._new = self.covered = False
-        self._dropped, self._inputs = step, flown_last[:, None]
-        self._speed = math.sqrt(sum(u * u for u in flown_last.tolist()))
-        self._feedback = []
+        self._begins = step
+        self._hold(flown_last[:, None].tolist(), 1)
+
+    def _hold(
+        self, inputs: list[list[float]], length: int, feedback: Sequence[Sequence[float]] = ()
+    ) -> None:
+        """Fly by a horizon from now on.
+
+        Args:
+            inputs: its inputs [m/s]; shape (axes, n).
+            length: number of them that are flown.
+            feedback: its feedback, see `wire.protocol.Horizon`; empty without.
+        """
+        last = [each[length - 1 if self._indexed else 0] for each in inputs]
+        within = [bounded(u, bound) for u, bound in zip(last, self._bounds, strict=True)]
+        speed = math.sqrt(sum(u * u for u in within))
+        told = feedback or [[0.0] * FEEDBACK] * len(inputs)
+        self._held = [
+            Held(
+                model=model,
+                inputs=each,
+                length=length,
+                indexed=self._indexed,
+                speed=speed,
+                brake=self._brake,
+                bound=bound,
+                feeds_back=bool(feedback),
+                gain_p=columns[GAIN_P],
+                gain_v=columns[GAIN_V],
+                disturbance=columns[DISTURBANCE],
+            )
+            for model, each, bound, columns in zip(
+                self._model, inputs, self._bounds, told, strict=True
+            )
+        ]
+        self._lead = [(columns[LED_P], columns[LED_V]) for columns in told]
+        self._lead_stage = 0
 
     def _comes_too_late(self, stage: int, committed: int, length: int) -> bool:
         """Whether a horizon that would come into force at a stage is of no use any more.
@@ -133,55 +162,34 @@ class Compensator:
         ended = bool(self._brake) and stage >= length  # braking is not begun anew
         return ended or (self._commits and stage > committed + self._late_max)
 
-    def choose(self, step: int, state: Array) -> Array:
-        """Input u* for `step` [m/s]; shape (axes,).
+    def choose(self, step: int, state: Sequence[tuple[float, float]]) -> list[float]:
+        """Input u* for `step` on each axis [m/s].
 
         Args:
             step: k, never smaller than before.
-            state: position [m] and velocity [m/s] at the step; shape (axes, 2).
+            state: position [m] and velocity [m/s] of each axis at the step.
         """
         if self._new:
             self.since, self._new = step, False
-        held = self.in_force != NO_HORIZON
-        stage = step - (self.in_force if held else self._dropped)
-        self.covered = held and stage < self._inputs.shape[1]
-        _, self.told = self._tell(stage)
-        back = self._led_back(stage, state) if self._feedback else self._nothing
-        return np.array(
-            [
-                flown(stage, u, led, bound)
-                for u, led, bound in zip(self.told, back, self._bounds, strict=True)
-            ]
-        )
+        stage = step - self._begins
+        self.covered = self.in_force != NO_HORIZON and stage < self._held[0].length
+        if self.feeds_back:
+            self._lead_to(stage)
+        axes = zip(self._held, self._lead, state, strict=True)
+        flown = [rule.step(held, stage, *lead, *x) for held, lead, x in axes]
+        self.told = [told for _, told, _, _ in flown]
+        return [u for u, _, _, _ in flown]
 
     @property
     def feeds_back(self) -> bool:
         """Whether the horizon that is held brings feedback."""
-        return bool(self._feedback)
+        return self._held[0].feeds_back
 
-    def _input(self, index: int) -> list[float]:
-        """One of the horizon's inputs, of each axis, within the bound [m/s]."""
-        inputs = self._inputs[:, index].tolist()
-        return [bounded(u, bound) for u, bound in zip(inputs, self._bounds, strict=True)]
-
-    def _tell(self, stage: int) -> tuple[float, list[float]]:
-        """Share of an input that is told at a stage, and what is told, of each axis [m/s]."""
-        length = self._inputs.shape[1]
-        share = remaining(stage, length, self._speed, self._brake)
-        return share, [share * u for u in self._input(entry(stage, length))]
-
-    def _led_back(self, stage: int, state: Array) -> list[float]:
-        """Feedback at a stage, of each axis [m/s]; x̄ is rolled on to there."""
-        for reached in range(self._led_stage, stage):
-            share, told = self._tell(reached)
-            self._led = [
-                advance(axis, *led, leading(u, feedback[2], share))
-                for axis, led, u, feedback in zip(
-                    self._model, self._led, told, self._feedback, strict=True
-                )
+    def _lead_to(self, stage: int) -> None:
+        """Roll x̄ on to a stage, unless it is there already."""
+        if stage > self._lead_stage:
+            self._lead = [
+                rule.lead_to(held, self._lead_stage, stage, *lead)
+                for held, lead in zip(self._held, self._lead, strict=True)
             ]
-            self._led_stage = reached + 1
-        return [
-            led_back(feedback[3], feedback[4], led[0] - p, led[1] - v)
-            for feedback, led, (p, v) in zip(self._feedback, self._led, state.tolist(), strict=True)
-        ]
+            self._lead_stage = stage

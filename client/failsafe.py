@@ -5,21 +5,21 @@
 `TABLE` is the machine: mode and cause give the next mode, and what is not in it changes nothing.
 `HOLD` is that of a vehicle which holds its last input for ever, as the paper's does: no failsafe.
 `Failsafe` finds the causes that take time: a good link, silence, late horizons, repeated mistakes.
-Time is an argument. What is flown in each mode is chosen in `client.vehicle`.
+Time is an argument. What is flown in each mode is chosen in `client.pilot`.
 """
 
 from collections import deque
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from shared.endpoint import MILLISECOND_NS, SECOND_NS
-from shared.protocol import Mode
-from shared.record import Reason
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Mode
 
 GOOD_NS = SECOND_NS
 """Time for which the link has to be good before horizons are taken [ns]."""
 STALL_NS = 100 * MILLISECOND_NS
-"""Lateness of a step above which the vehicle has been asleep [ns]."""
+"""Lateness of a step above which what is flown is too old, whatever kept the vehicle [ns]."""
 LATE_NS = 500 * MILLISECOND_NS
 """Time for which all horizons have to come late before the vehicle brakes [ns]."""
 LATE_SHARE = 0.75
@@ -31,19 +31,40 @@ MALFORMED_MAX = 5
 FUTURE_MAX = 10
 """Horizons for impossible times within `WINDOW_NS` that make it ask for its session anew."""
 
-BROKEN = frozenset({Reason.LOST, Reason.CLOSED, Reason.RESTARTED, Reason.MALFORMED, Reason.RESYNC})
+YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
+"""Causes for which somebody else flies the vehicle, or nobody."""
+GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY})
+"""Causes for which the vehicle brakes, and lands."""
+BROKEN = frozenset(
+    {
+        Reason.LOST,
+        Reason.CLOSED,
+        Reason.RESTARTED,
+        Reason.MALFORMED,
+        Reason.RESYNC,
+        Reason.MUTE,
+    }
+)
 """Causes after which the link has to be good for `GOOD_NS` anew, in every mode."""
-LOCKING = BROKEN | {Reason.LATE}
+LOCKING = BROKEN | GROUNDING | YIELDING | {Reason.LATE, Reason.RETURNED}
 """Causes of braking after which no horizon is taken before the vehicle hovers on a good link."""
 CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
 """Causes that end the session: another WELCOME is needed."""
-DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED}
+DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED, Reason.LEAPT}
 """Causes for which the horizon held is dropped."""
 
 Table = Mapping[tuple[Mode, Reason], Mode]
 
 _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not Mode.FAULT}
-_TO_BRAKE = BROKEN | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED}
+_TO_BRAKE = (
+    BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
+)
+_YIELDS = {
+    (mode, cause): Mode.MANUAL
+    for mode in Mode
+    if mode not in (Mode.INIT, Mode.LAND, Mode.FAULT)
+    for cause in YIELDING
+}
 
 TABLE: Table = MappingProxyType(
     {
@@ -60,13 +81,21 @@ TABLE: Table = MappingProxyType(
         (Mode.HOVER, Reason.HORIZON): Mode.TRACK,
         (Mode.HOVER, Reason.GOOD): Mode.HOVER,
         (Mode.HOVER, Reason.ALONE): Mode.LAND,
+        (Mode.HOVER, Reason.LEAPT): Mode.HOVER,
+        (Mode.MANUAL, Reason.RETURNED): Mode.HOVER,
+    }
+    | {
+        (mode, cause): Mode.LAND
+        for mode in (Mode.SYNC, Mode.READY, Mode.HOVER)
+        for cause in GROUNDING
     }
     | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
     | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
     | {(Mode.TRACK, cause): Mode.BRAKE for cause in _TO_BRAKE}
     | {(Mode.COAST, cause): Mode.BRAKE for cause in _TO_BRAKE}
-    | {(Mode.BRAKE, cause): Mode.BRAKE for cause in BROKEN}
+    | {(Mode.BRAKE, cause): Mode.BRAKE for cause in BROKEN | GROUNDING}
     | {(Mode.HOVER, cause): Mode.HOVER for cause in BROKEN}
+    | _YIELDS
     | _FAULTS
 )
 """Next mode by mode and cause; a mode may stay and its reason change."""
@@ -81,7 +110,9 @@ HOLD: Table = MappingProxyType(
         (Mode.TRACK, Reason.ENDED): Mode.COAST,
         (Mode.COAST, Reason.ENDED): Mode.COAST,
         (Mode.COAST, Reason.HORIZON): Mode.TRACK,
+        (Mode.MANUAL, Reason.RETURNED): Mode.READY,
     }
+    | _YIELDS
     | _FAULTS
 )
 """Next mode with `vehicle.exhausted = "hold"`: never does the vehicle brake or land by itself."""
@@ -131,6 +162,8 @@ class Failsafe:
         """Time since which it has hovered with a lost link, as far as it has."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
         """Times of the newest malformed messages."""
+        self._has_leapt = False
+        """Whether its state has leapt since it was armed: it does not know where it is."""
         self._future: deque[int] = deque(maxlen=FUTURE_MAX)
         """Times of the newest horizons for impossible times."""
 
@@ -138,7 +171,7 @@ class Failsafe:
     def takes(self) -> bool:
         """Whether a horizon that comes now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
-        return may and self.armed and self.reason not in LOCKING
+        return may and self.armed and not self._has_leapt and self.reason not in LOCKING
 
     @property
     def brakes(self) -> bool:
@@ -192,13 +225,18 @@ class Failsafe:
 
     # -- what time brings --------------------------------------------------------------------
 
-    def step(self, *, late_ns: int, now_ns: int) -> None:
+    def step(self, *, late_ns: int, hindrance: Reason | None, now_ns: int) -> None:
         """Meet what has become true by the start of a step.
 
         Args:
             late_ns: time by which the vehicle was woken late for it [ns].
+            hindrance: cause on the vehicle's side for which it must not follow a plan.
             now_ns: time now.
         """
+        if hindrance is not None:
+            self.meet(hindrance, now_ns=now_ns)
+        elif self.mode is Mode.MANUAL:
+            self.meet(Reason.RETURNED, now_ns=now_ns)
         if late_ns > STALL_NS:
             self.meet(Reason.STALLED, now_ns=now_ns)
         locked, lost = self.reason in LOCKING, self.is_lost(now_ns)
@@ -209,13 +247,22 @@ class Failsafe:
         if good and (locked or armed_now or self.mode is Mode.SYNC):
             self.meet(Reason.GOOD, now_ns=now_ns)
         if not self.armed:
+            self._has_leapt = False
             self.meet(Reason.UNARMED, now_ns=now_ns)
+        elif self._has_leapt and self.reason not in LOCKING:
+            self.meet(Reason.LEAPT, now_ns=now_ns)
         if now_ns - self._horizon_ns > self._timeout_ns:
             self.meet(Reason.OLD, now_ns=now_ns)
         if self.mode is not Mode.HOVER or not lost:
             self._alone_ns = now_ns
         elif now_ns - self._alone_ns >= self._land_after_ns:
             self.meet(Reason.ALONE, now_ns=now_ns)
+
+    def leapt(self, *, now_ns: int) -> None:
+        """Note that its state has leapt: no horizon is taken until it is disarmed and armed."""
+        self._has_leapt = self.brakes
+        if self.reason not in LOCKING:
+            self.meet(Reason.LEAPT, now_ns=now_ns)
 
     def meet(self, cause: Reason, *, now_ns: int) -> None:
         """Go where the table leads from here, if anywhere."""

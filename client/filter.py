@@ -14,21 +14,21 @@ r:
     K = P hᵀ / (h P hᵀ + r)        x ← x + K (z - h x)        P ← P - K h P
 
 so that one that is missing is simply left out. A measurement that is had late tells of the step it
-was made at. There the filter stands; what is reported is its state, rolled on to the present with
-the inputs flown since. A constant error of a sensor it cannot tell from the truth.
+was made at. There the filter stands; the estimate is its state, rolled on to the present with the
+inputs that have acted since. A constant error of a sensor it cannot tell from the truth.
 
 The covariance P does not depend on what is measured: axes that are alike share it.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from client.plant import white_acceleration
-from client.sensor import Measured
-from shared.config import Scenario
-from shared.model import Axis, advance
+from skytether.client.vehicle import Measurement
+from skytether.shared.law.model import Axis, advance, white_acceleration
+from skytether.shared.scenario.schema import Scenario
 
 DRIFT = 0.3
 """How fast w walks: that share of q [1], so w moves by DRIFT q √t in the time t."""
@@ -121,13 +121,16 @@ class Kalman:
         self.x: list[tuple[float, float, float]] = []
         """State of each axis, `delay` steps ago."""
         nothing = [0.0] * terms.axes
-        self._flown = deque([nothing] * delay, delay + 1)
-        """Inputs flown since [m/s]."""
+        self._acted: deque[tuple[list[float], Sequence[float]]] = deque(
+            [(nothing, ())] * delay, delay + 1
+        )
+        """Inputs that have acted since, see `advance` [m/s]."""
+        self._late = [each.late for each in terms.dead_times]
         self.gains: list[list[Gain]] = [[], []]
         """Gains by which position and velocity were corrected last, of each axis; empty where that
         was not measured at the last step."""
 
-    def begin(self, measured: Measured) -> None:
+    def begin(self, measured: Measurement) -> None:
         """Take the first measurement, which has a position; the vehicle stands."""
         assert measured.position is not None
         v, w = BEGIN_MPS
@@ -138,23 +141,31 @@ class Kalman:
         self.spreads = [P] * len(self._alike)
         self.x = [(p, v, 0.0) for p, v in zip(measured.position, velocity, strict=True)]
 
-    def advance(self, command: list[float]) -> None:
-        """Go on by a step that was flown with this input [m/s], of each axis."""
-        self._flown.append(command)
-        inputs = self._flown.popleft()
+    def advance(self, due: list[float], swing: Sequence[float] = ()) -> None:
+        """Go on by a step, over which these inputs act, see `shared.law.dead_time`.
+
+        Args:
+            due: the input that acts at its end, of each axis [m/s].
+            swing: by how much more acts at its begin [m/s]; empty without.
+        """
+        self._acted.append((due, swing))
+        inputs, more = self._acted.popleft()
         self.x = [
             (*advance(axis, p, v, u + w), w)
             for axis, (p, v, w), u in zip(self._model, self.x, inputs, strict=True)
         ]
+        if more:
+            moved = self._swung([(p, v) for p, v, _ in self.x], more)
+            self.x = [(p, v, w) for (p, v), (_, _, w) in zip(moved, self.x, strict=True)]
         self.spreads = [
             widened(axis, P, noise)
             for axis, P, noise in zip(self._alike, self.spreads, self._noise, strict=True)
         ]
 
-    def take(self, measured: Measured) -> None:
+    def take(self, measured: Measurement) -> None:
         """Take what was measured at the step the filter stands at."""
         for which, (correct, values) in enumerate(
-            zip((by_position, by_velocity), measured, strict=True)
+            zip((by_position, by_velocity), measured[1:], strict=True)
         ):
             self.gains[which] = []
             if values is None:
@@ -174,11 +185,24 @@ class Kalman:
     def estimate(self) -> list[tuple[float, float]]:
         """Position [m] and velocity [m/s] of each axis at the present step."""
         present = [(p, v) for p, v, _ in self.x]
-        for inputs in self._flown:
+        for inputs, more in self._acted:
             present = [
                 advance(axis, p, v, u + w)
                 for axis, (p, v), (_, _, w), u in zip(
                     self._model, present, self.x, inputs, strict=True
                 )
             ]
+            if more:
+                present = self._swung(present, more)
         return present
+
+    def _swung(
+        self, states: list[tuple[float, float]], swing: Sequence[float]
+    ) -> list[tuple[float, float]]:
+        """States at the end of a step at whose begin another input acted, see `advance`."""
+        axes = zip(states, self._late, swing, strict=True)
+        return [(p + late[0] * u, v + late[1] * u) for (p, v), late, u in axes]
+
+    def disturbance(self) -> list[float]:
+        """What acts on each axis like an input of its own, w [m/s]."""
+        return [w for _, _, w in self.x]

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from heapq import heapify, heappop, heappush
 from typing import Any
 
-from client.vehicle import Client
-from shared.config import Scenario
-from shared.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint
-from shared.events import Failure
+from skytether.client.endpoint import Client, figures
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.events import Failure
+from skytether.shared.scenario.schema import Scenario
 
 
 class Fleet(Endpoint):
@@ -16,7 +16,7 @@ class Fleet(Endpoint):
     def __init__(self, clients: Sequence[Client]) -> None:
         super().__init__()
         self._clients = clients
-        self.changeable = Client.changeable
+        self.changeable = clients[0].changeable
         self._due_ns = [client.next_wake_ns() for client in clients]
         self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns) if due_ns is not None]
         """Wakes that clients have asked for: time and client; one that is no longer wanted stays
@@ -80,8 +80,4 @@ class Fleet(Endpoint):
 
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
-        told = self._clients[:VEHICLES_TOLD_MAX]
-        each: dict[str, Any] = {f"vehicle {client.vehicle}": client.figures() for client in told}
-        if len(self._clients) > len(told):
-            each["and more"] = len(self._clients) - len(told)
-        return {"missed": sum(client.missed for client in self._clients), "each": each}
+        return figures(self._clients)

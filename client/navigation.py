@@ -1,77 +1,199 @@
-"""What a vehicle knows of its state: what its sensor measures, and what its filter makes of that.
+"""What a vehicle knows of its state: what it measures, and what its filter makes of that.
 
-What is known is what the vehicle flies by and reports. The truth is known to its record alone. With
-a sensor that measures the whole state as it is, at every step, both are the same to the last bit,
-and nothing is filtered.
+What is known is what the vehicle flies by and reports: with a dead time not its state now, but the
+one in which its next input will meet it (`shared.law.dead_time`). With a sensor that measures the
+whole state as it is, at every step, nothing is filtered, unless there is a dead time: to predict
+over that, the filter's disturbance is needed.
 """
 
 import math
+from collections.abc import Sequence
+from itertools import chain
+from typing import NamedTuple
 
-import numpy as np
+from skytether.client.filter import Kalman
+from skytether.client.vehicle import Measurement
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.law.dead_time import OnTheirWay
+from skytether.shared.law.leap import NOISE_M, NOISE_MPS, position_leaps, velocity_leaps
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
 
-from client.filter import Kalman
-from client.sensor import Measured, Sensor
-from shared.config import Scenario
-from shared.model import Array
+CARRIED_NS = SECOND_NS // 2
+"""Longest time for which a measurement is carried on [ns]; an older one is as if from then."""
+SIGMAS = 10.0
+"""Standard deviations of its sensor's noise by which a change may be off."""
 
 
-def navigation(scenario: Scenario, rng: np.random.Generator) -> "Navigation | None":
-    """What a scenario's vehicle knows of its state; None where that is the state as it is.
+class Sensing(NamedTuple):
+    """What is known of a scenario's sensor."""
 
-    Args:
-        rng: chance of the sensor's noise, for this vehicle alone.
-    """
-    sensor = Sensor(scenario, rng)
-    return None if sensor.exact else Navigation(scenario, sensor)
+    delay: int
+    """Time from measuring to having the measurement, D [steps]."""
+    every_ns: tuple[int, int]
+    """Time from one position, and one velocity, to the next [ns]; 0: never."""
+    exact: bool
+    """Whether it measures the whole state as it is, at every step."""
+
+
+def sensing(scenario: Scenario) -> Sensing:
+    """What is known of a scenario's sensor."""
+    sensor, dt_ns = scenario.sensor, scenario.dt_ns
+    delay = -(-seconds_to_ns(sensor.delay_s) // dt_ns)
+    position_ns, velocity_ns = (
+        0 if every_s == "never" else max(seconds_to_ns(every_s), dt_ns)
+        for every_s in (sensor.position_every_s, sensor.velocity_every_s)
+    )
+    noise = sensor.position_noise_m, sensor.velocity_noise_mps
+    wrong = any((*noise, *sensor.position_bias_m, *sensor.velocity_bias_mps))
+    late = delay > 0 or (position_ns, velocity_ns) != (dt_ns, dt_ns)
+    return Sensing(delay, (position_ns, velocity_ns), not (wrong or late))
+
+
+def filters(scenario: Scenario) -> bool:
+    """Whether a scenario's vehicle has a Kalman filter."""
+    late = any(scenario.terms().dead_time_s)
+    return scenario.sensor.filter == "kalman" and (late or not sensing(scenario).exact)
 
 
 class Navigation:
-    """A vehicle's sensor, and the filter behind it."""
+    """What a scenario's vehicle makes of its measurements."""
 
-    def __init__(self, scenario: Scenario, sensor: Sensor) -> None:
-        self._sensor = sensor
-        filters = scenario.sensor.filter == "kalman"
-        self._filter = Kalman(scenario, sensor.delay) if filters else Newest()
+    def __init__(self, scenario: Scenario) -> None:
+        known, axes = sensing(scenario), scenario.model.axes
+        terms = scenario.terms()
+        self._filter = Kalman(scenario, known.delay) if filters(scenario) else Newest(axes)
+        late = any(terms.dead_time_s)
+        self._inputs = OnTheirWay(terms.model.axes(), terms.dead_times) if late else None
+        """Inputs on their way; None where the model has each act at once."""
+        self._delay_ns = known.delay * scenario.dt_ns
+        """Time from measuring to having it that the filter itself reckons with [ns]."""
+        self._motions = list(zip(terms.tau_s, terms.gain, strict=True))
         self._begun = False
-        self.measured = self.estimate = np.full((scenario.model.axes, 2), math.nan)
-        """What was measured and is had since the last step, NaN where nothing is; and what is
-        reported: position [m] and velocity [m/s], shape (axes, 2)."""
+        self._leaps = _Leaps(scenario)
+        self.leapt = False
+        """Whether what was measured since the last step is what no vehicle can have come to."""
+        self._nothing = [math.nan] * axes
+        self.measured = [(math.nan, math.nan)] * axes
+        """What was measured and is had since the last step, position [m] and velocity [m/s] of each
+        axis; NaN where nothing is."""
+        self.estimate = self.measured
+        """State now, position [m] and velocity [m/s] of each axis."""
+        self.predicted = self.estimate
+        """State in which the next input will meet the vehicle, which is flown by and reported;
+        without a dead time the estimate."""
+        self.is_known = False
+        """Whether the estimate is finite, and can be flown by."""
 
-    def advance(self, state: Array, command: Array) -> None:
+    def advance(self, measurements: Sequence[Measurement], command: Array, *, now_ns: int) -> None:
         """Go on to a step; before the first the vehicle stands.
 
         Args:
-            state: its true state at the step; shape (axes, 2).
-            command: the input flown since the step before [m/s]; shape (axes,).
+            measurements: what has been measured and is had since the step before.
+            command: the input flown since then [m/s]; shape (axes,).
+            now_ns: begin of the step [ns; the client's clock].
         """
-        measured = self._sensor.measure(state)
+        position = velocity = self._nothing
+        due: list[float] = command.tolist()
+        swing: Sequence[float] = ()
+        if self._inputs is not None:
+            due, swing = self._inputs.issue(due)
         if self._begun:
-            self._filter.advance(command.tolist())
-            self._filter.take(measured)
-        else:
-            self._filter.begin(measured)
-            self._begun = True
-        missing = [math.nan] * len(state)
-        columns = [values or missing for values in measured]
-        self.measured = np.array(columns).T
-        self.estimate = np.array(self._filter.estimate())
+            self._filter.advance(due, swing)
+        self.leapt = False
+        for measured in measurements:
+            self.leapt |= self._leaps.leaps(measured)
+            if self._begun:
+                self._filter.take(self._carried(measured, now_ns - self._delay_ns, due))
+            else:
+                self._filter.begin(measured)
+                self._begun = True
+            position, velocity = measured.position or position, measured.velocity or velocity
+        self.measured = list(zip(position, velocity, strict=True))
+        if self._begun:
+            self.estimate = self.predicted = self._filter.estimate()
+            if self._inputs is not None:
+                self.predicted = self._inputs.predict(self.estimate, self._filter.disturbance())
+            self.is_known = all(map(math.isfinite, chain.from_iterable(self.predicted)))
+
+    def _carried(self, measured: Measurement, to_ns: int, due: list[float]) -> Measurement:
+        """A measurement as it would be later, by eq. (1); an earlier time changes nothing.
+
+        A real vehicle measures when it likes. For a time in which an input acted that is another
+        than that of the last step, the difference is left to the filter.
+
+        Args:
+            measured: what was measured.
+            to_ns: the time [ns; the client's clock].
+            due: the input that has acted in the last step, of each axis [m/s].
+        """
+        age = min(to_ns - measured.stamp_ns, CARRIED_NS) / SECOND_NS
+        if age <= 0.0:
+            return measured
+        known = measured.velocity or [v for _, v in self._filter.estimate()]
+        acting = zip(self._motions, due, self._filter.disturbance(), strict=True)
+        position, velocity = list(measured.position or ()), []
+        for i, ((tau, gain), u, w) in enumerate(acting):
+            left, steady = math.exp(-age / tau), gain * u + w
+            velocity.append(steady + (known[i] - steady) * left)
+            if position:
+                position[i] += steady * age + (known[i] - steady) * tau * (1.0 - left)
+        return Measurement(to_ns, position or None, velocity if measured.velocity else None)
+
+
+class _Leaps:
+    """Watch over what is measured: each is held against what was measured before."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        sensor = scenario.sensor
+        self._noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
+        self._noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
+        self._position: tuple[int, list[float]] | None = None
+        """Newest position [m] of each axis, and its stamp."""
+        self._velocity: tuple[int, list[float]] | None = None
+        """Newest velocity [m/s] of each axis, and its stamp."""
+
+    def leaps(self, measured: Measurement) -> bool:
+        """Whether no vehicle can have come to what is measured; it is what is known from now on."""
+        stamp_ns, position, velocity = measured
+        before, found = self._velocity, False
+        if velocity is not None:
+            if before is not None:
+                time, noise = (stamp_ns - before[0]) / SECOND_NS, self._noise_mps
+                for v, after_v in zip(before[1], velocity, strict=True):
+                    found |= velocity_leaps(v, after_v, time, noise)
+            self._velocity = stamp_ns, velocity
+        if position is not None:
+            if self._position is not None and before is not None:
+                since_ns, elsewhere = self._position
+                time, noise = (stamp_ns - since_ns) / SECOND_NS, self._noise_m
+                states = zip(elsewhere, before[1], position, velocity or before[1], strict=True)
+                for p, v, after_p, after_v in states:
+                    found |= position_leaps(p, v, after_p, after_v, time, noise)
+            self._position = stamp_ns, position
+        return found
 
 
 class Newest:
     """In place of a filter: each number as it was measured last."""
 
-    def __init__(self) -> None:
+    def __init__(self, axes: int) -> None:
+        self._nothing = [0.0] * axes
         self._position: list[float] = []
         self._velocity: list[float] = []
 
-    def begin(self, measured: Measured) -> None:
+    def begin(self, measured: Measurement) -> None:
         """Take the first measurement."""
         self.take(measured)
 
-    def advance(self, command: list[float]) -> None:
+    def advance(self, due: list[float], swing: Sequence[float] = ()) -> None:
         """Nothing changes by itself."""
 
-    def take(self, measured: Measured) -> None:
+    def disturbance(self) -> list[float]:
+        """Nothing is known of a disturbance."""
+        return self._nothing
+
+    def take(self, measured: Measurement) -> None:
         """Take what was measured."""
         self._position = measured.position or self._position
         self._velocity = measured.velocity or self._velocity

@@ -3,15 +3,19 @@
 A handshake is one attempt, with one ephemeral key: it is said again, with the newest cookie, until
 the WELCOME that it brings is adopted, or for ATTEMPT_NS. What answers no open attempt is dropped,
 so that nobody can open a channel a second time, whose counters would begin anew.
+
+Who copies an INITIATION to the server from an address of his own is given a cookie as well, good
+for that address alone, and may hand it on: the vehicle cannot tell it from its own. So each cookie
+that comes is tried at once, and none is ever the last word; but none more often than HELLO is said.
 """
 
 from collections.abc import Callable
 
-from client.link import AGAIN_NS
-from shared import channel, handshake
-from shared.channel import Channel, kind
-from shared.endpoint import SECOND_NS
-from shared.handshake import (
+from skytether.client.link import AGAIN_NS
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.wire import channel, handshake
+from skytether.shared.wire.channel import Channel, kind
+from skytether.shared.wire.handshake import (
     NO_COOKIE,
     check_place,
     pad,
@@ -20,12 +24,14 @@ from shared.handshake import (
     read_response,
     write_initiation,
 )
-from shared.keys import Key
-from shared.noise import KEY_BYTES, Initiator, NoiseError
-from shared.protocol import ProtocolError
+from skytether.shared.wire.keys import VehicleKey
+from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, Initiator, NoiseError
+from skytether.shared.wire.protocol import Drop, ProtocolError
 
 ATTEMPT_NS = 60 * SECOND_NS
 """Time for which an attempt is said again before another one is begun [ns]."""
+COOKIES_MAX = 64
+"""Number of cookies of an attempt that are remembered; the one tried longest ago gives way."""
 
 
 class _Attempt:
@@ -36,11 +42,11 @@ class _Attempt:
         self.hello = hello
         """Message that it carries."""
         self.began_ns = began_ns
-        self.cookies: set[bytes] = set()
-        """Cookies that it was given: the server makes one a minute for each address."""
+        self.tried_ns: dict[bytes, int] = {}
+        """Time at which each cookie was tried last, the longest ago first [ns]."""
 
 
-class Secure:
+class SecureLink:
     """Link that only the holder of the vehicle's key can read or write.
 
     Args:
@@ -51,11 +57,13 @@ class Secure:
     secure = True
     hello_ns = AGAIN_NS
 
-    def __init__(self, key: Key, *, entropy: Callable[[int], bytes]) -> None:
+    def __init__(self, key: VehicleKey, *, entropy: Callable[[int], bytes]) -> None:
         self._key = key
         self._entropy = entropy
         self._cookie = NO_COOKIE
         """Newest cookie, also from earlier attempts."""
+        self._answers: list[bytes] = []
+        """INITIATIONs that CHALLENGEs have drawn, to be sent."""
         self._attempt: _Attempt | None = None
         self._candidate: Channel | None = None
         """Channel of the WELCOME that was opened last."""
@@ -70,7 +78,7 @@ class Secure:
             noise = Initiator(key.psk, prologue(key), private, pad(payload))
             self._attempt = attempt = _Attempt(noise, payload, now_ns)
             self._candidate = None
-        return write_initiation(self._key, self._cookie, attempt.noise.message)
+        return self._initiation(attempt, now_ns)
 
     def seal(self, payload: bytes) -> bytes:
         """Datagram that carries any other message; a WELCOME must have been adopted."""
@@ -78,7 +86,7 @@ class Secure:
         return self._current.seal(payload)
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
-        """Message in a datagram; None of a CHALLENGE, after which HELLO is to be said at once.
+        """Message in a datagram; None of a CHALLENGE, whose answer is in the outbox.
 
         Raises:
             ProtocolError: it is not the server's, has come before, or answers nothing.
@@ -89,9 +97,14 @@ class Secure:
             case handshake.RESPONSE:
                 return self._response(datagram, now_ns)
             case handshake.CHALLENGE:
-                self._challenge(datagram)
+                self._challenge(datagram, now_ns)
                 return None
-        raise ProtocolError("not for a client")
+        raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
+
+    def outbox(self) -> list[bytes]:
+        """See `ClientLink`."""
+        answers, self._answers = self._answers, []
+        return answers
 
     def adopt(self, *, now_ns: int) -> None:
         """Seal in the channel of the WELCOME that was opened last, and close the attempt."""
@@ -112,16 +125,26 @@ class Secure:
                 payload = each.open(packet, now_ns=now_ns).payload
                 check_place(payload, in_handshake=False)
                 return payload
-        raise ProtocolError("unknown channel")
+        raise ProtocolError(Drop.UNKNOWN_CHANNEL)
 
-    def _challenge(self, packet: bytes) -> None:
-        """Take the cookie of a CHALLENGE; one that is repeated must draw no HELLO."""
+    def _challenge(self, packet: bytes, now_ns: int) -> None:
+        """Try the cookie of a CHALLENGE; one that was tried just now must draw no INITIATION."""
         attempt = self._asked()
         cookie = read_challenge(self._key, packet, attempt.noise.public)
-        if cookie in attempt.cookies:
-            raise ProtocolError("replayed")
-        attempt.cookies.add(cookie)
+        tried_ns = attempt.tried_ns.get(cookie)
+        if tried_ns is not None and now_ns - tried_ns < AGAIN_NS:
+            raise ProtocolError(Drop.REPLAYED)
         self._cookie = cookie
+        self._answers.append(self._initiation(attempt, now_ns))
+
+    def _initiation(self, attempt: _Attempt, now_ns: int) -> bytes:
+        """INITIATION of an attempt, with the newest cookie."""
+        tried_ns = attempt.tried_ns
+        tried_ns.pop(self._cookie, None)
+        tried_ns[self._cookie] = now_ns
+        if len(tried_ns) > COOKIES_MAX:
+            del tried_ns[next(iter(tried_ns))]
+        return write_initiation(self._key, self._cookie, attempt.noise.message)
 
     def _response(self, packet: bytes, now_ns: int) -> bytes:
         """WELCOME of a RESPONSE, whose channel may be adopted."""
@@ -130,7 +153,7 @@ class Secure:
         try:
             welcome, keys = attempt.noise.open(message)
         except NoiseError:
-            raise ProtocolError("forged") from None
+            raise ProtocolError(Drop.FORGED) from None
         check_place(welcome, in_handshake=True)
         self._candidate = Channel(
             self._key.vehicle, number, seal=keys.forth, open_=keys.back, born_ns=now_ns
@@ -139,5 +162,5 @@ class Secure:
 
     def _asked(self) -> _Attempt:
         if self._attempt is None:
-            raise ProtocolError("unasked")
+            raise ProtocolError(Drop.UNASKED)
         return self._attempt

@@ -1,11 +1,11 @@
-"""`python -m netem`: the network as a process."""
+"""`python -m skytether.netem`: the network as a process."""
 
 import sys
 
-from shell.start import run
+from skytether.shell.start import run
 
 if __name__ == "__main__":  # before the imports below, which take a while
-    sys.exit(run("netem.__main__:emulate", "netem"))
+    sys.exit(run("skytether.netem.__main__:emulate", "netem"))
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -13,19 +13,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from netem.proxy import FLOWS_MAX, Proxy
-from shared.config import Scenario
-from shared.record import PACKET_COLUMNS
-from shell import command
-from shell.command import ScenarioFlags, ScenarioName
-from shell.log import LogFormat
-from shell.udp import files_max, sockets_max
+from skytether.netem.proxy import FLOWS_MAX, Proxy
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import PACKET_COLUMNS
+from skytether.shell import command
+from skytether.shell.command import ScenarioFlags, ScenarioName
+from skytether.shell.log import LogFormat
+from skytether.shell.options import Argument
+from skytether.shell.udp import files_max, sockets_max
 
 
 @dataclass(frozen=True)
-class Options:
+class NetemOptions:
     """Options of `skytether netem`."""
 
     scenario: ScenarioName = "demo"
@@ -39,8 +38,9 @@ class Options:
     log: LogFormat = "text"
     """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
-    """File for netem's part of the record: the fate of every packet."""
-    flows: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """File for netem's part of the record: the fate of every packet. One that ends in .mcap becomes
+    a recording with all that netem says, see `skytether join`."""
+    flows: Annotated[int | None, Argument(metavar="N")] = None
     """Most clients at once, each of which takes a socket: 512 unless given, or as many as the
     system allows."""
     json: Path | None = None
@@ -51,6 +51,7 @@ class Options:
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     metrics: str | None = None
     """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
+    plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
 
@@ -59,14 +60,14 @@ def emulate(argv: Sequence[str]) -> None:
 
     SIGUSR1 prints what was counted so far.
     """
-    options = command.parse(Options(), argv, "skytether netem", emulate.__doc__)
+    options = command.parse(NetemOptions(), argv, "skytether netem", emulate.__doc__)
     flows = _flows(options.flows)
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
-    record = options.record
+    part = command.part_of(options.record)
     with (
-        command.recorded(record, PACKET_COLUMNS) if record else nullcontext() as recording,
-        command.fed(options.feed) as feed,
+        command.recorded(part, PACKET_COLUMNS) if part else nullcontext() as recording,
+        command.fed(options.feed, options.record, "netem", options, secure=False) as feed,
     ):
         recorder = command.recorder("netem", PACKET_COLUMNS, recording, feed)
         endpoint = Proxy(options.config, server=server, flows=flows, recorder=recorder)

@@ -23,8 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shared.config import DirectionConfig
-from shared.endpoint import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.scenario.schema import DirectionConfig
 
 SLOT_NS = MILLISECOND_NS
 """Length of a slot [ns]: shorter than any step, so that no two horizons and no two observations

@@ -4,10 +4,11 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import Any
 
-from netem.fate import SLOT_NS, Fates
-from shared.endpoint import MILLISECOND_NS, Datagram
-from shared.histogram import Histogram
-from shared.record import Recorder
+from skytether.netem.fate import SLOT_NS, Fates
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.telemetry.histogram import Histogram
+from skytether.shared.telemetry.record import Recorder
 
 QUEUE_MAX = 65536
 """Most packets under way in one direction; more are dropped, and counted apart from losses."""
@@ -165,8 +166,8 @@ class Link:
             "overflowed": counts.overflowed,
             "queue": self.depth(),
             "queue_max": counts.depth_max,
-            "delays": counts.delay.by_bin(),
-            "delays_within": counts.delay.within(DELAY_EDGES_MS),
+            "delays_ms": counts.delay.by_bin(),
+            "delays_within_ms": counts.delay.within(DELAY_EDGES_MS),
             "error_ms_p50": counts.error.quantile_ms(0.5),
             "error_ms_p99": counts.error.quantile_ms(0.99),
             "error_ms_max": counts.error.largest_ns / MILLISECOND_NS,

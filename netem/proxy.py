@@ -13,13 +13,15 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from netem.fate import Fates
-from netem.link import Lane, Link
-from shared.config import DirectionConfig, Scenario
-from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
-from shared.events import FlowOpened
-from shared.record import DOWNLINK, UPLINK, Recorder
-from shared.terms import keys_of
+from skytether.netem.fate import Fates
+from skytether.netem.link import Lane, Link
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.events import FlowOpened
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.schema import DirectionConfig, Scenario
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
 """Most clients at once, unless another number is asked for; packets of others are dropped and
@@ -53,7 +55,7 @@ class Proxy(Endpoint):
         recorder: takes one row a packet.
     """
 
-    changeable = keys_of("netem's") - {"network.mtu"}
+    changeable = keys_of(InFlight.IMPAIRMENT)
 
     def __init__(
         self,

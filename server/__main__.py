@@ -1,11 +1,11 @@
-"""`python -m server`: the server as a process."""
+"""`python -m skytether.server`: the server as a process."""
 
 import sys
 
-from shell.start import run
+from skytether.shell.start import run
 
 if __name__ == "__main__":  # before the imports below, which take a while
-    sys.exit(run("server.__main__:serve", "server"))
+    sys.exit(run("skytether.server.__main__:serve", "server"))
 
 import secrets
 import time
@@ -16,25 +16,26 @@ from pathlib import Path
 from socket import socket
 from typing import Annotated
 
-import tyro
-
-from server.endpoint import VEHICLES_MAX, Server
-from server.gate import Plain
-from server.secure import FORMS, Secure
-from shared import keys
-from shared.config import Scenario
-from shared.endpoint import Address
-from shared.record import plan_columns, server_columns
-from shared.steady import Steady
-from shared.stopwatch import Stopwatch
-from shell import command, workers
-from shell.command import CommandError, ScenarioFlags, ScenarioName
-from shell.log import LogFormat
-from shell.udp import AddressError
+from skytether.server.endpoint import VEHICLES_MAX, Server
+from skytether.server.gate import PlainGate
+from skytether.server.secure import FORMS, SecureGate
+from skytether.shared.base import kernel
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.steady import Steady
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import RECORDING, plan_columns, server_columns
+from skytether.shared.wire import keys
+from skytether.shared.wire.keys import Keyring
+from skytether.shell import command, workers
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.log import LogFormat
+from skytether.shell.options import Argument
+from skytether.shell.udp import AddressError
 
 
 @dataclass(frozen=True)
-class Options:
+class ServerOptions:
     """Options of `skytether server`."""
 
     scenario: ScenarioName = "demo"
@@ -46,12 +47,13 @@ class Options:
     log: LogFormat = "text"
     """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
-    """File for the server's part of the record."""
-    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = VEHICLES_MAX
+    """File for the server's part of the record; one that ends in .mcap becomes a recording with
+    all that the server says and its plans, see `skytether join`."""
+    vehicles: Annotated[int, Argument(metavar="N")] = VEHICLES_MAX
     """Most vehicles at once, in each worker."""
-    workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    workers: Annotated[int, Argument(metavar="N")] = 1
     """Number of processes that share the address and the vehicles, one a core; with several, each
-    has files of its own, numbered, as in RECORD.1."""
+    has files of its own, numbered, as in RECORD.1 or RECORD.1.mcap."""
     json: Path | None = None
     """File for what was counted, and the CPU time it took."""
     keys: Path | None = None
@@ -66,6 +68,7 @@ class Options:
     metrics: str | None = None
     """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz. Worker N
     listens at PORT + N - 1."""
+    plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
 
@@ -74,21 +77,28 @@ def serve(argv: Sequence[str]) -> None:
 
     SIGUSR1 prints what was counted so far.
     """
-    options = command.parse(Options(), argv, "skytether server", serve.__doc__)
+    options = command.parse(ServerOptions(), argv, "skytether server", serve.__doc__)
     command.check_count("--vehicles", options.vehicles, 65_536)
     command.check_count("--workers", options.workers, 64)
     command.check_sockets("--workers", options.workers)
     bind = command.address("--bind", options.bind)
     metrics = command.optional_address("--metrics", options.metrics)
+    keyring = keys.load(options.keys) if options.keys else None
+    command.check_sealed(bind, secure=bool(keyring) or options.insecure)
     if options.workers == 1:
-        _work(options, bind, "", metrics)
+        _work(options, keyring, bind, "", metrics)
         return
 
     def work(number: int, sock: socket) -> None:
         suffix = f".{number}"
         own = metrics and (metrics[0], metrics[1] and metrics[1] + number - 1)
-        sys.exit(command.main(lambda _: _work(options, sock, suffix, own), (), f"server{suffix}"))
+        sys.exit(
+            command.main(
+                lambda _: _work(options, keyring, sock, suffix, own), (), f"server{suffix}"
+            )
+        )
 
+    _ready()
     try:
         worst = workers.run(options.workers, bind, work)
     except AddressError as error:
@@ -97,21 +107,35 @@ def serve(argv: Sequence[str]) -> None:
         raise CommandError("a worker has failed", worst)
 
 
-def _work(options: Options, bind: Address | socket, suffix: str, metrics: Address | None) -> None:
+def _ready() -> None:
+    """Have what plans in memory before a vehicle waits for it, and workers share it."""
+    command.prepare(kernel.missing())
+    kernel.load()
+
+
+def _work(
+    options: ServerOptions,
+    keyring: Keyring | None,
+    bind: Address | socket,
+    suffix: str,
+    metrics: Address | None,
+) -> None:
     """Run one worker, whose files have names that end in `suffix`."""
 
     def own(path: Path | None) -> Path | None:
+        if path and path.suffix == RECORDING:
+            return path.with_name(path.stem + suffix + RECORDING)
         return path and path.with_name(path.name + suffix)
 
     # Each worker knows sessions of its own.
-    keyring = keys.load(options.keys) if options.keys else None
-    gate = Secure(keyring, entropy=secrets.token_bytes) if keyring else Plain()
+    gate = SecureGate(keyring, entropy=secrets.token_bytes) if keyring else PlainGate()
     axes, planned = options.config.model.axes, options.config.terms().planned
-    record, columns = own(options.record), server_columns(axes)
+    record, columns = own(options.record), server_columns(axes, options.config.control.scheme)
+    part = command.part_of(record)
     stopwatch = Stopwatch(time.perf_counter_ns)
     with (
-        command.recorded(record, columns) if record else nullcontext() as recording,
-        command.fed(own(options.feed)) as feed,
+        command.recorded(part, columns) if part else nullcontext() as recording,
+        command.fed(own(options.feed), record, "server", options, secure=gate.secure) as feed,
     ):
         endpoint = Server(
             options.config,
@@ -139,4 +163,6 @@ def _work(options: Options, bind: Address | socket, suffix: str, metrics: Addres
             control=own(options.control),
             feed=feed,
             metrics=metrics,
+            warnings=command.flight_warnings(options.config),
+            ready=_ready,
         )

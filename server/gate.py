@@ -1,11 +1,11 @@
 """The server's side of the link: who sent a datagram, and how that peer is answered.
 
-`Plain` believes everybody. `server.secure` opens what was sealed with a vehicle's key.
+`PlainGate` believes everybody. `server.secure` opens what was sealed with a vehicle's key.
 """
 
 from typing import NamedTuple, Protocol
 
-from shared.endpoint import Datagram
+from skytether.shared.core.endpoint import Datagram
 
 
 class Line(Protocol):
@@ -48,7 +48,7 @@ class Gate(Protocol):
         """Datagrams of the gate's own to be sent; each is handed out once."""
 
 
-class Plain:
+class PlainGate:
     """Gate without keys: everybody may pass."""
 
     secure = False

@@ -17,35 +17,43 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.endpoint import MILLISECOND_NS
-from shared.kernel import F4, R2, kernel, part, record, records
-from shared.protocol import NO_HORIZON, Observation
-from shared.terms import Terms
+from skytether.shared.base.kernel import F4, R2, kernel, part, record, records, shared
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.law import leap
+from skytether.shared.law.leap import NOISE_M, NOISE_MPS
+from skytether.shared.law.terms import Terms
+from skytether.shared.wire.protocol import NO_HORIZON, Observation
 
 REPEATS = 3
 """Observations in a row, each possible after the one before, that are believed in the end."""
 SLACK_NS = 50 * MILLISECOND_NS
 """What clocks that drift may take from a round trip [ns]."""
-ACCELERATION_MPS2 = 50.0
-"""Acceleration that no vehicle exceeds [m/s²]."""
-JUMP_M, JUMP_MPS = 1.0, 2.0
-"""What noise may add to a change of position [m] and of velocity [m/s]."""
-
-SAID = record(
-    ("epoch", "i8"),
-    ("step", "i8"),
-    ("in_force", "i8"),
-    ("since", "i8"),
-    ("forward", "i8"),
-    ("backward", "i8"),
-    ("count", "i8"),
-)
-"""An observation: begin of step 0 [ns; vehicle's clock]; its step, or -1 where there is none; the
-horizon in force, and its first step; F and G of `server.clock` [ns]; and, of one that is doubted,
-how many in a row agree, itself included."""
 
 
-class Verdict(IntEnum):
+class Statement:
+    """Record: an observation, but for its state."""
+
+    epoch: int
+    """Begin of step 0 [ns; vehicle's clock]."""
+    step: int
+    """Its step, or -1 where there is no observation."""
+    in_force: int
+    """Step that the horizon in force was made for, or NO_HORIZON."""
+    since: int
+    """First step flown with that horizon."""
+    forward: int
+    """F of `server.control.clock` [ns]."""
+    backward: int
+    """G of `server.control.clock` [ns]."""
+    count: int
+    """Number of doubted ones in a row that agree, itself included; 0 unless it is doubted."""
+
+
+STATEMENT = record(Statement)
+position_leaps, velocity_leaps = shared(leap.position_leaps), shared(leap.velocity_leaps)
+
+
+class Belief(IntEnum):
     """What becomes of an observation."""
 
     ANEW = -1
@@ -61,10 +69,10 @@ LAST, DOUBTED, NEW = 0, 1, 2
 """Places of a vehicle's observations: believed last, doubted last, and to be judged."""
 
 
-class Said(NamedTuple):
+class HeardNumbers(NamedTuple):
     """What vehicles have said."""
 
-    numbers: Annotated[NDArray[np.void], records(SAID, 2)]
+    numbers: Annotated[NDArray[np.void], records(STATEMENT, 2)]
     """Observations at their three places; shape (3, capacity)."""
     states: F4
     """Their positions [m] and velocities [m/s]; shape (3, capacity, axes, 2)."""
@@ -74,11 +82,13 @@ class Plausibility:
     """Judge of the observations of up to `capacity` vehicles."""
 
     def __init__(self, terms: Terms, capacity: int) -> None:
-        self._said = Said(
-            numbers=np.zeros((3, capacity), dtype=SAID),
+        self._said = HeardNumbers(
+            numbers=np.zeros((3, capacity), dtype=STATEMENT),
             states=np.zeros((3, capacity, terms.axes, 2)),
         )
         self._dt_s, self._H = terms.dt_s, terms.horizon
+        self._noise_m = NOISE_M + NOISE_MPS * max(terms.dead_time_s)
+        """What noise may add to a change of position, predicted over the dead time [m]."""
         for row in range(capacity):
             self.forget(row)
 
@@ -93,13 +103,13 @@ class Plausibility:
             row: the vehicle.
             observation: what it says.
             epoch: begin of step 0, by its stamp and its step [ns; vehicle's clock].
-            F, G: of the observation and its echo, see `server.clock` [ns].
+            F, G: of the observation and its echo, see `server.control.clock` [ns].
 
         Returns:
-            a `Verdict`.
+            a `Belief`.
         """
         if epoch < 0:  # before its clock began, and maybe more than an int64 holds
-            return Verdict.EPOCH
+            return Belief.EPOCH
         told = observation
         return _judge(
             self._said,
@@ -113,15 +123,16 @@ class Plausibility:
             G,
             self._H,
             self._dt_s,
+            self._noise_m,
         )
 
 
-ANEW, BELIEVED, EPOCH, CLOCK, HORIZON, JUMP = map(int, Verdict)
+ANEW, BELIEVED, EPOCH, CLOCK, HORIZON, JUMP = map(int, Belief)
 """As kernels take them."""
 
 
 @part
-def _against(said: Said, row: int, which: int, H: int, dt: float) -> int:
+def _against(said: HeardNumbers, row: int, which: int, H: int, dt: float, noise_m: float) -> int:
     """What speaks against the new observation after another; BELIEVED where nothing does."""
     before, new = said.numbers[which, row], said.numbers[NEW, row]
     verdict = BELIEVED
@@ -137,31 +148,31 @@ def _against(said: Said, row: int, which: int, H: int, dt: float) -> int:
             back = new.in_force < before.in_force or new.since < before.since
             if new.in_force != NO_HORIZON and back:
                 verdict = HORIZON
-            elif _jumps(said, row, which, (new.step - before.step) * dt):
+            elif _jumps(said, row, which, (new.step - before.step) * dt, noise_m):
                 verdict = JUMP
     return verdict
 
 
 @part
-def _jumps(said: Said, row: int, which: int, time: float) -> bool:
+def _jumps(said: HeardNumbers, row: int, which: int, time: float, noise_m: float) -> bool:
     """Whether no vehicle can come from the state of another observation to the new one's in time.
 
     Args:
         time: between the two [s].
+        noise_m: what noise may add to a change of position [m].
     """
     jumps = False
     for axis in range(said.states.shape[2]):
         p, v = said.states[which, row, axis, 0], said.states[which, row, axis, 1]
         after_p, after_v = said.states[NEW, row, axis, 0], said.states[NEW, row, axis, 1]
-        off = after_p - p - 0.5 * (v + after_v) * time
-        jumps |= abs(after_v - v) > JUMP_MPS + ACCELERATION_MPS2 * time
-        jumps |= abs(off) > JUMP_M + 0.5 * ACCELERATION_MPS2 * time * time
+        jumps |= velocity_leaps(v, after_v, time, NOISE_MPS)
+        jumps |= position_leaps(p, v, after_p, after_v, time, noise_m)
     return jumps
 
 
 @kernel
 def _judge(
-    said: Said,
+    said: HeardNumbers,
     row: int,
     state: R2,
     epoch: int,
@@ -172,6 +183,7 @@ def _judge(
     G: int,
     H: int,
     dt: float,
+    noise_m: float,
 ) -> int:
     """The verdict on a new observation, which takes its place among those of its vehicle."""
     numbers, place = said.numbers, LAST
@@ -179,11 +191,11 @@ def _judge(
     new.epoch, new.step, new.in_force, new.since = epoch, step, in_force, since
     new.forward, new.backward, new.count = F, G, 0
     said.states[NEW, row] = state
-    verdict = _against(said, row, LAST, H, dt)
+    verdict = _against(said, row, LAST, H, dt, noise_m)
     if verdict != BELIEVED:
         place = DOUBTED
         agrees = numbers[DOUBTED, row].step >= 0 and (
-            _against(said, row, DOUBTED, H, dt) == BELIEVED
+            _against(said, row, DOUBTED, H, dt, noise_m) == BELIEVED
         )
         numbers[NEW, row].count = numbers[DOUBTED, row].count + 1 if agrees else 1
         if numbers[NEW, row].count == REPEATS:

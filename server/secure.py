@@ -12,11 +12,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from server.gate import Call
-from shared import channel, handshake
-from shared.channel import OVERHEAD_BYTES, VERSION, Channel, kind
-from shared.endpoint import SECOND_NS, Address, Datagram, Form
-from shared.handshake import (
+from skytether.server.gate import Call
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Form
+from skytether.shared.wire import channel, handshake
+from skytether.shared.wire.channel import OVERHEAD_BYTES, VERSION, Channel, kind
+from skytether.shared.wire.handshake import (
     CHANNEL,
     COOKIE_BYTES,
     INITIATION_BYTES,
@@ -27,19 +28,21 @@ from shared.handshake import (
     write_challenge,
     write_response,
 )
-from shared.keys import Key, Keyring
-from shared.noise import KEY_BYTES, NoiseError, Responder
-from shared.protocol import PAYLOAD_BYTES_MAX, Hello, ProtocolError
+from skytether.shared.wire.keys import Keyring, VehicleKey
+from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, NoiseError, Responder
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, Hello, ProtocolError
 
 COOKIE_NS = 60 * SECOND_NS
 """Time for which cookies are alike; each is good for this time and the next [ns]."""
 HANDSHAKES = 5
-"""Number of handshakes of a vehicle in a second."""
+"""Number of attempts of a vehicle, and of answers to what is repeated of them, in a second."""
 PENDING_MAX = 64
 """Number of pending channels of a vehicle. It uses the first that it hears of, and within a round
 trip of 12 s no more are made, even of HELLOs that somebody repeats: five a second."""
-CHALLENGES_MAX = 1024
-"""Number of challenges that wait to be sent; older ones give way."""
+DONE_MAX = 16
+"""Number of a vehicle's newest attempts that have brought a channel and are answered no more."""
+OUT_MAX = 1024
+"""Number of answers of the gate's own that wait to be sent; older ones give way."""
 
 
 class _Pending(NamedTuple):
@@ -48,6 +51,8 @@ class _Pending(NamedTuple):
     channel: Channel
     public: bytes
     """Ephemeral key of the attempt that it came from."""
+    response: bytes
+    """RESPONSE that has brought it."""
 
 
 FORMS = (
@@ -59,22 +64,46 @@ FORMS = (
 array of msgpack) is dropped as well, but the operator is to be told of it."""
 
 
-class _Vehicle:
-    """What is kept of one vehicle."""
+class _Rate:
+    """Number of handshakes in a second.
 
-    __slots__ = ("done", "handshakes_ns", "live", "pending", "previous")
+    Args:
+        now_ns: time now; all of them are left.
+    """
+
+    __slots__ = ("_granted_ns",)
 
     def __init__(self, now_ns: int) -> None:
-        self.handshakes_ns = now_ns - SECOND_NS
-        """Time up to which handshakes have been granted, each a share of a second [ns]."""
+        self._granted_ns = now_ns - SECOND_NS
+        """Time up to which they have been granted, each a share of a second [ns]."""
+
+    def grant(self, now_ns: int) -> bool:
+        """Whether one more is granted."""
+        begun_ns = max(self._granted_ns, now_ns - SECOND_NS)
+        if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
+            return False
+        self._granted_ns = begun_ns + SECOND_NS // HANDSHAKES
+        return True
+
+
+class _KeyedVehicle:
+    """What is kept of one vehicle."""
+
+    __slots__ = ("attempts", "done", "live", "pending", "previous", "repeats")
+
+    def __init__(self, now_ns: int) -> None:
+        self.attempts = _Rate(now_ns)
+        """Attempts, which nobody else can make: repeats, which anybody can, take none of them."""
+        self.repeats = _Rate(now_ns)
+        """Other answers to an attempt that has been answered."""
         self.live: Channel | None = None
         """Channel that the vehicle sends in."""
         self.previous: Channel | None = None
         """Channel that it has sent in before."""
         self.pending: dict[int, _Pending] = {}
         """Channels by number that it may send in next, the oldest first."""
-        self.done = b""
-        """Ephemeral key of the attempt that has brought the live channel."""
+        self.done: deque[bytes] = deque(maxlen=DONE_MAX)
+        """Ephemeral keys of the newest attempts that have brought a channel."""
 
     def find(self, number: int) -> Channel | None:
         """Channel with a number."""
@@ -84,23 +113,22 @@ class _Vehicle:
         pending = self.pending.get(number)
         return None if pending is None else pending.channel
 
-    def grant(self, now_ns: int) -> bool:
-        """Whether one more handshake is granted."""
-        begun_ns = max(self.handshakes_ns, now_ns - SECOND_NS)
-        if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
-            return False
-        self.handshakes_ns = begun_ns + SECOND_NS // HANDSHAKES
-        return True
+    def response(self, public: bytes) -> bytes | None:
+        """Newest RESPONSE to an attempt, whose channel is pending; None where there is none."""
+        answered = (each for each in reversed(self.pending.values()) if each.public == public)
+        newest = next(answered, None)
+        return None if newest is None else newest.response
 
-    def add(self, channel: Channel, public: bytes) -> None:
+    def add(self, pending: _Pending) -> None:
         """Keep a channel as pending; the oldest gives way where there are too many."""
-        self.pending[channel.number] = _Pending(channel, public)
+        self.pending[pending.channel.number] = pending
         if len(self.pending) > PENDING_MAX:
             del self.pending[next(iter(self.pending))]
 
     def promote(self, number: int, now_ns: int) -> None:
         """Make a pending channel the live one; those that were pending before it go."""
-        channel, self.done = self.pending[number]
+        channel, public, _ = self.pending[number]
+        self.done.append(public)
         for each in list(self.pending):
             del self.pending[each]
             if each == number:
@@ -113,13 +141,13 @@ class _Vehicle:
 class _Answer:
     """Line of a HELLO: its answer brings a channel."""
 
-    def __init__(self, gate: "Secure", key: Key, noise: Responder, now_ns: int) -> None:
+    def __init__(self, gate: "SecureGate", key: VehicleKey, noise: Responder, now_ns: int) -> None:
         self._gate = gate
         self._noise = noise
         self.public = noise.public
         self._now_ns = now_ns
         self.key = key
-        self.channel: Channel | None = None
+        self.pending: _Pending | None = None
         """Channel that the answer has brought; each answer has another."""
 
     def seal(self, payload: bytes) -> bytes:
@@ -132,15 +160,15 @@ class _Answer:
         try:
             message, keys = self._noise.answer(gate.entropy(KEY_BYTES), payload)
         except NoiseError:
-            raise ProtocolError("forged") from None
+            raise ProtocolError(Drop.FORGED) from None
         number = gate.number(vehicle)
-        self.channel = Channel(
-            vehicle, number, seal=keys.back, open_=keys.forth, born_ns=self._now_ns
-        )
-        return write_response(self.key, number, message, self.public)
+        brought = Channel(vehicle, number, seal=keys.back, open_=keys.forth, born_ns=self._now_ns)
+        response = write_response(self.key, number, message, self.public)
+        self.pending = _Pending(brought, self.public, response)
+        return response
 
 
-class Secure:
+class SecureGate:
     """Gate that only vehicles with a key pass.
 
     Args:
@@ -155,12 +183,12 @@ class Secure:
         self.entropy = entropy
         self._secret = entropy(hashlib.blake2s.MAX_KEY_SIZE)
         """What cookies are made of in this life of the server."""
-        self._vehicles: dict[int, _Vehicle] = {}
+        self._vehicles: dict[int, _KeyedVehicle] = {}
         """Vehicles that have a key and have come back with a cookie."""
-        self._challenges: deque[Datagram] = deque(maxlen=CHALLENGES_MAX)
+        self._out: deque[Datagram] = deque(maxlen=OUT_MAX)
 
     def open(self, datagram: Datagram, *, now_ns: int) -> Call | None:
-        """Message in a datagram; None of an INITIATION that draws a CHALLENGE.
+        """Message in a datagram; None of an INITIATION whose answer is in the outbox.
 
         Raises:
             ProtocolError: no vehicle that has a key made it, or it has come before or too late.
@@ -170,20 +198,20 @@ class Secure:
                 return self._data(datagram.payload, now_ns)
             case handshake.INITIATION:
                 return self._initiation(datagram, now_ns)
-        raise ProtocolError("not for a server")
+        raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
     def admit(self, call: Call, *, now_ns: int) -> None:  # noqa: ARG002 - as of any `Gate`
         """Keep the channel that came with the answer to the HELLO in this call as pending."""
         answer = call.line
         assert isinstance(answer, _Answer)
-        assert answer.channel is not None
-        self._vehicles[answer.key.vehicle].add(answer.channel, answer.public)
+        assert answer.pending is not None
+        self._vehicles[answer.key.vehicle].add(answer.pending)
 
     def outbox(self) -> list[Datagram]:
-        """Challenges to be sent; each is handed out once."""
-        challenges = list(self._challenges)
-        self._challenges.clear()
-        return challenges
+        """See `Gate`."""
+        out = list(self._out)
+        self._out.clear()
+        return out
 
     def number(self, vehicle: int) -> int:
         """Number for a new channel of a vehicle, which nobody can guess."""
@@ -198,7 +226,7 @@ class Secure:
         known = self._vehicles.get(vehicle)
         used = None if known is None else known.find(number)
         if known is None or used is None:
-            raise ProtocolError("unknown channel")
+            raise ProtocolError(Drop.UNKNOWN_CHANNEL)
         payload, newest = used.open(packet, now_ns=now_ns)
         check_place(payload, in_handshake=False)
         if number in known.pending:
@@ -206,29 +234,39 @@ class Secure:
         return Call(payload, vehicle, used, moves=newest and used is known.live)
 
     def _initiation(self, datagram: Datagram, now_ns: int) -> Call | None:
-        """Call of a HELLO with a cookie; without one it draws a CHALLENGE."""
+        """Call of a HELLO with a cookie; without one it draws a CHALLENGE.
+
+        An attempt is answered anew as long as repeats are granted, and then as before: nobody who
+        repeats what a vehicle has sent can use up the answers that it needs.
+        """
         packet, peer = datagram.payload, datagram.peer
         vehicle, number = handshake.address(packet)
         key = self._keyring.find(vehicle, number)
         if key is None:
-            raise ProtocolError("unknown key")
+            raise ProtocolError(Drop.UNKNOWN_KEY)
         cookie, message = read_initiation(key, packet)
         if not self._is_valid(cookie, peer, now_ns):
             fresh = self._cookie(peer, now_ns // COOKIE_NS)
             challenge = write_challenge(key, fresh, message[:KEY_BYTES])
-            self._challenges.append(Datagram(challenge, peer))
+            self._out.append(Datagram(challenge, peer))
             return None
         known = self._vehicles.get(vehicle)
         if known is None:
-            known = self._vehicles[vehicle] = _Vehicle(now_ns)
-        if message[:KEY_BYTES] == known.done:  # the vehicle has closed this attempt
-            raise ProtocolError("replayed")
-        if not known.grant(now_ns):
-            raise ProtocolError("too many handshakes")
+            known = self._vehicles[vehicle] = _KeyedVehicle(now_ns)
+        public = message[:KEY_BYTES]
+        if public in known.done:  # the vehicle has closed this attempt
+            raise ProtocolError(Drop.REPLAYED)
+        response = known.response(public)
+        if response is None:
+            if not known.attempts.grant(now_ns):
+                raise ProtocolError(Drop.TOO_MANY_HANDSHAKES)
+        elif not known.repeats.grant(now_ns):
+            self._out.append(Datagram(response, peer))
+            return None
         try:
             noise = Responder(key.psk, prologue(key), message)
         except NoiseError:
-            raise ProtocolError("forged") from None
+            raise ProtocolError(Drop.FORGED) from None
         hello = unpad(noise.payload)
         check_place(hello, in_handshake=True)
         return Call(hello, vehicle, _Answer(self, key, noise, now_ns), moves=False)

@@ -8,17 +8,18 @@ that are free are used again, lowest first, so that what is in use lies close to
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import islice
 
 import numpy as np
 
-from server.gate import Line
-from shared.endpoint import SECOND_NS, Address
-from shared.model import Indices
-from shared.protocol import Hello, Observation, ProtocolError
+from skytether.server.gate import Line
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.law.model import Indices
+from skytether.shared.wire.protocol import Drop, Hello, Observation, ProtocolError
 
 SESSION_NS = 30 * SECOND_NS
 """A vehicle unheard for so long is forgotten [ns]."""
@@ -36,6 +37,8 @@ class Session:
     """Number of the session, named in everything that follows."""
     boot_id: int
     """Number of this life of the vehicle."""
+    home: Address
+    """Where its newest HELLO came from, which has heard from us there."""
     address: Address
     """Where its newest observation came from."""
     line: Line
@@ -48,8 +51,21 @@ class Session:
     """When something was heard of it last."""
     sent_ns: int = 0
     """When something was sent to it last."""
+    doubted: bool = False
+    """Whether its newest observation was not believed."""
     stale: int = 0
     """Number of observations that came after a newer one."""
+
+    def sealed(self, payload: bytes) -> Sequence[Datagram]:
+        """Datagram that brings the vehicle a message; one each where it may be in two places.
+
+        It may have another address since its HELLO, or somebody may send on copies of its packets
+        that come before the packets themselves: it must be heard at home then.
+        """
+        packet = self.line.seal(payload)
+        if self.address == self.home:
+            return (Datagram(packet, self.home),)
+        return Datagram(packet, self.address), Datagram(packet, self.home)
 
 
 class Sessions:
@@ -78,6 +94,8 @@ class Sessions:
         """Rows in use, rising; shape (n,)."""
         self.vehicle = np.zeros(room, dtype=np.int64)
         """Number of the vehicle in each row; shape (room,)."""
+        self.idle = np.zeros(room, dtype=np.int64)
+        """Why no plan is made for the vehicle in each row, as it was told last; shape (room,)."""
 
     def __len__(self) -> int:
         return len(self._live)
@@ -123,12 +141,13 @@ class Sessions:
         """
         live = self._live.get(hello.vehicle)
         if live is not None and live.boot_id == hello.boot_id:
+            live.home = address
             return live
         waiting = self._waiting(hello.vehicle)
         session = waiting.pop(hello.vehicle, None)
         if session is None or session.boot_id != hello.boot_id:
-            session = Session(hello.vehicle, self._number(), hello.boot_id, address, line)
-        session.heard_ns = now_ns
+            session = Session(hello.vehicle, self._number(), hello.boot_id, address, address, line)
+        session.home, session.heard_ns = address, now_ns
         if waiting is self.coming and len(waiting) == len(self._free_rows):
             self.coming.popitem(last=False)
         waiting[hello.vehicle] = session
@@ -161,9 +180,9 @@ class Sessions:
         waiting = self._waiting(observation.vehicle)
         session = waiting.get(observation.vehicle)
         if session is None or session.number != observation.session:
-            raise ProtocolError("unknown session")
+            raise ProtocolError(Drop.UNKNOWN_SESSION)
         if before is not None and self._is_heard(before, now_ns):
-            raise ProtocolError("taken")
+            raise ProtocolError(Drop.TAKEN)
         del waiting[session.vehicle]
         session.row = heappop(self._free_rows) if before is None else before.row
         session.sent_ns = now_ns
@@ -180,7 +199,7 @@ class Sessions:
         """
         session = self._live.get(vehicle)
         if session is None or session.number != number:
-            raise ProtocolError("unknown session")
+            raise ProtocolError(Drop.UNKNOWN_SESSION)
         self._forget(session)
 
     def expire(self, now_ns: int) -> list[Session]:

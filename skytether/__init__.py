@@ -1,1 +1,68 @@
-"""Skytether flies a UAV over a bad network; this package is the `skytether` command."""
+"""Skytether flies a UAV over a network that delays, reorders and loses packets.
+
+    import skytether
+
+    flight = skytether.fly("demo", duration=20)
+    print(flight.summary.rmse_xy)
+
+`docs/python.md` shows all of it. What stands in `__all__` is the library; a name is imported when
+it is first used, so that `import skytether` costs next to nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from skytether.library.flight import Column, Flight
+    from skytether.library.flying import check, fly, fly_batch, load
+    from skytether.library.sweeping import Swept, sweep
+    from skytether.shared.base.errors import ConfigError, FlightError, RecordingError
+    from skytether.shared.core.endpoint import Datagram, Endpoint
+    from skytether.shared.scenario.schema import Scenario
+    from skytether.shared.telemetry.summary import Summary
+    from skytether.sim.world import World
+
+__all__ = [
+    "Column",
+    "ConfigError",
+    "Datagram",
+    "Endpoint",
+    "Flight",
+    "FlightError",
+    "RecordingError",
+    "Scenario",
+    "Summary",
+    "Swept",
+    "World",
+    "check",
+    "fly",
+    "fly_batch",
+    "load",
+    "sweep",
+]
+
+_HOMES = {
+    "skytether.library.flight": ("Column", "Flight"),
+    "skytether.library.flying": ("check", "fly", "fly_batch", "load"),
+    "skytether.library.sweeping": ("Swept", "sweep"),
+    "skytether.shared.base.errors": ("ConfigError", "FlightError", "RecordingError"),
+    "skytether.shared.core.endpoint": ("Datagram", "Endpoint"),
+    "skytether.shared.scenario.schema": ("Scenario",),
+    "skytether.shared.telemetry.summary": ("Summary",),
+    "skytether.sim.world": ("World",),
+}
+"""Names of the library, by the module that each comes from."""
+
+
+if not TYPE_CHECKING:  # or a type checker would take any name for one of ours
+
+    def __getattr__(name: str) -> Any:
+        for module, names in _HOMES.items():
+            if name in names:
+                value = globals()[name] = getattr(import_module(module), name)
+                return value
+        raise AttributeError(f"module 'skytether' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

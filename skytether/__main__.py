@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from shell import start
+from skytether.shell import start
 
 USAGE = """usage: skytether COMMAND ...
 
@@ -11,10 +11,12 @@ Flies a UAV over a bad network: a server plans, a client flies, and netem, betwe
 reorders and loses their packets.
 
   fly [SCENARIO]        one flight, with everything it needs; the command to start with
+  straight [SCENARIO]   the same by set-points sent straight to an autopilot, to compare with
   fleet [SCENARIO]      many vehicles on one server, and what each costs it
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
   envelope [SCENARIO]   the networks and settings that a scenario bears, by random flights
   margins [SCENARIO]    whether its loop is stable, and with which vehicles, computed
+  identify KIND         a vehicle's gain, time constant and dead time, from small steps it flies
   torture               flights through faults and attacks, and whether anything unsafe is flown
   reproduce             the paper's table and figures, and more, as a report
   compare               schemes and triggers on the same seeds, each at its best weights
@@ -25,51 +27,69 @@ reorders and loses their packets.
   report FILE           a recording as a page with figures, for the browser
   export FILE           a recording as tables, CSV or Parquet
   recover FILE          a recording whose flight was killed, mended
+  join FILE... --out F  recordings of server, netem and client, as one
   set PATH KEY=VALUE    change something while it flies, at a process with --control
   scenarios             what can be flown
+  triggers              policies for control.trigger, a sentence each
+  references            shapes for reference.shape, a sentence each
+  vehicles              what may fly, for vehicle.kind, a sentence each
   keygen FILE           keys for vehicles, so that nobody else can fly them
   server [SCENARIO]     one process by hand: plans for vehicles
   netem [SCENARIO]      one process by hand: the network
   client [SCENARIO]     one process by hand: a vehicle
+  autopilot [SCENARIO]  one process by hand: an autopilot that speaks MAVLink, simulated
+  station [SCENARIO]    one process by hand: a ground station that sends set-points to one
 
 Each has a --help of its own. `skytether fly demo` flies a demonstration."""
 
 
 def list_scenarios(argv: Sequence[str]) -> None:
     """Print the scenarios that come with Skytether, a line each."""
-    from shared import config
-    from shell.command import CommandError
+    from skytether.shared.scenario import reading
+    from skytether.shell.command import CommandError
 
-    if argv:
-        raise CommandError(f"got {argv[0]!r}, expected nothing", 2)
-    names = config.names()
+    match argv:
+        case ["-h" | "--help", *_]:
+            print("usage: skytether scenarios\n\nPrint the scenarios that come with Skytether.")
+            return
+        case [word, *_]:
+            raise CommandError(f"got {word!r}, expected nothing", 2)
+    names = reading.names()
     width = max(map(len, names))
     for name in names:
-        print(f"{name:{width}}  {config.load(name).title}")
+        print(f"{name:{width}}  {reading.load(name).title}")
 
 
 COMMANDS = {
-    "fly": "skytether.fly:fly",
-    "fleet": "skytether.fleet:fleet",
-    "sweep": "skytether.sweep:sweep",
-    "envelope": "skytether.envelope:envelope",
-    "margins": "skytether.margins:margins",
-    "torture": "skytether.torture:torture",
-    "reproduce": "skytether.reproduce:reproduce",
-    "compare": "skytether.compare:compare",
-    "calibrate": "skytether.calibrate:calibrate",
-    "duel": "skytether.duel:duel",
-    "replay": "skytether.replay:replay",
-    "page": "view.__main__:show",
-    "report": "skytether.report:report",
-    "export": "skytether.export:export",
-    "recover": "skytether.recover:recover",
-    "set": "skytether.set:set_keys",
+    "fly": "skytether.cli.fly:fly",
+    "straight": "skytether.cli.straight:straight",
+    "fleet": "skytether.cli.fleet:fleet",
+    "sweep": "skytether.lab.commands.sweep:sweep",
+    "envelope": "skytether.lab.commands.envelope:envelope",
+    "margins": "skytether.lab.commands.margins:margins",
+    "identify": "skytether.lab.commands.identify:identify",
+    "torture": "skytether.lab.commands.torture:torture",
+    "reproduce": "skytether.lab.commands.reproduce:reproduce",
+    "compare": "skytether.lab.commands.compare:compare",
+    "calibrate": "skytether.lab.commands.calibrate:calibrate",
+    "duel": "skytether.cli.duel:duel",
+    "replay": "skytether.cli.replay:replay",
+    "page": "skytether.view.__main__:show",
+    "report": "skytether.cli.report:report",
+    "export": "skytether.cli.export:export",
+    "recover": "skytether.cli.recover:recover",
+    "join": "skytether.cli.join:join",
+    "set": "skytether.cli.set:set_keys",
     "scenarios": "skytether.__main__:list_scenarios",
-    "keygen": "skytether.keygen:keygen",
-    "server": "server.__main__:serve",
-    "netem": "netem.__main__:emulate",
-    "client": "client.__main__:fly",
+    "triggers": "skytether.cli.names:triggers",
+    "references": "skytether.cli.names:references",
+    "vehicles": "skytether.cli.names:vehicles",
+    "keygen": "skytether.cli.keygen:keygen",
+    "server": "skytether.server.__main__:serve",
+    "netem": "skytether.netem.__main__:emulate",
+    "client": "skytether.client.__main__:fly",
+    "autopilot": "skytether.autopilot.__main__:pilot",
+    "station": "skytether.station.__main__:fly",
 }
 """Function of each subcommand, imported once it is called: netem need not wait for what a server
 compiles."""
@@ -88,8 +108,8 @@ def introduce(argv: Sequence[str]) -> None:
     """Print the commands, or the version."""
     from importlib import metadata
 
-    from shared.hint import hint
-    from shell.command import CONFIGURATION, CommandError
+    from skytether.shared.base.hint import hint
+    from skytether.shell.command import CONFIGURATION, CommandError
 
     match argv:
         case [] | ["-h" | "--help", *_]:

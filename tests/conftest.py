@@ -3,7 +3,11 @@
 import os
 import signal
 import socket
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from contextlib import nullcontext
 from functools import cache
+from typing import Any
 
 import pytest
 
@@ -13,6 +17,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # No flight of a test serves a page, unless the test asks for one.
 os.environ.setdefault("SKYTETHER_PAGE", "none")
+# Tests share the cores among themselves; threads for matrices of a hundred rows wait in loops.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 @cache
@@ -30,3 +36,23 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip what needs IPv6 where there is none."""
     if item.get_closest_marker("ipv6") and not has_ipv6():
         pytest.skip("this machine has no IPv6")
+
+
+class Here(Executor):
+    """Does everything in this process, which takes no time to begin."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Do it at once."""
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@pytest.fixture(scope="module")
+def here() -> Iterator[None]:
+    """Flights of the laboratory's commands are flown in this process, not in workers."""
+    from skytether.lab.commands import pool
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pool, "_executor", lambda _: nullcontext(Here()))
+        yield

@@ -13,28 +13,49 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, flood, link, netem, restarts, solvers, tick, versions, wire
-from benchmarks.__main__ import DOCUMENT, ROOT, SECTIONS, write
-from benchmarks.airspace import PlannedFleet
-from benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
-from benchmarks.harness import HOT, PACED, Lateness, Table, interleave, machine, refresh
-from benchmarks.problems import Recorded, listening, record
-from benchmarks.reference import Reference
-from server.controller import BLOCK
-from server.exact import ExactSolver
+from skytether.lab.benchmarks import (
+    accuracy,
+    flood,
+    footprint,
+    link,
+    netem,
+    restarts,
+    solvers,
+    tick,
+    versions,
+    wire,
+)
+from skytether.lab.benchmarks.__main__ import DOCUMENT, ROOT, SECTIONS, write
+from skytether.lab.benchmarks.airspace import PlannedFleet
+from skytether.lab.benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
+from skytether.lab.benchmarks.harness import (
+    HOT,
+    PACED,
+    Lateness,
+    TextTable,
+    interleave,
+    machine,
+    refresh,
+)
+from skytether.lab.benchmarks.problems import RecordedProblems, listening, record
+from skytether.lab.benchmarks.reference import Reference
+from skytether.server.control.controller import BLOCK
+from skytether.server.control.exact import ExactSolver
 
 pytestmark = pytest.mark.long
 
 TINY = MappingProxyType(
     {
-        "netem": netem.Options(runs=1, seconds=1, rate=1000),
-        "solvers": solvers.Counts(hot=6, paced=2, tuning=3),
-        "tick": tick.Counts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
-        "wire": wire.Counts(each=10),
-        "accuracy": accuracy.Counts(ticks=3, random=2, horizons=(1, 30)),
-        "link": link.Counts(packets=60, handshakes=60, vehicles=2, seconds=0.5, turns=1, seeds=1),
-        "flood": flood.Counts(seconds=1, forged=2000, hellos=200, lead_s=0.5),
-        "restarts": restarts.Counts(kills=1, stops=0, flight_s=0.5, subjects=("netem",)),
+        "netem": netem.NetemBenchmarkOptions(runs=1, seconds=1, rate=1000),
+        "solvers": solvers.SolversCounts(hot=6, paced=2, tuning=3),
+        "tick": tick.TickCounts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
+        "wire": wire.WireCounts(each=10),
+        "accuracy": accuracy.AccuracyCounts(ticks=3, random=2, horizons=(1, 30)),
+        "link": link.LinkCounts(
+            packets=60, handshakes=60, vehicles=2, seconds=0.5, turns=1, seeds=1
+        ),
+        "flood": flood.FloodCounts(seconds=1, forged=2000, hellos=200, lead_s=0.5),
+        "restarts": restarts.RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("netem",)),
     }
 )
 
@@ -57,7 +78,7 @@ def _results() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def saturated() -> Recorded:
+def saturated() -> RecordedProblems:
     """A flight that often meets its bounds."""
     return record(solvers.flights()["saturated"], 1000)
 
@@ -93,7 +114,7 @@ def test_the_exact_solver_is_found_exact(results: Mapping[str, Any]) -> None:
 
 
 def test_the_flights_are_what_they_are_called(
-    results: Mapping[str, Any], saturated: Recorded
+    results: Mapping[str, Any], saturated: RecordedProblems
 ) -> None:
     """Never at a bound, and often."""
     assert results["solvers"]["smooth"]["active"] == 0.0
@@ -120,22 +141,24 @@ def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(contestants(TUNINGS[0]).keys() - {NOTHING}))
-def test_contestants_solve_the_same_problems(name: str, saturated: Recorded) -> None:
+def test_contestants_solve_the_same_problems(name: str, saturated: RecordedProblems) -> None:
     """Whatever form they are given them in; at OSQP's own tolerance only roughly."""
-    entry = solvers.Entry(contestants(TUNINGS[0])[name], saturated)
+    entry = solvers.SolverEntry(contestants(TUNINGS[0])[name], saturated)
     for i in range(20):
         entry.tick(i)
     assert entry.unsolved() == 0
-    exact = solvers.Entry(ExactSolver, saturated)
+    exact = solvers.SolverEntry(ExactSolver, saturated)
     for i in range(20):
         exact.tick(i)
     np.testing.assert_allclose(entry.inputs(), exact.inputs(), rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("tuning", TUNINGS[::8], ids=str)
-def test_every_form_of_osqp_is_the_same_problem(tuning: Tuning, saturated: Recorded) -> None:
+def test_every_form_of_osqp_is_the_same_problem(
+    tuning: Tuning, saturated: RecordedProblems
+) -> None:
     """Condensed by axis, jointly, and with states."""
-    ours, theirs = (solvers.Entry(make, saturated) for make in (ExactSolver, tuning.make))
+    ours, theirs = (solvers.SolverEntry(make, saturated) for make in (ExactSolver, tuning.make))
     for i in range(5):
         ours.tick(i)
         theirs.tick(i)
@@ -151,13 +174,13 @@ def test_what_is_not_installed_does_not_compete() -> None:
 
 @pytest.mark.skipif(find_spec("quadprog") is None, reason="quadprog is not installed")
 def test_the_reference_is_the_same_whoever_finds_it(
-    monkeypatch: pytest.MonkeyPatch, saturated: Recorded
+    monkeypatch: pytest.MonkeyPatch, saturated: RecordedProblems
 ) -> None:
     """By quadprog or by scipy: what is proved is the one optimum."""
     reference = Reference(saturated.problem.hessian[0], saturated.problem.mpc.bounds[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]
-    monkeypatch.setattr("benchmarks.reference.find_spec", lambda _: None)
+    monkeypatch.setattr("skytether.lab.benchmarks.reference.find_spec", lambda _: None)
     by_scipy = [reference.solve(gradient) for gradient in gradients]
     np.testing.assert_allclose(by_scipy, by_quadprog, rtol=0, atol=1e-14)
 
@@ -184,7 +207,7 @@ def test_a_checkout_is_compared_with_itself(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Both processes do the same work, and every contest and mix has a row in the table."""
-    tiny = versions.Counts(1, 1, (2,), 1, 3, 1, 1, 0.5)
+    tiny = versions.VersionsCounts(1, 1, (2,), 1, 3, 1, 1, 0.5)
     monkeypatch.setattr(versions, "QUICK", tiny)
     monkeypatch.setattr(tick, "tune", lambda *_: {})
     monkeypatch.setattr(tick, "fleets", lambda *_: results["tick"]["fleets"])
@@ -213,7 +236,7 @@ def test_a_folder_that_is_no_checkout_is_not_compared(
 
 def test_a_table_without_a_place_is_an_error() -> None:
     """The document and the benchmarks have drifted apart."""
-    table = Table(["a", "b"], [["1", "2"]])
+    table = TextTable(["a", "b"], [["1", "2"]])
     text = refresh("x\n<!-- table: one -->\nold\n<!-- end -->\ny\n", {"one": table})
     assert (
         text
@@ -223,13 +246,23 @@ def test_a_table_without_a_place_is_an_error() -> None:
         refresh(text, {"two": table})
 
 
-def test_the_lock_file_carries_hashes_and_no_addresses() -> None:
-    """As the others do, and agrees with what the program itself is locked to."""
-    program, extra = (
-        [line for line in (ROOT / name).read_text().splitlines() if line and line[0].isalnum()]
-        for name in ("requirements.lock", "requirements-bench.lock")
-    )
-    assert set(program) <= set(extra)
-    text = (ROOT / "requirements-bench.lock").read_text()
-    assert text.count("--hash=sha256:") >= len(extra)
-    assert "://" not in text
+def test_the_footprint_is_of_what_is_installed(tmp_path: Path) -> None:
+    """A client with keys is larger, for it has its ciphers; an extra adds what it needs."""
+    options = footprint.FootprintOptions(runs=1, flight_s=0.5, extras=("", "record"))
+    try:
+        found = footprint.measure(options)
+    except RuntimeError as error:
+        pytest.skip(f"{error}, which may reach no index")
+    bare, record = (found["extras"][extra] for extra in options.extras)
+    assert record["packages"] > bare["packages"]
+    assert record["disk_bytes"] > bare["disk_bytes"] > 0
+    plaintext, keys = found["aboard"]["plaintext"], found["aboard"]["keys"]
+    assert keys["resident_bytes"] > plaintext["resident_bytes"] > plaintext["mapped_bytes"] > 0
+    assert plaintext["cpu_s"] > 0
+    extras, aboard = footprint.tables(found).values()
+    assert [row[0] for row in extras.rows] == ["none (≤ 150 MB)", "record"]
+    assert [row[0] for row in aboard.rows] == ["plaintext", "keys"]
+
+    (tmp_path / "file").write_bytes(bytes(100_000))
+    (tmp_path / "link").symlink_to("file")
+    assert 100_000 <= footprint.disk_bytes(tmp_path) < 110_000

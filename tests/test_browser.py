@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.browser import (
+from skytether.lab.benchmarks.browser import (
     CHROMIUM,
     chromium,
     flown_s,

@@ -10,17 +10,19 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from lab import calibration
-from lab.calibration import COLUMNS, HERE, TABLE_1, UNFLYABLE, Limits, Rmse, Table1
-from lab.journal import sealed
-from lab.search import Free, Optimiser, Point, Values, check_free, put
-from lab.sweep import interval, summaries
-from shared import config
-from shared.config import ConfigError
 from skytether.__main__ import main
-from skytether.pool import Crew
+from skytether.lab import calibration
+from skytether.lab.calibration import COLUMNS, HERE, TABLE_1, UNFLYABLE, Limits, Rmse, Table1
+from skytether.lab.commands.pool import Crew
+from skytether.lab.journal import sealed
+from skytether.lab.search import Free, Optimiser, SearchPoint, Values, check_free, put
+from skytether.lab.sweep import interval, summaries
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import reading
 
-PAPER = config.load("paper")
+pytestmark = pytest.mark.usefixtures("here")
+
+PAPER = reading.load("paper")
 RADIUS = Free("reference.radius_m", 0.5, 5.0)
 LAG = Free("model.tau_s.0", 0.2, 2.0)
 TENTH = Limits(packets=0.1)
@@ -228,10 +230,10 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def flown(out: Path) -> list[Point]:
+def flown(out: Path) -> list[SearchPoint]:
     """All points in the journal of a search."""
     lines = map(json.loads, (out / "journal.jsonl").read_text().splitlines())
-    return [msgspec.convert(point, Point) for _, generation in lines for point in generation]
+    return [msgspec.convert(point, SearchPoint) for _, generation in lines for point in generation]
 
 
 def test_the_best_point_of_all_is_kept(searched: Path) -> None:
@@ -239,7 +241,7 @@ def test_the_best_point_of_all_is_kept(searched: Path) -> None:
     points = flown(searched)
     assert len(points) == 8
     best = min(points, key=lambda point: point.score)
-    found = config.load(str(searched / "best.toml"))
+    found = reading.load(str(searched / "best.toml"))
     assert found.reference.radius_m == best.keys["reference.radius_m"]
     assert found.model.tau_s == (best.keys["model.tau_s.0"],)
 
@@ -266,7 +268,7 @@ def test_the_smallest_error_is_searched_for_and_shown(
     assert (settings["objective"], settings["packets"]) == ("rmse", 0.3)
     points = flown(tmp_path)
     best = min(points, key=lambda point: point.score)
-    found = config.load(str(tmp_path / "best.toml"))
+    found = reading.load(str(tmp_path / "best.toml"))
     assert found.control.epsilon == best.keys["control.epsilon"]
     assert found.control.state_weight == (
         PAPER.control.state_weight[0],

@@ -1,4 +1,4 @@
-"""`shared.chance`: streams that are known by their names."""
+"""`shared.base.chance`: streams that are known by their names."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from shared.chance import stream
+from skytether.shared.base.chance import stream
 
 NAMES = ("uplink", "delay", 7)
 
@@ -23,7 +23,8 @@ def test_the_same_names_give_the_same_stream() -> None:
 
 def test_a_stream_is_the_same_in_another_process() -> None:
     """Python's own hash of a text would not be."""
-    program = f"from shared.chance import stream; print(stream(3, *{NAMES}).integers(2**63))"
+    drawn = f"stream(3, *{NAMES}).integers(2**63)"
+    program = f"from skytether.shared.base.chance import stream; print({drawn})"
     environment = {**os.environ, "PYTHONHASHSEED": "12345"}
     printed = subprocess.check_output([sys.executable, "-P", "-c", program], env=environment)
     assert int(printed) == numbers(3, *NAMES)[0]

@@ -9,23 +9,26 @@ import msgspec
 import numpy as np
 import pytest
 
-from client.failsafe import TABLE
-from client.fleet import Fleet
-from client.plant import FirstOrderPlant
-from client.vehicle import Client
-from netem.proxy import Proxy
-from server.endpoint import Server
-from shared import config
-from shared.chance import stream
-from shared.change import REQUEST_BYTES_MAX, Answer, Running
-from shared.config import ConfigError, Scenario, VehicleConfig
-from shared.endpoint import Datagram, Endpoint
-from shared.events import Changed, ChangeRefused, Event, Flying, ModeChanged
-from shared.protocol import Mode
-from shared.record import UPLINK, Reason
-from sim.flight import Flight, fly
+from skytether.client.endpoint import Client
+from skytether.client.failsafe import TABLE
+from skytether.client.fleet import Fleet
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.vehicle import simulated
+from skytether.client.simulated.weather import Weather
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.events import Changed, ChangeRefused, Event, Flying, ModeChanged
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario, VehicleConfig
+from skytether.shared.telemetry.record import UPLINK, Reason, Record
+from skytether.shared.wire.protocol import Mode
+from skytether.sim.flight import fly
 
-DEMO = config.load("demo")
+DEMO = reading.load("demo")
 FORGOTTEN = {"control.epsilon": 2.5}
 
 
@@ -149,12 +152,12 @@ def test_the_trajectory_s_file_is_not_read_again(
     """A disk may be slow, and a control tick is not; with another check the change would fail."""
     file = tmp_path / "way.csv"
     file.write_text("t,x,y\n0,0,0\n9,1,1\n")
-    table = config.to_table(DEMO) | {"reference": {"shape": "csv", "file": str(file)}}
-    scenario = config.check(table, "test")
+    table = reading.to_table(DEMO) | {"reference": {"shape": "csv", "file": str(file)}}
+    scenario = reading.check(table, "test")
     file.unlink()
     probe(scenario)[1].change(FORGOTTEN, now_ns=5)
-    check = config.check
-    monkeypatch.setattr(config, "check", lambda raw, known: check(raw))  # noqa: ARG005
+    check = reading.check
+    monkeypatch.setattr(reading, "check", lambda raw, known: check(raw))  # noqa: ARG005
     with pytest.raises(ConfigError, match="a readable file"):
         probe(scenario)[1].change(FORGOTTEN, now_ns=5)
 
@@ -206,9 +209,7 @@ def make(kind: type[Endpoint]) -> Endpoint:
         return Server(DEMO, boot_id=1, entropy=stream(1, "entropy").bytes)
     if kind is Proxy:
         return Proxy(DEMO, server=("server", 0))
-    client = Client(
-        DEMO, FirstOrderPlant(DEMO, stream(1, "wind")), server=("netem", 0), vehicle=1, boot_id=1
-    )
+    client = Client(DEMO, simulated(DEMO, 1), server=("netem", 0), vehicle=1, boot_id=1)
     return Fleet([client]) if kind is Fleet else client
 
 
@@ -217,13 +218,13 @@ def make(kind: type[Endpoint]) -> Endpoint:
 
 def scenario(**changes: Any) -> Scenario:
     """Ten seconds of the demonstration."""
-    table = config.to_table(DEMO) | {"duration": 10.0, "settle": 0.0}
+    table = reading.to_table(DEMO) | {"duration": 10.0, "settle": 0.0}
     for key, value in changes.items():
         table[key] = table[key] | value if isinstance(value, dict) else value
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
-def told(flight: Flight, *kinds: type[Event]) -> list[tuple[float, str, Event]]:
+def told(flight: Record, *kinds: type[Event]) -> list[tuple[float, str, Event]]:
     """Events of these kinds: time [s], host, event."""
     return [(at / 1e9, host, event) for at, host, event in flight.events if type(event) in kinds]
 
@@ -300,10 +301,11 @@ def test_wind_blows_from_the_next_step_on_and_changes_nothing_before() -> None:
 def test_a_gust_that_blows_goes_on_with_its_new_strength() -> None:
     """It blows the way it did, as if it had always had it."""
     air = VehicleConfig(gust_mps2=1.0, gust_every_s=1e-9, gust_s=1e9)
-    plant = FirstOrderPlant(msgspec.structs.replace(DEMO, vehicle=air), stream(1, "wind"))
+    flown = msgspec.structs.replace(DEMO, vehicle=air)
+    plant = FirstOrderPlant(flown, Weather(flown, stream(1, "wind")))
     plant.advance(np.zeros(2))
     before = plant.state()[:, 1].copy()
-    plant.change(msgspec.structs.replace(air, gust_mps2=3.0))
+    plant.weather.change(msgspec.structs.replace(air, gust_mps2=3.0))
     plant.advance(np.zeros(2))
     gained = plant.state()[:, 1] - before * np.exp(-0.05 / DEMO.tau_s)
     np.testing.assert_allclose(gained, 3.0 * before, rtol=1e-9)
@@ -345,7 +347,7 @@ def test_only_a_live_point_can_be_led() -> None:
     )
 
 
-def arming(*changes: tuple[float, bool], armed: bool = True) -> Flight:
+def arming(*changes: tuple[float, bool], armed: bool = True) -> Record:
     """A flight in which the vehicle is armed and disarmed at these times [s]."""
     flown = scenario(armed=armed, duration=12.0)
     return fly(flown, changes=[(at, {"armed": value}) for at, value in changes])
@@ -387,7 +389,7 @@ def test_without_its_rows_in_the_table_a_disarmed_vehicle_would_fly_on(
 ) -> None:
     """The guard of the test above: it would fly its plan to the end."""
     rows = {key: mode for key, mode in TABLE.items() if key[1] is not Reason.UNARMED}
-    monkeypatch.setattr("client.vehicle.TABLE", rows)
+    monkeypatch.setattr("skytether.client.endpoint.TABLE", rows)
     modes = [str(event) for *_, event in told(arming((5.0, False)), ModeChanged)]
     assert "vehicle 1 brakes: it is not armed" not in modes
 

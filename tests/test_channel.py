@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared import channel as channels
-from shared.channel import (
+from skytether.shared.wire import channel as channels
+from skytether.shared.wire.channel import (
     DATA,
     FRESH_NS,
     FRESH_PACKETS,
@@ -25,9 +25,9 @@ from shared.channel import (
     VERSION,
     WINDOW,
     Channel,
-    Window,
+    ReplayWindow,
 )
-from shared.protocol import ProtocolError
+from skytether.shared.wire.protocol import ProtocolError
 
 LONG = os.environ.get("SKYTETHER_LONG") == "1"
 STEPS = 10**7 if LONG else 10**5
@@ -78,7 +78,7 @@ class Oracle:
 
 def agree(counters: Iterator[int] | list[int]) -> int:
     """Number of counters taken; window and oracle must say the same of each."""
-    window, oracle, taken = Window(), Oracle(), 0
+    window, oracle, taken = ReplayWindow(), Oracle(), 0
     for counter in counters:
         new = window.is_new(counter)
         assert new == oracle.is_new(counter), counter
@@ -126,7 +126,8 @@ def test_the_window_is_a_set_over_a_long_run() -> None:
 
 def test_a_window_lets_the_oldest_in_and_nothing_older() -> None:
     """2048 counters, to the last."""
-    window = Window()
+    assert WINDOW == 2048
+    window = ReplayWindow()
     window.add(WINDOW)
     assert [counter for counter in range(WINDOW + 2) if not window.is_new(counter)] == [0, WINDOW]
 
@@ -169,7 +170,7 @@ def test_without_the_window_a_packet_is_opened_twice(monkeypatch: pytest.MonkeyP
     vehicle, server = ends()
     packet = vehicle.seal(b"message")
     server.open(packet, now_ns=0)
-    monkeypatch.setattr(Window, "is_new", lambda *_: True)
+    monkeypatch.setattr(ReplayWindow, "is_new", lambda *_: True)
     assert server.open(packet, now_ns=0).payload == b"message"
 
 

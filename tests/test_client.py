@@ -6,15 +6,12 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from client.link import HELLO_NS
-from client.plant import FirstOrderPlant
-from client.vehicle import Client
-from shared import config
-from shared.chance import stream
-from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Address, Datagram
-from shared.events import (
-    Difference,
+from skytether.client.endpoint import Client
+from skytether.client.link import HELLO_NS
+from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.events import (
     Finished,
     Flying,
     ModeChanged,
@@ -22,22 +19,25 @@ from shared.events import (
     NoSession,
     SessionRefused,
 )
-from shared.protocol import (
-    ACCEPTED,
-    FULL,
+from skytether.shared.law.terms import Difference
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.wire.protocol import (
     NO_HORIZON,
-    TAKEN,
+    Drop,
     Heartbeat,
     Hello,
     Horizon,
+    Idle,
     Message,
     Observation,
+    Refusal,
     Terms,
     Welcome,
     decode,
     encode,
 )
-from shared.record import Recorder, Rows, client_columns, parse
 
 SERVER: Address = ("server", 0)
 OPENED = ModeChanged(vehicle=4, before="init", after="ready", reason="its session is open")
@@ -46,10 +46,10 @@ OPENED = ModeChanged(vehicle=4, before="init", after="ready", reason="its sessio
 
 def scenario(**changes: Any) -> Scenario:
     """A short flight of the paper's, with some keys changed."""
-    table = config.to_table(config.load("paper-every-step")) | {"duration": 10.0}
+    table = reading.to_table(reading.load("paper-every-step")) | {"duration": 10.0}
     for section, values in changes.items():
         table[section] |= values
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
 class Server:
@@ -61,7 +61,7 @@ class Server:
         self.sink = io.BytesIO()
         self.client = Client(
             flown,
-            FirstOrderPlant(flown, stream(1, "wind")),
+            simulated(flown, 1),
             server=SERVER,
             vehicle=4,
             boot_id=99,
@@ -90,12 +90,12 @@ class Server:
         *,
         boot_id: int = 99,
         server_boot_id: int = 1,
-        refusal: int = ACCEPTED,
+        refusal: int = Refusal.ACCEPTED,
         terms: Terms | None = None,
     ) -> None:
         """Open a session, or refuse it."""
         self.epoch_ns = self.epoch_ns or self.now_ns
-        session, terms = self.session if refusal == ACCEPTED else 0, terms or self.terms
+        session, terms = self.session if refusal == Refusal.ACCEPTED else 0, terms or self.terms
         self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
 
     def horizon(self, step: int, value: float, *, observed: int | None = None) -> None:
@@ -158,8 +158,8 @@ def test_another_scenario_at_the_server_ends_the_client_with_the_difference() ->
 @pytest.mark.parametrize(
     ("refusal", "reason", "said"),
     [
-        (FULL, "full", "the server is full; see its --vehicles"),
-        (TAKEN, "taken", "another client flies under this number; see --id"),
+        (Refusal.FULL, "full", "the server is full; see its --vehicles"),
+        (Refusal.TAKEN, "taken", "another client flies under this number; see --id"),
     ],
 )
 def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason(
@@ -176,13 +176,23 @@ def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason
     assert server.client.events() == (failure,)
     assert str(failure) == f"vehicle 4 is refused by server:0: {said}"
     assert server.client.next_wake_ns() is None
-    assert server.client.counts == {f"dropped: {reason}": 38}
+    assert server.client.dropped == {reason: 38}
+
+
+def test_a_vehicle_that_hears_its_server_says_no_hello_again() -> None:
+    """Without keys there are none to be exchanged: it tells its state alone."""
+    server = flying(link={"heartbeat_s": 0.1, "timeout_s": 1.0})
+    said: list[Message] = []
+    for step in range(100):
+        said += server.wake()
+        server.say(Heartbeat(4, server.session, 1234 + step, Idle.PLANS, 0))
+    assert [type(message) for message in said] == [Observation] * 100
 
 
 def test_a_vehicle_that_was_refused_flies_once_there_is_room() -> None:
     """The refusals before leave nothing behind."""
     server = Server(scenario())
-    for refusal in (FULL, TAKEN, ACCEPTED):
+    for refusal in (Refusal.FULL, Refusal.TAKEN, Refusal.ACCEPTED):
         server.wake()
         server.welcome(refusal=refusal)
     (said,) = server.wake()
@@ -194,11 +204,11 @@ def test_a_vehicle_that_was_refused_flies_once_there_is_room() -> None:
 def test_a_refusal_in_flight_is_told_and_flown_through() -> None:
     """After its first session a vehicle never gives up; a refusal that comes late is no news."""
     server = flying(link={"heartbeat_s": 0.1, "timeout_s": 1.0, "connect_s": 2.0})
-    server.welcome(refusal=TAKEN)
+    server.welcome(refusal=Refusal.TAKEN)
     assert server.client.events() == (Flying(vehicle=4), OPENED)
     for _ in range(100):
         server.wake()
-        server.welcome(refusal=TAKEN)
+        server.welcome(refusal=Refusal.TAKEN)
     taken = NoSession(vehicle=4, host="server", port=0, reason="taken")
     assert server.client.events() == (taken,)
     server.welcome()
@@ -263,6 +273,35 @@ def test_an_input_is_flown_from_the_step_after_it_came() -> None:
     assert rows["age_ns"].tolist() == [-1, *(n * server.dt_ns for n in (1, 2, 3))]
 
 
+def test_ages_are_counted_from_a_clock_that_begins_with_the_flight_as_well() -> None:
+    """The observation of step 0 is stamped 0 then; without a horizon the age is -1."""
+    server = Server(scenario())
+    server.now_ns = 0
+    server.wake()
+    server.welcome()
+    server.wake()
+    server.horizon(0, 1.0)
+    for _ in range(3):
+        server.wake()
+    assert server.rows()["age_ns"].tolist() == [-1, *(n * server.dt_ns for n in (1, 2, 3))]
+    assert server.client.told()["age_ms"] == 150.0
+
+
+def test_a_vehicle_that_does_not_know_its_true_state_records_its_estimate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As a real one does; all else is as ever."""
+    monkeypatch.setattr(SimulatedVehicle, "truth", lambda _: None)
+    server = flying()
+    said = [message for _ in range(3) for message in server.wake()]
+    rows = server.rows()
+    np.testing.assert_array_equal(rows["state"], rows["estimate"])
+    assert rows["step"].tolist() == [0, 1, 2]
+    for row, message in zip(rows, said, strict=True):
+        assert isinstance(message, Observation)
+        np.testing.assert_array_equal(row["estimate"], message.state)
+
+
 def test_steps_slept_through_are_flown_with_the_old_input_and_counted() -> None:
     """The actuator holds what it was told last; only the present step is observed."""
     server = flying()
@@ -303,7 +342,7 @@ def test_a_restarted_server_is_flown_with_in_its_new_session() -> None:
     assert (said.session, said.step) == (8, 1)
     server.session = 7
     server.horizon(1, 1.0)
-    assert server.client.counts == {"dropped: unknown session": 1}
+    assert server.client.dropped == {Drop.UNKNOWN_SESSION: 1}
 
 
 def test_an_answer_to_another_life_is_dropped() -> None:
@@ -311,7 +350,7 @@ def test_an_answer_to_another_life_is_dropped() -> None:
     server = Server(scenario())
     server.wake()
     server.welcome(boot_id=98)
-    assert server.client.counts == {"dropped: for another life": 1}
+    assert server.client.dropped == {Drop.FOR_ANOTHER_LIFE: 1}
     assert [type(message) for message in server.wake()] == [Hello]
 
 
@@ -344,3 +383,13 @@ def test_an_exhausted_horizon_brakes_or_holds() -> None:
     expected = np.maximum(0.0, 1.0 - np.arange(1, 62) * 2.0 * 0.05 / np.sqrt(2.0))
     np.testing.assert_allclose(speeds["brake"][39:], expected, atol=1e-9)
     assert speeds["brake"][-1] == 0.0
+
+
+def test_only_the_servers_address_is_heard() -> None:
+    """Not even what the server has said, from anywhere else: it opens no session."""
+    server = Server(scenario())
+    server.wake()
+    welcome = Welcome(4, 7, 99, 1, 1234, Refusal.ACCEPTED, server.terms)
+    server.client.receive(Datagram(encode(welcome), ("elsewhere", 1)), now_ns=0)
+    assert server.client.dropped == {"not from the server's address": 1}
+    assert not any(isinstance(event, Flying) for event in server.client.events())

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server import clock as clocks
-from server.clock import ECHOES, ClockMap, shortest_ns
-from shared.endpoint import MILLISECOND_NS as MS
-from shared.endpoint import SECOND_NS as S
+from skytether.server.control import clock as clocks
+from skytether.server.control.clock import ECHOES, ClockMap, shortest_ns
+from skytether.shared.base.units import MILLISECOND_NS as MS
+from skytether.shared.base.units import SECOND_NS as S
 
 quick = settings(max_examples=60, deadline=None)
 

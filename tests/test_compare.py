@@ -9,11 +9,8 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future
-from contextlib import nullcontext
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,32 +18,45 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from lab import contenders
-from lab.calibration import Limits, Rmse
-from lab.comparison import (
+from skytether.__main__ import main
+from skytether.lab import contenders
+from skytether.lab.calibration import Limits, Rmse
+from skytether.lab.commands import pool
+from skytether.lab.comparison import (
     BYTES_UP,
     CLAIMS,
     SHARE,
     Claim,
-    Compared,
-    Flown,
+    ComparedCase,
+    ContenderRuns,
     judge,
     measure,
     ranks_table,
     ratio,
 )
-from lab.contenders import ABOARD, BESIDE, CASES, CONTENDERS, LOOKED_AT, Contender, Flying, Found
-from shared import config
-from shared.config import COMPARED, ConfigError, Scenario
-from shared.summary import summarise
-from sim import flight
-from skytether import pool
-from skytether.__main__ import main
+from skytether.lab.contenders import (
+    ABOARD,
+    BESIDE,
+    CASES,
+    CONTENDERS,
+    LOOKED_AT,
+    Contender,
+    FlownContender,
+    Found,
+)
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.reading import COMPARED
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.summary import summarise
+from skytether.sim import flight
 
-PAPER = config.load("paper")
+pytestmark = pytest.mark.usefixtures("here")
+
+PAPER = reading.load("paper")
 BY_NAME = {contender.name: contender for contender in CONTENDERS}
 BY_CASE = {case.name: case for case in CASES}
-SCALE = contenders.Scale(100, 20)
+SCALE = contenders.ComparisonSize(100, 20)
 TARGET = CASES[0]
 
 
@@ -93,17 +103,17 @@ def test_a_case_may_be_named() -> None:
 def test_every_contender_in_every_case_comes_along() -> None:
     """Under its name, in one file; with weights that were free, and nothing else changed."""
     pairs = {contenders.entry(*pair): pair for pair in SCALE.searched}
-    assert {name.removeprefix("compare/") for name in config.names(COMPARED)} == set(pairs)
+    assert {name.removeprefix("compare/") for name in reading.names(COMPARED)} == set(pairs)
     for name, (contender, case) in pairs.items():
         start = contenders.search_start(contender, case, SCALE)
-        scenario, free = config.load(f"{COMPARED}/{name}"), Rmse(start, Limits()).free()
+        scenario, free = reading.load(f"{COMPARED}/{name}"), Rmse(start, Limits()).free()
         there = contenders.differences(start, case.plant)
         here = contenders.differences(scenario, case.plant)
         changed = {key for key, value in here.items() if value != there.get(key)}
         assert changed <= {key.key.removesuffix(".0").removesuffix(".1") for key in free}, name
         assert scenario.control.state_weight[0] == PAPER.control.state_weight[0]
         assert scenario.title == f"{contender.title}, at its best: {case.title}"
-    assert "compare" not in " ".join(config.names())
+    assert "compare" not in " ".join(reading.names())
 
 
 def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
@@ -114,7 +124,7 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
     found = replace(start, control=control)
     file = tmp_path / "mine.toml"
     file.write_text(contenders.to_file([Found(contender, case, found, "A line.")], SCALE))
-    read = config.load(f"{file}/committed-gap-gusts")
+    read = reading.load(f"{file}/committed-gap-gusts")
     assert replace(read, title="") == replace(
         found, title="", duration=PAPER.duration, seed=PAPER.seed
     )
@@ -123,7 +133,7 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
     assert f"- {case.effort_mps:g} m/s in the case gusts" in said
     assert '# A line.\n["committed-gap-gusts"]\n' in file.read_text()
     assert "radius" not in file.read_text()
-    assert config.names(str(file)) == [f"{file}/committed-gap-gusts"]
+    assert reading.names(str(file)) == [f"{file}/committed-gap-gusts"]
 
 
 def thresholds(
@@ -169,7 +179,7 @@ def flew(
     share: float = 0.1,
     threshold: float | None = None,
     tuned: bool = True,
-) -> Flown:
+) -> ContenderRuns:
     """A contender with these errors, that sent a share of its 20 packets/s."""
     counts = {"uplink_packets": round(1200 * share), "uplink_bytes": 60_000}
     counts |= {"downlink_packets": 1200, "downlink_bytes": 120_000}
@@ -177,7 +187,7 @@ def flew(
         replace(SUMMARY, rmse_xy=error, event_ratio=share, duration_s=60.0, **counts)
         for error in errors
     ]
-    return Flown(Flying(BY_NAME[name], threshold, tuned, {}), runs)
+    return ContenderRuns(FlownContender(BY_NAME[name], threshold, tuned, {}), runs)
 
 
 def test_packets_and_bytes_are_of_a_second_of_flight() -> None:
@@ -248,7 +258,7 @@ CLAIM = Claim("committed-gap", "committed-periodic", at_most={"target": 0.9})
 PERIODIC = flew("committed-periodic", [1.0, 1.1, 1.2])
 
 
-def curve(*points: tuple[float, float, float]) -> list[Flown]:
+def curve(*points: tuple[float, float, float]) -> list[ContenderRuns]:
     """Curve of the cost gap: threshold, share of packets, error; the first of them is tuned."""
     return [
         flew(
@@ -301,7 +311,9 @@ def test_what_is_equal_may_be_bytes() -> None:
     claim = Claim("committed-gap", "committed-periodic", BYTES_UP, {"target": 0.9})
     few = [replace(run, uplink_bytes=50_000) for run in PERIODIC.runs]
     assert judge(claim, TARGET, [*curve((1, 0.1, 0.5)), PERIODIC]).holds
-    assert not judge(claim, TARGET, [*curve((1, 0.1, 0.5)), Flown(PERIODIC.what, few)]).holds
+    assert not judge(
+        claim, TARGET, [*curve((1, 0.1, 0.5)), ContenderRuns(PERIODIC.what, few)]
+    ).holds
 
 
 def test_a_run_that_went_astray_moves_the_mean_and_not_the_median() -> None:
@@ -320,7 +332,7 @@ def test_nobodys_rank_is_hidden() -> None:
     """By mean error in each case; who has not flown comes last."""
     here = [flew("paper-event", [0.3]), flew("committed-gap", [0.2]), flew("feedback-gap", [None])]
     there = [flew("paper-event", [0.3]), flew("committed-gap", [0.4]), flew("feedback-gap", [0.1])]
-    table = ranks_table([Compared(TARGET, here), Compared(BY_CASE["loss-0.5"], there)])
+    table = ranks_table([ComparedCase(TARGET, here), ComparedCase(BY_CASE["loss-0.5"], there)])
     assert [row[1:] for row in table.rows] == [
         ("2: 0.300 @ 10%", "2: 0.300 @ 10%"),
         ("1: 0.200 @ 10%", "3: 0.400 @ 10%"),
@@ -344,24 +356,6 @@ FLOWN = 38
 a case that nobody has searched all at one, twice."""
 
 
-class Here(Executor):
-    """Does everything in this process, which takes no time to begin."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Do it at once."""
-        future: Future[Any] = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
-
-
-@pytest.fixture(scope="module", autouse=True)
-def here() -> Iterator[None]:
-    """Nothing but Ctrl-C needs processes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pool, "_executor", lambda _: nullcontext(Here()))
-        yield
-
-
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of quick searches, with the file of the weights that they have found."""
@@ -382,7 +376,7 @@ def out(tuned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_contender_gets_the_same_search(tuned: Path) -> None:
     """Seeds, points, flights and limits; what it found is its scenario."""
     weights, searches = tuned / "weights.toml", list((tuned / "searches").iterdir())
-    assert len(searches) == len(config.names(str(weights))) == len(LOOKED_AT)
+    assert len(searches) == len(reading.names(str(weights))) == len(LOOKED_AT)
     for folder in searches:
         head = tomllib.loads((folder / "settings.toml").read_text())
         (line,) = (folder / "journal.jsonl").read_text().splitlines()
@@ -392,7 +386,7 @@ def test_every_contender_gets_the_same_search(tuned: Path) -> None:
         limits = (head["packets"], head["effort_mps"], head["saturated"])
         assert limits == (0.1, TARGET.effort_mps, contenders.SATURATED)
         best = min(generation, key=lambda point: point["score"])
-        found = config.load(f"{weights}/{folder.name}")
+        found = reading.load(f"{weights}/{folder.name}")
         assert found.control.input_weight == best["keys"]["control.input_weight"]
         assert found.duration == PAPER.duration
 
@@ -417,7 +411,7 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
     table = rows(out / "contenders.csv")
     assert [row["contender"] for row in table] == [*LOOKED_AT] * 2
     (row,) = [row for row in table if (row["case"], row["contender"]) == ("target", "feedback-gap")]
-    found = config.load(f"{tuned / 'weights.toml'}/feedback-gap-target")
+    found = reading.load(f"{tuned / 'weights.toml'}/feedback-gap-target")
     scenario = replace(found, duration=12.0)
     runs = [
         summarise(replace(scenario, seed=seed), "", each.client, each.server, each.netem)
@@ -543,7 +537,7 @@ def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
         )
     assert main([*TUNE, "--out", str(tmp_path)]) == 0
     assert journal.read_text().startswith(flown)
-    assert len(config.names(str(tmp_path / "weights.toml"))) == len(LOOKED_AT)
+    assert len(reading.names(str(tmp_path / "weights.toml"))) == len(LOOKED_AT)
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from client.compensator import Compensator
-from shared.config import check
-from shared.model import Array
-from shared.protocol import FEEDBACK, NO_HORIZON, Horizon, ProtocolError
-from shared.terms import Terms
+from skytether.client.compensator import Compensator
+from skytether.shared.law import rule
+from skytether.shared.law.model import Array
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.reading import check
+from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon, ProtocolError
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -52,24 +53,29 @@ def holding(step: int, inputs: Array = INPUTS, **keys: str) -> Compensator:
     return compensator
 
 
+def chosen(compensator: Compensator, step: int, state: Array) -> Array:
+    """Input that is chosen for a step, as an array."""
+    return np.array(compensator.choose(step, state.tolist()))
+
+
 def test_vehicle_hovers_before_its_first_horizon() -> None:
     """There is nothing to fly yet."""
     compensator = Compensator(terms())
     assert compensator.in_force == NO_HORIZON
-    assert compensator.choose(0, HERE).tolist() == [0.0, 0.0]
-    assert compensator.choose(1000, HERE).tolist() == [0.0, 0.0]
+    assert chosen(compensator, 0, HERE).tolist() == [0.0, 0.0]
+    assert chosen(compensator, 1000, HERE).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("step", range(100, 100 + H))
 def test_stage_is_the_step_since_the_horizon_was_made(step: int) -> None:
     """Input u(k|k_h): a packet under way for five steps is entered at its fifth stage."""
-    np.testing.assert_allclose(holding(100).choose(step, HERE), INPUTS[:, step - 100], rtol=1e-7)
+    np.testing.assert_allclose(chosen(holding(100), step, HERE), INPUTS[:, step - 100], rtol=1e-7)
 
 
 @pytest.mark.parametrize("step", [100 + H, 101 + H, 100_000])
 def test_held_horizon_flies_its_last_input_for_ever(step: int) -> None:
     """E10: the paper's min(k, k_h + H - 1)."""
-    np.testing.assert_allclose(holding(100).choose(step, HERE), INPUTS[:, -1], rtol=1e-7)
+    np.testing.assert_allclose(chosen(holding(100), step, HERE), INPUTS[:, -1], rtol=1e-7)
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
@@ -77,20 +83,20 @@ def test_horizon_for_a_later_step_begins_at_once(exhausted: str) -> None:
     """The server's idea of the step may be ahead: its first input is the nearest there is."""
     compensator = Compensator(terms(exhausted=exhausted))
     compensator.offer(horizon(105), 100, 99)
-    np.testing.assert_allclose(compensator.choose(101, HERE), INPUTS[:, 0], rtol=1e-7)
+    np.testing.assert_allclose(chosen(compensator, 101, HERE), INPUTS[:, 0], rtol=1e-7)
 
 
 def test_braking_begins_only_after_the_last_stage() -> None:
     """The last input is flown for its own step in full."""
     np.testing.assert_allclose(
-        holding(100, exhausted="brake").choose(99 + H, HERE), INPUTS[:, -1], rtol=1e-7
+        chosen(holding(100, exhausted="brake"), 99 + H, HERE), INPUTS[:, -1], rtol=1e-7
     )
 
 
 def test_brake_takes_the_speed_away_at_its_rate() -> None:
     """1.0 m/s at 2 m/s² in steps of 0.1 s: 0.8, 0.6 … 0, then hovering."""
     compensator = holding(0, np.tile([[0.6], [0.8]], H), exhausted="brake")
-    speeds = [float(np.linalg.norm(compensator.choose(H + i, HERE))) for i in range(8)]
+    speeds = [float(np.linalg.norm(chosen(compensator, H + i, HERE))) for i in range(8)]
     assert speeds == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0, 0.0, 0.0, 0.0], abs=1e-7)
 
 
@@ -99,18 +105,18 @@ def test_brake_takes_the_speed_away_at_its_rate() -> None:
 def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> None:
     """Whatever was flown last, its direction stays and its speed only falls."""
     compensator = holding(0, np.tile([[x], [y]], H), exhausted="brake")
-    last, now, then = (compensator.choose(H - 1 + i, HERE) for i in (0, later, later + 1))
+    last, now, then = (chosen(compensator, H - 1 + i, HERE) for i in (0, later, later + 1))
     assert last[0] * now[1] == pytest.approx(last[1] * now[0], abs=1e-12)
     assert float(last @ now) >= 0.0
     lost = np.linalg.norm(now) - np.linalg.norm(then)
     assert -1e-12 <= lost <= 0.2 + 1e-12
-    assert compensator.choose(H + 10, HERE).tolist() == [0.0, 0.0]
+    assert chosen(compensator, H + 10, HERE).tolist() == [0.0, 0.0]
 
 
 def test_brake_from_a_standstill_stays() -> None:
     """There is no direction to brake in."""
     compensator = holding(0, np.zeros((2, H)), exhausted="brake")
-    assert compensator.choose(H + 3, HERE).tolist() == [0.0, 0.0]
+    assert chosen(compensator, H + 3, HERE).tolist() == [0.0, 0.0]
 
 
 def test_stale_horizon_is_ignored_after_reordering() -> None:
@@ -120,7 +126,7 @@ def test_stale_horizon_is_ignored_after_reordering() -> None:
         new = horizon(made, INPUTS + 0.01 * (made - 10), observed_ns=made)
         compensator.offer(new, 14, 9)
     assert (compensator.in_force, compensator.observed_ns, compensator.stale) == (12, 12, 3)
-    np.testing.assert_allclose(compensator.choose(14, HERE), INPUTS[:, 2] + 0.02, rtol=1e-6)
+    np.testing.assert_allclose(chosen(compensator, 14, HERE), INPUTS[:, 2] + 0.02, rtol=1e-6)
 
 
 @quick
@@ -131,7 +137,7 @@ def test_order_of_arrival_does_not_matter(order: list[int], step: int) -> None:
     for made in order:
         compensator.offer(horizon(made, INPUTS * 0.1 * (made + 1)), 4, 0)
     expected = INPUTS[:, min(step - 4, H - 1)] * 0.5
-    np.testing.assert_allclose(compensator.choose(step, HERE), expected, rtol=1e-6)
+    np.testing.assert_allclose(chosen(compensator, step, HERE), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
@@ -141,7 +147,7 @@ def test_without_compensation_the_newest_first_input_is_flown(step: int, exhaust
     compensator = holding(5, scheme="none", exhausted=exhausted)
     compensator.offer(horizon(7, INPUTS + 0.2), 9, 8)
     compensator.offer(horizon(6, INPUTS + 0.3), 9, 8)
-    np.testing.assert_allclose(compensator.choose(step, HERE), INPUTS[:, 0] + 0.2, rtol=1e-6)
+    np.testing.assert_allclose(chosen(compensator, step, HERE), INPUTS[:, 0] + 0.2, rtol=1e-6)
 
 
 def test_horizon_from_the_future_is_refused() -> None:
@@ -150,7 +156,7 @@ def test_horizon_from_the_future_is_refused() -> None:
     with pytest.raises(ProtocolError, match=r"^from the future$"):
         compensator.offer(horizon(111 + H, INPUTS + 0.2), 110, 109)
     assert (compensator.in_force, compensator.stale) == (100, 0)
-    np.testing.assert_allclose(compensator.choose(103, HERE), INPUTS[:, 3], rtol=1e-7)
+    np.testing.assert_allclose(chosen(compensator, 103, HERE), INPUTS[:, 3], rtol=1e-7)
 
 
 def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
@@ -163,15 +169,15 @@ def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
 def test_inputs_are_held_within_the_bounds() -> None:
     """The last clamp, apart from the parser's: each axis its own, on both sides."""
     compensator = holding(0, np.tile([[1.8015, -5.0], [-0.9005, 3.0]], H // 2))
-    assert compensator.choose(0, HERE).tolist() == [1.8, -0.9]
-    assert compensator.choose(1, HERE).tolist() == [-1.8, 0.9]
+    assert chosen(compensator, 0, HERE).tolist() == [1.8, -0.9]
+    assert chosen(compensator, 1, HERE).tolist() == [-1.8, 0.9]
 
 
 def test_chosen_input_is_the_caller_s_own() -> None:
     """Writing to it does not write to the horizon."""
     for compensator in (holding(0), holding(0, scheme="none"), holding(0, exhausted="brake")):
-        compensator.choose(0, HERE)[:] = 9.0
-        np.testing.assert_allclose(compensator.choose(0, HERE), INPUTS[:, 0], rtol=1e-7)
+        compensator.choose(0, HERE.tolist())[:] = [9.0, 9.0]
+        np.testing.assert_allclose(chosen(compensator, 0, HERE), INPUTS[:, 0], rtol=1e-7)
 
 
 # -- too old, too late ---------------------------------------------------------------------------
@@ -204,7 +210,7 @@ def test_a_horizon_from_an_old_or_impossible_observation_is_refused(
         compensator.offer(horizon(step), 101, observed)
     assert (compensator.in_force, compensator.stale) == (95, 0)
     np.testing.assert_allclose(
-        compensator.choose(96, HERE), INPUTS[:, int(scheme != "none")], rtol=1e-6
+        chosen(compensator, 96, HERE), INPUTS[:, int(scheme != "none")], rtol=1e-6
     )
 
 
@@ -215,7 +221,7 @@ def test_a_horizon_is_flown_no_longer_than_the_age_bound(exhausted: str, after: 
     compensator.offer(horizon(100, np.tile([[0.6], [0.8]], H)), 101, 54)
     flown = []
     for step in (103, 104, 105):
-        flown.append(float(np.linalg.norm(compensator.choose(step, HERE))))
+        flown.append(float(np.linalg.norm(chosen(compensator, step, HERE))))
         assert compensator.covered == (step <= 104)
     assert flown == pytest.approx([1.0, 1.0, after], abs=1e-6)
 
@@ -224,8 +230,16 @@ def test_a_horizon_is_flown_no_longer_than_the_age_bound(exhausted: str, after: 
 def test_without_compensation_the_age_bound_ends_the_input(exhausted: str) -> None:
     """The paper's scheme of no compensation, too, brakes once what it flies is too old."""
     compensator = holding(5, np.tile([[0.6], [0.8]], H), scheme="none", exhausted=exhausted)
-    speeds = [float(np.linalg.norm(compensator.choose(step, HERE))) for step in (55, 56, 57)]
+    speeds = [float(np.linalg.norm(chosen(compensator, step, HERE))) for step in (55, 56, 57)]
     assert speeds == pytest.approx([1.0, 0.8, 0.6] if exhausted == "brake" else [1.0] * 3, abs=1e-6)
+
+
+def test_without_compensation_the_first_input_is_braked_along_whatever_follows_it() -> None:
+    """At 2 m/s² from 1 m/s; the inputs after it, of 0.5 m/s, are never flown."""
+    inputs = np.concatenate([[[0.6], [0.8]], np.tile([[0.3], [0.4]], H - 1)], axis=1)
+    compensator = holding(5, inputs, scheme="none", exhausted="brake")
+    speeds = [float(np.linalg.norm(chosen(compensator, step, HERE))) for step in (55, 56, 57)]
+    assert speeds == pytest.approx([1.0, 0.8, 0.6], abs=1e-6)
 
 
 @pytest.mark.parametrize("scheme", ["predictive", "committed"])
@@ -268,10 +282,10 @@ def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
     compensator.offer(with_feedback(x, disturbance), 100, 99)
     for u in INPUTS[:, :stage].T:
         x = flown.model.step(x, u + disturbance)
-    on_course = compensator.choose(100 + stage, x)
+    on_course = chosen(compensator, 100 + stage, x)
     np.testing.assert_allclose(on_course, INPUTS[:, stage], atol=1e-6)
     away = np.array([[0.02, -0.01], [0.03, 0.04]])
-    back = compensator.choose(100 + stage, x + away) - on_course
+    back = chosen(compensator, 100 + stage, x + away) - on_course
     np.testing.assert_allclose(back, [-0.045, -0.08], atol=1e-6)
 
 
@@ -280,16 +294,16 @@ def test_feedback_stays_within_the_bounds() -> None:
     compensator = Compensator(terms(scheme="committed", feedback=True))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     far = np.array([[1e6, 0.0], [-1e6, 0.0]])
-    assert compensator.choose(105, far).tolist() == [-1.8, 0.9]
+    assert chosen(compensator, 105, far).tolist() == [-1.8, 0.9]
 
 
 def test_there_is_no_feedback_before_the_first_stage() -> None:
     """Nothing says where the vehicle should be."""
     compensator, plain = Compensator(terms(exhausted="brake")), holding(100, exhausted="brake")
     compensator.offer(with_feedback(HERE, np.zeros(2)), 99, 98)
-    near, far = (compensator.choose(99, HERE + away) for away in (0.0, 3.0))
+    near, far = (chosen(compensator, 99, HERE + away) for away in (0.0, 3.0))
     np.testing.assert_array_equal(near, far)
-    np.testing.assert_array_equal(near, plain.choose(99, HERE))
+    np.testing.assert_array_equal(near, chosen(plain, 99, HERE))
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
@@ -300,13 +314,13 @@ def test_feedback_goes_on_after_the_last_stage(step: int, exhausted: str) -> Non
     compensator, plain = Compensator(flown), holding(100, exhausted=exhausted)
     disturbance, x = np.array([0.25, -0.5]), HERE
     compensator.offer(with_feedback(HERE, disturbance), 100, 99)
-    for told in (plain.choose(k, HERE) for k in range(100, step)):
+    for told in (chosen(plain, k, HERE) for k in range(100, step)):
         x = flown.model.step(x, told + disturbance if told.any() else told)
-    on_course = compensator.choose(step, x)
-    np.testing.assert_allclose(on_course, plain.choose(step, HERE), atol=1e-6)
-    np.testing.assert_array_equal(compensator.told, plain.choose(step, HERE))
+    on_course = chosen(compensator, step, x)
+    np.testing.assert_allclose(on_course, chosen(plain, step, HERE), atol=1e-6)
+    np.testing.assert_array_equal(compensator.told, chosen(plain, step, HERE))
     away = np.array([[0.02, -0.01], [0.03, 0.04]])
-    back = compensator.choose(step, x + away) - on_course
+    back = chosen(compensator, step, x + away) - on_course
     np.testing.assert_allclose(back, [-0.045, -0.08], atol=1e-6)
 
 
@@ -319,22 +333,22 @@ def test_with_feedback_it_brakes_and_stays_where_it_is_in_wind(
     compensator, x, places = Compensator(flown), HERE, []
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     if not goes_on:
-        led_back = Compensator._led_back
+        whole = rule.flown
 
-        def end(self: Compensator, stage: int, state: Array) -> list[float]:
+        def end(stage: int, told: float, back: float, bound: float) -> float:
             """Feedback up to the last input, as it once was."""
-            return led_back(self, stage, state) if stage < H else [0.0, 0.0]
+            return whole(stage, told, back if stage < H else 0.0, bound)
 
-        monkeypatch.setattr(Compensator, "_led_back", end)
+        monkeypatch.setattr(rule, "flown", end)
     for step in range(100, 400 + H):
-        x = flown.model.step(x, compensator.choose(step, x) + wind)
+        x = flown.model.step(x, chosen(compensator, step, x) + wind)
         places.append(x[:, 0])
     drift = np.abs(places[-1] - places[-100])
     assert not any(compensator.told)
     if goes_on:
         assert drift.max() < 1e-6
         assert np.abs(x[:, 1]).max() < 1e-6
-        np.testing.assert_allclose(compensator.choose(400 + H, x), -wind, atol=1e-6)
+        np.testing.assert_allclose(chosen(compensator, 400 + H, x), -wind, atol=1e-6)
     else:
         np.testing.assert_allclose(drift, [2.97, 1.98], atol=0.01)
 
@@ -345,10 +359,21 @@ def test_a_horizon_that_is_dropped_leaves_no_feedback() -> None:
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     compensator.drop(104, np.array([0.6, 0.8]))
     for away in (0.0, 3.0):
-        flown = compensator.choose(105, HERE + away)
+        flown = chosen(compensator, 105, HERE + away)
         np.testing.assert_allclose(flown, [0.48, 0.64])
         np.testing.assert_array_equal(compensator.told, flown)
     assert not compensator.feeds_back
+
+
+def test_a_horizon_that_is_dropped_covers_nothing_from_then_on() -> None:
+    """Also before the next input is chosen, and it does not count as one that is chosen anew."""
+    compensator = holding(100, exhausted="brake")
+    chosen(compensator, 101, HERE)
+    assert (compensator.covered, compensator.since) == (True, 101)
+    compensator.drop(101, np.array([0.6, 0.8]))
+    assert (compensator.covered, compensator.in_force) == (False, NO_HORIZON)
+    chosen(compensator, 102, HERE)
+    assert (compensator.covered, compensator.since) == (False, 101)
 
 
 def test_feedback_ends_with_its_horizon() -> None:
@@ -356,5 +381,5 @@ def test_feedback_ends_with_its_horizon() -> None:
     compensator = Compensator(terms(scheme="committed", feedback=True))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     compensator.offer(horizon(101), 101, 100)
-    near, far = (compensator.choose(103, HERE + away) for away in (0.0, 3.0))
+    near, far = (chosen(compensator, 103, HERE + away) for away in (0.0, 3.0))
     np.testing.assert_array_equal(near, far)

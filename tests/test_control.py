@@ -4,6 +4,7 @@ import os
 import random
 import socket
 import stat
+import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import closing, suppress
@@ -12,18 +13,18 @@ from typing import Any
 
 import pytest
 
-import shell.control
-from netem.proxy import Proxy
-from shared import config
-from shared.change import Running
-from shared.events import Changed, ChangeRefused, Event
-from shell import command
-from shell.control import REST_S, RESTS, Caller, Control, controlled
-from shell.driver import Shell, run
-from shell.local import LocalError
-from skytether.set import set_keys, value
+import skytether.shell.control
+from skytether.cli.set import set_keys, value
+from skytether.netem.proxy import Proxy
+from skytether.shared.core.change import Running
+from skytether.shared.core.events import Changed, ChangeRefused, Event
+from skytether.shared.scenario import reading, schema
+from skytether.shell import command
+from skytether.shell.control import REST_S, RESTS, Caller, Control, ControlError, controlled
+from skytether.shell.driver import Shell, run
+from skytether.shell.local import LocalError
 
-DEMO = config.load("demo")
+DEMO = reading.load("demo")
 
 
 class Closing(Proxy):
@@ -31,7 +32,7 @@ class Closing(Proxy):
 
     finished = False
 
-    def change(self, scenario: config.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+    def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """Change, and perhaps end."""
         super().change(scenario, keys, now_ns=now_ns)
         self.finished = scenario.network.uplink.loss == 1.0
@@ -132,7 +133,7 @@ def test_a_request_that_takes_long_is_followed_by_a_rest_that_is_longer(
     seconds = iter((10.0, 10.5))
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, _ = heeding(control)
-        monkeypatch.setattr(shell.control.time, "monotonic", lambda: next(seconds))
+        monkeypatch.setattr(skytether.shell.control.time, "monotonic", lambda: next(seconds))
         loop.turn()
     assert [rest_s for rest_s, _ in loop.rests] == [0.5 * RESTS]
 
@@ -179,6 +180,18 @@ def test_what_is_too_long_for_a_datagram_is_refused_whole(tmp_path: Path) -> Non
         loop.turn()
         assert b"expected a shorter request" in caller._socket.recv(9000)
     assert flown.change({"network.uplink.loss": 0.1}, now_ns=0) == ()
+
+
+@pytest.mark.parametrize("said", [b"", b"[]", b"\xff", b'{"values":{"a":' + b"[" * 30_000])
+def test_an_answer_of_something_else_is_a_control_error(said: bytes, tmp_path: Path) -> None:
+    """Whoever listens there need be no process of ours."""
+    path = tmp_path / "netem"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
+        other.bind(str(path))
+        with closing(Caller(path)) as caller:
+            other.sendto(said, caller._socket.getsockname())
+            with pytest.raises(ControlError, match=f"{path}: whoever listens there answers as no"):
+                caller.ask({})
 
 
 # -- its place -------------------------------------------------------------------------------------
@@ -254,7 +267,7 @@ def test_a_socket_that_cannot_be_made_is_said_before_anything_flies(
     name: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With the flag, the path and the reason."""
-    from netem.__main__ import emulate
+    from skytether.netem.__main__ import emulate
 
     path = tmp_path / name
     code = command.main(emulate, ["--bind", "127.0.0.1:0", "--control", str(path)], "netem")
@@ -338,12 +351,23 @@ def test_answers_come_to_beside_the_socket_that_was_asked(
         assert not address.parent.exists()
 
 
+def test_where_no_address_for_answers_can_be_made_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither beside the socket nor in the folder for temporary files; nothing is left open."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    path = tmp_path / "gone" / "netem"
+    assert command.main(set_keys, [str(path)], "set") == 1
+    said = f"set: {path}: no address for answers can be made\n"
+    assert capsys.readouterr().err == said
+
+
 def test_one_that_listens_and_does_not_answer_is_not_waited_for_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A process that is stopped, for instance."""
     path = tmp_path / "netem"
-    monkeypatch.setattr(shell.control, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(skytether.shell.control, "PATIENCE_S", 0.05)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
         deaf.bind(str(path))
         assert command.main(set_keys, [str(path)], "set") == 1

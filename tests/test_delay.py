@@ -7,11 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.fate import Fates
-from server import delay
-from server.delay import DelayBound, acknowledge, at_least, begin, delay_bound, forget
-from shared.config import DirectionConfig
-from shared.endpoint import seconds_to_ns
+from skytether.netem.fate import Fates
+from skytether.server.control import delay
+from skytether.server.control.delay import (
+    DelayBound,
+    acknowledge,
+    at_least,
+    begin,
+    delay_bound,
+    forget,
+)
+from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.scenario.schema import DirectionConfig
 
 quick = settings(max_examples=100, deadline=None)
 

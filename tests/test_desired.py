@@ -8,19 +8,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.controller import BLOCK
-from server.desired import EMPTY, PAGE, PAGES, Desired, _led
-from server.live import MEMORY_S, REST_S, LivePoint
-from shared import reference as shapes
-from shared.chance import stream
-from shared.config import ConfigError, Scenario, check, load, to_table
-from shared.endpoint import SECOND_NS, seconds_to_ns
-from shared.kernel import plain
-from shared.model import Array, Indices
-from shared.reference import Reference
-from shared.summary import desired as desired_positions
-from shared.summary import summarise
-from sim.flight import Flight, fly
+from skytether.server.control.controller import BLOCK
+from skytether.server.control.desired import EMPTY, PAGE, PAGES, Desired, _led
+from skytether.server.control.live import MEMORY_S, REST_S, LivePoint
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.kernel import plain
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.law.model import Array, Indices
+from skytether.shared.scenario import reference as shapes
+from skytether.shared.scenario.reading import check, load, to_table
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import desired as desired_positions
+from skytether.shared.telemetry.summary import summarise
+from skytether.sim.flight import fly
 
 H = 15
 
@@ -66,6 +69,57 @@ def test_the_reference_looked_up_is_the_reference(calls: list[list[int]]) -> Non
     for steps in calls:
         found = window(desired, np.array(steps), np.zeros(len(steps), dtype=np.int64))
         np.testing.assert_array_equal(found, [truth(step) for step in steps])
+
+
+LATE_S = (0.27, 0.1)
+"""Dead times of a model, the first of which is no whole number of steps [s]."""
+
+
+def late(**reference: Any) -> Scenario:
+    """The circle, for a vehicle with a dead time."""
+    table = to_table(scenario(**reference))
+    table["model"]["dead_time_s"] = LATE_S
+    return check(table, "test")
+
+
+def test_a_vehicle_with_dead_time_is_planned_along_the_reference_that_much_later() -> None:
+    """Each axis by its own, from any step; what is desired now stays what it is."""
+    flown, steps, ahead = late(), np.array([3, 900]), np.array([2, 0])
+    desired, sample = make(flown), flown.make_reference()
+    found = window(desired, steps, ahead)
+    times_s = (steps[:, None] + ahead[:, None] + np.arange(H + 1)) * DT_S
+    for axis, late_s in enumerate(LATE_S):
+        np.testing.assert_array_equal(found[:, :, axis], sample(times_s + late_s)[:, :, axis])
+        then = sample(steps * DT_S + late_s)[:, axis]
+        np.testing.assert_array_equal(desired.due(np.arange(2), steps)[:, axis], then)
+    now = desired.now(np.arange(2), steps)
+    np.testing.assert_array_equal(now, sample(steps * DT_S))
+
+
+@pytest.mark.parametrize("preview_s", [0.0, 0.2, 0.5])
+def test_a_dead_time_lets_nobody_see_further_ahead(preview_s: float) -> None:
+    """What lies behind the preview is predicted from there, also within the dead time."""
+    flown = late(preview=preview_s)
+    desired, sample, step = make(flown), flown.make_reference(), 40
+    (found,) = window(desired, np.array([step]), np.array([2]))
+    for axis, late_s in enumerate(LATE_S):
+        seen_s = min(late_s, preview_s)
+        whole = int((preview_s - seen_s) / DT_S + 1e-9)
+        for stage, state in enumerate(found[:, axis]):
+            steps = min(2 + stage, whole)
+            p, v = sample(np.array(step * DT_S + steps * DT_S + seen_s))[axis]
+            after_s = (2 + stage - steps) * DT_S + late_s - seen_s
+            np.testing.assert_allclose(state, [p + after_s * v, v], rtol=0.0, atol=1e-12)
+
+
+def test_a_live_point_is_led_on_over_the_dead_time() -> None:
+    """With the velocity that is told."""
+    live = {"shape": "live", "points_m": [[1.0, 2.0]], "velocity_mps": [0.5, -1.0]}
+    desired = make(late(**live))
+    desired.tick(0)
+    due = desired.due(np.arange(1), np.array([7]))[0]
+    expected = [[1.0 + 0.5 * LATE_S[0], 0.5], [2.0 - LATE_S[1], -1.0]]
+    np.testing.assert_allclose(due, expected, rtol=0.0, atol=1e-12)
 
 
 def test_the_reference_is_right_for_vehicles_that_are_hours_apart() -> None:
@@ -181,7 +235,7 @@ def turning(scale: float) -> Reference:
     return sample
 
 
-def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> list[Flight]:
+def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> list[Record]:
     """Two flights of one seed, after targets that differ from TURN on."""
     flown = replaced("target", {"duration": 6.0, "settle": 0.0}, preview=preview)
     flights = []
@@ -198,13 +252,13 @@ def replaced(name: str, changes: dict[str, Any], **reference: Any) -> Scenario:
     return check(table, "test")
 
 
-def first_difference(flights: list[Flight]) -> int:
+def first_difference(flights: list[Record]) -> int:
     """First step at which what the servers planned or decided differs."""
     one, other = (flight.server for flight in flights)
     n = min(len(one), len(other))
     unlike = [
         (one[name][:n] != other[name][:n]).reshape(n, -1).any(axis=1)
-        for name in ("planned", "input", "error", "event")
+        for name in ("planned", "input", "cost_gap", "event")
     ]
     return int(one["step"][:n][np.any(unlike, axis=0)][0])
 
@@ -393,7 +447,7 @@ def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.Monke
 
     assert MEMORY_S == 0.2
     assert spread() < 0.07
-    monkeypatch.setattr("server.live.MEMORY_S", 1e-6)
+    monkeypatch.setattr("skytether.server.control.live.MEMORY_S", 1e-6)
     assert spread() > 0.5
 
 

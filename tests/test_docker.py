@@ -1,8 +1,8 @@
-"""The three containers, flown for real: how they are locked in, and what a flight survives.
+"""The containers, flown for real: how they are locked in, and what a flight survives.
 
 `make docker-test` needs a Docker engine with Compose and takes about three minutes; `-s` shows how
 it goes. COMPOSE is the command to use where neither `docker compose` nor `docker-compose` will do,
-BASE_IMAGE what to build the image on.
+BASE_IMAGE what to build the images on.
 """
 
 import contextlib
@@ -24,17 +24,20 @@ from typing import Any, TypeVar
 import msgspec
 import pytest
 
-from shared import config
-from shared.record import read
-from shared.summary import Summary
+from skytether.shared.scenario import reading
+from skytether.shared.telemetry.record import read
+from skytether.shared.telemetry.summary import Summary
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
 SERVICES = ("server", "netem", "client")
-STEPS_PER_S = round(1 / config.load("demo").control.dt)
+IMAGES = ("client", "page", "server")
+STEPS_PER_S = round(1 / reading.load("demo").control.dt)
 
 FLIGHT_S = 60
+GATE_FLIGHT_S = 10
 FAULTY_FLIGHT_S = 110
 """Duration of the flight with faults [s]; faults and what proves their end take 45 s of it."""
 FAULT_S = 3.0
@@ -43,6 +46,24 @@ HORIZONS = 6
 """Number of new horizons that shows that orders flow."""
 HOVER_M = 1.58
 """Error `rmse_xy` of the demo for a vehicle that stays at its start [m]."""
+
+
+@pytest.mark.usefixtures("compose")
+def test_each_image_carries_what_it_runs_and_no_more() -> None:
+    """The client's is the bare package; the server's and the page's have an extra each."""
+    packages, sizes = {}, {}
+    listing = "ls /opt/skytether/lib/*/site-packages"
+    for image in IMAGES:
+        name = f"skytether-{image}"
+        listed = ("--entrypoint=sh", name, "-c", listing)
+        packages[image] = set(run("docker", "run", "--rm", "--network=none", *listed).split())
+        sizes[image] = int(run("docker", "image", "inspect", "--format", "{{.Size}}", name))
+        say(f"the image of the {image} has {sizes[image] / 1e6:.0f} MB")
+    extras = {"numba", "llvmlite", "scipy", "osqp", "viser", "mcap", "matplotlib", "pip"}
+    assert packages["client"] & extras == set()
+    assert packages["page"] & extras == {"viser"}
+    assert packages["server"] & extras == {"numba", "llvmlite", "scipy", "osqp"}
+    assert sizes["client"] < min(sizes["page"], sizes["server"])
 
 
 def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
@@ -77,6 +98,26 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
         last_words = three.said("client").rsplit("flying", 1)[1]
         assert 0 < number("step", last_words) < FLIGHT_S * STEPS_PER_S
         say("SIGTERM ended all three with 0")
+
+
+@pytest.mark.parametrize(("seconds", "code"), [(GATE_FLIGHT_S, 0), (0, 2)])
+def test_one_command_flies_for_a_gate(
+    compose: list[str], tmp_path: Path, seconds: int, code: int
+) -> None:
+    """README's: after the flight all have ended, and the exit code is the client's."""
+    (line,) = (line for line in README.splitlines() if "--exit-code-from" in line)
+    *command, build = shlex.split(line)[:4]
+    assert (command, build) == (["docker", "compose", "up"], "--build")
+    three = Containers(compose, seconds)
+    try:
+        found, said = three.attempt("up", *shlex.split(line)[4:])
+        assert found == code, said[-4000:]
+        statuses = {each: three.state(each)["Status"] for each in (*SERVICES, "keys", "page")}
+        assert set(statuses.values()) == {"exited"}, statuses
+        if code == 0:
+            assert three.land(tmp_path).steps > 0.9 * seconds * STEPS_PER_S
+    finally:
+        three.compose("down", "--volumes", "--remove-orphans")
 
 
 def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) -> None:
@@ -140,9 +181,27 @@ class Containers:
 
     def compose(self, *arguments: str) -> str:
         """What Compose printed."""
-        file = str(ROOT / "docker-compose.yml")
-        flight = {"FLIGHT_SECONDS": str(self.seconds), "SCENARIO": "demo"}
-        return run(*self.command, "-f", file, "-p", self.project, *arguments, more_env=flight)
+        return run(*self.argv(*arguments), more_env=self.flight)
+
+    def attempt(self, *arguments: str) -> tuple[int, str]:
+        """Exit code of Compose, and what it printed."""
+        return attempt(*self.argv(*arguments), within_s=150.0, more_env=self.flight)
+
+    def argv(self, *arguments: str) -> list[str]:
+        """Command line of Compose."""
+        return [
+            *self.command,
+            "-f",
+            str(ROOT / "docker-compose.yml"),
+            "-p",
+            self.project,
+            *arguments,
+        ]
+
+    @property
+    def flight(self) -> dict[str, str]:
+        """What the environment says of the flight."""
+        return {"FLIGHT_SECONDS": str(self.seconds), "SCENARIO": "demo"}
 
     def docker(self, *arguments: str) -> str:
         """What Docker printed."""
@@ -233,7 +292,7 @@ class Containers:
     def squatter(self, network: str) -> Iterator[None]:
         """A stranger who takes the address that a container had in a network."""
         argv = ["run", "--detach", "--rm", "--network", self.network(network)]
-        argv += ["--entrypoint", "sleep", "skytether", "600"]
+        argv += ["--entrypoint", "sleep", "skytether-client", "600"]
         stranger = self.docker(*argv).strip()
         try:
             yield
@@ -262,7 +321,7 @@ class Containers:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "capture.pcap"
             argv = ["docker", "run", "--rm", "--network", f"container:{self.id('netem')}"]
-            argv += ["--user=0", "--cap-add=NET_RAW", "--entrypoint=python", "skytether"]
+            argv += ["--user=0", "--cap-add=NET_RAW", "--entrypoint=python", "skytether-client"]
             with (
                 file.open("wb") as out,
                 subprocess.Popen([*argv, "-c", script], stdout=out) as sniffer,
@@ -306,7 +365,9 @@ class Containers:
         assert "Read-only file system" in output
         assert self.inside(service, "touch", "/tmp/file")[0] == 0
 
-        code, where = self.inside(service, "python", "-c", "import shared; print(shared.__file__)")
+        code, where = self.inside(
+            service, "python", "-c", "import skytether; print(skytether.__file__)"
+        )
         assert where.startswith("/opt/skytether/lib/"), where
         assert self.inside(service, "sh", "-c", "command -v cc gcc g++ make")[0] != 0
 
@@ -334,8 +395,15 @@ class Containers:
 
     def ask_for_the_server(self, host: str) -> tuple[int, str]:
         """Exit code and output of another client, where the client is."""
-        argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}", "skytether"]
-        argv += ["client", "demo", "--id=2", "--link.connect-s=2", f"--server={host}:47001"]
+        argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}"]
+        argv += [
+            "skytether-client",
+            "client",
+            "demo",
+            "--id=2",
+            "--link.connect-s=2",
+            f"--server={host}:47001",
+        ]
         argv += ["--insecure"]
         return attempt(*argv)
 
@@ -358,7 +426,7 @@ def containers(compose: list[str], seconds: int) -> Iterator[Containers]:
 
 @pytest.fixture(scope="module")
 def compose() -> list[str]:
-    """The command for Compose, after it has built the image."""
+    """The command for Compose, after it has built the images."""
     given = os.environ.get("COMPOSE")
     known = [given] if given else ["docker compose", "docker-compose"]
     if not works("docker", "version"):
@@ -366,10 +434,8 @@ def compose() -> list[str]:
     command = next((found for found in map(shlex.split, known) if works(*found, "version")), None)
     if command is None:
         pytest.skip(f"no Compose: tried {' and '.join(known)}")
-    say(f"{shlex.join(command)} builds the image")
+    say(f"{shlex.join(command)} builds the images")
     Containers(command, FLIGHT_S).compose("build")
-    size = run("docker", "image", "inspect", "--format", "{{.Size}}", "skytether")
-    say(f"the image has {int(size) / 1e6:.0f} MB")
     return command
 
 
@@ -393,15 +459,18 @@ def works(*command: str) -> bool:
         return False
 
 
-def attempt(*command: str) -> tuple[int, str]:
+def attempt(
+    *command: str, within_s: float = 60.0, more_env: Mapping[str, str] = MappingProxyType({})
+) -> tuple[int, str]:
     """Exit code and output of a command."""
     done = subprocess.run(
         command,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=60,
+        timeout=within_s,
         check=False,
+        env={**os.environ, **more_env},
     )
     return done.returncode, done.stdout
 

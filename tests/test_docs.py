@@ -6,14 +6,18 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
-from shared.protocol import PAYLOAD_BYTES_MAX
-from shared.summary import Summary
-from shell import command
-from skytether.set import set_keys
+import warm
+from skytether.__main__ import main
+from skytether.cli.set import set_keys
+from skytether.lab import maps
+from skytether.shared.telemetry.summary import Summary
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
+from skytether.shell import command
 
 pytestmark = pytest.mark.long
 
@@ -54,14 +58,22 @@ def skytether(line: str) -> list[str]:
                 "skytether ca",
                 "skytether en",
                 "skytether ma",
+                "skytether st",
+                "skytether id",
             )
         )
         and "--control" not in line
+        and "mavlink" not in line  # there is no autopilot to be heard; by test_identify.py
         and "--record" not in line
+        and "--plugin" not in line  # by test_plugins.py
+        and not line.startswith("skytether station")  # by hand
     ],
 )
-def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
-    """As written; over UDP a tenth as long and as many, and sweeps with few and short flights."""
+@pytest.mark.usefixtures("here")
+def test_a_documented_flight_flies(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As written, and shorter; fleets are smaller, and sweeps have few flights."""
     if "sweep" in line:
         line += " --settle 0 --duration 1 --runs 2"
     if "envelope" in line:
@@ -72,17 +84,27 @@ def test_a_documented_flight_flies(line: str, tmp_path: Path) -> None:
         line += " --tau 1 --gain 1 --dead-time 0 --burst 0 --settle 0 --duration 1"
     if "calibrate" in line:
         line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
+    line = re.sub(r"--vehicles \d+0\b", "--vehicles 5", line)
     if re.search(r"--duration (20|600)\b", line):
-        line = line.replace("--vehicles 50", "--vehicles 5") + " --settle 0 --duration 4"
-    run = subprocess.run(skytether(line), cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    assert run.stdout.strip()
+        line += " --settle 0 --duration 4"
+    _, *argv = shlex.split(line)
+    monkeypatch.setattr(maps, "TIMINGS", 2)
+    monkeypatch.chdir(tmp_path)
+    if argv[0] in ("fly", "fleet"):
+        run = warm.skytether(*argv)
+        assert run.returncode == 0, run.stderr
+        assert run.stdout.strip()
+    else:
+        assert main(argv) == 0
+        assert capsys.readouterr().out.strip()
 
 
 def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
     """The block of README with server, netem and client, each line in a process of its own."""
     on_one, _ = terminals()
-    assert "PLAINTEXT" in fly_together(on_one, tmp_path)
+    said = fly_together(on_one, tmp_path)
+    assert "PLAINTEXT" in said
+    assert "NO FAILSAFE" not in said
 
 
 def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
@@ -107,7 +129,7 @@ def terminals() -> list[list[str]]:
 def fly_together(lines: list[str], folder: Path) -> str:
     """What the client says that flies with a server and a netem."""
     server, netem, client = (skytether(line) for line in lines)
-    client += ["--settle", "0", "--duration", "3"]
+    client += ["--settle", "0", "--duration", "6"]  # with keys the first plan comes after 3 s
     with (
         subprocess.Popen(server, cwd=folder, stdout=subprocess.DEVNULL) as one,
         subprocess.Popen(netem, cwd=folder, stdout=subprocess.DEVNULL) as two,
@@ -151,42 +173,65 @@ def test_the_documented_changes_are_made_in_flight(
 
 
 @pytest.mark.parametrize("document", ["docs/page.md", "docs/tour.md"])
-def test_the_documented_pages_are_served(document: str, tmp_path: Path) -> None:
+def test_the_documented_pages_are_served(
+    document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Replays and duels of a document, until Ctrl-C; what they show is recorded before."""
     lines = [line for block in blocks(ROOT / document) for line in block]
     served = [line for line in lines if line.startswith(("skytether replay ", "skytether duel "))]
     assert served
     records = next(line for line in lines if "--record" in line)
-    subprocess.run(skytether(records), cwd=tmp_path, capture_output=True, check=True)
+    monkeypatch.chdir(tmp_path)
+    assert warm.skytether(*shlex.split(records)[1:]).returncode == 0
     for line in served:
-        argv = [*skytether(line), "--page", "127.0.0.1:0"]
         said = []
-        with subprocess.Popen(
-            argv, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        ) as page:
-            assert page.stdout is not None
+        with warm.Command(*shlex.split(line)[1:], "--page", "127.0.0.1:0") as page:
             for word in page.stdout:
                 said.append(word)
                 if "the page is at http://127.0.0.1:" in word:
                     page.send_signal(signal.SIGINT)
                     break
             said.append(page.stdout.read())
-        assert page.returncode in (0, command.INTERRUPTED), said
+            assert page.wait(60) in (0, command.INTERRUPTED), said
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/recordings.md", "docs/tour.md"])
-def test_the_documented_recordings_are_made_and_read(document: str, tmp_path: Path) -> None:
+def test_the_documented_recordings_are_made_and_read(
+    document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Those of a document, one after the other."""
     reads = ("skytether report ", "skytether export ", "skytether recover ")
     lines = [line for block in blocks(ROOT / document) for line in block]
     lines = [line for line in lines if line.startswith(reads) or "--record" in line]
     assert any(line.startswith(reads) for line in lines)
+    monkeypatch.chdir(tmp_path)
     for line in lines:
         short = "--duration 20" if "--virtual" in line else "--duration 5 --settle 0"
-        argv = skytether(line.replace("--duration 20", short))
-        made = subprocess.run(argv, cwd=tmp_path, capture_output=True, text=True, check=False)
+        made = warm.skytether(*shlex.split(line.replace("--duration 20", short))[1:])
         assert (made.returncode, made.stderr) == (0, "")
         assert made.stdout.strip()
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/python.md"])
+def test_the_documented_python_runs_and_prints_what_it_says(
+    document: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Every block of a document, one after the other; `# →` is what a block prints."""
+    pytest.importorskip("pandas")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "docs"}
+    compared = 0
+    found = re.findall(r"```python\n(.*?)```", (ROOT / document).read_text(), re.DOTALL)
+    for block in found:
+        exec(block, names)
+        printed = capsys.readouterr().out.splitlines()
+        told = re.findall(r"^# → (.*)$", block, re.MULTILINE)
+        assert not told or printed == told, block
+        compared += len(told)
+    assert compared
 
 
 @pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
@@ -198,20 +243,35 @@ def test_documented_targets_exist(line: str) -> None:
     assert run.returncode == 0, run.stderr
 
 
+def test_documented_extras_exist() -> None:
+    """README's table has each that is for users, and whatever is installed names one of them."""
+    extras = set(metadata.metadata("skytether").get_all("Provides-Extra", ()))
+    readme = (ROOT / "README.md").read_text()
+    told = set(re.findall(r"(?m)^\| `(\w+)` \| .* \| .* \|$", readme.partition("| extra |")[2]))
+    assert told == extras - {"bench", "dev", "fuzz"}
+    for document in DOCUMENTS:
+        for named in re.findall(r"pip install [^`\n]*\[(\w+)\]", document.read_text()):
+            assert named in extras
+
+
 def test_every_documented_command_is_tested() -> None:
     """Here, or by make docker-test."""
-    known = ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
+    known: tuple[str, ...] = ("pip install .", "pip install '.[all]'")  # by test_packaging.py
+    known += ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
     known += ("skytether scenarios", "skytether calibrate ", "skytether envelope ")
-    known += ("skytether margins ",)
+    known += ("skytether margins ", "skytether straight", "skytether identify ")
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py
     known += ("skytether keygen ",)  # by test_keys.py
     known += ("skytether torture",)  # by test_torture.py
     known += ("skytether set ", "skytether report ", "skytether export ", "skytether recover ")
     known += ("skytether replay ", "skytether duel ")
+    known += ("skytether autopilot ",)  # by test_autopilot.py
     known += ("docker compose up",)
     known += ("docker compose --profile observe up",)  # by test_observe.py, as far as it can be
+    known += ("skytether autopilot ",)  # by test_aboard_udp.py
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
+    by_hand += ("skytether station ", "skytether autopilot ")
     for line in COMMANDS:
         assert line.startswith((*known, *by_hand)), line
 

@@ -1,8 +1,8 @@
 """The driver: mistakes of an endpoint's code are told, and the endpoint is driven on."""
 
-from shared.endpoint import Datagram, Endpoint
-from shared.events import Event, Fault, Flying
-from shell.driver import Shell, run
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.events import Event, Fault, Flying
+from skytether.shell.driver import Shell, run
 
 
 class Faulty(Endpoint):

@@ -11,29 +11,39 @@ import msgspec
 import numpy as np
 import pytest
 
-from client.plant import FirstOrderPlant
-from lab.envelope import Envelope, Point, Verdict, disc, draw, judge, settling_s, worst_first
-from lab.journal import Journal
-from lab.keys import lay
-from server.controller import Controller
-from shared import config
-from shared.chance import stream
-from shared.config import Scenario
-from shared.model import Array, Flags, Indices
-from shared.record import Rows, client_columns
-from shell import command
-from sim import flight
-from skytether import fly
 from skytether.__main__ import main
+from skytether.cli import fly
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.weather import Weather
+from skytether.lab.envelope import (
+    Envelope,
+    EnvelopePoint,
+    PointVerdict,
+    disc,
+    draw,
+    judge,
+    settling_s,
+    worst_first,
+)
+from skytether.lab.journal import Journal
+from skytether.server.control.controller import Controller
+from skytether.shared.base.chance import stream
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Rows, client_columns
+from skytether.shell import command
+from skytether.sim import flight
 
-DEMO = Envelope("demo", config.load("demo"))
+DEMO = Envelope("demo", reading.load("demo"))
 
 
 def changed(**keys: Any) -> Scenario:
     """The demo with some keys changed."""
-    table = config.to_table(config.load("demo"))
+    table = reading.to_table(reading.load("demo"))
     lay({key.replace("__", "."): value for key, value in keys.items()}, table)
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
 # -- the points ----------------------------------------------------------------------------------
@@ -68,7 +78,7 @@ def test_a_point_is_the_same_whatever_else_is_flown() -> None:
     assert draw(1, 5) == draw(1, 5)
     assert draw(1, 5) != draw(2, 5)
     scenario = DEMO.scenario_of(1)
-    assert config.to_table(scenario)["control"]["horizon"] == draw(1, 1)["control.horizon"]
+    assert reading.to_table(scenario)["control"]["horizon"] == draw(1, 1)["control.horizon"]
     assert scenario.network.uplink.minimum_s == draw(1, 1)["network.uplink.minimum_s"]
     assert scenario.reference == DEMO.scenario.reference
 
@@ -78,7 +88,7 @@ def test_the_command_line_of_a_point_flies_that_point() -> None:
     plan = Envelope("demo", changed(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2]))
     line = plan.command(1).split()
     assert line[:4] == ["skytether", "fly", "demo", "--virtual"]
-    options = command.parse(fly.Options(), line[2:], "skytether fly", "")
+    options = command.parse(fly.FlyOptions(), line[2:], "skytether fly", "")
     assert options.config == plan.scenario_of(1)
     assert "--reference.radius-m" not in line
 
@@ -105,7 +115,7 @@ def record(state: Array, inputs: Array, covered: Flags, age_s: float = 1.0) -> R
 
 def along(command: Callable[[int, Array], Any], covered: Flags = YES) -> Rows:
     """The record of a vehicle that flies a command of step and state, without wind."""
-    plant = FirstOrderPlant(SCENARIO, stream(1, "test"))
+    plant = FirstOrderPlant(SCENARIO, Weather(SCENARIO, stream(1, "test")))
     states, inputs = [], []
     for step in range(STEPS):
         states.append(plant.state())
@@ -133,7 +143,7 @@ def until(*ends: int) -> Flags:
 def test_a_flight_near_the_reference_is_flown() -> None:
     """Its largest error is that after settling, when it started a metre and a half away."""
     rows = record(PATH, PATH[..., 1], YES)
-    assert judge(SCENARIO, rows) == Verdict("flown", 0.0, 1.0, pytest.approx(0.0))
+    assert judge(SCENARIO, rows) == PointVerdict("flown", 0.0, 1.0, pytest.approx(0.0))
     late = rows.copy()
     late["state"][settling_s(SCENARIO) - 1.0 > TIME_S, 0, 0] += 1.5
     assert judge(SCENARIO, late).outcome == "flown"
@@ -143,7 +153,7 @@ def test_a_flight_near_the_reference_is_flown() -> None:
 def test_what_never_got_a_plan_and_stood_still_is_hovering() -> None:
     """Nothing is settled, and nothing is wrong."""
     verdict = judge(SCENARIO, along(lambda *_: [0.0, 0.0], NO))
-    assert verdict == Verdict("hovering", None, 0.0, 0.0)
+    assert verdict == PointVerdict("hovering", None, 0.0, 0.0)
 
 
 def test_a_flight_that_brakes_along_the_curve_is_hovering() -> None:
@@ -185,7 +195,7 @@ def test_a_flight_beside_the_reference_is_astray() -> None:
 
 def test_a_flight_without_a_step_is_unanswered() -> None:
     """No session, no record."""
-    assert judge(SCENARIO, np.zeros(0, client_columns(2))) == Verdict("unanswered")
+    assert judge(SCENARIO, np.zeros(0, client_columns(2))) == PointVerdict("unanswered")
 
 
 def held(step: int, state: Array) -> Array:
@@ -241,9 +251,9 @@ def test_feedback_may_lead_back_after_a_horizon_s_end(
     inputs = np.where(UNPLANNED[:, None], PATH[..., 1], [0.3, 0.0])
     rows = record(state, inputs, UNPLANNED)
     rows["age_ns"][400:] = round(3e9) if is_held else -1
-    table = config.to_table(SCENARIO)
+    table = reading.to_table(SCENARIO)
     table["control"]["feedback"] = feedback
-    assert judge(config.check(table, "test"), rows).outcome == outcome
+    assert judge(reading.check(table, "test"), rows).outcome == outcome
 
 
 @pytest.mark.parametrize(
@@ -341,9 +351,13 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
 ) -> None:
     """Two thirds of a round trip more than they are made for: by many metres."""
     monkeypatch.setattr(Controller, "able", _able_whatever_the_delay)
-    monkeypatch.setattr("server.replay.committed_max", lambda terms: terms.horizon)
-    monkeypatch.setattr("client.compensator.Compensator._comes_too_late", lambda *_: False)
-    table = config.to_table(config.load("demo"))
+    monkeypatch.setattr(
+        "skytether.server.control.committed.committed_max", lambda terms: terms.horizon
+    )
+    monkeypatch.setattr(
+        "skytether.client.compensator.Compensator._comes_too_late", lambda *_: False
+    )
+    table = reading.to_table(reading.load("demo"))
     for direction, delay_s in (("uplink", 0.05), ("downlink", 1.4)):
         network = f"network.{direction}"
         lay({f"{network}.delay": "constant", f"{network}.minimum_s": delay_s}, table)
@@ -384,18 +398,18 @@ def test_a_point_that_raises_has_crashed(monkeypatch: pytest.MonkeyPatch) -> Non
         raise ZeroDivisionError("division by zero")
 
     monkeypatch.setattr(flight, "fly", fail)
-    assert DEMO.fly(1) == Point(1, "crashed", line="ZeroDivisionError: division by zero")
+    assert DEMO.fly(1) == EnvelopePoint(1, "crashed", line="ZeroDivisionError: division by zero")
 
 
 def test_the_worst_come_first() -> None:
     """Crashes, then who flew furthest, then who was furthest from the reference."""
     points = [
-        Point(0, "astray", 1.2),
-        Point(1, "flyaway", None, 0.0, 3.0),
-        Point(2, "flown", 0.1),
-        Point(3, "flyaway", None, 0.0, 50.0),
-        Point(4, "crashed"),
-        Point(5, "astray", 2.2),
+        EnvelopePoint(0, "astray", 1.2),
+        EnvelopePoint(1, "flyaway", None, 0.0, 3.0),
+        EnvelopePoint(2, "flown", 0.1),
+        EnvelopePoint(3, "flyaway", None, 0.0, 50.0),
+        EnvelopePoint(4, "crashed"),
+        EnvelopePoint(5, "astray", 2.2),
     ]
     assert [point.number for point in worst_first(points)] == [4, 3, 1, 5, 0]
 
@@ -405,6 +419,7 @@ def test_the_worst_come_first() -> None:
 SHORT = ["envelope", "demo", "--duration", "4", "--settle", "0", "--workers", "1"]
 
 
+@pytest.mark.usefixtures("here")
 def test_more_points_go_on_where_fewer_ended(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -433,9 +448,9 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
 ) -> None:
     """Which flies that point again; what went astray is told, too, and is no failure."""
     plan = Envelope("demo", changed(duration=4.0, settle=0.0))
-    lost = Point(0, "flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
-    with closing(Journal(tmp_path, plan.settings(), Point)) as journal:
-        journal.append(Point(1, "astray", 1.25, 1.0, 0.0))
+    lost = EnvelopePoint(0, "flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
+    with closing(Journal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
+        journal.append(EnvelopePoint(1, "astray", 1.25, 1.0, 0.0))
         journal.append(lost)
     assert main([*SHORT, "--points", "2", "--out", str(tmp_path)]) == 1
     said = capsys.readouterr()
@@ -447,7 +462,7 @@ def test_another_seed_does_not_go_on_in_the_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its points are others."""
-    Journal(tmp_path, DEMO.settings(), Point).close()
+    Journal(tmp_path, DEMO.settings(), EnvelopePoint).close()
     assert main(["envelope", "demo", "--seed", "2", "--points", "1", "--out", str(tmp_path)]) == 2
     said = f"envelope: {tmp_path}: seed: got 2, expected 1, to go on there; or another --out\n"
     assert capsys.readouterr().err == said

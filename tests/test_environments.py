@@ -96,7 +96,7 @@ def test_streams_that_were_closed_are_there_for_children_too(tmp_path: Path) -> 
         f"pathlib.Path({str(file)!r}).write_text(' '.join(names))"
     )
     code = (
-        "import shell.start, subprocess, sys; shell.start.begin(); "
+        "import subprocess, sys; from skytether.shell import start; start.begin(); "
         f"subprocess.run([sys.executable, '-c', {child!r}], check=True)"
     )
     line = f"{shlex.join([sys.executable, '-P', '-c', code])} <&- >&- 2>&-"
@@ -200,7 +200,7 @@ def test_a_process_that_cannot_write_does_not_start(
     assert capfd.readouterr().err == said
 
 
-def test_a_full_disk_is_one_line() -> None:
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     """Where output goes to it, and where a file does."""
     full = subprocess.run(
         ["sh", "-c", f"{shlex.join([*SKYTETHER, 'scenarios'])} >/dev/full"],
@@ -209,8 +209,15 @@ def test_a_full_disk_is_one_line() -> None:
         check=False,
     )
     assert (full.returncode, full.stderr) == (1, "scenarios: No space left on device\n")
-    flown = run(["fly", "--virtual", *SHORT, "--json", "/dev/full"])
-    said = "fly: /dev/full: cannot be written: No space left on device\n"
+    file = tmp_path / "summary.json"
+    argv = [*SKYTETHER, "fly", "--virtual", *SHORT, "--json", str(file)]
+    flown = subprocess.run(
+        ["sh", "-c", f"ulimit -f 0; {shlex.join(argv)}"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    said = f"fly: {file}: cannot be written: File too large\n"
     assert (flown.returncode, flown.stderr) == (1, said)
 
 
@@ -260,7 +267,8 @@ def children(pid: int) -> list[int]:
 )
 def test_sigusr1_ends_no_process_that_starts(argv: list[str], tmp_path: Path) -> None:
     """It asks for figures, which there are none of yet: it is ignored from the first moment."""
-    command = [sys.executable, "-P", "-m", *argv]
+    module = argv[0] if argv[0] == "skytether" else f"skytether.{argv[0]}"
+    command = [sys.executable, "-P", "-m", module, *argv[1:]]
     with subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as process:

@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.clock import ClockMap
-from server.controller import Controller
-from server.estimator import Estimator
-from server.gain import feedback_gain
-from server.scheme import Foresight, foresight
-from shared import config
-from shared.config import Scenario
-from shared.model import Array, Indices, discretise
-from shared.protocol import NO_HORIZON, Mode, Observation
-from shared.stopwatch import Stopwatch
-from shared.summary import summarise
-from sim.flight import fly
+from skytether.server.control.clock import ClockMap
+from skytether.server.control.controller import Controller
+from skytether.server.control.gain import feedback_gain
+from skytether.server.control.predictive import Estimator
+from skytether.server.control.scheme import Foresight, foresight
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.model import Array, Indices, discretise
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
+from skytether.sim.flight import fly
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -57,7 +57,7 @@ def scenario(scheme: str, **control: Any) -> Scenario:
         "network": {"uplink": direct, "downlink": direct},
         "link": {"age_max_s": REACH * DT},
     }
-    return config.check(raw, "test")
+    return reading.check(raw, "test")
 
 
 def computed(inputs: Array) -> Foresight:
@@ -363,10 +363,10 @@ def test_the_paper_s_scheme_flies_better_with_observer_and_with_feedback() -> No
 
     def rmse(wind: dict[str, Any], **control: Any) -> float:
         """RMSE of 25 s with a packet at every step [m]."""
-        table = config.to_table(config.load("paper-every-step")) | {"duration": 25.0}
+        table = reading.to_table(reading.load("paper-every-step")) | {"duration": 25.0}
         table["control"] |= control
         table["vehicle"] |= wind
-        windy = config.check(table, "test")
+        windy = reading.check(table, "test")
         error = summarise(windy, "test", fly(windy).client).rmse_xy
         assert error is not None
         return error
@@ -385,9 +385,9 @@ def test_the_paper_s_scheme_flies_better_with_observer_and_with_feedback() -> No
 @pytest.fixture(scope="module", params=["none", "predictive", "committed"])
 def controller(request: pytest.FixtureRequest) -> Controller:
     """The controller of a vehicle under each scheme, in steps of 0.05 s."""
-    table = config.to_table(config.load("paper"))
+    table = reading.to_table(reading.load("paper"))
     table["control"] = {**table["control"], "scheme": request.param, "dt": 0.05}
-    flown = config.check(table, "test")
+    flown = reading.check(table, "test")
     return Controller(flown, flown.terms(), 1, ClockMap(1, flown.dt_ns), Stopwatch())
 
 

@@ -1,6 +1,7 @@
 """The exact solver: right to rounding, the same whatever came before, and never a guess."""
 
 from collections.abc import Callable
+from functools import cache
 from types import FunctionType
 from typing import Any
 
@@ -11,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from benchmarks.problems import gradients
-from server import exact
-from server.exact import ExactSolver, active_set, workspace
-from server.mpc import LATER, Problem, make_mpc, pose
-from server.planner import make_solver
-from server.solver import OsqpSolver
-from shared import config
-from shared.kernel import part
-from shared.model import Array
+from skytether.lab.benchmarks.problems import gradients
+from skytether.server.control import exact
+from skytether.server.control.exact import ExactSolver, active_set, workspace
+from skytether.server.control.mpc import LATER, Problem, make_mpc, pose
+from skytether.server.control.planner import make_solver
+from skytether.server.control.solver import OsqpSolver
+from skytether.shared.base.kernel import part
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
 
-PAPER = config.load("paper")
+PAPER = reading.load("paper")
 U_MAX = np.array([1.8, 1.0])
 
 
@@ -42,6 +43,7 @@ ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 
 """Long steps and hardly a cost of the input: here sets wander in circles."""
 
 
+@cache
 def active_set_with(**constants: float) -> Callable[..., int]:
     """`active_set` compiled with other constants than those of its module."""
     code = exact.active_set.py_func.__code__

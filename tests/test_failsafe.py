@@ -12,26 +12,31 @@ import msgspec
 import numpy as np
 import pytest
 
-import client.compensator
-import client.vehicle
-from client import failsafe
-from client.clamp import clamped
-from client.compensator import Compensator
-from client.failsafe import HOLD, TABLE, Failsafe
-from client.link import Plain
-from client.plant import FirstOrderPlant
-from client.vehicle import Client
-from lab.states import svg
-from shared import config
-from shared.chance import stream
-from shared.config import ConfigError, Scenario
-from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
-from shared.events import Event, ModeChanged
-from shared.protocol import (
-    ACCEPTED,
+import skytether.client.endpoint
+import skytether.client.pilot
+import skytether.client.session
+from skytether.client import failsafe
+from skytether.client.clamp import clamped
+from skytether.client.compensator import Compensator
+from skytether.client.endpoint import Client
+from skytether.client.failsafe import HOLD, TABLE, Failsafe
+from skytether.client.link import PlainLink
+from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.lab.states import svg
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.events import Event, ModeChanged
+from skytether.shared.law import rule
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason, Recorder, Rows, client_columns, parse
+from skytether.shared.wire.protocol import (
     NO_FEEDBACK,
     NO_HORIZON,
     Close,
+    Drop,
     Heartbeat,
     Hello,
     Horizon,
@@ -39,11 +44,11 @@ from shared.protocol import (
     Message,
     Mode,
     Observation,
+    Refusal,
     Welcome,
     decode,
     encode,
 )
-from shared.record import Reason, Recorder, Rows, client_columns, parse
 
 SERVER: Address = ("server", 0)
 DIAGRAM = Path(__file__).parent.parent / "docs/failsafe.svg"
@@ -55,7 +60,7 @@ SPEED = 1.0
 """Input of all horizons, along x [m/s]."""
 
 
-class Sealed(Plain):
+class Sealed(PlainLink):
     """A link that vouches for the server."""
 
     secure = True
@@ -68,14 +73,14 @@ class Hand:
         self.scenario = msgspec.structs.replace(scenario(**sections), armed=armed)
         self.terms = self.scenario.terms()
         self.sink = io.BytesIO()
-        self.plant = FirstOrderPlant(self.scenario, stream(1, "wind"))
+        self.flies = simulated(self.scenario, 1)
         self.client = Client(
             self.scenario,
-            self.plant,
+            self.flies,
             server=SERVER,
             vehicle=4,
             boot_id=99,
-            link=Sealed() if secure else Plain(),
+            link=Sealed() if secure else PlainLink(),
             recorder=Recorder(client_columns(self.terms.axes), self.sink),
         )
         self.now_ns = self.epoch_ns = 5 * SECOND_NS
@@ -91,7 +96,7 @@ class Hand:
 
     def welcome(self, *, server_boot_id: int = 1) -> None:
         """Open a session."""
-        self.say(Welcome(4, self.session, 99, server_boot_id, 1, ACCEPTED, self.terms))
+        self.say(Welcome(4, self.session, 99, server_boot_id, 1, Refusal.ACCEPTED, self.terms))
 
     def heartbeat(self) -> None:
         """Say that the server lives."""
@@ -170,12 +175,12 @@ class Hand:
 
 def scenario(**sections: Any) -> Scenario:
     """A long flight of the demo at 50 Hz in calm air; sections are laid over."""
-    table = config.to_table(config.load("demo")) | {"duration": 100.0}
+    table = reading.to_table(reading.load("demo")) | {"duration": 100.0}
     table["control"] |= {"dt": 0.02, "horizon": H, "feedback": False}
     table["vehicle"] |= {"wind": 0.0, "land_after_s": 10.0}
     for section, values in sections.items():
         table[section] |= values
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
 def tracking(**keys: Any) -> Hand:
@@ -211,7 +216,7 @@ def test_a_vehicle_takes_a_horizon_after_a_second_of_good_link() -> None:
     hand = Hand()
     hand.fly(0.98, plans=True)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.SYNC, False, 0.0)
-    assert hand.client.counts["dropped: not taken"] == 49
+    assert hand.client.dropped[Drop.NOT_TAKEN] == 49
     hand.fly(0.04)
     assert (hand.mode, hand.takes) == (Mode.READY, True)
     hand.horizon()
@@ -240,6 +245,19 @@ def test_a_link_that_stutters_is_not_good() -> None:
         assert hand.mode is Mode.SYNC
 
 
+@pytest.mark.parametrize(("steps", "mode"), [(25, Mode.READY), (26, Mode.SYNC)])
+def test_a_link_is_good_while_it_is_never_silent_for_more_than_half_of_the_time_out(
+    steps: int, mode: Mode
+) -> None:
+    """A heartbeat every 0.5 s, and every 0.52 s, for ten seconds: silence of 1 s is a loss."""
+    hand = Hand()
+    hand.fly(1 / STEPS_PER_S, beats=False)
+    for _ in range(20):
+        hand.heartbeat()
+        hand.fly(steps / STEPS_PER_S, beats=False)
+    assert (hand.mode, hand.takes) == (mode, mode is Mode.READY)
+
+
 def test_a_horizon_planned_before_the_vehicle_took_any_is_dropped() -> None:
     """The server reckoned that it would stand still."""
     hand = Hand()
@@ -247,7 +265,7 @@ def test_a_horizon_planned_before_the_vehicle_took_any_is_dropped() -> None:
     hand.horizon(observed=30)
     hand.fly(0.02)
     assert hand.mode is Mode.READY
-    assert hand.client.counts["dropped: not taken"] == 1
+    assert hand.client.dropped[Drop.NOT_TAKEN] == 1
 
 
 def test_a_vehicle_that_is_not_armed_flies_nothing() -> None:
@@ -327,7 +345,7 @@ def test_what_is_told_while_braking_never_speeds_up_whatever_feedback_adds(
     hand.fly((D + H) / STEPS_PER_S + 0.3)
     braked = hand.speed
     assert (hand.mode, 0.2 < braked < 0.8) == (Mode.BRAKE, True)
-    monkeypatch.setattr(client.compensator, "remaining", lambda *_: 1.0)
+    monkeypatch.setattr(rule, "remaining", lambda *_: 1.0)
     hand.fly(0.02)
     assert hand.speed == pytest.approx(braked - 2.0 * 0.02, abs=1e-6)
 
@@ -485,10 +503,16 @@ def test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon()
     hand.heartbeat()
     hand.fly(0.02)
     assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, True, NO_HORIZON)
-    assert hand.changes[-1] == ("brake", "its own computer was asleep")
+    assert hand.changes[-1] == ("brake", "its own computer woke it too late")
     hand.horizon()
     hand.fly(0.02)
     assert hand.mode is Mode.TRACK
+
+
+def test_being_woken_late_is_not_said_to_be_sleep() -> None:
+    """A busy machine, a stopped process and a host that is asleep look alike to a vehicle."""
+    assert "asleep" not in str(Reason.STALLED)
+    assert "late" in str(Reason.STALLED)
 
 
 def test_a_vehicle_that_oversleeps_by_less_flies_on() -> None:
@@ -514,13 +538,13 @@ def test_a_solver_that_fails_or_a_server_that_is_degraded_is_told() -> None:
 
 def test_what_is_not_finite_ends_in_fault_for_good() -> None:
     """A state or an input: zero is flown, and nothing after that."""
-    for seen in (FirstOrderPlant, Compensator):
+    for seen in (SimulatedVehicle, Compensator):
         hand = tracking()
         with pytest.MonkeyPatch.context() as mad:
             if seen is Compensator:
                 mad.setattr(Compensator, "choose", lambda *_: np.array([np.nan, 0.0]))
             else:
-                mad.setattr(hand.plant, "state", lambda: np.full((2, 2), np.inf))
+                mad.setattr(hand.flies.plant, "x", [(np.inf, np.inf)] * 2)
             hand.fly(0.02, plans=True)
         hand.fly(3.0, plans=True)
         rows = hand.rows()[160:]
@@ -529,18 +553,50 @@ def test_what_is_not_finite_ends_in_fault_for_good() -> None:
         assert hand.changes[-1] == ("fault", "its state or its input is not finite")
 
 
-@pytest.mark.parametrize("slept", [True, False])
-def test_a_sleep_of_minutes_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
-    *, slept: bool
+def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again() -> None:
+    """A position that changes by 300 m in a step, or a velocity by 20 m/s, is not flown by."""
+    for p, v in ((300.0, 0.0), (0.0, 20.0)):
+        hand = tracking()
+        hand.flies.plant.x = [(x + p, w + v) for x, w in hand.flies.plant.x]
+        hand.fly(0.02, plans=True)
+        assert (hand.mode, hand.speed) == (Mode.BRAKE, pytest.approx(SPEED - 0.04))
+        assert hand.changes[-1] == ("brake", "its state has leapt as no vehicle can")
+        hand.fly(20.0, plans=True)
+        assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+        assert hand.changes[-1] == ("hover", "its state has leapt as no vehicle can")
+        for armed in (False, True):
+            flown = msgspec.structs.replace(hand.scenario, armed=armed)
+            hand.client.change(flown, frozenset({"armed"}), now_ns=hand.now_ns)
+            hand.fly(0.1)
+        assert hand.takes
+        hand.fly(0.1, plans=True)
+        assert hand.mode is Mode.TRACK
+
+
+def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
+    """Once it is good again the vehicle still does not know where it is, and says so."""
+    hand = tracking()
+    hand.flies.plant.x = [(x + 300.0, w) for x, w in hand.flies.plant.x]
+    hand.fly(3.0, plans=True)
+    hand.fly(2.0, beats=False)
+    assert hand.changes[-1] == ("hover", "the server is silent")
+    hand.fly(3.0, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+    assert hand.changes[-1] == ("hover", "its state has leapt as no vehicle can")
+
+
+@pytest.mark.parametrize(("slept_s", "mode"), [(0, Mode.TRACK), (30, Mode.TRACK), (31, Mode.BRAKE)])
+def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
+    slept_s: int, mode: Mode
 ) -> None:
-    """Seen through `Steady` no time has passed; the server's clock has gone on, or has not."""
+    """Seen through `Steady` no time has passed; the server's clock has gone on by half a minute."""
     hand = tracking()
     hand.say(Heartbeat(4, hand.session, SECOND_NS, Idle.PLANS, 0))
     hand.fly(0.1, beats=False)
-    passed_ns = 100 * MILLISECOND_NS + (120 * SECOND_NS if slept else 0)
+    passed_ns = 100 * MILLISECOND_NS + slept_s * SECOND_NS
     hand.say(Heartbeat(4, hand.session, SECOND_NS + passed_ns, Idle.PLANS, 0))
     hand.fly(0.1, beats=False)
-    assert hand.mode == (Mode.BRAKE if slept else Mode.TRACK)
+    assert hand.mode is mode
 
 
 # -- the paper's own rule --------------------------------------------------------------------------
@@ -612,10 +668,10 @@ def test_no_mistake_of_the_compensator_reaches_the_plant(
     """100 m/s on both axes, from one step to the next; without the clamp it is flown."""
     hand = tracking(vehicle={"slew_mps2": 5.0})
     if not clamps:
-        monkeypatch.setattr(client.vehicle, "clamped", lambda wanted, *_, **__: wanted)
+        monkeypatch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: wanted)
     monkeypatch.setattr(Compensator, "choose", lambda *_: np.array([100.0, -100.0]))
     # What is over u_max is no message: the record tells.
-    monkeypatch.setattr(client.vehicle.Client, "_send", lambda *_: None)
+    monkeypatch.setattr(skytether.client.session.ServerSession, "send", lambda *_: None)
     hand.fly(0.4, plans=True)
     flown = hand.rows()["input"]
     bounded = np.abs(flown).max() <= hand.terms.u_max[0]
@@ -652,7 +708,8 @@ def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
         land_after_ns=SECOND_NS,
         changed=lambda _, __, cause, ___: told.append(cause),
     )
-    calm = [each for each in Reason if each not in (Reason.ALONE, Reason.NOT_FINITE)]
+    final = (Reason.ALONE, Reason.NOT_FINITE, Reason.LEAPT)
+    calm = [each for each in Reason if each not in final]
     locked = False
     for now_ns in range(10_000):
         cause = calm[int(rng.integers(len(calm)))]
@@ -671,6 +728,78 @@ def test_the_diagram_in_the_documents_is_that_of_the_table() -> None:
 
 # -- without its guards ----------------------------------------------------------------------------
 
+# -- what the vehicle's own side says ---------------------------------------------------------
+
+
+def hindered(monkeypatch: pytest.MonkeyPatch, hand: Hand, cause: Reason | None) -> None:
+    """Let the vehicle have this hindrance from now on."""
+    monkeypatch.setattr(hand.flies, "hindrance", lambda *, now_ns: cause)  # noqa: ARG005
+
+
+@pytest.mark.parametrize("cause", [Reason.TAKEN, Reason.DISARMED])
+def test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back(
+    cause: Reason, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zero from the next step on, and no horizon is taken; then it hovers for a second first."""
+    hand = tracking()
+    hindered(monkeypatch, hand, cause)
+    hand.fly(0.02)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.MANUAL, False, 0.0)
+    hand.fly(5.0, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.MANUAL, 0.0)
+    hindered(monkeypatch, hand, None)
+    hand.fly(0.9, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+    hand.fly(0.2, plans=True)
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+
+
+@pytest.mark.parametrize("cause", [Reason.BATTERY, Reason.ASTRAY])
+def test_a_vehicle_that_can_fly_no_further_brakes_and_lands(
+    cause: Reason, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does so with the best of links, and stays down where the cause is gone again."""
+    landed: list[Mode] = []
+    hand = tracking()
+    monkeypatch.setattr(hand.flies, "land", lambda: landed.append(hand.client._failsafe.mode))
+    hindered(monkeypatch, hand, cause)
+    hand.fly(0.02)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
+    hand.fly(2.0, plans=True)
+    assert hand.mode is Mode.LAND
+    assert landed == [Mode.LAND]
+    hindered(monkeypatch, hand, None)
+    hand.fly(2.0, plans=True)
+    assert hand.mode is Mode.LAND
+
+
+def test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However long it takes; a second after it is heard again, plans are flown."""
+    hand = tracking()
+    hindered(monkeypatch, hand, Reason.MUTE)
+    hand.fly(0.02)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
+    hand.fly(20.0, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
+    hindered(monkeypatch, hand, None)
+    hand.fly(1.1)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, True)
+
+
+def hindrance_test(test: Callable[..., None], *causes: Reason) -> Callable[[], None]:
+    """Test of a hindrance as a row's scenario."""
+
+    def run() -> None:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            test(*causes, monkeypatch=monkeypatch)
+
+    return run
+
+
 ROWS: dict[Reason, Callable[[], None]] = {
     Reason.GOOD: test_a_vehicle_takes_a_horizon_after_a_second_of_good_link,
     Reason.UNARMED: test_a_vehicle_that_is_not_armed_flies_nothing,
@@ -686,6 +815,23 @@ ROWS: dict[Reason, Callable[[], None]] = {
     Reason.CLOSED: test_a_server_that_closes_the_session_ends_in_brake_at_once,
     Reason.STALLED: test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon,
     Reason.NOT_FINITE: test_what_is_not_finite_ends_in_fault_for_good,
+    Reason.LEAPT: test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again,
+    Reason.TAKEN: hindrance_test(
+        test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back, Reason.TAKEN
+    ),
+    Reason.DISARMED: hindrance_test(
+        test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back, Reason.DISARMED
+    ),
+    Reason.RETURNED: hindrance_test(
+        test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back, Reason.TAKEN
+    ),
+    Reason.BATTERY: hindrance_test(
+        test_a_vehicle_that_can_fly_no_further_brakes_and_lands, Reason.BATTERY
+    ),
+    Reason.ASTRAY: hindrance_test(
+        test_a_vehicle_that_can_fly_no_further_brakes_and_lands, Reason.ASTRAY
+    ),
+    Reason.MUTE: hindrance_test(test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it),
 }
 """Scenario that needs the table's rows of a cause."""
 
@@ -696,7 +842,7 @@ def test_without_the_rows_of_a_cause_its_scenario_goes_wrong(
 ) -> None:
     """Every row is needed."""
     rows = {key: after for key, after in TABLE.items() if key[1] is not cause}
-    monkeypatch.setattr(client.vehicle, "TABLE", rows)
+    monkeypatch.setattr(skytether.client.endpoint, "TABLE", rows)
     with pytest.raises(AssertionError):
         ROWS[cause]()
 
@@ -711,15 +857,15 @@ GUARDS: dict[str, tuple[object, str, object, Callable[[], None]]] = {
         test_a_silent_server_ends_in_brake_with_horizon_left,
     ),
     "dropping": (
-        *(client.vehicle, "DROPPING", frozenset()),
+        *(skytether.client.pilot, "DROPPING", frozenset()),
         test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link,
     ),
     "closing": (
-        *(client.vehicle, "CLOSING", frozenset()),
+        *(skytether.client.endpoint, "CLOSING", frozenset()),
         test_a_server_that_closes_the_session_ends_in_brake_at_once,
     ),
     "who is malformed": (
-        *(Plain, "secure", True),
+        *(PlainLink, "secure", True),
         test_in_plaintext_a_stranger_cannot_make_it_brake_by_malformed_messages,
     ),
     "late in a row": (

@@ -1,14 +1,17 @@
 """`netem.fate`: the delays of eq. (17) as corrected, and fates that follow from names and time."""
 
+from bisect import bisect_right
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy import stats
 
-from netem.fate import SLOT_NS, Fate, Fates
-from shared.config import DirectionConfig
-from shared.endpoint import MILLISECOND_NS, SECOND_NS
+from skytether.netem import fate as fate_module
+from skytether.netem.fate import SLOT_NS, Fate, Fates
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.scenario.schema import DirectionConfig
 
 SAMPLES = 20_000
 TAIL = 8
@@ -163,6 +166,31 @@ def test_bursts_are_as_long_and_lose_as_much_as_asked(loss: float, burst_s: floa
         assert lengths_s.mean() == pytest.approx(mean_s, rel=4 / np.sqrt(len(runs)) + 0.02)
         assert lengths_s.std() == pytest.approx(mean_s, rel=8 / np.sqrt(len(runs)) + 0.02)
     assert lost.mean() == pytest.approx(loss, rel=6 * np.sqrt(burst_s * 2 / (loss * count * 0.01)))
+
+
+def test_a_channel_is_as_it_was_drawn_at_the_newest_moment_before() -> None:
+    """Moments of every cell, one after the other up to its end, found here all at once."""
+    fates = Fates(replace(PAPER, loss=0.3, burst_s=0.1), 5, "uplink", 0)
+    drawn: list[tuple[float, float]] = []
+    for cell in range(-40, 200):
+        moment, number = float(cell), 0
+        while True:
+            gap, state = fate_module._uniform(fates._moments, cell, number)
+            moment, number = moment - np.log1p(-gap), number + 1
+            if moment > cell + 1.0:
+                break
+            drawn.append((moment, state))
+    moments = [moment for moment, _ in drawn]
+    for time in np.linspace(0.0, 199.0, 2000).tolist():
+        assert fates._state(time) == drawn[bisect_right(moments, time) - 1][1]
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.3, 2.0, 50.0, 1000.0])
+def test_no_draw_lies_beyond_the_last_number_of_slots(mean: float) -> None:
+    """The probabilities rise to 1 exactly, for a draw may come as close to it as it likes."""
+    _, cumulative = fate_module._poisson(mean)
+    assert cumulative[-1] == 1.0
+    assert list(cumulative) == sorted(cumulative)
 
 
 def test_in_a_burst_everything_is_lost() -> None:

@@ -6,10 +6,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lab.faults import RANGES, SHORTEST_NS, Fault, Kind, Trial, dumps, loads, schedule, shrink
-from shared.chance import stream
-from shared.config import ConfigError
-from shared.endpoint import SECOND_NS
+from skytether.lab.faults import (
+    RANGES,
+    SHORTEST_NS,
+    Kind,
+    ScheduledFault,
+    Trial,
+    dumps,
+    loads,
+    schedule,
+    shrink,
+)
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import SECOND_NS
 
 MINUTE_NS = 60 * SECOND_NS
 DRAWN = [schedule(stream(seed, "faults"), MINUTE_NS) for seed in range(300)]
@@ -64,7 +74,7 @@ def test_a_schedule_is_one_line_and_comes_back_as_it_was() -> None:
         (dumps(Trial(1, DRAWN[0])).replace(DRAWN[0][0].kind, "rain"), "Invalid enum value 'rain'"),
         (dumps(Trial(1, (replace(DRAWN[0][0], start_ns=-1),))), ">= 0"),
         (
-            dumps(Trial(1, (Fault(Kind.FREEZE, "both", 0, 1, 1.0),))),
+            dumps(Trial(1, (ScheduledFault(Kind.FREEZE, "both", 0, 1, 1.0),))),
             "got 'both', expected server or client",
         ),
     ],
@@ -83,7 +93,7 @@ def test_a_schedule_shrinks_to_the_faults_that_matter(seed: int, data: st.DataOb
     culprits = data.draw(st.sets(st.sampled_from(drawn), min_size=1, max_size=3))
     needed_ns = {fault.start_ns: fault.length_ns // 5 for fault in culprits}
 
-    def fails(faults: tuple[Fault, ...]) -> bool:
+    def fails(faults: tuple[ScheduledFault, ...]) -> bool:
         length_ns = {fault.start_ns: fault.length_ns for fault in faults}
         return all(length_ns.get(start, -1) >= least for start, least in needed_ns.items())
 
@@ -101,10 +111,10 @@ def test_what_fails_whatever_happens_shrinks_to_nothing() -> None:
 
 def test_shrinking_asks_seldom() -> None:
     """For two culprits among 1000 faults, less than a tenth as often as one by one."""
-    many = tuple(Fault(Kind.STEP, "server", start, 0, 1.0) for start in range(1000))
+    many = tuple(ScheduledFault(Kind.STEP, "server", start, 0, 1.0) for start in range(1000))
     asked = []
 
-    def fails(faults: tuple[Fault, ...]) -> bool:
+    def fails(faults: tuple[ScheduledFault, ...]) -> bool:
         asked.append(len(faults))
         return {many[17], many[803]} <= set(faults)
 

@@ -21,13 +21,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import shell.feed
-from netem.proxy import Proxy
-from shared import config
-from shared.change import Running
-from shared.events import Changed, Degraded, Event, Finished
-from shared.feed import (
+import skytether.shell.feed
+from skytether.netem.proxy import Proxy
+from skytether.server import tick
+from skytether.shared.core.change import Running
+from skytether.shared.core.events import Changed, Degraded, Event, Finished
+from skytether.shared.scenario import reading, schema
+from skytether.shared.telemetry.feed import (
     FRAME_BYTES_MAX,
+    LENGTH_BYTES,
     FeedError,
     Figures,
     Frame,
@@ -40,10 +42,10 @@ from shared.feed import (
     encode,
     table,
 )
-from shared.record import PACKET_COLUMNS, Recorder, parse, plan_columns
-from shell import command
-from shell.driver import Shell, run
-from shell.feed import (
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, parse, plan_columns
+from skytether.shell import command
+from skytether.shell.driver import Shell, run
+from skytether.shell.feed import (
     BACKLOG_BYTES_MAX,
     READERS_MAX,
     ROWS_BYTES_MAX,
@@ -51,10 +53,10 @@ from shell.feed import (
     Feed,
     Subscriber,
 )
-from shell.local import LocalError
-from sim import flight
+from skytether.shell.local import LocalError
+from skytether.sim import flight
 
-DEMO = config.load("demo")
+DEMO = reading.load("demo")
 OPENED = Opened(process="netem", name="demo", scenario="", parts={}, wall_ns=2, time_ns=1)
 PATIENCE_S = 30.0
 
@@ -66,7 +68,7 @@ def rows(number: int, part: str = "netem", size: int = 28) -> Rows:
 
 # -- the frames ------------------------------------------------------------------------------------
 
-FIGURES = {"vehicles": 1, "each": {"vehicle 1": {"step": 7}}, "mode": "track", "share": 0.5}
+FIGURES = {"vehicles": 1, "by_vehicle": {"1": {"step": 7}}, "mode": "track", "share": 0.5}
 FRAMES: list[Frame] = [
     OPENED,
     rows(1),
@@ -102,15 +104,26 @@ def test_garbage_is_a_feed_error_or_waits_for_more(garbage: bytes, framed: bool)
 @given(st.sampled_from(FRAMES), st.data())
 @settings(max_examples=300)
 def test_a_damaged_frame_is_another_one_or_a_feed_error(frame: Frame, data: st.DataObject) -> None:
-    """One byte of it is another."""
-    damaged = bytearray(encode(frame))
-    damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    """One byte of it is another; where the length has grown, a reader waits for the rest."""
+    whole = encode(frame)
+    at = data.draw(st.integers(0, len(whole) - 1))
+    damaged = bytearray(whole)
+    damaged[at] ^= data.draw(st.integers(1, 255))
+    size = int.from_bytes(damaged[:LENGTH_BYTES], "big")
     reader = Reader()
     try:
-        reader.read(bytes(damaged))
-        reader.read(bytes(1000))
+        read = reader.read(bytes(damaged))
     except FeedError:
-        pass
+        assert at >= LENGTH_BYTES or not len(whole) - LENGTH_BYTES < size <= FRAME_BYTES_MAX
+        return
+    if at < LENGTH_BYTES:
+        assert read == []
+        assert len(whole) - LENGTH_BYTES < size <= FRAME_BYTES_MAX
+    else:
+        (other,) = read
+        assert encode(other) != whole
+    with pytest.raises(FeedError):  # a frame of no bytes, or one that has ended in the midst
+        reader.read(bytes(size + LENGTH_BYTES))
 
 
 def test_a_frame_longer_than_any_is_refused_before_it_has_come() -> None:
@@ -144,7 +157,13 @@ def test_columns_survive_the_round_trip() -> None:
         table(b"x", PACKET_COLUMNS)
 
 
-@pytest.mark.parametrize("text", ["", "3", "null", "[]", '[["a","zzz"]]', '[["a"]]', '{"a":"b"}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "3", "null", "[]", '[["a","zzz"]]', '[["a"]]', '{"a":"b"}', "[" * 100_000),
+        *('[["a","f8,("]]', '[["a","3f8"]]', '[["a","O"]]', '[["a","<M8[s]"]]', '[["a",["<f8"]]]'),
+    ],
+)
 def test_columns_that_are_none_are_a_feed_error(text: str) -> None:
     """As `columns_of` promises."""
     with pytest.raises(FeedError, match="no columns"):
@@ -356,7 +375,7 @@ def test_without_the_bound_memory_grows_for_who_does_not_read(
     driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nobody is dropped then, and all that was told waits."""
-    monkeypatch.setattr(shell.feed, "WAITING_BYTES_MAX", 1 << 60)
+    monkeypatch.setattr(skytether.shell.feed, "WAITING_BYTES_MAX", 1 << 60)
     dropped, waiting = flooded(driven)
     assert dropped == 0
     assert waiting > 1.5 * WAITING_BYTES_MAX
@@ -441,7 +460,7 @@ def test_the_end_does_not_wait_long_for_who_does_not_read(
     driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All of them share the time."""
-    monkeypatch.setattr(shell.feed, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(skytether.shell.feed, "PATIENCE_S", 0.01)
     for _ in range(READERS_MAX):
         driven.look()
     driven.tell(*range(16), size=65536)
@@ -479,7 +498,7 @@ def test_a_feed_that_cannot_be_made_is_said_before_anything_flies(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With the flag, the path and the reason."""
-    from netem.__main__ import emulate
+    from skytether.netem.__main__ import emulate
 
     path = tmp_path / "none" / "feed"
     code = command.main(emulate, ["--bind", "127.0.0.1:0", "--feed", str(path)], "netem")
@@ -508,7 +527,7 @@ class Passing(Proxy):
         super().__init__(DEMO, server=("127.0.0.1", 1), recorder=recorder)
         self.recorder = recorder
 
-    def change(self, scenario: config.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+    def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """Change, and perhaps end."""
         super().change(scenario, keys, now_ns=now_ns)
         self.recorder.append(1, number=round(100 * scenario.network.uplink.loss))
@@ -548,7 +567,7 @@ def test_a_process_tells_its_readers_while_it_is_driven(
 
     The feed ends with the process, its last words included.
     """
-    monkeypatch.setattr(shell.feed, "AGAIN_S", 0.05)
+    monkeypatch.setattr(skytether.shell.feed, "AGAIN_S", 0.05)
     path, seen, late, sink = tmp_path / "feed", Seen(), Seen(), io.BytesIO()
     recorder = Recorder(PACKET_COLUMNS, sink)
     loop: list[asyncio.AbstractEventLoop] = []
@@ -597,7 +616,7 @@ def test_a_process_tells_its_readers_while_it_is_driven(
     for opened, loss in ((before, 0.1), (after, 0.25)):
         assert isinstance(opened, Opened)
         assert (opened.process, opened.name) == ("netem", "demo")
-        scenario = msgspec.toml.decode(opened.scenario, type=config.Scenario)
+        scenario = msgspec.toml.decode(opened.scenario, type=schema.Scenario)
         assert scenario.network.uplink.loss == loss
     assert isinstance(before, Opened)
     columns = columns_of(before.parts["netem"])
@@ -611,7 +630,7 @@ def test_a_subscriber_begins_anew_where_a_process_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also after one that told garbage; once closed it calls nobody any more."""
-    monkeypatch.setattr(shell.feed, "AGAIN_S", 0.02)
+    monkeypatch.setattr(skytether.shell.feed, "AGAIN_S", 0.02)
     path, seen = tmp_path / "feed", Seen()
     with closing(Subscriber({"netem": path}, seen.take, seen.lose)):
         for life, words in enumerate((encode(OPENED), b"\xff" * 99, encode(OPENED)), start=1):
@@ -634,18 +653,18 @@ def test_the_plans_told_are_those_that_are_sent(
     scheme: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each horizon has a row: its inputs behind the committed ones, and where they begin."""
-    sent, encode_horizon = [], flight.Server.__init__.__globals__["encode_horizon"]
+    sent, encode_horizon = [], tick.encode_horizon
 
     def spied(vehicle: int, session: int, step: int, *rest: Any) -> bytes:
         sent.append((vehicle, step, np.frombuffer(rest[2], np.float32).reshape(2, -1).copy()))
         return bytes(encode_horizon(vehicle, session, step, *rest))
 
-    monkeypatch.setitem(flight.Server.__init__.__globals__, "encode_horizon", spied)
-    raw = config.to_table(DEMO) | {"duration": 6.0, "settle": 2.0}
+    monkeypatch.setattr(tick, "encode_horizon", spied)
+    raw = reading.to_table(DEMO) | {"duration": 6.0, "settle": 2.0}
     raw["control"] |= {"scheme": scheme, "trigger": "always"}
     raw["control"] |= {"feedback": scheme == "dead_reckoning", "observer_s": 0.0}
     raw["vehicle"]["wind"] = 0.0
-    flown = config.check(raw, "test")
+    flown = reading.check(raw, "test")
     terms = flown.terms()
     flight_ = flight.fly(flown, vehicles=2)
     plans = flight_.plan
@@ -681,7 +700,7 @@ def test_flights_of_a_batch_keep_no_plans() -> None:
 
 def test_events_are_of_the_log_and_limited() -> None:
     """What a reader is told is what the log has, and no more."""
-    from shell.log import Log
+    from skytether.shell.log import Log
 
     told: list[Event] = []
     with closing(Log("netem", "json", told.append)) as log:

@@ -13,23 +13,25 @@ from socket import SOCK_DGRAM, socket
 import numpy as np
 import pytest
 
-from client.fleet import Fleet
-from client.plant import FirstOrderPlant
-from client.vehicle import Client
-from netem.proxy import Proxy
-from server.endpoint import Server
-from shared import config
-from shared.chance import stream
-from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Address, Datagram
-from shared.events import NoAnswer
-from shared.record import Recorder, Rows, client_columns, parse
-from shell import workers
-from sim.world import Clock, World
-from skytether.fleet import STAGES
+from skytether.cli.fleet import STAGES
+from skytether.client.endpoint import Client
+from skytether.client.fleet import Fleet
+from skytether.client.simulated.vehicle import simulated
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.events import NoAnswer
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shell import workers
+from skytether.sim.world import Clock, World
+from warm import skytether
 
-GUSTY = config.check(
-    config.to_table(config.load("fleet"))
+GUSTY = reading.check(
+    reading.to_table(reading.load("fleet"))
     | {"duration": 4.0, "settle": 0.0, "vehicle": {"wind": 0.1, "gust_mps2": 0.5}},
     "test",
 )
@@ -43,7 +45,7 @@ def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Clien
     made = [
         Client(
             scenario,
-            FirstOrderPlant(scenario, stream(scenario.seed, "wind", number)),
+            simulated(scenario, number),
             server=server,
             vehicle=number,
             boot_id=number,
@@ -115,22 +117,22 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
     vehicles, _ = clients(GUSTY, 2, ("server", 1))
     fleet = Fleet(vehicles)
     fleet.receive(Datagram(b"?", ("server", 1), 1), now_ns=0)
-    assert [client.counts.total() for client in vehicles] == [0, 1]
-    assert fleet.figures()["each"]["vehicle 2"] == {
-        "vehicle": 2,
+    assert [client.dropped.total() for client in vehicles] == [0, 1]
+    assert fleet.figures()["by_vehicle"]["2"] == {
         "mode": "init",
         "step": 0,
         "steps": 200,
         "missed": 0,
-        "counts": {"dropped: not a message": 1},
+        "horizons": 0,
+        "dropped": {"not a message": 1},
     }
 
 
 def test_figures_of_many_vehicles_stay_readable() -> None:
     """Figures tell of sixteen vehicles, and of how many more there are."""
     vehicles, _ = clients(GUSTY, 20, ("server", 1))
-    each = Fleet(vehicles).figures()["each"]
-    assert (len(each), each["and more"]) == (17, 4)
+    figures = Fleet(vehicles).figures()
+    assert (len(figures["by_vehicle"]), figures["vehicles"]) == (16, 20)
 
 
 # -- the command ---------------------------------------------------------------------------------
@@ -139,12 +141,8 @@ def test_figures_of_many_vehicles_stay_readable() -> None:
 def fleet_command(tmp_path: Path, *argv: str) -> dict[str, object]:
     """The summary of `skytether fleet`."""
     file = tmp_path / "fleet.json"
-    subprocess.run(
-        [sys.executable, "-P", "-m", "skytether", "fleet", *argv, "--json", str(file)],
-        check=True,
-        capture_output=True,
-        timeout=100,
-    )
+    done = skytether("fleet", *argv, "--json", str(file), timeout_s=100.0)
+    assert done.returncode == 0, done.stderr
     summary: dict[str, object] = json.loads(file.read_bytes())
     return summary
 
@@ -218,13 +216,7 @@ def test_a_fleet_has_a_page_where_one_is_asked_for() -> None:
 )
 def test_impossible_numbers_are_refused(argv: list[str], line: str) -> None:
     """In one line, with what would do."""
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "skytether", *argv],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    done = skytether(*argv)
     assert (done.returncode, done.stderr.strip()) == (2, line)
 
 

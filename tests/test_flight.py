@@ -8,24 +8,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared import config
-from shared.config import Scenario
-from shared.events import Finished, FlowOpened, Flying, ModeChanged, SessionOpened
-from shared.model import Array
-from shared.record import DOWNLINK, UPLINK, client_columns
-from shared.summary import Summary, summarise
-from sim.flight import Flight, fly
+from skytether.shared.core.events import Finished, FlowOpened, Flying, ModeChanged, SessionOpened
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, client_columns
+from skytether.shared.telemetry.summary import Summary, position_error, summarise
+from skytether.shell.command import summary_rows
+from skytether.sim.flight import fly, fly_batch
 
 
 def scenario(name: str, **changes: Any) -> Scenario:
     """A packaged scenario with some keys changed."""
-    table = config.to_table(config.load(name))
+    table = reading.to_table(reading.load(name))
     for key, value in changes.items():
         table[key] = table[key] | value if isinstance(value, dict) else value
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
-def summary(flown: Scenario, flight: Flight) -> Summary:
+def summary(flown: Scenario, flight: Record) -> Summary:
     """Summary of a flight's three parts."""
     return summarise(flown, "test", flight.client, flight.server, flight.netem)
 
@@ -37,34 +38,33 @@ QUIET = {
 """A network that does nothing."""
 
 HASH = """
-from shared import config
-from sim.flight import fly
+from skytether.shared.scenario import reading
+from skytether.sim.flight import fly
 import msgspec
-flown = msgspec.structs.replace(config.load("paper"), duration=8.0, seed=5)
+flown = msgspec.structs.replace(reading.load("paper"), duration=8.0, seed=5)
 print(fly(flown).trace_hash())
 """
 
 
-def test_the_same_seed_flies_the_same_in_other_processes_and_hash_seeds() -> None:
+def test_the_same_seed_flies_the_same_in_another_process_and_hash_seed() -> None:
     """To the last bit of the record."""
-    hashes = set()
-    for hash_seed in ("0", "1"):
-        environment = os.environ | {"PYTHONHASHSEED": hash_seed}
-        run = subprocess.run(
-            [sys.executable, "-c", HASH], env=environment, capture_output=True, check=True
-        )
-        hashes.add(run.stdout.decode().strip())
+    environment = os.environ | {"PYTHONHASHSEED": "1"}
+    run = subprocess.run(
+        [sys.executable, "-c", HASH], env=environment, capture_output=True, check=True
+    )
+    hashes = {run.stdout.decode().strip()}
     hashes.add(fly(scenario("paper", duration=8.0, seed=5)).trace_hash())
     assert len(hashes) == 1
     assert fly(scenario("paper", duration=8.0, seed=6)).trace_hash() not in hashes
 
 
 def test_compensation_is_worth_a_factor_of_two_and_a_half() -> None:
-    """The paper's claim, over ten seeds: without compensation the error is 2.5 times as large."""
+    """The paper's claim, over five seeds: without compensation the error is 2.5 times as large."""
     error = {}
     for name in ("paper-no-compensation", "paper-every-step"):
-        flights = [scenario(name, seed=seed, duration=33.0) for seed in range(1, 11)]
-        error[name] = np.mean([summary(flown, fly(flown)).rmse_xy or 0.0 for flown in flights])
+        flown = scenario(name, duration=33.0)
+        flights = fly_batch(flown, range(1, 6))
+        error[name] = np.mean([summary(flown, flight).rmse_xy for flight in flights])
     assert error["paper-no-compensation"] >= 2.5 * error["paper-every-step"]
 
 
@@ -93,6 +93,18 @@ def test_without_network_the_estimate_is_the_state() -> None:
     np.testing.assert_array_equal(flight.server["estimate"], flight.client["state"][:199])
 
 
+def test_a_flight_that_is_over_before_it_has_settled_has_an_error() -> None:
+    """The error is that of its second half; `demo` leaves out 8 s, where it is long enough."""
+    flown = scenario("demo", duration=5.0)
+    flight = fly(flown)
+    error = position_error(flown, flight.client, flight.server)[50:]
+    assert summary(flown, flight).rmse_x == pytest.approx(np.sqrt((error[:, 0] ** 2).mean()))
+    assert scenario("demo", duration=9.0).settled_s == 8.0
+
+
+HORIZONS = "uplink horizons, other packets"
+
+
 def test_the_summary_counts_what_the_network_saw() -> None:
     """Every packet once, lost ones with them."""
     flown = scenario("paper", duration=20.0)
@@ -108,6 +120,9 @@ def test_the_summary_counts_what_the_network_saw() -> None:
     assert result.uplink_packets == len(up)
     assert result.event_ratio is not None
     assert result.event_ratio * len(flight.server) == pytest.approx(flight.server["event"].sum())
+    assert result.uplink_horizons == flight.server["event"].sum()
+    horizons = summary_rows(result)[[name for name, _ in summary_rows(result)].index(HORIZONS)][1]
+    assert horizons == f"{result.uplink_horizons}, {len(up) - result.uplink_horizons}"
     assert result.lost == flight.netem["lost"].sum() > 0
     assert result.reordered == flight.netem["overtaken"].sum() > 0
     assert result.solve_ms_p50 is None
@@ -277,3 +292,13 @@ def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
     alone = sent_s("state_gap")
     assert most(sent_s("state_gap & budget(5, 2)")) <= 2.0 + 1e-9 < 4.0 < most(alone)
     assert np.diff(sent_s("state_gap | silence(1)")).max() <= 1.0 + 1e-9 < np.diff(alone).max()
+
+
+def test_what_is_never_flown_costs_no_packets() -> None:
+    """Over a round trip of 1.6 s the last 1.3 s of a plan are too old before their turn comes."""
+    slow = {"minimum_s": 0.76}
+    long = scenario("demo", duration=30.0, network={"uplink": slow, "downlink": slow})
+    assert long.link.age_max_s == 5.0
+    found = [summary(long, flight) for flight in fly_batch(long, range(1, 7))]
+    assert max(each.event_ratio or 1.0 for each in found) < 0.08  # 0.6 where all of it is compared
+    assert np.median([each.rmse_xy or 1.0 for each in found]) < 0.035

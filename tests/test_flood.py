@@ -9,16 +9,16 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from benchmarks import flood
-from benchmarks.flood import FORGED, Counts
-from benchmarks.link import NOW_NS, PEER, Ends
-from benchmarks.wire import messages
-from server.secure import FORMS, Secure
-from shared.config import load
-from shared.endpoint import Datagram, Form
-from shared.protocol import Hello, Observation, ProtocolError, Welcome, encode
-from shell.udp import admit_only, kernel_drops, open_socket
-from sim.flight import make_keys
+from skytether.lab.benchmarks import flood
+from skytether.lab.benchmarks.flood import FORGED, FloodCounts
+from skytether.lab.benchmarks.link import NOW_NS, PEER, Ends
+from skytether.lab.benchmarks.wire import messages
+from skytether.server.secure import FORMS, SecureGate
+from skytether.shared.core.endpoint import Datagram, Form
+from skytether.shared.scenario.reading import load
+from skytether.shared.wire.protocol import Hello, Observation, ProtocolError, Welcome, encode
+from skytether.shell.udp import admit_only, kernel_drops, open_socket
+from skytether.sim.flight import make_keys
 
 pytestmark = pytest.mark.long
 
@@ -28,7 +28,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="the filter is one of
 class Linked(NamedTuple):
     """A vehicle's link with a server, and packets of the vehicle's."""
 
-    gate: Secure
+    gate: SecureGate
     ends: Ends
     observation: bytes
     plain: dict[type, bytes]
@@ -39,7 +39,7 @@ def linked() -> Linked:
     """Both ends, which have shaken hands."""
     plain = {type(message): encode(message) for message in messages(load("demo").terms())}
     keyring = make_keys(1, 1)
-    gate = Secure(keyring, entropy=secrets.token_bytes)
+    gate = SecureGate(keyring, entropy=secrets.token_bytes)
     ends = Ends(gate, keyring, 1, plain[Hello], plain[Welcome])
     ends.challenge()
     ends.welcome()
@@ -47,7 +47,7 @@ def linked() -> Linked:
     return Linked(gate, ends, ends.link.seal(plain[Observation]), plain)
 
 
-def refusals(gate: Secure, packets: Iterable[bytes]) -> set[str]:
+def refusals(gate: SecureGate, packets: Iterable[bytes]) -> set[str]:
     """Reasons for which packets are refused; "" of one that is not."""
     found = set()
     for packet in packets:
@@ -134,7 +134,7 @@ def test_all_that_a_vehicle_sends_comes_through_and_random_bytes_do_not(linked: 
 def test_a_flight_goes_on_beside_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
     """With real processes, at a small rate: it is refused and kept out, and a newcomer flies."""
     monkeypatch.setattr(flood, "KINDS", (FORGED,))
-    result = flood.measure(Counts(seconds=2, forged=2000, hellos=0, lead_s=0.5))
+    result = flood.measure(FloodCounts(seconds=2, forged=2000, hellos=0, lead_s=0.5))
     (found,) = flood.floods_of(result)
     assert found.sent > 0.0
     assert found.read > 0.0

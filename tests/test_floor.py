@@ -6,22 +6,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client.plant import FirstOrderPlant
-from lab.floor import fly_aboard, summarise_aboard, target_floor_m, wind_floor_m
-from shared import config, reference
-from shared.chance import stream
-from shared.config import Scenario
-from shared.record import Rows, client_columns
-from shared.summary import summarise
-from sim.flight import fly
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.weather import Weather
+from skytether.lab.floor import fly_aboard, summarise_aboard, target_floor_m, wind_floor_m
+from skytether.shared.base.chance import stream
+from skytether.shared.scenario import reading, reference
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Rows, client_columns
+from skytether.shared.telemetry.summary import summarise
+from skytether.sim.flight import fly
 
 
 def scenario(name: str = "paper", **changes: Any) -> Scenario:
     """A packaged scenario with some keys changed; sections are laid over."""
-    table = config.to_table(config.load(name))
+    table = reading.to_table(reading.load(name))
     for key, value in changes.items():
         table[key] = table[key] | value if isinstance(value, dict) else value
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
 def aged(flown: Scenario, age_steps: int, plan_steps: int) -> Rows:
@@ -38,7 +39,7 @@ def test_the_winds_floor_is_what_it_does_until_an_input_has_done_its_work() -> N
     flown = scenario(duration=10.0, vehicle={"wind": 0.1})
     blown = []
     for seed in range(400):
-        plant = FirstOrderPlant(flown, stream(seed, "test"))
+        plant = FirstOrderPlant(flown, Weather(flown, stream(seed, "test")))
         start = plant.state()
         for _ in range(20):
             plant.advance(np.zeros(2))

@@ -1,33 +1,64 @@
-"""`fuzz`: whatever a peer sends, no endpoint raises; what was found once stays mended."""
+"""`fuzz`: whatever others send or write, only the documented error comes of it, and bounds hold."""
 
-from itertools import islice
+from pathlib import Path
 from random import Random
 
+import msgspec
 import numpy as np
 import pytest
+from mcap.exceptions import McapError
 
-from fuzz.mutators import corpus, hostile, seeds
-from fuzz.targets import SCENARIOS, InFlight, Target, decoder, targets
-from shared import protocol
-from shared.config import Scenario
-from shared.protocol import decode
+from skytether.lab.fuzz import __main__ as command
+from skytether.lab.fuzz.datagrams import SCENARIOS, Decoder, EndpointInFlight
+from skytether.lab.fuzz.handshake import Holder, Strangers
+from skytether.lab.fuzz.mutators import corpus, seeds
+from skytether.lab.fuzz.target import Target, functions
+from skytether.lab.fuzz.targets import TARGETS
+from skytether.server.reception import IMPLAUSIBLE
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import feed
+from skytether.shared.wire import handshake, protocol
+from skytether.shared.wire.protocol import Drop, decode
+from skytether.shell import log
+from skytether.view import container
 
-TARGETS = targets()
+COUNTS = {
+    "decoder": 10_000,
+    "flight": 500,
+    "sealed": 500,
+    "handshake": 3_000,
+    "holder": 300,
+    "control": 150,
+    "recording": 4,
+    "scenario": 150,
+    "feed": 5_000,
+    "page": 300,
+    "log": 5_000,
+}
+"""Number of inputs of each target here; `make fuzz` gives it more."""
 BY_AXES = pytest.mark.parametrize("scenario", SCENARIOS, ids=["2-D", "3-D"])
 
 
-def attack(target: Target, known: list[bytes], count: int) -> None:
-    """Give a target so many payloads."""
-    for payload in islice(hostile(Random(1), known, {}), count):
-        target(payload)
+def attack(target: Target, count: int) -> None:
+    """Give a target so many inputs."""
+    rng = Random(1)
+    for _ in range(count):
+        target(target.next(rng))
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_every_payload_of_the_corpus_is_survived(name: str) -> None:
-    """Odd ones, and a message of each type, with terms of either scenario."""
-    messages = [seed for scenario in SCENARIOS for seed in seeds(scenario.terms())]
-    for payload in (*corpus().values(), *messages):
-        TARGETS[name](payload)
+def test_hostile_inputs_break_no_promise(name: str, tmp_path: Path) -> None:
+    """Corpus, seeds of the target, and mutated ones of these."""
+    target = TARGETS[name](tmp_path)
+    for payload in (*corpus().values(), *target.seeds()[:30], b""):
+        target(payload)
+    attack(target, COUNTS[name])
+
+
+def test_functions_of_a_module_are_its_own_and_those_of_its_classes() -> None:
+    """Not those that it has from elsewhere."""
+    names = {each.__qualname__ for each in functions(feed)}
+    assert names == {"encode", "Reader.__init__", "Reader.read", "described", "columns_of", "table"}
 
 
 @BY_AXES
@@ -39,22 +70,40 @@ def test_seeds_are_messages_of_every_type(scenario: Scenario) -> None:
 
 
 @BY_AXES
-def test_a_hundred_thousand_payloads_do_not_break_the_decoder(scenario: Scenario) -> None:
-    """Together with the other scenario; `make fuzz` and `python -m fuzz` give it more."""
-    attack(decoder(scenario), [*corpus().values(), *seeds(scenario.terms())], 50_000)
-
-
-@BY_AXES
 def test_a_flight_goes_on_whatever_is_said_to_both_ends(scenario: Scenario) -> None:
     """Payloads reach past the decoder, into session and plausibility, and bounds hold."""
-    flight = InFlight(scenario)
-    known = [*corpus().values(), *seeds(scenario.terms())]
-    for payload in islice(hostile(Random(1), known, flight.newest), 8_000):
-        flight(payload)
-    dropped = " ".join((*flight.server.counts, *flight.client.counts))
-    for reason in ("implausible", "unknown session", "from the future", "for another life"):
+    flight = EndpointInFlight(scenario)
+    attack(flight, 8_000)
+    dropped = {*flight.server.dropped, *flight.client.dropped}
+    for reason in (Drop.UNKNOWN_SESSION, Drop.FROM_THE_FUTURE, Drop.FOR_ANOTHER_LIFE):
         assert reason in dropped
-    assert flight.client.figures()["step"] > 20
+    assert dropped & set(IMPLAUSIBLE.values())
+    assert flight.client.told()["step"] > 20
+
+
+def test_strangers_are_kept_out_at_every_place() -> None:
+    """What they send is dropped for every reason there is, and the flight goes on."""
+    strangers = Strangers()
+    attack(strangers, 3_000)
+    at_server, at_newcomer = strangers.server.dropped, strangers.newcomer.dropped
+    assert {*at_server} >= {Drop.NOT_SEALED, Drop.LENGTH, Drop.FORGED, Drop.REPLAYED}
+    assert {*at_server} >= {Drop.UNKNOWN_CHANNEL, Drop.UNKNOWN_KEY, Drop.NOT_FOR_A_SERVER}
+    assert {*at_newcomer} >= {Drop.UNASKED, Drop.LENGTH, Drop.NOT_FOR_A_CLIENT}
+    assert strangers.client.told()["step"] > 20
+
+
+def test_the_holder_of_a_key_reaches_past_the_handshake() -> None:
+    """What is sealed in it is opened: it gets in as itself, or is dropped for what it says."""
+    holder, rng, came = Holder(), Random(1), set()
+    for _ in range(400):
+        holder(holder.next(rng))
+        came |= {bool(holder.server.sessions.coming), holder.client._session.number is not None}
+    dropped = {*holder.server.dropped, *holder.client.dropped}
+    assert came == {False, True}
+    assert dropped >= {Drop.FORGED, Drop.OUT_OF_PLACE, Drop.FIELD}
+
+
+# -- what would be found out -----------------------------------------------------------------------
 
 
 def test_a_decoder_that_does_not_look_at_shapes_is_found_out(
@@ -68,4 +117,62 @@ def test_a_decoder_that_does_not_look_at_shapes_is_found_out(
     )
     for scenario in SCENARIOS:
         with pytest.raises((TypeError, ValueError)):
-            attack(decoder(scenario), seeds(scenario.terms()), 5_000)
+            attack(Decoder(scenario), 5_000)
+
+
+def test_a_gate_that_looks_at_no_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client then answers each challenge that anybody has made up."""
+    monkeypatch.setattr(handshake, "is_authentic", lambda *_: True)
+    with pytest.raises(AssertionError):
+        attack(Strangers(), 3_000)
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "errors", "raised"),
+    [
+        ("feed", feed, "_UNDECODABLE", (RecursionError, UnicodeDecodeError)),
+        ("log", log, "_UNDECODABLE", (RecursionError, UnicodeDecodeError)),
+        ("recording", container, "BROKEN", (TypeError, ValueError, LookupError)),
+    ],
+)
+def test_a_reader_that_forgets_an_error_is_found_out(
+    name: str,
+    module: object,
+    errors: str,
+    raised: tuple[type[Exception], ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that knows those of its library alone."""
+    monkeypatch.setattr(module, errors, (msgspec.DecodeError, McapError))
+    with pytest.raises(raised):
+        attack(TARGETS[name](tmp_path), 2_000)
+
+
+# -- the command -----------------------------------------------------------------------------------
+
+
+class Fussy(Decoder):
+    """A target that breaks at some inputs."""
+
+    def __init__(self, _: Path, fussy: int = 250) -> None:
+        self._fussy = fussy
+
+    def __call__(self, payload: bytes) -> None:
+        """Break where the first byte is large."""
+        if payload and payload[0] > self._fussy:
+            raise ZeroDivisionError
+
+
+def test_a_fault_is_told_with_the_input_that_makes_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Target, seed, number and bytes; and without a fault the number of inputs and their rate."""
+    monkeypatch.setattr(command, "TARGETS", {"fussy": Fussy, "calm": lambda _: Fussy(_, 255)})
+    assert command.attack("calm", tmp_path, 1, 1050, 60.0).startswith("calm: 1050 inputs in ")
+    with pytest.raises(ZeroDivisionError):
+        command.attack("fussy", tmp_path, 1, 10_000, 60.0)
+    told, payload = capsys.readouterr().err.split(": ")
+    assert told.startswith("fussy, seed 1, input ")
+    with pytest.raises(ZeroDivisionError):
+        Fussy(tmp_path)(bytes.fromhex(payload))

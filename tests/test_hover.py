@@ -5,27 +5,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-import sim.flight
-from server.endpoint import Server
-from shared import config
-from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Datagram
-from shared.events import Finished, ModeChanged, NotFlown
-from shared.protocol import Heartbeat, Horizon, Idle, decode, encode
-from sim.flight import MIDNIGHT_NS, Flight, fly
+import skytether.sim.flight
+from skytether.server.endpoint import Server
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import Finished, ModeChanged, NotFlown
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.wire.protocol import Heartbeat, Horizon, Idle, decode, encode
+from skytether.sim.flight import MIDNIGHT_NS, fly
 
 
 def scenario(**sections: Any) -> Scenario:
     """Twenty seconds of the demo over 0.2 s each way without loss; sections are laid over."""
-    table = config.to_table(config.load("demo")) | {"duration": 20.0}
+    table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
     quick = {"delay": "constant", "minimum_s": 0.2, "loss": 0.0}
     table["network"] = {"uplink": quick, "downlink": quick}
     for section, values in sections.items():
         table[section] |= values
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
-def said(flight: Flight, host: str = "client") -> list[Any]:
+def said(flight: Record, host: str = "client") -> list[Any]:
     """Events of a host of the flight."""
     return [event for _, name, event in flight.events if name.split()[0] == host]
 
@@ -40,6 +42,7 @@ class Interrupted(Server):
 
     def __init__(self, flown: Scenario, **keys: Any) -> None:
         super().__init__(flown, **keys)
+        self._terms = flown.terms()
         self._made: tuple[Scenario, dict[str, Any]] | None = flown, keys
 
     def gone(self, now_ns: int) -> bool:
@@ -70,9 +73,9 @@ class Interrupted(Server):
             super().wake(now_ns=now_ns)
         elif self.mute:
             super().wake(now_ns=now_ns)
-            self._out = [each._replace(payload=self.muted(each.payload)) for each in self._out]
+            self._out[:] = [each._replace(payload=self.muted(each.payload)) for each in self._out]
         else:
-            self._due_ns = None
+            self._grid.rest()
 
 
 def interrupted(
@@ -82,14 +85,14 @@ def interrupted(
     end_s: float = 1e6,
     *,
     mute: bool = False,
-) -> Flight:
+) -> Record:
     """A flight with a server that is gone, or sends no horizon, from one time to another."""
 
     class ThisOne(Interrupted):
         gone_s = begin_s, end_s
 
     ThisOne.mute = mute
-    monkeypatch.setattr(sim.flight, "Server", ThisOne)
+    monkeypatch.setattr(skytether.sim.flight, "Server", ThisOne)
     return fly(flown)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 HELPER = """
 from typing import NamedTuple
-from shared.kernel import F1, inline
+from skytether.shared.base.kernel import F1, inline
 
 FACTOR = 2
 
@@ -21,7 +21,7 @@ def scaled(x):
 CALLER = """
 import numpy as np
 from helper import Given, scaled
-from shared.kernel import kernel
+from skytether.shared.base.kernel import kernel
 
 @kernel
 def double(given: Given) -> None:
@@ -32,6 +32,36 @@ def double(given: Given) -> None:
 values = np.ones(1)
 double(Given(values))
 print(values[0], sum(double.stats.cache_hits.values()))
+"""
+
+
+HELP = """
+import sys
+from skytether.__main__ import COMMANDS, main
+for line in [f"{name} --help" for name in COMMANDS] + sys.argv[1:]:
+    try:
+        code = main(line.split())
+    except SystemExit as ended:
+        code = ended.code
+    assert code == (2 if line in sys.argv else 0), (line, code)
+"""
+REFUSED = (
+    "fly nosuch --virtual",
+    "fly demo --virtual --control.horizon 0",
+    "fleet --virtual --workers 2",
+    "margins demo --runs 0",
+    "reproduce --runs 0",
+    "sweep demo --out x --grid control.horizon=0",
+    "server demo --bind 0.0.0.0:0 --no-such-flag",
+    "server demo --bind 0.0.0.0:0",
+    "server demo --bind 127.0.0.1:0 --keys no-such-file",
+    "server demo --bind 0.0.0.0:0 --workers 2 --keys no-such-file",
+)
+PREPARED = """
+import caller
+from skytether.shared.base import kernel
+from skytether.shell.command import prepare
+prepare(kernel.missing())
 """
 
 
@@ -69,6 +99,34 @@ def test_a_kernel_is_compiled_anew_when_what_it_calls_has_changed(tmp_path: Path
     helper.write_text(HELPER.replace("x * FACTOR", "x * FACTOR + 1"))
     assert run(tmp_path) == "3.0 0"
     assert run(tmp_path) == "3.0 1"
+
+
+def quiet(folder: Path, code: str, *argv: str) -> str:
+    """What a program prints on stderr that keeps machine code in a folder."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code, *argv],
+        cwd=folder,
+        env={"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stderr
+
+
+def test_a_help_and_a_refusal_compile_nothing(tmp_path: Path) -> None:
+    """Every command is asked, with nothing on disk: it took 80 s until the first words."""
+    quiet(tmp_path, HELP, *REFUSED)
+    assert not (tmp_path / "kept").exists()
+
+
+def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
+    """A line where there is no terminal; nothing where machine code is on disk."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER.split("\nvalues = ", maxsplit=1)[0])
+    said = "compiling what flies, once on this machine: it takes up to a minute\n"
+    assert quiet(tmp_path, PREPARED) == said
+    assert quiet(tmp_path, PREPARED) == ""
 
 
 def test_machine_code_for_a_type_that_is_gone_is_no_reason_to_fail(tmp_path: Path) -> None:

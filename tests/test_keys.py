@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import pytest
 
-from shared.config import ConfigError
-from shared.keys import Key, Keyring, load, parse, write
-from shell import command
-from skytether.keygen import keygen as keygen_
+from skytether.cli.keygen import keygen as keygen_
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.wire.keys import Keyring, VehicleKey, load, parse, write
+from skytether.shell import command
 
 ROOT = Path(__file__).parent.parent
 A, B, C = (bytes([i]) * 32 for i in (0xA1, 0xB2, 0xC3))
@@ -51,9 +51,9 @@ def test_a_vehicle_uses_its_key_with_the_highest_number() -> None:
     """Unless it is told another; the server finds each by its number."""
     keys = keyring(write(1, 7, A), "# the next\n\n", write(1, 9, B), f"2 0 {C.hex()} # spare\n")
     assert len(keys) == 3
-    assert keys.of(1) == Key.of(1, 9, B)
-    assert keys.of(1, 7) == Key.of(1, 7, A) == keys.find(1, 7)
-    assert keys.of(2) == keys.find(2, 0) == Key.of(2, 0, C)
+    assert keys.of(1) == VehicleKey.of(1, 9, B)
+    assert keys.of(1, 7) == VehicleKey.of(1, 7, A) == keys.find(1, 7)
+    assert keys.of(2) == keys.find(2, 0) == VehicleKey.of(2, 0, C)
     assert keys.find(2, 7) is None
     assert keys.numbers(1) == [7, 9]
 
@@ -69,7 +69,7 @@ def test_a_key_that_is_missing_is_named() -> None:
 
 def test_what_is_derived_from_a_secret_depends_on_all_of_it() -> None:
     """Key and MAC have nothing in common, and one bit of the secret changes both."""
-    key, other = Key.of(1, 1, A), Key.of(1, 1, A[:-1] + b"\0")
+    key, other = VehicleKey.of(1, 1, A), VehicleKey.of(1, 1, A[:-1] + b"\0")
     assert len({key.psk, key.mac, other.psk, other.mac, A}) == 5
 
 
@@ -120,9 +120,43 @@ def test_a_file_that_others_can_read_or_write_is_refused(mode: int, tmp_path: Pa
     with pytest.raises(ConfigError, match=rf"its mode is {mode:04o}, expected 0600"):
         load(path)
     path.chmod(0o600)
-    assert load(path).of(1) == Key.of(1, 1, A)
+    assert load(path).of(1) == VehicleKey.of(1, 1, A)
     path.chmod(0o400)
     assert len(load(path)) == 1
+
+
+def test_a_file_that_others_can_put_another_for_is_refused(tmp_path: Path) -> None:
+    """By a link, in a folder that anybody may write to, sticky or not, and within such a folder."""
+    content = write(1, 1, A).encode()
+    folder = tmp_path / "open" / "own"
+    folder.mkdir(parents=True)
+    file, link = put(folder / "keys", content), tmp_path / "link"
+    link.symlink_to(file)
+    with pytest.raises(ConfigError, match="link: cannot be read: it is a link, expected the file"):
+        load(link)
+    assert load(file)
+    link.unlink()
+    link.symlink_to(folder)
+    assert load(link / "keys")
+    for where, mode in ((folder, 0o777), (folder, 0o1777), (folder.parent, 0o777)):
+        where.chmod(mode)
+        for path in (file, link / "keys"):
+            with pytest.raises(ConfigError, match=f"anybody may write .* {mode:04o}:"):
+                load(path)
+        where.chmod(0o755)
+    folder.parent.chmod(0o1777)
+    assert load(file)
+
+
+def test_keygen_makes_no_file_that_would_be_refused(tmp_path: Path) -> None:
+    """In a folder that anybody may write to, or by a link that leads nowhere yet."""
+    (tmp_path / "link").symlink_to(tmp_path / "keys")
+    run = keygen("link", cwd=tmp_path)
+    assert (run.returncode, "it is a link" in run.stderr) == (2, True)
+    tmp_path.chmod(0o777)
+    run = keygen("keys", cwd=tmp_path)
+    assert (run.returncode, "anybody may write to the folder" in run.stderr) == (2, True)
+    assert not (tmp_path / "keys").exists()
 
 
 def test_what_is_no_file_of_keys_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -144,7 +178,7 @@ def test_no_secret_is_shown_by_a_repr() -> None:
     """Neither the secret nor what is derived from it; a worker gets all of it nevertheless."""
     keys = keyring(write(1, 7, A))
     key = keys.of(1)
-    assert repr(key) == "Key(vehicle=1, number=7)"
+    assert repr(key) == "VehicleKey(vehicle=1, number=7)"
     assert repr(keys) == "Keyring(name='keys')"
     assert pickle.loads(pickle.dumps(key)) == key
 
@@ -170,7 +204,7 @@ def test_keygen_adds_the_next_key_and_no_third(tmp_path: Path) -> None:
     assert keygen("k", "--add", "--first", "4", cwd=tmp_path).returncode == 0
     keys = load(path)
     assert keys.numbers(4) == [1, 2]
-    assert keys.of(4, 1) == Key.of(4, 1, A)
+    assert keys.of(4, 1) == VehicleKey.of(4, 1, A)
     content = path.read_bytes()
     run = keygen("k", "--add", "--first", "4", cwd=tmp_path)
     assert run.returncode == 2

@@ -4,8 +4,6 @@ import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,10 +12,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared import config
-from shared.events import Listening, Plaintext, Unauthenticated
-from shared.protocol import Hello, encode
-from shell.log import Line
+from skytether.shared.core.events import Listening, Plaintext, Unauthenticated
+from skytether.shared.scenario import reading
+from skytether.shared.wire.protocol import Hello, encode
+from skytether.shell.log import LogLine
+from warm import Command, skytether
 
 PATIENCE_S = 60.0
 QUICK = [
@@ -28,18 +27,11 @@ QUICK = [
 SECRET = "6f" * 32
 
 
-def skytether_(*argv: str) -> subprocess.CompletedProcess[str]:
-    """One command to its end."""
-    command = [sys.executable, "-P", "-m", "skytether", *argv]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-
-
 class Server:
     """A server process, and its events."""
 
     def __init__(self, *argv: str) -> None:
-        command = [sys.executable, "-P", "-m", "server", "demo", "--bind", "127.0.0.1:0"]
-        self.popen = subprocess.Popen([*command, "--log", "json", *argv], stdout=subprocess.PIPE)
+        self.popen = Command("server", "demo", "--bind", "127.0.0.1:0", "--log", "json", *argv)
         self.events: list[object] = []
         self._listens = threading.Event()
         self.port = 0
@@ -48,10 +40,9 @@ class Server:
         assert self._listens.wait(PATIENCE_S)
 
     def _read(self) -> None:
-        assert self.popen.stdout is not None
         with self.popen.stdout as said:
             for line in said:
-                event = msgspec.json.decode(line, type=Line).event
+                event = msgspec.json.decode(line, type=LogLine).event
                 self.events.append(event)
                 if isinstance(event, Listening):
                     self.port = event.port
@@ -77,7 +68,7 @@ def serving(*argv: str) -> Iterator[Server]:
         yield server
     finally:
         server.popen.kill()
-        server.popen.wait()
+        server.popen.wait(PATIENCE_S)
         server.reader.join()
 
 
@@ -93,7 +84,7 @@ def key_file(folder: Path, secret: str = SECRET, *, mode: int = 0o600, name: str
 def test_a_flight_is_sealed_from_end_to_end(tmp_path: Path) -> None:
     """`fly --secure` makes keys, flies by them over UDP, and says so."""
     file = tmp_path / "summary.json"
-    ended = skytether_("fly", "--secure", "--duration", "4", "--json", str(file), *QUICK)
+    ended = skytether("fly", "--secure", "--duration", "4", "--json", str(file), *QUICK)
     assert ended.returncode == 0, ended.stderr
     summary = json.loads(file.read_text())
     assert summary["secure"] is True
@@ -107,7 +98,7 @@ def test_a_wrong_key_is_one_line_at_each_end(tmp_path: Path) -> None:
     other = key_file(tmp_path, "70" * 32, name="other")
     with serving("--keys", str(ours)) as server:
         argv = ["client", "demo", "--server", server.address(), "--link.connect-s", "1"]
-        ended = skytether_(*argv, "--keys", str(other))
+        ended = skytether(*argv, "--keys", str(other))
         events = server.end()
     assert ended.returncode == 1
     (line,) = ended.stderr.splitlines()
@@ -122,7 +113,7 @@ def test_a_server_with_keys_answers_nothing_in_plaintext(tmp_path: Path) -> None
     with serving("--keys", str(key_file(tmp_path))) as server:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.settimeout(0.5)
-            hello = encode(Hello(1, 1, config.load("demo").terms()))
+            hello = encode(Hello(1, 1, reading.load("demo").terms()))
             for payload in (hello, b"\0", os.urandom(512)):
                 stranger.sendto(payload, ("127.0.0.1", server.port))
             with pytest.raises(TimeoutError):
@@ -148,12 +139,12 @@ def test_plaintext_is_said_loudly() -> None:
 )
 def test_without_keys_no_other_machine_is_spoken_to(argv: tuple[str, ...]) -> None:
     """Unless it is asked for by name."""
-    ended = skytether_(*argv)
+    ended = skytether(*argv)
     assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()
     assert line.endswith("expected --keys FILE (see skytether keygen), or --insecure")
     if argv[0] == "client":
-        ended = skytether_(*argv, "--insecure", "--link.connect-s", "0.2")
+        ended = skytether(*argv, "--insecure", "--link.connect-s", "0.2")
         assert ended.returncode == 1
         assert "on the network can fly the vehicle" in ended.stdout
 
@@ -174,7 +165,7 @@ def test_a_bad_key_file_is_one_line(name: str, process: str, tmp_path: Path) -> 
     """It names the file and what was expected, and never the secret."""
     secret, mode, said = BAD_FILES[name]
     file = tmp_path / "keys" if secret is None else key_file(tmp_path, secret, mode=mode)
-    ended = skytether_(process, "demo", "--keys", str(file))
+    ended = skytether(process, "demo", "--keys", str(file))
     assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()
     assert str(file) in line
@@ -193,7 +184,7 @@ def test_a_key_that_is_not_there_is_one_line(
     more: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
     """Neither a number of a key nor a vehicle that the file does not have."""
-    ended = skytether_("client", "demo", "--keys", str(key_file(tmp_path)), *more)
+    ended = skytether("client", "demo", "--keys", str(key_file(tmp_path)), *more)
     assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()
     assert said in line

@@ -1,8 +1,8 @@
 """How much is said: a few events of a kind in a second, and how many more there were."""
 
-from shared.endpoint import SECOND_NS
-from shared.events import Event, Flying, Omitted, SessionEnded
-from shell.limit import KIND_MAX, Limit
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import Event, Flying, Omitted, SessionEnded
+from skytether.shell.limit import KIND_MAX, Limit
 
 
 def told(limit: Limit, events: list[Event], now_ns: int) -> list[Event]:

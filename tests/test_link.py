@@ -7,12 +7,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem import link as link_module
-from netem.fate import SLOT_NS, Fate, Fates
-from netem.link import QUEUE_BYTES_MAX, Lane, Link
-from shared.config import DirectionConfig
-from shared.endpoint import MILLISECOND_NS, Datagram
-from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Recorder, Rows, parse
+from skytether.netem import link as link_module
+from skytether.netem.fate import SLOT_NS, Fate, Fates
+from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.telemetry.record import (
+    DOWNLINK,
+    PACKET_COLUMNS,
+    UPLINK,
+    Recorder,
+    Rows,
+    parse,
+)
 
 PEER = ("192.0.2.1", 5000)
 
@@ -189,6 +197,22 @@ def test_what_leaves_makes_room_for_as_many_bytes(monkeypatch: pytest.MonkeyPatc
     assert (link.depth(), link.counts.overflowed) == (1, 1)
 
 
+def test_figures_tell_delays_between_edges_and_how_late_packets_have_left() -> None:
+    """Errors of 0, 1, 1 and 10 ms, to the 20 µs of their bins; and the edges by name."""
+    link, late_ms = make_link(), (0, 1, 1, 10)
+    lane = make_lane(*[150 * MILLISECOND_NS] * 4)
+    for number, late in enumerate(late_ms):
+        entered_ns = number * 1000 * MILLISECOND_NS
+        take(link, lane, "a", now_ns=entered_ns)
+        assert give(link, now_ns=entered_ns + (150 + late) * MILLISECOND_NS) == "a"
+    figures = link.figures()
+    assert figures["error_ms_p50"] == pytest.approx(1.0, abs=0.03)
+    assert figures["error_ms_p99"] == pytest.approx(10.0, abs=0.03)
+    assert figures["error_ms_max"] == 10.0
+    edges = [20, 40, 60, 80, 100, 140, 200, 300, 400, 500, 600, 800, 1000, 2000]
+    assert list(figures["delays_within_ms"]) == [*map(str, edges), "inf"]
+
+
 def test_the_greatest_depth_is_remembered() -> None:
     """After the queue has emptied as well."""
     link = make_link()
@@ -246,7 +270,7 @@ def test_the_delay_histogram_is_of_delays_as_drawn() -> None:
     link, ms = make_link(), MILLISECOND_NS
     take(link, make_lane(400 * ms, 440 * ms, 440 * ms, 500 * ms, lost=[3]), "abcd")
     give(link, now_ns=900 * ms)
-    assert link.counts.delay.by_bin() == {"400 ms": 1, "440 ms": 2}
+    assert link.counts.delay.by_bin() == {"400": 1, "440": 2}
 
 
 def recorded(direction: int, lane: Lane, names: str) -> Rows:

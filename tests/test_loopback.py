@@ -12,21 +12,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client.plant import FirstOrderPlant
-from client.vehicle import Client
-from netem.proxy import Proxy
-from server.endpoint import Server
-from shared import config
-from shared.chance import stream
-from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
-from shared.events import Event, FlowOpened
-from shared.record import PACKET_COLUMNS, Recorder, client_columns, parse, server_columns
-from shell import timer, udp
-from shell.driver import Shell, new_event_loop
-from shell.udp import AddressError, open_socket
-from sim.flight import Flight
-from sim.flight import fly as fly_virtually
+from skytether.client.endpoint import Client
+from skytether.client.simulated.vehicle import simulated
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.events import Event, FlowOpened
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import (
+    PACKET_COLUMNS,
+    Record,
+    Recorder,
+    client_columns,
+    parse,
+    server_columns,
+)
+from skytether.shell import timer, udp
+from skytether.shell.driver import Shell, new_event_loop
+from skytether.shell.udp import AddressError, open_socket
+from skytether.sim.flight import fly as fly_virtually
 
 LOOPBACK: Address = ("127.0.0.1", 0)
 LOOPBACK_6: Address = ("::1", 0)
@@ -122,7 +129,7 @@ async def test_wakes_come_in_time_and_never_early(
 ) -> None:
     """Both timers, twenty wakes: some already past when asked for, some in the future."""
     if not kernel:
-        monkeypatch.setattr("shell.driver.make_timer", timer.LoopTimer)
+        monkeypatch.setattr("skytether.shell.driver.make_timer", timer.LoopTimer)
     now_ns = time.monotonic_ns()
     wakes_ns = [now_ns + step * 2_000_000 for step in range(-5, 15)]
     echo = Echo(wakes_ns, last=20)
@@ -207,7 +214,7 @@ async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.Monk
         return addresses["first" if len(looked_up) == 1 else "then"]
 
     monkeypatch.setattr(udp, "look_up", look_up)
-    monkeypatch.setattr("shell.driver.RESOLVE_EVERY_S", 0.001)
+    monkeypatch.setattr("skytether.shell.driver.RESOLVE_EVERY_S", 0.001)
     driver = Shell(Echo(), LOOPBACK, [("moving", 1)])
     assert driver._names.name(addresses["first"]) == ("moving", 1)
     async with driven(driver):
@@ -308,13 +315,13 @@ def test_addresses_of_no_use_are_named() -> None:
 
 def scenario(name: str, **changes: Any) -> Scenario:
     """A packaged scenario with some keys changed."""
-    table = config.to_table(config.load(name)) | {"settle": 0.0}
+    table = reading.to_table(reading.load(name)) | {"settle": 0.0}
     for key, value in changes.items():
         table[key] = table[key] | value if isinstance(value, dict) else value
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
-async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = None) -> Flight:
+async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = None) -> Record:
     """The three endpoints in this process, over real UDP.
 
     Args:
@@ -322,7 +329,7 @@ async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = No
     """
     axes = flown.model.axes
     sinks = [io.BytesIO() for _ in range(3)]
-    columns = (client_columns(axes), server_columns(axes), PACKET_COLUMNS)
+    columns = (client_columns(axes), server_columns(axes, flown.control.scheme), PACKET_COLUMNS)
     recorders = [Recorder(column, sink) for column, sink in zip(columns, sinks, strict=True)]
     server = Shell(
         Server(flown, boot_id=1, entropy=stream(1, "entropy").bytes, recorder=recorders[1]),
@@ -333,7 +340,7 @@ async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = No
         Shell(
             Client(
                 flown,
-                FirstOrderPlant(flown, stream(flown.seed, "wind", number)),
+                simulated(flown, number),
                 server=netem.address,
                 vehicle=number,
                 boot_id=1,
@@ -350,7 +357,7 @@ async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = No
         flights = asyncio.gather(*(each.run() for each in clients))
         await asyncio.wait_for(flights, flown.duration + 20.0)
     client_rows, server_rows, netem_rows = (parse(sink.getvalue()) for sink in sinks)
-    return Flight(client_rows, server_rows, netem_rows)
+    return Record(client_rows, server_rows, netem_rows)
 
 
 FAST = {
@@ -385,7 +392,7 @@ async def test_two_vehicles_in_space_on_one_server() -> None:
     assert set(flight.netem["flow"]) == {0, 1}
 
 
-def differences(real: Flight, virtual: Flight) -> list[str]:
+def differences(real: Record, virtual: Record) -> list[str]:
     """Columns in which two flights of one scenario are not equal to the last bit."""
     steps = min(len(real.server), len(virtual.server))
     return [

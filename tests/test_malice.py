@@ -6,16 +6,18 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from client.plant import FirstOrderPlant
-from client.vehicle import Client
-from server.endpoint import VEHICLES_MAX, Server
-from shared import config
-from shared.chance import stream
-from shared.endpoint import EVENTS_MAX, SECOND_NS, Datagram, Endpoint
-from shared.events import Omitted
-from shared.protocol import (
+from skytether.client.endpoint import Client
+from skytether.client.simulated.vehicle import simulated
+from skytether.server.endpoint import VEHICLES_MAX, Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import EVENTS_MAX, Address, Datagram, Endpoint
+from skytether.shared.core.events import Omitted
+from skytether.shared.scenario import reading
+from skytether.shared.wire.protocol import (
     FEEDBACK,
     Close,
+    Drop,
     Heartbeat,
     Hello,
     Horizon,
@@ -26,8 +28,9 @@ from shared.protocol import (
     encode,
 )
 
-SCENARIO = config.load("paper")
+SCENARIO = reading.load("paper")
 TERMS = SCENARIO.terms()
+SERVER: Address = ("server", 0)
 STRANGER = ("stranger", 6)
 DATAGRAMS = 10_000
 
@@ -67,10 +70,10 @@ def hostile(rng: random.Random) -> Iterator[bytes]:
 
 def endpoints() -> list[Endpoint]:
     """A server and a client, as they are before any session."""
-    plant = FirstOrderPlant(SCENARIO, stream(1, "wind"))
+    flies = simulated(SCENARIO, 1)
     return [
         Server(SCENARIO, boot_id=2**40, entropy=stream(1, "entropy").bytes),
-        Client(SCENARIO, plant, server=("server", 0), vehicle=1, boot_id=2**50),
+        Client(SCENARIO, flies, server=SERVER, vehicle=1, boot_id=2**50),
     ]
 
 
@@ -81,19 +84,17 @@ def test_ten_thousand_hostile_datagrams_are_counted_and_change_nothing(
     """No exception, no answer, no session, no wake; a bounded set of reasons."""
     asleep_until = endpoint.next_wake_ns()
     datagrams = hostile(random.Random(1))
+    sender = SERVER if isinstance(endpoint, Client) else STRANGER  # others are not even heard
     for _ in range(DATAGRAMS):
-        endpoint.receive(Datagram(next(datagrams), STRANGER), now_ns=SECOND_NS)
+        endpoint.receive(Datagram(next(datagrams), sender), now_ns=SECOND_NS)
     assert endpoint.outbox() == []
     assert endpoint.next_wake_ns() == asleep_until
     assert not endpoint.finished
-    assert sum(endpoint.counts.values()) == DATAGRAMS
-    assert set(endpoint.counts) <= {
-        f"dropped: {reason}"
-        for reason in (
-            *("too long", "not msgpack", "not a message", "version", "type", "field", "shape"),
-            *("not finite", "input out of range", "unknown session", "for another life"),
-            *("not for a server", "not for a client"),
-        )
+    assert sum(endpoint.dropped.values()) == DATAGRAMS
+    assert set(endpoint.dropped) <= {
+        *(Drop.TOO_LONG, Drop.NOT_MSGPACK, Drop.NOT_A_MESSAGE, Drop.VERSION, Drop.TYPE, Drop.FIELD),
+        *(Drop.SHAPE, Drop.NOT_FINITE, Drop.INPUT_OUT_OF_RANGE, Drop.UNKNOWN_SESSION),
+        *(Drop.FOR_ANOTHER_LIFE, Drop.NOT_FOR_A_SERVER, Drop.NOT_FOR_A_CLIENT),
     }
 
 

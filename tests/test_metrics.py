@@ -16,24 +16,33 @@ import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-import shell.metrics
-from client.fleet import Fleet
-from client.plant import FirstOrderPlant
-from client.vehicle import Client
-from shared import config, metrics
-from shared.chance import stream
-from shared.endpoint import VEHICLES_TOLD_MAX
-from shared.events import Measured
-from shared.metrics import HEALTHY, LEFT_OUT, TABLES, families, trouble
-from shared.protocol import Mode
-from shared.stopwatch import Stopwatch
-from shell import command
-from shell.log import Line
-from shell.metrics import CONNECTIONS_MAX, Collected, Metrics, MetricsError, names
-from sim import flight
+import skytether.shell.exporter
+from airborne import Air
+from skytether.client.endpoint import Client
+from skytether.client.fleet import Fleet
+from skytether.client.simulated.vehicle import simulated
+from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX
+from skytether.shared.core.events import Measured
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario import reading
+from skytether.shared.wire.protocol import Drop, Mode
+from skytether.shell import command, metrics
+from skytether.shell.exporter import CONNECTIONS_MAX, Collected, Metrics, MetricsError, names
+from skytether.shell.log import LogLine
+from skytether.shell.metrics import (
+    HEALTHY,
+    LEFT_OUT,
+    TABLES,
+    Label,
+    families,
+    flat,
+    matched,
+    trouble,
+)
+from skytether.sim import flight
 
 ROOT = Path(__file__).parent.parent
-DEMO = config.load("demo")
+DEMO = reading.load("demo")
 PROCESS: dict[str, Any] = {
     "cpu_s": 1.5,
     "kernel_drops": 2,
@@ -51,17 +60,21 @@ def figures() -> dict[str, dict[str, Any]]:
     clients = [
         Client(
             DEMO,
-            FirstOrderPlant(DEMO, stream(1, "wind")),
+            simulated(DEMO, 1),
             server=("server", 1),
             vehicle=vehicle,
             boot_id=1,
         )
         for vehicle in range(20)
     ]
-    clients[0].counts["horizons"] += 1
-    clients[0].counts["dropped: not a message"] += 1
+    clients[0].horizons += 1
+    clients[0].dropped[Drop.NOT_A_MESSAGE] += 1
+    air = Air()
+    air.run(5.0)
     each = {**flown.figures, "client": Fleet(clients).figures(), "alone": clients[0].figures()}
-    each["server"]["counts"] |= {"dropped: forged": 3, "refused: full": 1}
+    for client in ("client", "alone"):
+        each[client]["by_vehicle"]["0"]["autopilot"] = air.figures()
+    each["server"] |= {"dropped": {"forged": 3}, "refused": {"full": 1}}
     return {process: told | PROCESS for process, told in each.items()}
 
 
@@ -100,16 +113,15 @@ def test_a_figure_that_is_not_known_is_found(figures: dict[str, dict[str, Any]])
 def test_no_line_of_the_tables_is_about_nothing(figures: dict[str, dict[str, Any]]) -> None:
     """Each metric tells something in a flight, and each that is left out is there."""
     rare = {
-        "counts/horizons lost",
-        "each/and more",
-        "each/vehicle {vehicle}/age_ms",
-        "each/vehicle {vehicle}/plan_age_ms",
+        ("counts", "horizons_lost"),
+        ("by_vehicle", Label("vehicle"), "age_ms"),
+        ("by_vehicle", Label("vehicle"), "plan_age_ms"),
     }
     for process, table in TABLES.items():
-        flat = [name for name, _ in metrics._flat(figures[process])]
+        paths = [path for path, _ in flat(figures[process])]
         for figure in [*(each.figure for each in table), *LEFT_OUT[process]]:
-            pattern = metrics._pattern(figure)
-            assert figure in rare or any(map(pattern.fullmatch, flat)), (process, figure)
+            told = [path for path in paths if matched(figure, path) is not None]
+            assert told or figure in rare, (process, figure)
 
 
 def test_names_follow_prometheus() -> None:
@@ -136,7 +148,7 @@ def test_numbers_are_the_figures_in_base_units(figures: dict[str, dict[str, Any]
     assert told["skytether_server_steps_total", ()] == server["counts"]["steps"] > 100
     assert told["skytether_server_dropped_datagrams_total", ("reason=forged",)] == 3.0
     bound_s = told["skytether_server_vehicle_clock_bound_seconds", ("vehicle=1",)]
-    assert bound_s == pytest.approx(server["each"]["vehicle 1"]["clock_bound_ms"] / 1e3)
+    assert bound_s == pytest.approx(server["by_vehicle"]["1"]["clock_bound_ms"] / 1e3)
     ticks = told["skytether_server_tick_seconds_bucket", ("le=+Inf",)]
     assert ticks == told["skytether_server_tick_seconds_count", ()] > 100
     assert told["skytether_feed_dropped_readers_total", ()] == 1.0
@@ -178,14 +190,14 @@ def test_vehicles_told_of_are_bounded(figures: dict[str, dict[str, Any]]) -> Non
 def test_figures_of_a_client_in_flight_have_ages() -> None:
     """As its record has them; before a horizon is in force there are none."""
     seen: list[dict[str, Any]] = []
-    advance = Client._report
+    fly = Client._fly
 
-    def spied(self: Client, *args: Any) -> None:
-        advance(self, *args)
-        seen.append(self.figures())
+    def spied(self: Client, now_ns: int) -> None:
+        fly(self, now_ns)
+        seen.append(self.told())
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Client, "_report", spied)
+        patch.setattr(Client, "_fly", spied)
         flown = flight.fly(msgspec.structs.replace(DEMO, duration=8.0))
     assert "age_ms" not in seen[0]
     ages = [-1 if "age_ms" not in told else round(told["age_ms"] * 1e6) for told in seen]
@@ -201,11 +213,12 @@ def test_figures_of_a_client_in_flight_have_ages() -> None:
 @pytest.mark.parametrize("mode", list(Mode))
 def test_a_client_is_well_while_it_is_flown_or_could_be(mode: Mode) -> None:
     """The metrics of a vehicle that is alone, and of any among several."""
-    alone = {"vehicle": 1, "mode": str(mode), "missed": 0}
-    several = {"missed": 0, "each": {"vehicle 3": {"mode": "track"}, "vehicle 1": alone}}
+    one = {"mode": str(mode), "missed": 0}
+    alone = {"vehicles": 1, "missed": 0, "by_vehicle": {"1": one}}
+    several = {"vehicles": 2, "missed": 0, "by_vehicle": {"3": {"mode": "track"}, "1": one}}
     why = "" if mode in (Mode.READY, Mode.TRACK, Mode.COAST) else f"vehicle 1 is in mode {mode}"
     assert (str(mode) in HEALTHY) == (not why)
-    assert trouble("client", alone) == trouble("client", several | {"and more": 3}) == why
+    assert trouble("client", alone) == trouble("client", several) == why
 
 
 def test_a_server_is_well_while_it_is_in_time() -> None:
@@ -220,7 +233,7 @@ def test_a_process_that_is_stuck_is_not_well(monkeypatch: pytest.MonkeyPatch) ->
     assert collected.health()[0] == 503
     collected.take({"degraded": False})
     assert collected.health() == (200, b'{"process":"server.1","healthy":true,"trouble":""}\n')
-    monkeypatch.setattr(shell.metrics, "FRESH_S", -1.0)
+    monkeypatch.setattr(skytether.shell.exporter, "FRESH_S", -1.0)
     status, body = collected.health()
     assert (status, json.loads(body)["trouble"]) == (503, "it has been stuck for 0 s")
 
@@ -312,7 +325,7 @@ def test_who_says_nothing_keeps_nobody_out(served: Metrics) -> None:
 
 def test_who_is_slow_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether it is slow to ask or never to end."""
-    monkeypatch.setattr(shell.metrics, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(skytether.shell.exporter, "PATIENCE_S", 0.05)
     with closing(Metrics(("127.0.0.1", 0), Collected("netem", "demo", 0.05))) as served:
         with calling(served) as sock:
             sock.sendall(b"GET /metr")
@@ -335,7 +348,7 @@ def test_an_address_that_is_taken_is_said_in_a_line(
     served: Metrics, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Before anything flies, with the flag and the reason."""
-    from netem.__main__ import emulate
+    from skytether.netem.__main__ import emulate
 
     host, port = served.address
     argv = ["--bind", "127.0.0.1:0", "--metrics", f"{host}:{port}"]
@@ -367,7 +380,7 @@ def test_the_documented_metrics_are_those_there_are() -> None:
     labels = {name: set(filter(None, told.split(", "))) for name, _, told, _ in lines}
     for table in TABLES.values():
         for each in table:
-            named = set(re.findall(r"\{(\w+)\}", each.figure)) - {"le"}
+            named = {name.name for name in each.figure if isinstance(name, Label)} - {"le"}
             modes = {"mode"} if each.kind == "modes" else set()
             assert labels[each.name] == named | {name for name, _ in each.labels} | modes
 
@@ -386,7 +399,7 @@ def test_each_worker_of_a_server_has_a_feed_and_metrics_of_its_own(tmp_path: Pat
         told = {}
         try:
             while len(told) < 2:
-                line = msgspec.json.decode(server.stdout.readline(), type=Line)
+                line = msgspec.json.decode(server.stdout.readline(), type=LogLine)
                 if isinstance(line.event, Measured):
                     told[line.process] = line.event.port
             assert told == {"server.1": port, "server.2": port + 1}

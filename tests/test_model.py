@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from server.model import advance as compiled
-from shared.model import advance, discretise
+from skytether.server.control.law import advance as shared
+from skytether.shared.base.kernel import part
+from skytether.shared.law.model import advance, discretise, white_acceleration
 
 quick = settings(max_examples=60, deadline=None)
 time_constants = st.floats(0.02, 50.0)
@@ -100,7 +101,19 @@ def test_very_short_time_constant_follows_at_once() -> None:
     np.testing.assert_allclose(x, [[2.0 * 0.5 - 11.0 * 1e-4, 2.0]], rtol=1e-14)
 
 
-@pytest.mark.parametrize("step", [advance, compiled])
+def test_a_roll_is_its_steps() -> None:
+    """To the last bit, from the state that it begins with on."""
+    model, rng = discretise([0.8, 0.3, 1.1], 0.05), np.random.default_rng(2)
+    x, inputs = rng.normal(size=(3, 2)), rng.normal(size=(3, 7))
+    states = model.roll(x, inputs)
+    assert states.shape == (8, 3, 2)
+    for state, u in zip(states, inputs.T, strict=False):
+        np.testing.assert_array_equal(state, x)
+        x = model.step(x, u)
+    np.testing.assert_array_equal(states[-1], x)
+
+
+@pytest.mark.parametrize("step", [advance, part(shared)])
 def test_one_axis_in_numbers_steps_as_all_in_arrays(step: Callable[..., Any]) -> None:
     """To the last bit, compiled or not: what a client flies is what the server reckons with."""
     model, rng = discretise([0.8, 0.3, 1.1], 0.05), np.random.default_rng(1)
@@ -123,3 +136,16 @@ def test_a_step_is_the_matrix_equation(seed: int) -> None:
     x, u = rng.normal(size=(3, 2)), rng.normal(size=3)
     expected = (model.A @ x[..., None])[..., 0] + model.B * u[:, None]
     np.testing.assert_allclose(model.step(x, u), expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("dt_s", [0.02, 0.05, 0.5])
+def test_the_covariance_under_white_acceleration_is_that_of_the_integral(dt_s: float) -> None:
+    """∫ e^{As} G Gᵀ e^{Aᵀs} over a step, by quadrature, on axes that differ."""
+    tau_s = np.array([0.2, 0.84, 3.0])
+    roots = white_acceleration(tau_s, dt_s)
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    s = 0.5 * dt_s * (nodes + 1.0)
+    for root, tau in zip(roots, tau_s, strict=True):
+        felt = np.array([tau * (1.0 - np.exp(-s / tau)), np.exp(-s / tau)])
+        expected = 0.5 * dt_s * (weights * felt) @ felt.T
+        np.testing.assert_allclose(root @ root.T, expected, rtol=1e-6)

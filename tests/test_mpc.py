@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from benchmarks.problems import gradients
-from server.mpc import (
+from skytether.lab.benchmarks.problems import gradients
+from skytether.server.control.mpc import (
     FIRST,
     LATER,
     Problem,
@@ -22,9 +22,9 @@ from server.mpc import (
     pose,
     shifted,
 )
-from server.solver import OsqpSolver
-from shared.config import ControlConfig, ModelConfig, Scenario
-from shared.model import Array, discretise
+from skytether.server.control.solver import OsqpSolver
+from skytether.shared.law.model import Array, discretise
+from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 
 quick = settings(max_examples=40, deadline=None)
 

@@ -2,29 +2,37 @@
 
 import io
 from collections.abc import Iterable
+from copy import deepcopy
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2
 
-from client import filter as aboard
-from client.filter import Kalman
-from client.navigation import Navigation, navigation
-from client.plant import FirstOrderPlant, white_acceleration
-from client.sensor import Measured, Sensor
-from client.vehicle import Client
-from server import replay
-from shared import config
-from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Datagram
-from shared.model import Array
-from shared.protocol import ACCEPTED, Horizon, Observation, Welcome, decode, encode
-from shared.record import Recorder, Rows, client_columns, parse
-from shared.summary import summarise
-from sim.flight import fly, fly_batch
+from skytether.client import filter as aboard
+from skytether.client.endpoint import Client
+from skytether.client.filter import Kalman
+from skytether.client.navigation import Navigation, sensing
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.sensor import Sensor
+from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.client.simulated.weather import Weather
+from skytether.client.vehicle import Measurement, Vehicle
+from skytether.server.control import committed
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.law.model import Array, white_acceleration
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.registry import VEHICLES, Entry
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire.protocol import Horizon, Observation, Refusal, Welcome, decode, encode
+from skytether.sim.flight import fly, fly_batch
 
+DT_NS = 50 * MILLISECOND_NS
 NOISE = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
 """That of the scenario `target`."""
 POSITIONS = {"position_noise_m": 0.02, "position_every_s": 0.2, "velocity_every_s": "never"}
@@ -33,10 +41,10 @@ POSITIONS = {"position_noise_m": 0.02, "position_every_s": 0.2, "velocity_every_
 
 def scenario(name: str = "demo", **changes: Any) -> Scenario:
     """A scenario that comes with Skytether, with some keys changed."""
-    table = config.to_table(config.load(name))
+    table = reading.to_table(reading.load(name))
     for key, value in changes.items():
         table[key] = table[key] | value if isinstance(value, dict) else value
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
 def matrices(flown: Scenario) -> tuple[Array, Array, Array]:
@@ -70,21 +78,38 @@ def wander(flown: Scenario, steps: int, seed: int) -> tuple[Array, Array]:
     return inputs, np.array(states)
 
 
-def follow(known: Navigation, inputs: Array, states: Array) -> tuple[Array, Array]:
+def follow(flown: Scenario, inputs: Array, states: Array) -> tuple[Array, Array]:
     """What is measured and estimated along a flight; each of the shape (steps + 1, axes, 2)."""
+    sensor, known = Sensor(flown, np.random.default_rng(0)), Navigation(flown)
     measured, estimates = [], []
-    for u, x in zip([np.zeros(states.shape[1]), *inputs], states, strict=True):
-        known.advance(x[:, :2], u)
+    pairs = zip([np.zeros(states.shape[1]), *inputs], states, strict=True)
+    for step, (u, x) in enumerate(pairs):
+        known.advance([sensor.measure(x[:, :2])], u, now_ns=step * flown.dt_ns)
         measured.append(known.measured)
         estimates.append(known.estimate)
     return np.array(measured), np.array(estimates)
 
 
-def known_of(flown: Scenario, seed: int = 0) -> Navigation:
-    """Sensor and filter of a scenario that has noise."""
-    found = navigation(flown, np.random.default_rng(seed))
-    assert found is not None
-    return found
+@pytest.mark.parametrize(("number", "least"), [("position", 1.2625), ("velocity", 5.0)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_ten_sigmas_of_noise_cannot_explain_is_a_leap(
+    number: str, least: float, sign: float
+) -> None:
+    """Within a step of 50 ms, on either axis: 1 m or 2 m/s, 50 m/s² for so long, and 10 sigmas."""
+    for axis in (0, 1):
+        for far, leaps in ((least - 1e-9, False), (least + 1e-9, True)):
+            known = Navigation(scenario(sensor=NOISE))
+            x = {"position": [3.0, 3.0], "velocity": [0.0, 0.0]}
+            told = []
+            for step in range(3):
+                measured = Measurement(step * DT_NS, **deepcopy(x))
+                known.advance([measured], np.zeros(2), now_ns=step * DT_NS)
+                told.append(known.leapt)
+                before = x["velocity"][axis]
+                x[number][axis] += sign * far if step == 0 else 0.0
+                # The mean of its velocity carries the vehicle along.
+                x["position"][axis] += 0.025 * (before + x["velocity"][axis])
+            assert told == [False, leaps, False]
 
 
 # -- the sensor --------------------------------------------------------------------------------
@@ -94,7 +119,7 @@ def test_a_sensor_without_imperfection_needs_no_filter() -> None:
     """What is flown by and reported is the state itself, as ever."""
     exact = {"position_every_s": 0.05, "velocity_every_s": 0.01, "position_bias_m": [0.0, 0.0]}
     for sensor in ({}, exact, {"filter": "none"}):
-        assert navigation(scenario(sensor=sensor), np.random.default_rng(0)) is None
+        assert sensing(scenario(sensor=sensor)).exact
     flight = fly(scenario(duration=10.0, settle=1.0))
     for column in ("measured", "estimate"):
         np.testing.assert_array_equal(flight.client[column], flight.client["state"])
@@ -105,7 +130,7 @@ def test_noise_and_bias_are_those_that_were_asked_for() -> None:
     """Positions and velocities, on every axis."""
     bias = {"position_bias_m": [0.3, -0.1], "velocity_bias_mps": [0.0, 0.2]}
     sensor = Sensor(scenario(sensor=NOISE | bias), np.random.default_rng(1))
-    told = np.array([sensor.measure(np.ones((2, 2))) for _ in range(20_000)])
+    told = np.array([sensor.measure(np.ones((2, 2)))[1:] for _ in range(20_000)])
     np.testing.assert_allclose(told.mean(axis=0), [[1.3, 0.9], [1.0, 1.2]], atol=0.002)
     np.testing.assert_allclose(told.std(axis=0), [[0.02] * 2, [0.05] * 2], rtol=0.02)
 
@@ -129,6 +154,64 @@ def test_measurements_come_when_they_are_due(
     assert [step for step, each in enumerate(known) if each.velocity] == velocities
     for step in positions:
         assert known[step].position == [float(max(step - told.delay, 0))] * 2
+        assert known[step].stamp_ns == max(step - told.delay, 0) * DT_NS
+
+
+def test_a_vehicle_tells_what_it_has_measured_when_it_is_asked() -> None:
+    """Stamped by the clock of who asks; all steps that were slept through, and each once."""
+    flown = scenario(sensor=POSITIONS | {"delay_s": 0.1})
+    flies, began_ns = simulated(flown, 1), 10**12
+    first = flies.measurements(now_ns=began_ns)
+    assert [(each.stamp_ns, each.velocity) for each in first] == [(began_ns, None)]
+    assert not flies.measurements(now_ns=began_ns)
+    later = flies.measurements(now_ns=began_ns + 20 * DT_NS)
+    assert [each.stamp_ns for each in later] == [
+        began_ns + (step - 2) * DT_NS for step in (4, 8, 12, 16, 20)
+    ]
+
+
+class Plane(Vehicle):
+    """A vehicle that is not ours: it measures now and then, and nobody knows its true state."""
+
+    def __init__(self, every: int) -> None:
+        self.every = every
+        self.asked = 0
+        self.flown: list[list[float]] = []
+
+    def fly(self, velocity: Array) -> None:
+        """See `Vehicle`."""
+        self.flown.append(velocity.tolist())
+
+    def measurements(self, *, now_ns: int) -> list[Measurement]:
+        """See `Vehicle`."""
+        self.asked += 1
+        return (
+            [Measurement(now_ns, [0.5, 0.25], [0.0, 0.0])] if self.asked % self.every == 1 else []
+        )
+
+
+def test_a_vehicle_of_one_s_own_is_flown_by_what_it_tells() -> None:
+    """Its true state is nobody's: the record has the estimate, which stays between measurements."""
+    flies, sink, flown = Plane(3), io.BytesIO(), scenario()
+    client = Client(
+        flown,
+        flies,
+        server=("server", 0),
+        vehicle=1,
+        boot_id=9,
+        recorder=Recorder(client_columns(2), sink),
+    )
+    client.wake(now_ns=SECOND_NS)
+    welcome = Welcome(1, 7, 9, 1, 5, Refusal.ACCEPTED, flown.terms())
+    client.receive(Datagram(encode(welcome), ("server", 0)), now_ns=SECOND_NS)
+    for step in range(6):
+        client.wake(now_ns=SECOND_NS + step * flown.dt_ns)
+    rows = parse(sink.getvalue())
+    np.testing.assert_array_equal(rows["state"], rows["estimate"])
+    assert np.isnan(rows["measured"]).all(axis=(1, 2)).tolist() == [False, True, True] * 2
+    assert (rows["estimate"] == [[0.5, 0.0], [0.25, 0.0]]).all()
+    assert flies.flown == [[0.0, 0.0]] * 6
+    assert client.changeable == {"armed"}
 
 
 # -- the filter --------------------------------------------------------------------------------
@@ -139,7 +222,7 @@ def test_the_gains_settle_where_the_riccati_equation_says() -> None:
     flown = scenario(sensor=NOISE)
     kalman, (F, _, Q) = Kalman(flown, 0), matrices(flown)
     H, R = np.eye(2, 3), np.diag([0.02, 0.05]) ** 2
-    nothing = Measured([0.0, 0.0], [0.0, 0.0])
+    nothing = Measurement(0, [0.0, 0.0], [0.0, 0.0])
     kalman.begin(nothing)
     for _ in range(2000):
         kalman.advance([0.0, 0.0])
@@ -158,7 +241,7 @@ def test_it_is_the_kalman_filter_of_its_equations(
     """As written down with matrices, all measurements of a step taken at once."""
     flown = scenario(sensor=sensor, model={"tau_s": tau_s})
     inputs, states = wander(flown, 60, seed=1)
-    measured, estimates = follow(known_of(flown), inputs, states)
+    measured, estimates = follow(flown, inputs, states)
     delay = Sensor(flown, np.random.default_rng(0)).delay
     inputs = np.concatenate([np.zeros((delay, 2)), inputs])
     for axis in range(2):
@@ -202,7 +285,7 @@ def test_late_measurements_are_rolled_on_by_what_was_flown_since() -> None:
     """Exact ones to a millimetre in still air; taken for the present they are decimetres off."""
     late = {"delay_s": 0.3, "velocity_every_s": 0.2}
     flown = scenario(vehicle={"wind": 0.0})
-    plant = FirstOrderPlant(flown, np.random.default_rng(0))
+    plant = FirstOrderPlant(flown, Weather(flown, np.random.default_rng(0)))
     inputs = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, (20, 2)), 10, axis=0)
     states = [plant.state()]
     for u in inputs:
@@ -210,8 +293,8 @@ def test_late_measurements_are_rolled_on_by_what_was_flown_since() -> None:
         states.append(plant.state())
     off = {}
     for name in ("kalman", "none"):
-        known = known_of(scenario(sensor=late | {"filter": name}, vehicle={"wind": 0.0}))
-        off[name] = np.abs(follow(known, inputs, np.array(states))[1] - states).max(axis=(0, 1))
+        known_by = scenario(sensor=late | {"filter": name}, vehicle={"wind": 0.0})
+        off[name] = np.abs(follow(known_by, inputs, np.array(states))[1] - states).max(axis=(0, 1))
     assert off["kalman"].max() < 0.001
     assert off["none"].min() > 0.1
 
@@ -220,7 +303,7 @@ def test_wind_that_stays_and_a_wrong_gain_leave_no_offset(monkeypatch: Any) -> N
     """With positions alone, at 5 Hz; ablation: a filter without w is off."""
     vehicle = {"wind": 0.02, "steady_wind_mps": [0.3, -0.2], "gain": 0.8}
     flown = scenario(sensor=POSITIONS, vehicle=vehicle)
-    plant = FirstOrderPlant(flown, np.random.default_rng(0))
+    plant = FirstOrderPlant(flown, Weather(flown, np.random.default_rng(0)))
     states = [plant.state()]
     inputs = np.full((1600, 2), 0.5)
     for u in inputs:
@@ -228,7 +311,7 @@ def test_wind_that_stays_and_a_wrong_gain_leave_no_offset(monkeypatch: Any) -> N
         states.append(plant.state())
 
     def offset() -> Array:
-        estimates = follow(known_of(flown), inputs, np.array(states))[1]
+        estimates = follow(flown, inputs, np.array(states))[1]
         found: Array = np.abs((estimates - states)[400:].mean(axis=0)).max(axis=0)
         return found
 
@@ -279,7 +362,7 @@ def test_the_server_does_not_learn_noise_for_wind(monkeypatch: Any) -> None:
         return float(np.mean([flight.server["event"].mean() for flight in flights]))
 
     with_it = share()
-    monkeypatch.setattr(replay, "FOLLOW_S", 1e-6)
+    monkeypatch.setattr(committed, "FOLLOW_S", 1e-6)
     assert share() > 1.1 * with_it
 
 
@@ -307,8 +390,7 @@ def test_noisy_observations_are_all_plausible() -> None:
     loud = {"position_noise_m": 0.1, "velocity_noise_mps": 0.25}
     for name in ("kalman", "none"):
         flight = fly(scenario(sensor=loud | {"filter": name}, duration=20.0, settle=1.0))
-        counts = flight.figures["server"]["counts"]
-        assert not [reason for reason in counts if reason.startswith("dropped: ")]
+        assert not flight.figures["server"]["dropped"]
 
 
 def test_the_same_seed_has_the_same_noise_and_vehicles_have_their_own() -> None:
@@ -327,19 +409,20 @@ def test_the_same_seed_has_the_same_noise_and_vehicles_have_their_own() -> None:
 def steps_of(flown: Scenario, awake: Iterable[int]) -> tuple[Rows, list[Observation]]:
     """Record and observations of a vehicle that is awake at some steps, and told to fly 0.5 m/s."""
     sink, terms, server = io.BytesIO(), flown.terms(), ("server", 0)
+    plant = FirstOrderPlant(flown, Weather(flown, np.random.default_rng(0)))
+    sensor = Sensor(flown, np.random.default_rng(0))
     client = Client(
         flown,
-        FirstOrderPlant(flown, np.random.default_rng(0)),
+        SimulatedVehicle(flown.dt_ns, plant, sensor),
         server=server,
         vehicle=1,
         boot_id=9,
-        navigation=known_of(flown),
         recorder=Recorder(client_columns(2), sink),
     )
     client.wake(now_ns=SECOND_NS)
     client.outbox()
     inputs = np.full((2, terms.horizon + 5), 0.5, np.float32)
-    welcome = Welcome(1, 7, 9, 1, 5, ACCEPTED, terms)
+    welcome = Welcome(1, 7, 9, 1, 5, Refusal.ACCEPTED, terms)
     client.receive(Datagram(encode(welcome), server), now_ns=SECOND_NS)
     for step in (0, 1, *awake):
         if step == 2:
@@ -360,3 +443,67 @@ def test_the_filter_goes_on_through_a_sleep() -> None:
     np.testing.assert_array_equal([each.state for each in told], asleep["estimate"])
     assert asleep["state"][-1, 0, 1] > 0.2
     assert np.abs(asleep["estimate"] - asleep["state"]).max() < 0.1
+
+
+# -- stamps of the vehicle's own -------------------------------------------------------------------
+
+
+def test_a_measurement_between_two_steps_is_carried_to_the_step() -> None:
+    """By eq. (1), exactly; one at the step itself is taken as it is, to the last bit."""
+    flown, u = scenario(), np.array([1.0, -0.5])
+    tau, position, velocity = flown.tau_s, [1.0, 2.0], [0.3, 0.4]
+    known = Navigation(flown)
+    known.advance([Measurement(0, [0.0, 0.0], [0.0, 0.0])], u, now_ns=0)
+    for age_ns in (0, 1, 17_000_000, DT_NS - 1):
+        measured = Measurement(DT_NS - age_ns, position, velocity)
+        carried = known._carried(measured, DT_NS, u.tolist())
+        assert (carried is measured) == (age_ns == 0)
+        age, v = age_ns / SECOND_NS, np.array(velocity)
+        left = np.exp(-age / tau)
+        np.testing.assert_allclose(carried.velocity, u + (v - u) * left, rtol=1e-12)
+        moved = u * age + (v - u) * tau * (1.0 - left)
+        np.testing.assert_allclose(carried.position, position + moved, rtol=1e-12)
+
+
+class Restless(Vehicle):
+    """The simulated vehicle, measured every 30 ms whatever the steps are."""
+
+    def __init__(self, flown: Scenario, number: int) -> None:
+        fine = msgspec.structs.replace(flown.control, dt=0.005)
+        self._flies = simulated(msgspec.structs.replace(flown, control=fine), number)
+        self._next_ns = 0
+
+    def fly(self, velocity: Array) -> None:
+        """See `Vehicle`."""
+        self._flies.fly(velocity)
+
+    def measurements(self, *, now_ns: int) -> list[Measurement]:
+        """See `Vehicle`."""
+        told = []
+        for each in self._flies.measurements(now_ns=now_ns):
+            if each.stamp_ns >= self._next_ns:
+                self._next_ns = each.stamp_ns + 30 * MILLISECOND_NS
+                told.append(each)
+        return told
+
+    def truth(self) -> Array:
+        """See `Vehicle`."""
+        return self._flies.truth()
+
+
+def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By stamps of its own; ablation: measurements taken as if they were of the step."""
+    monkeypatch.setitem(VEHICLES, "restless", Entry(Restless, (), ""))
+    flown = scenario(duration=20.0, settle=5.0, vehicle={"wind": 0.0, "steady_wind_mps": []})
+    flown = msgspec.structs.replace(
+        flown, vehicle=msgspec.structs.replace(flown.vehicle, kind="restless")
+    )
+    off_m = []
+    for carried in (Navigation._carried, lambda _, measured, *__: measured):
+        monkeypatch.setattr(Navigation, "_carried", carried)
+        flight = fly(flown).client
+        off_m.append(np.abs(flight["estimate"] - flight["state"])[20:, :, 0].max())
+    assert off_m[0] < 0.002
+    assert off_m[1] > 0.01

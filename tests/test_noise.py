@@ -7,7 +7,14 @@ from typing import NamedTuple
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-from shared.noise import KEY_BYTES, MESSAGE_BYTES, Initiator, Keys, NoiseError, Responder
+from skytether.shared.wire.noise_nnpsk0 import (
+    KEY_BYTES,
+    MESSAGE_BYTES,
+    Initiator,
+    Keys,
+    NoiseError,
+    Responder,
+)
 
 PSK = bytes(range(32))
 

@@ -20,16 +20,17 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from shared.endpoint import Address
-from shared.events import Event, Measured, ModeChanged
-from shared.metrics import TABLES
-from shell.metrics import names
-from skytether.processes import Child, started
+from skytether.cli.processes import Child, started
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import Measured, ModeChanged
+from skytether.shell.exporter import names
+from skytether.shell.log import LogLine
+from skytether.shell.metrics import TABLES
 
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parent.parent
-OBSERVE = ROOT / "observe"
+OBSERVE = ROOT / "deploy"
 DOCUMENT = ROOT / "docs" / "feed.md"
 DASHBOARD = json.loads((OBSERVE / "grafana" / "dashboards" / "skytether.json").read_text())
 RULES = yaml.safe_load((OBSERVE / "rules.yml").read_text())
@@ -65,7 +66,8 @@ async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
     flying = asyncio.Event()
 
     def hear(process: str) -> Any:
-        def on_event(event: Event) -> None:
+        def on_event(line: LogLine) -> None:
+            event = line.event
             if isinstance(event, Measured):
                 told[process] = event.host, event.port
             if isinstance(event, ModeChanged) and event.after == "track":

@@ -1,30 +1,37 @@
 """The page without a browser: who may play, what a slider asks for, and what is answered."""
 
+import contextlib
 import re
 import socket
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+import viser
 
-from shared import config, policy
-from shared.change import Answer, Running
-from shared.events import PageServed
-from sim import flight as virtual
-from skytether import pages
-from skytether.duel import Options, both, titles
-from view import plots
-from view.access import Visitor, is_loopback, may_play
-from view.controls import CUT, THRESHOLDS, TRIGGERS, compared, knobs, triggers
-from view.flight import Flight
-from view.frames import of_flight
-from view.replay import Player
-from view.scene import extent, grid, quadrotor, segments
-from view.state import Curves
+from skytether.cli import page_process
+from skytether.cli.duel import DuelOptions, both, titles
+from skytether.shared.core.change import Answer, Running
+from skytether.shared.core.events import PageServed
+from skytether.shared.scenario import reading, registry, schema
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell.command import CommandError
+from skytether.sim import flight as virtual
+from skytether.view import plots
+from skytether.view.browser import serve
+from skytether.view.browser.access import Visitor, is_loopback, may_play
+from skytether.view.browser.flight import PageFlight
+from skytether.view.browser.replay import Player
+from skytether.view.controls import CUT, THRESHOLDS, TRIGGERS, compared, knobs, triggers
+from skytether.view.frames import of_flight
+from skytether.view.report import with_gaps
+from skytether.view.scene import extent, fence, grid, home, quadrotor, segments
+from skytether.view.state import Curves, State
 
 HERE = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}
 
@@ -72,13 +79,12 @@ def test_a_name_that_only_looks_like_this_machine_is_none() -> None:
         assert not is_loopback(host), host
 
 
-def running(process: str, scenario: config.Scenario) -> tuple[Running, dict[str, Any]]:
+def running(process: str, scenario: schema.Scenario) -> tuple[Running, dict[str, Any]]:
     """An endpoint of a process that can be changed, and the values that it has."""
-    from client.plant import FirstOrderPlant
-    from client.vehicle import Client
-    from netem.proxy import Proxy
-    from server.endpoint import Server
-    from shared.chance import stream
+    from skytether.client.endpoint import Client
+    from skytether.client.simulated.vehicle import simulated
+    from skytether.netem.proxy import Proxy
+    from skytether.server.endpoint import Server
 
     match process:
         case "server":
@@ -86,8 +92,8 @@ def running(process: str, scenario: config.Scenario) -> tuple[Running, dict[str,
         case "netem":
             endpoint = Proxy(scenario, server=("server", 0), flows=1)
         case _:
-            plant = FirstOrderPlant(scenario, stream(scenario.seed, "wind", 1))
-            endpoint = Client(scenario, plant, server=("server", 0), vehicle=1, boot_id=1)
+            flies = simulated(scenario, 1)
+            endpoint = Client(scenario, flies, server=("server", 0), vehicle=1, boot_id=1)
     runs = Running(endpoint, scenario)
     answer = msgspec.json.decode(runs.answer(b"{}", now_ns=0), type=Answer)
     return runs, answer.values
@@ -96,7 +102,7 @@ def running(process: str, scenario: config.Scenario) -> tuple[Running, dict[str,
 @pytest.mark.parametrize("axes", [2, 3])
 def test_every_slider_asks_for_what_the_processes_take(axes: int) -> None:
     """Its lowest, highest and some number in between are accepted, and read back as they are."""
-    scenario = config.load("demo")
+    scenario = reading.load("demo")
     model = msgspec.structs.replace(scenario.model, axes=axes)
     control = msgspec.structs.replace(scenario.control, horizon=50)  # fits, whatever the delay
     scenario = msgspec.structs.replace(scenario, model=model, control=control)
@@ -113,7 +119,7 @@ def test_every_slider_asks_for_what_the_processes_take(axes: int) -> None:
 
 def test_every_trigger_that_is_offered_can_be_flown() -> None:
     """With the scheme for which it is offered."""
-    demo = config.load("demo")
+    demo = reading.load("demo")
     for scheme in ("committed", "predictive", "none", "dead_reckoning"):
         offered = triggers(scheme, "always")
         assert "always" in offered
@@ -124,9 +130,9 @@ def test_every_trigger_that_is_offered_can_be_flown() -> None:
                 trigger=trigger,
                 feedback=scheme == "dead_reckoning",
             )
-            config.check(config.to_table(msgspec.structs.replace(demo, control=control)))
+            reading.check(reading.to_table(msgspec.structs.replace(demo, control=control)))
     assert triggers("committed", "periodic(7)")[0] == "periodic(7)"
-    assert {name for each in TRIGGERS for name in [each.split(" ")[0]]} <= set(policy.SIGNATURES)
+    assert {name for each in TRIGGERS for name in [each.split(" ")[0]]} <= set(registry.TRIGGERS)
 
 
 def test_only_the_thresholds_of_the_trigger_are_shown() -> None:
@@ -140,7 +146,7 @@ def test_only_the_thresholds_of_the_trigger_are_shown() -> None:
 def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) -> None:
     """Each direction its own loss; a link that is cut is not cut again."""
     asked: list[tuple[str, Any]] = []
-    flight = Flight("", tmp_path)
+    flight = PageFlight("", tmp_path)
     flight.ask = lambda process, values: asked.append((process, dict(values)))  # type: ignore[method-assign]
     flight.cut()
     assert not asked, "nothing is known of the network yet"
@@ -157,7 +163,7 @@ def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) ->
 
 def test_that_nobody_answers_is_said_in_words(tmp_path: Path) -> None:
     """Once somebody has asked for a change; not where the page itself asks what may change."""
-    flight = Flight("", tmp_path)
+    flight = PageFlight("", tmp_path)
     flight.ask("netem", {})
     flight.ask("client", {"armed": False})
     ends_s = time.monotonic() + 10
@@ -170,9 +176,9 @@ def test_that_nobody_answers_is_said_in_words(tmp_path: Path) -> None:
 
 def test_a_player_shows_any_time_of_a_flight() -> None:
     """Forwards as it comes, and the same when it is sought, backwards too."""
-    scenario = msgspec.structs.replace(config.load("demo"), duration=10.0)
+    scenario = msgspec.structs.replace(reading.load("demo"), duration=10.0)
     frames = list(of_flight(scenario, "demo", virtual.fly(scenario)))
-    flight = Flight()
+    flight = PageFlight()
     player = Player([flight], [frames])
     player.plays = False
     second_ns = 1_000_000_000
@@ -190,7 +196,7 @@ def test_a_player_shows_any_time_of_a_flight() -> None:
 
 def test_a_duel_is_on_the_same_network_and_seed() -> None:
     """Those of the first, whatever the second one says."""
-    one, other = both(Options("demo", "paper-no-compensation", duration=12.0, seed=7))
+    one, other = both(DuelOptions("demo", "paper-no-compensation", duration=12.0, seed=7))
     assert one.network == other.network
     assert (one.seed, other.seed, one.duration, other.duration) == (7, 7, 12.0, 12.0)
     assert other.control.scheme == "none"
@@ -198,24 +204,58 @@ def test_a_duel_is_on_the_same_network_and_seed() -> None:
     assert len(set(titles("a/demo.toml", "demo"))) == 2
 
 
-def test_no_line_of_a_plot_has_a_gap() -> None:
-    """The browser would draw nothing at all of it."""
+def test_a_gap_of_a_plot_is_drawn_as_a_gap() -> None:
+    """Nothing is where nothing is known: the browser would draw no line that has a NaN in it."""
     nan = np.nan
     x, late, never = np.arange(4.0), np.array([nan, nan, 5.0, 6.0]), np.full(4, nan)
-    early = np.array([nan, 1.0, 2.0, 3.0])
-    drawn = plots.known([x, late, early, never])
-    assert [each.tolist() for each in drawn] == [
+    cut = np.array([nan, 1.0, nan, 3.0])
+    drawn = plots.drawable(plots.begun([x, late, cut, never]))
+    assert [list(each) for each in drawn] == [
         [1.0, 2.0, 3.0],
-        [5.0, 5.0, 6.0],
-        [1.0, 2.0, 3.0],
-        [0.0, 0.0, 0.0],
+        [None, 5.0, 6.0],
+        [1.0, None, 3.0],
+        [None, None, None],
     ]
-    assert Curves.__doc__
+    assert isinstance(drawn[0], np.ndarray), "what has no gap goes as it is"
+
+
+def test_a_plot_with_gaps_reaches_a_browser() -> None:
+    """The library takes them, and puts them on the wire as they are."""
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        plot = plots.Plot("", (plots.PlotLine("age", lambda look: look.curves.age_s),))
+        shown = plots.Plots(server.gui, [""], [plot])
+        nothing = np.empty(0)
+        time_s, age_s = np.arange(3.0), np.array([1.0, np.nan, 3.0])
+        curves = Curves(
+            time_s, nothing, nothing, nothing, nothing, nothing, age_s=age_s, solve_ms=nothing
+        )
+        shown.draw([plots.Look(State(), curves, 0)])
+        sent = list(server._websock_server.get_message_buffer().message_from_id.values())[-1]
+        data = sent.as_serializable_dict([])["updates"]["data"]
+        assert data[1] == [1.0, None, 3.0]
+    finally:
+        server.stop()
+
+
+def test_the_lines_of_a_scene_have_the_gaps_of_what_is_known() -> None:
+    """No piece leads over one."""
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [np.nan, np.nan], [3.0, 0.0], [4.0, 0.0]])
+    assert segments(points)[:, :, 0].tolist() == [[0.0, 1.0], [3.0, 4.0]]
+
+
+def test_the_figures_of_a_report_have_a_gap_where_rows_are_missing() -> None:
+    """A server that plans nothing has no line then; one that plans has one that is whole."""
+    steps, values = np.array([3, 4, 9, 10]), np.array([1.0, 2.0, 3.0, 4.0])
+    assert np.array_equal(with_gaps(steps, values), [1.0, 2.0, np.nan, 3.0, 4.0], equal_nan=True)
+    assert np.array_equal(with_gaps(np.arange(4), values), values)
+    places = np.stack([values, values], axis=1)
+    assert with_gaps(steps, places).shape == (5, 2)
 
 
 def test_a_scene_has_room_for_all_that_is_flown() -> None:
     """Lines on the ground reach further than what is shown, in steps that are round."""
-    middle, reach_m = extent([config.load("demo")])
+    middle, reach_m = extent([reading.load("demo")])
     assert middle == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
     assert 2.0 < reach_m < 3.0
     lines = grid(middle, reach_m)
@@ -226,33 +266,86 @@ def test_a_scene_has_room_for_all_that_is_flown() -> None:
     assert segments(np.zeros((5, 2)), dashed=True).shape == (2, 2, 3)
 
 
+def fenced(**keys: Any) -> Scenario:
+    """The scenario demo, with a fence."""
+    scenario = reading.load("demo")
+    return msgspec.structs.replace(
+        scenario, fence=msgspec.convert(keys, type(scenario.fence), strict=False)
+    )
+
+
+def test_a_fence_is_drawn_as_far_as_it_has_bounds() -> None:
+    """In the plane a rectangle has four sides; one that is open reaches far on that side."""
+    box = fence(fenced(low_m=(-3, -2), high_m=(3, 2)), 2.0)
+    assert box.shape == (4, 2, 3)
+    assert (np.abs(box).max(axis=(0, 1)) == [3.0, 2.0, 0.0]).all()
+    opened = fence(fenced(low_m=(-3, -2)), 2.0)
+    assert opened[..., 0].min() == -3.0
+    assert opened[..., 0].max() > 5.0
+    around = fence(fenced(radius_m=9.0), 2.0)
+    begin = home(reading.load("demo"))[0]
+    assert np.hypot(*(around[..., :2] - begin).T) == pytest.approx(9.0, abs=1e-5)
+    assert len(fence(fenced(speed_mps=2.0), 2.0)) == 0
+
+
 def test_a_port_that_is_taken_is_said() -> None:
     """With the one that was asked for."""
     event = PageServed(address="http://127.0.0.1:8081", taken="127.0.0.1:8080")
-    assert str(event) == "the page is at http://127.0.0.1:8081, for 127.0.0.1:8080 is taken"
+    assert str(event) == "the page is at http://127.0.0.1:8081 (127.0.0.1:8080 is taken)"
 
 
 def heard(at: str, folder: Path, seconds: float = 30.0) -> list[str]:
     """What is said of a page that is served at an address for as long as it takes to be said."""
     said: list[str] = []
-    with pages.beside([folder], at, said.append):
+    with page_process.beside([folder], at, said.append):
         ends_s = time.monotonic() + seconds
         while not said and time.monotonic() < ends_s:
             time.sleep(0.05)
-        if said and (found := re.search(r"http://[^ ,]*", said[0])):
+        if said and (found := re.search(r"http://\S*", said[0])):
             with urllib.request.urlopen(found[0]) as page:
                 said.append(page.read().decode())
     return said
 
 
-def test_a_page_is_served_elsewhere_where_its_port_is_taken(tmp_path: Path) -> None:
-    """On a port that is free, as it says; and it has nothing in it that is loaded from outside."""
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        at = f"127.0.0.1:{taken.getsockname()[1]}"
-        address, page = heard(at, tmp_path)
-    assert address.endswith(f", for {at} is taken")
+@pytest.fixture
+def neighbours() -> Iterator[int]:
+    """A port that is taken, and so is the next one; the one after these is free."""
+    for port in range(20_000, 60_000, 7):
+        with contextlib.suppress(OSError), contextlib.ExitStack() as taken:
+            for each in (port + 2, port + 1, port):
+                sock = taken.enter_context(socket.socket())
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                sock.bind(("127.0.0.1", each))
+                if each == port + 2:
+                    sock.close()
+                else:
+                    sock.listen()
+            yield port
+            return
+
+
+def test_a_page_is_served_on_the_next_free_port_where_its_own_is_taken(
+    tmp_path: Path, neighbours: int
+) -> None:
+    """As it says, ready to be copied; and it has nothing in it that is loaded from outside."""
+    at = f"127.0.0.1:{neighbours}"
+    address, page = heard(at, tmp_path)
+    assert address == f"the page is at http://127.0.0.1:{neighbours + 2} ({at} is taken)"
     assert "<html" in page
     assert not re.search(r"<(?:script|link|img)[^>]*(?:src|href)=[\"']?(?:https?:)?//", page)
+
+
+def test_where_no_port_is_free_that_is_said(
+    neighbours: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those after it are not tried for ever."""
+    assert serve.next_free("127.0.0.1", neighbours) == neighbours + 2
+    assert serve.next_free("127.0.0.1", 0) == 0
+    monkeypatch.setattr(serve, "PORTS_TRIED", 2)
+    with pytest.raises(CommandError, match=f"{neighbours}: .*is taken, and so are"):
+        serve.next_free("127.0.0.1", neighbours)
+    with pytest.raises(CommandError, match="cannot be listened on"):
+        serve.next_free("192.0.2.1", neighbours)
 
 
 def test_a_flight_goes_on_without_a_page(tmp_path: Path) -> None:

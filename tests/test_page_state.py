@@ -7,17 +7,26 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared import config
-from shared.config import Scenario, to_toml
-from shared.endpoint import SECOND_NS
-from shared.events import ModeChanged
-from shared.feed import Frame, Opened, Rows, Said, described
-from shared.protocol import Mode
-from shared.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Reason, client_columns
-from sim import flight
-from view import words
-from view.frames import of_flight
-from view.state import BINS, DELAY_BINS, SAID_MAX, SLOTS_MAX, SPAN_S, VEHICLES_MAX, State
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import ModeChanged
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.reading import to_toml
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.feed import FeedError, Figures, Frame, Opened, Rows, Said, described
+from skytether.shared.telemetry.record import (
+    DOWNLINK,
+    PACKET_COLUMNS,
+    UPLINK,
+    Reason,
+    Record,
+    client_columns,
+)
+from skytether.shared.wire.protocol import Mode
+from skytether.sim import flight
+from skytether.view import plots, words
+from skytether.view.frames import of_flight
+from skytether.view.rows import planned
+from skytether.view.state import BINS, DELAY_BINS, SAID_MAX, SLOTS_MAX, SPAN_S, VEHICLES_MAX, State
 
 
 @dataclass(frozen=True)
@@ -25,7 +34,7 @@ class Shown:
     """A flight, and what is shown at its end."""
 
     scenario: Scenario
-    flown: flight.Flight
+    flown: Record
     frames: tuple[tuple[int, str, Frame], ...]
     state: State
 
@@ -38,7 +47,7 @@ class Shown:
 @cache
 def demo(cut_s: float = 0.0, vehicles: int = 1) -> Shown:
     """Twelve seconds of the demonstration, the link of which may be cut."""
-    scenario = msgspec.structs.replace(config.load("demo"), duration=12.0)
+    scenario = msgspec.structs.replace(reading.load("demo"), duration=12.0)
     lost = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
     changes = [(cut_s, lost)] if cut_s else []
     flown = flight.fly(scenario, vehicles=vehicles, changes=changes)
@@ -70,13 +79,40 @@ def test_the_curves_of_a_vehicle_are_its_record() -> None:
         if step in flown and step in planned and step >= 100:
             assert curves.position[index] == pytest.approx(flown[step]["state"][:, 0])
             assert curves.reference[index] == pytest.approx(planned[step]["reference"][:, 0])
-            assert curves.figure[index] == planned[step]["error"]
+            assert curves.figure[index] == planned[step]["cost_gap"]
             assert curves.threshold[index] == planned[step]["threshold"]
             if flown[step]["age_ns"] >= 0:
                 assert curves.age_s[index] == flown[step]["age_ns"] / SECOND_NS
             checked += 1
     assert checked > 100
     assert curves.event.sum() == server["event"].sum() == track.sent
+
+
+def test_a_cut_link_is_a_gap_in_all_that_nobody_knows_meanwhile() -> None:
+    """In age and reference, as soon as the words say a dash; the vehicle itself is seen on."""
+    shown = demo(cut_s=6.0)
+    track, client, server = shown.state.vehicles[1], shown.flown.client, shown.flown.server
+    curves, dt = track.curves(1201), shown.scenario.control.dt  # a grid of the steps themselves
+    steps = np.round(curves.time_s / dt).astype(int)
+    aged = {int(row["step"]) for row in client if row["age_ns"] >= 0}
+    planned = {int(row["step"]) for row in server}
+    flown = range(int(client["step"][-1]) + 1)
+    assert max(aged) < flown[-1] - 30
+    assert max(planned) < flown[-1] - 30
+    for step, age_s, goal, position in zip(
+        steps.tolist(), curves.age_s, curves.reference[:, 0], curves.position[:, 0], strict=True
+    ):
+        assert np.isnan(age_s) == (step not in aged), step
+        assert np.isnan(goal) == (step not in planned), step
+        assert np.isnan(position) == (step not in flown), step
+    assert np.isnan(track.age_s)
+    assert track.goal(1.0) is None
+    assert track.goal(SPAN_S) is not None
+    look = plots.Look(shown.state, curves, shown.now_ns)
+    for direction in (UPLINK, DOWNLINK):
+        delays_s = plots._delays(direction)(look)
+        assert np.isnan(delays_s[-40:]).all()
+        assert not np.isnan(delays_s[-160:-130]).any()
 
 
 def test_the_error_is_that_of_the_record() -> None:
@@ -103,6 +139,9 @@ def test_the_plan_leads_on_from_where_the_vehicle_is() -> None:
     fastest = np.linalg.norm(shown.scenario.u_max) * shown.scenario.control.dt
     assert steps.max() <= fastest * 1.001
     assert np.linalg.norm(ahead[0] - track.trail()[-1]) < 1.0
+    newest = shown.flown.plan[-1]
+    assert newest["disturbance"].any()
+    np.testing.assert_array_equal(ahead, planned(shown.scenario, newest)[-len(ahead) :])
 
 
 def test_loss_and_rates_are_those_of_the_packets() -> None:
@@ -152,6 +191,23 @@ def test_a_cut_link_is_said_in_words_and_colour() -> None:
     assert good.state.vehicles[1].mode is Mode.TRACK
 
 
+def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() -> None:
+    """Nothing without an autopilot, and dashes for what makes no sense."""
+    shown = demo()
+    state, number = shown.state, 1
+    assert "autopilot" not in words.status(state, number, shown.now_ns)
+    home = {"latitude_deg": 47.5, "longitude_deg": 8.25}
+    told = {"mode": "GUIDED", "armed": 1, "battery": 0.83, "voltage_v": 15.14, "home": home}
+    for autopilot, said in (
+        (told, ("GUIDED, armed", "83 %, 15.1 V", "47.500000°, 8.250000°")),
+        ({"mode": "<b>", "battery": "full", "home": 3}, ("&lt;b&gt;, disarmed", "–, –")),
+    ):
+        figures = {"by_vehicle": {"1": {"autopilot": autopilot}}}
+        state.take("client", Figures(time_ns=shown.now_ns, figures=figures))
+        page = words.status(state, number, shown.now_ns)
+        assert all(each in page for each in said)
+
+
 def test_what_comes_again_counts_once() -> None:
     """A feed tells its newest frames to whoever connects anew."""
     shown = demo()
@@ -197,7 +253,7 @@ def opened(
     return Opened(
         process=process,
         name="demo",
-        scenario=to_toml(scenario or config.load("demo")).decode(),
+        scenario=to_toml(scenario or reading.load("demo")).decode(),
         parts=described(parts),
         wall_ns=0,
         time_ns=0,
@@ -206,7 +262,7 @@ def opened(
 
 def test_a_day_takes_no_more_memory_than_a_minute() -> None:
     """Rings, events and histograms keep their sizes."""
-    scenario = config.load("demo")
+    scenario = reading.load("demo")
     fast = msgspec.structs.replace(
         scenario, control=msgspec.structs.replace(scenario.control, dt=0.001)
     )
@@ -229,6 +285,34 @@ def test_a_day_takes_no_more_memory_than_a_minute() -> None:
     assert state.network.histogram(UPLINK, state.newest_ns).shape == (DELAY_BINS,)
     assert state.network.rates(UPLINK, state.newest_ns).shape == (int(SPAN_S),)
     assert BINS == 240
+
+
+def test_what_makes_no_sense_is_refused_and_changes_nothing() -> None:
+    """A scenario of another version, a mode that there is none of, and columns of other axes."""
+    shown = demo()
+    state, newest_ns = state_of(shown.frames), shown.state.newest_ns
+    does, trail = state.vehicles[1].does, state.vehicles[1].trail().tolist()
+    columns = client_columns(2)
+    rows = np.zeros(1, columns)
+    rows["vehicle"], rows["step"], rows["mode"] = 1, 1000, 99
+    other = opened("client", {"client": columns})
+    for scenario in ("of = 'another version'", "no TOML", "a = " + "[" * 100_000):
+        with pytest.raises(FeedError, match="got no scenario"):
+            state.take("client", msgspec.structs.replace(other, scenario=scenario, time_ns=7))
+    with pytest.raises(ValueError, match="client: mode: got 99"):
+        state.take("client", Rows(part="client", time_ns=newest_ns + 1, rows=rows.tobytes()))
+    assert (state.flights, state.vehicles[1].does) == (1, does)
+    assert state.vehicles[1].trail().tolist() == trail
+
+
+def test_a_part_with_columns_of_no_flight_is_left_out() -> None:
+    """Those of another number of axes: it is not drawn."""
+    state, columns = State(), client_columns(3)
+    rows = np.zeros(1, columns)
+    rows["vehicle"] = 1
+    state.take("client", opened("client", {"client": columns}))
+    state.take("client", Rows(part="client", time_ns=1, rows=rows.tobytes()))
+    assert not state.vehicles
 
 
 def test_rows_of_an_hour_ago_change_nothing() -> None:

@@ -3,7 +3,7 @@
 `OnPaper` is section 4.1 once more, for one vehicle, with a dense solver and no batch.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -12,25 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-import server.planner
-from benchmarks.problems import gradients, listening, solving
-from server.controller import BLOCK
-from server.desired import Desired
-from server.exact import ExactSolver, Workspace
-from server.mpc import FIRST, LATER, Problem, make_mpc, pose
-from server.planner import (
-    FIGURES,
-    GENERATOR,
-    TRACKER,
-    Batch,
-    Figures,
-    Planner,
-)
-from server.scheme import Foresight, foresight
-from server.solver import OsqpSolver
-from shared.config import Scenario, check
-from shared.model import Array, Flags, Indices
-from shared.stopwatch import Stopwatch
+import skytether.server.control.planner
+from skytether.lab.benchmarks.problems import gradients, listening, solving
+from skytether.server.control.controller import BLOCK
+from skytether.server.control.desired import Desired
+from skytether.server.control.exact import ExactSolver, Workspace
+from skytether.server.control.mpc import FIRST, LATER, Problem, make_mpc, pose
+from skytether.server.control.planner import FIGURES, GENERATOR, TRACKER, Batch, Figures, Planner
+from skytether.server.control.scheme import Foresight, foresight
+from skytether.server.control.solver import OsqpSolver
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.scenario.reading import check
+from skytether.shared.scenario.schema import Scenario
 
 H = 15
 SCENARIO = check(
@@ -325,7 +319,7 @@ def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
     (figures,), off = made.figures, found.start[0] - before.states[0, :, gap]
     P = np.array(SCENARIO.control.terminal_weight)
     assert (figures["step"], figures["fresh"], figures["solved"]) == (40 - d + gap, False, True)
-    assert figures["error"] == pytest.approx((off**2 @ P).sum())
+    assert figures["state_gap"] == pytest.approx((off**2 @ P).sum())
     target, told = made.states[0], shift(before.tracked[0], gap)
     cost = cost_of(found, target, told, found.held[0]) - cost_of(
         found, target, told, made.tracked[0]
@@ -361,6 +355,34 @@ def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
     assert figures["expected_gap"] == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("flown", [0, 1, H - 3, H])
+def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
+    """What is told beyond that changes no figure; what is told before changes the costs."""
+    rng, rows = np.random.default_rng(7), np.array([0])
+    first, found = crowd(rng, np.array([0])), crowd(rng, np.array([0]))
+    found = found._replace(
+        doubt=np.array([[0.2]]),
+        doubted=rng.uniform(-1.0, 1.0, size=(1, 1, 2, H)),
+        doubted_start=np.zeros((1, 1, 2, 2)),
+    )
+    found.flown[:] = flown
+
+    def figures() -> Any:
+        planner = make()
+        plan(planner, rows, np.array([40]), first)
+        return plan(planner, rows, np.array([41]), found).figures[0]
+
+    before = figures()
+    for told in (found.held, found.doubted):
+        told[..., flown:] += 0.5
+    assert figures() == before
+    if flown:
+        for told in (found.held, found.doubted):
+            told[..., 0] += 0.5
+        assert figures()["cost_gap"] != before["cost_gap"]
+        assert figures()["expected_gap"] != before["expected_gap"]
+
+
 @pytest.mark.parametrize("first", [True, False])
 def test_figures_that_compare_with_nothing_are_zero(first: bool) -> None:
     """V and deviation at a first step; with "predictive", what compares with what was sent."""
@@ -370,7 +392,7 @@ def test_figures_that_compare_with_nothing_are_zero(first: bool) -> None:
     if not first:
         run(planner, 0, START)
     (figures,) = plan(planner, rows, np.array([1]), crowd(rng, np.array([0]))).figures
-    assert (figures["error"] == 0.0, figures["cost_gap"] == 0.0) == (first, not first)
+    assert (figures["state_gap"] == 0.0, figures["cost_gap"] == 0.0) == (first, not first)
     assert figures["deviation_m"] == 0.0
 
 
@@ -382,7 +404,7 @@ ROUGH = {
 """Long steps, hardly a cost of the input, and corners."""
 
 
-compiled_pass = server.planner._plan
+compiled_pass = skytether.server.control.planner._plan
 
 
 def leaving(batch: Batch, rows: Indices, steps: Indices, work: Workspace) -> int:
@@ -416,7 +438,7 @@ def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
     It makes no difference either which vehicles the pass has to leave to the moves.
     """
     if leaves:
-        monkeypatch.setattr(server.planner, "_plan", leaving)
+        monkeypatch.setattr(skytether.server.control.planner, "_plan", leaving)
     rng, capacity = np.random.default_rng(seed), 40
     compiled = make(capacity, scenario)
     with listening() as listeners:
@@ -450,7 +472,7 @@ class Faulty:
         self._asks = TRACKER
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """See `server.solver.Solver`."""
+        """See `server.control.solver.Solver`."""
         self._asks = TRACKER if self._asks == GENERATOR else GENERATOR
         if self._asks in self._fails:
             return guess.copy(), np.zeros(len(gradient), dtype=np.bool_)

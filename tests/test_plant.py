@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from client.plant import FirstOrderPlant, white_acceleration
-from shared.config import Scenario, check
-from shared.model import Array, discretise
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.weather import Weather
+from skytether.shared.law.model import Array, discretise, white_acceleration
+from skytether.shared.scenario.reading import check
+from skytether.shared.scenario.schema import Scenario
 
 FLIGHT = {
     "model": {"tau_s": [0.81, 0.3]},
@@ -26,7 +28,8 @@ def scenario(**vehicle: object) -> Scenario:
 
 def plant(seed: int = 0, **vehicle: object) -> FirstOrderPlant:
     """A vehicle of `scenario`, with a chance of its own."""
-    return FirstOrderPlant(scenario(**vehicle), np.random.default_rng(seed))
+    flown = scenario(**vehicle)
+    return FirstOrderPlant(flown, Weather(flown, np.random.default_rng(seed)))
 
 
 def flight(flown: FirstOrderPlant, commands: Array = COMMANDS) -> Array:
@@ -147,7 +150,8 @@ def test_plant_flies_in_space() -> None:
         "control": {"dt": 0.05},
         "reference": {"shape": "circle", "radius_m": 1.5, "altitude_m": 2.0},
     }
-    flown = FirstOrderPlant(check(raw, "test"), np.random.default_rng(0))
+    checked = check(raw, "test")
+    flown = FirstOrderPlant(checked, Weather(checked, np.random.default_rng(0)))
     assert flown.state().tolist() == [[1.5, 0.0], [0.0, 0.0], [2.0, 0.0]]
     (state,) = flight(flown, np.array([[0.0, 0.0, 1.0]]))
     expected = discretise(np.array([0.81]), 0.05).step(np.array([[2.0, 0.0]]), np.array([1.0]))
@@ -258,5 +262,5 @@ def test_same_chance_is_the_same_flight() -> None:
 def test_calm_flight_needs_no_chance() -> None:
     """Without wind and gusts the generator is left as it was."""
     rng = np.random.default_rng(3)
-    flight(FirstOrderPlant(scenario(), rng))
+    flight(FirstOrderPlant(scenario(), Weather(scenario(), rng)))
     assert rng.random() == np.random.default_rng(3).random()

@@ -1,6 +1,7 @@
 """Which observations are believed: those that a vehicle can make, and those that repeat."""
 
 import random
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,23 +9,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import sim.flight
-from client import vehicle
-from netem.proxy import Proxy
-from server.plausibility import REPEATS, Plausibility, Verdict
-from shared import config
-from shared.config import Scenario
-from shared.endpoint import MILLISECOND_NS as MS
-from shared.endpoint import SECOND_NS as S
-from shared.endpoint import Datagram
-from shared.protocol import Mode, Observation
-from shared.summary import summarise
-from sim.flight import Flight, fly
-from sim.world import Clock
+import skytether.sim.flight
+from skytether.client.session import ServerSession
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.netem.proxy import Proxy
+from skytether.server.plausibility import REPEATS, Belief, Plausibility
+from skytether.shared.base.units import MILLISECOND_NS as MS
+from skytether.shared.base.units import SECOND_NS as S
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import ModeChanged, StateDoubted
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire.protocol import Drop, Mode, Observation
+from skytether.sim.flight import fly, fly_batch
+from skytether.sim.world import Clock
 
 quick = settings(max_examples=60, deadline=None)
 
-TERMS = config.load("demo").terms()
+TERMS = reading.load("demo").terms()
 DT_NS, H = TERMS.dt_ns, TERMS.horizon
 HOUR = 3600 * S
 DELAY_NS = 440 * MS
@@ -57,9 +62,7 @@ def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
     return told._replace(**changed or {})
 
 
-def judge(
-    plausibility: Plausibility, told: Observation, *, row: int = 0, step: int = -1
-) -> Verdict:
+def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: int = -1) -> Belief:
     """The verdict on an observation that arrives after its delay, or when that of `step` would."""
     now_ns = BEGAN_NS + (told.step if step < 0 else step) * DT_NS - CLOCK_NS + DELAY_NS
     forward_ns, backward_ns = now_ns - told.stamp_ns, told.received_ns - told.server_ns
@@ -71,7 +74,7 @@ def after(count: int = 5) -> Plausibility:
     """What has believed the steps from 100 on, so many of them."""
     plausibility = Plausibility(TERMS, 2)
     for step in range(100, 100 + count):
-        assert judge(plausibility, seen(step)) == Verdict.BELIEVED
+        assert judge(plausibility, seen(step)) == Belief.BELIEVED
     return plausibility
 
 
@@ -80,43 +83,53 @@ def moved(metres: float, speed: float = 0.0) -> np.ndarray:
     return seen(105).state + np.array([[metres, speed], [0.0, 0.0]])
 
 
-ODD: dict[str, tuple[dict[str, Any], Verdict]] = {
-    "step 2^36": ({"step": 2**36}, Verdict.EPOCH),
-    "a step ahead": ({"step": 106}, Verdict.EPOCH),
-    "a stamp an hour ahead": ({"stamp_ns": BEGAN_NS + 105 * DT_NS + HOUR}, Verdict.EPOCH),
-    "a stamp a nanosecond ahead": ({"stamp_ns": BEGAN_NS + 105 * DT_NS + 1}, Verdict.EPOCH),
+def test_a_predicted_position_may_be_off_by_what_the_velocity_may_over_the_dead_time() -> None:
+    """Ablation: of a vehicle whose model has none, the same position is a jump."""
+    for dead_time_s, verdict in ((0.0, Belief.JUMP), (0.5, Belief.BELIEVED)):
+        terms = TERMS._replace(dead_time_s=(0.0, dead_time_s))
+        plausibility = Plausibility(terms, 2)
+        for step in range(100, 105):
+            judge(plausibility, seen(step))
+        assert judge(plausibility, seen(105, {"state": moved(1.8)})) == verdict
+
+
+ODD: dict[str, tuple[dict[str, Any], Belief]] = {
+    "step 2^36": ({"step": 2**36}, Belief.EPOCH),
+    "a step ahead": ({"step": 106}, Belief.EPOCH),
+    "a stamp an hour ahead": ({"stamp_ns": BEGAN_NS + 105 * DT_NS + HOUR}, Belief.EPOCH),
+    "a stamp a nanosecond ahead": ({"stamp_ns": BEGAN_NS + 105 * DT_NS + 1}, Belief.EPOCH),
     "an echo an hour ahead": (
         {"server_ns": BEGAN_NS + 105 * DT_NS - CLOCK_NS + HOUR},
-        Verdict.CLOCK,
+        Belief.CLOCK,
     ),
-    "an echo that came before it was sent": ({"received_ns": 0}, Verdict.CLOCK),
-    "a horizon from far ahead": ({"in_force": 105 + H + 1}, Verdict.HORIZON),
-    "a horizon of before": ({"in_force": 91}, Verdict.HORIZON),
-    "in force since a later step": ({"since": 106}, Verdict.HORIZON),
-    "in force since long ago": ({"since": 101}, Verdict.HORIZON),
-    "a jump": ({"state": moved(2.0)}, Verdict.JUMP),
-    "a jump in speed": ({"state": moved(0.0, 5.0)}, Verdict.JUMP),
-    "the end of the world": ({"state": moved(1e300, 1e300)}, Verdict.JUMP),
+    "an echo that came before it was sent": ({"received_ns": 0}, Belief.CLOCK),
+    "a horizon from far ahead": ({"in_force": 105 + H + 1}, Belief.HORIZON),
+    "a horizon of before": ({"in_force": 91}, Belief.HORIZON),
+    "in force since a later step": ({"since": 106}, Belief.HORIZON),
+    "in force since long ago": ({"since": 101}, Belief.HORIZON),
+    "a jump": ({"state": moved(2.0)}, Belief.JUMP),
+    "a jump in speed": ({"state": moved(0.0, 5.0)}, Belief.JUMP),
+    "the end of the world": ({"state": moved(1e300, 1e300)}, Belief.JUMP),
 }
 """What is odd in the observation of step 105, and what is said of it."""
 
 
 @pytest.mark.parametrize(("changed", "verdict"), ODD.values(), ids=ODD)
 def test_an_odd_observation_is_not_believed_and_changes_nothing(
-    changed: dict[str, Any], verdict: Verdict
+    changed: dict[str, Any], verdict: Belief
 ) -> None:
     """Once or twice; the next that follows from those before is believed as ever."""
     for times in (1, 2):
         plausibility = after()
         for _ in range(times):
             assert judge(plausibility, seen(105, changed), step=105) == verdict
-        assert judge(plausibility, seen(106)) == Verdict.BELIEVED
+        assert judge(plausibility, seen(106)) == Belief.BELIEVED
 
 
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
     """What is odd for one may be the first that is heard of another."""
-    expected = Verdict.EPOCH if row == 0 else Verdict.BELIEVED
+    expected = Belief.EPOCH if row == 0 else Belief.BELIEVED
     assert judge(after(), seen(105, {"stamp_ns": 90 * HOUR}), row=row) == expected
 
 
@@ -135,12 +148,12 @@ def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
     plausibility = after()
     verdicts = [judge(plausibility, elsewhere(step)) for step in range(105, 110)]
     assert verdicts == [
-        *[Verdict.EPOCH] * (REPEATS - 1),
-        Verdict.ANEW,
-        Verdict.BELIEVED,
-        Verdict.BELIEVED,
+        *[Belief.EPOCH] * (REPEATS - 1),
+        Belief.ANEW,
+        Belief.BELIEVED,
+        Belief.BELIEVED,
     ]
-    assert judge(plausibility, seen(110)) == Verdict.EPOCH
+    assert judge(plausibility, seen(110)) == Belief.EPOCH
 
 
 def test_three_that_do_not_agree_are_not_believed() -> None:
@@ -148,17 +161,17 @@ def test_three_that_do_not_agree_are_not_believed() -> None:
     plausibility = after()
     for n, step in enumerate(range(105, 125)):
         odd = seen(step, {"stamp_ns": BEGAN_NS + step * DT_NS + (n + 1) * S})
-        assert judge(plausibility, odd, step=step) == Verdict.EPOCH
-    assert judge(plausibility, seen(125)) == Verdict.BELIEVED
+        assert judge(plausibility, odd, step=step) == Belief.EPOCH
+    assert judge(plausibility, seen(125)) == Belief.BELIEVED
 
 
 def test_two_among_believed_ones_are_not_in_a_row() -> None:
     """However many there are of them."""
     plausibility = after()
     for step in range(105, 205, 3):
-        assert judge(plausibility, elsewhere(step)) == Verdict.EPOCH
-        assert judge(plausibility, elsewhere(step + 1)) == Verdict.EPOCH
-        assert judge(plausibility, seen(step + 2)) == Verdict.BELIEVED
+        assert judge(plausibility, elsewhere(step)) == Belief.EPOCH
+        assert judge(plausibility, elsewhere(step + 1)) == Belief.EPOCH
+        assert judge(plausibility, seen(step + 2)) == Belief.BELIEVED
 
 
 def test_an_odd_one_among_those_that_agree_begins_the_row_anew() -> None:
@@ -171,37 +184,35 @@ def test_an_odd_one_among_those_that_agree_begins_the_row_anew() -> None:
         elsewhere(108),
         elsewhere(109),
     ]
-    assert all(judge(plausibility, each) > Verdict.BELIEVED for each in told)
-    assert judge(plausibility, elsewhere(110)) == Verdict.ANEW
+    assert all(judge(plausibility, each) > Belief.BELIEVED for each in told)
+    assert judge(plausibility, elsewhere(110)) == Belief.ANEW
 
 
 def test_a_late_observation_tells_of_the_clocks_alone() -> None:
     """Its horizon and its state are of before; what is held against the next is the newest."""
     plausibility = after()
-    assert judge(plausibility, seen(90)) == Verdict.BELIEVED
-    assert judge(plausibility, seen(105)) == Verdict.BELIEVED
-    assert judge(plausibility, seen(90, {"stamp_ns": 90 * HOUR})) == Verdict.EPOCH
-    assert (
-        judge(plausibility, seen(104, {"in_force": -1, "state": moved(50.0)})) == Verdict.BELIEVED
-    )
-    assert judge(plausibility, seen(106)) == Verdict.BELIEVED
+    assert judge(plausibility, seen(90)) == Belief.BELIEVED
+    assert judge(plausibility, seen(105)) == Belief.BELIEVED
+    assert judge(plausibility, seen(90, {"stamp_ns": 90 * HOUR})) == Belief.EPOCH
+    assert judge(plausibility, seen(104, {"in_force": -1, "state": moved(50.0)})) == Belief.BELIEVED
+    assert judge(plausibility, seen(106)) == Belief.BELIEVED
 
 
 def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
     """As one that was never heard; its neighbour is not forgotten."""
     plausibility = after()
-    assert judge(plausibility, seen(100), row=1) == Verdict.BELIEVED
+    assert judge(plausibility, seen(100), row=1) == Belief.BELIEVED
     plausibility.forget(0)
-    assert judge(plausibility, elsewhere(3)) == Verdict.BELIEVED
-    assert judge(plausibility, elsewhere(101), row=1) == Verdict.EPOCH
+    assert judge(plausibility, elsewhere(3)) == Belief.BELIEVED
+    assert judge(plausibility, elsewhere(101), row=1) == Belief.EPOCH
 
 
 def test_an_odd_first_observation_is_forgotten_after_three() -> None:
     """Nothing is known that would speak against it."""
     plausibility = Plausibility(TERMS, 1)
-    assert judge(plausibility, seen(100, {"stamp_ns": 90 * HOUR})) == Verdict.BELIEVED
+    assert judge(plausibility, seen(100, {"stamp_ns": 90 * HOUR})) == Belief.BELIEVED
     verdicts = [judge(plausibility, seen(step)) for step in range(101, 105)]
-    assert verdicts == [Verdict.EPOCH, Verdict.EPOCH, Verdict.ANEW, Verdict.BELIEVED]
+    assert verdicts == [Belief.EPOCH, Belief.EPOCH, Belief.ANEW, Belief.BELIEVED]
 
 
 @quick
@@ -227,7 +238,7 @@ def test_whatever_a_vehicle_may_say_is_believed(
         backward_ns = CLOCK_NS - drift_ns + up_ns
         epoch_ns = told.stamp_ns - step * DT_NS
         verdict = plausibility.judge(0, told, epoch_ns, now_ns - told.stamp_ns, backward_ns)
-        assert verdict == Verdict.BELIEVED
+        assert verdict == Belief.BELIEVED
 
 
 @quick
@@ -235,10 +246,10 @@ def test_whatever_a_vehicle_may_say_is_believed(
 def test_no_flipped_bit_of_a_step_or_a_stamp_is_believed(field: str, bit: int, step: int) -> None:
     """Neither comes without the other."""
     plausibility = Plausibility(TERMS, 1)
-    assert judge(plausibility, seen(step - 1)) == Verdict.BELIEVED
+    assert judge(plausibility, seen(step - 1)) == Belief.BELIEVED
     told = seen(step)
     odd = told._replace(**{field: getattr(told, field) ^ 1 << bit})
-    assert judge(plausibility, odd, step=step) > Verdict.BELIEVED
+    assert judge(plausibility, odd, step=step) > Belief.BELIEVED
 
 
 @pytest.mark.parametrize("first", [True, False])
@@ -250,8 +261,26 @@ def test_the_largest_numbers_on_the_wire_overflow_nothing(
     plausibility = Plausibility(TERMS, 1) if first else after()
     odd = seen(105)._replace(step=step, stamp_ns=stamp_ns, in_force=-1, since=0)
     impossible = stamp_ns < step * DT_NS
-    expected = Verdict.EPOCH if impossible or not first else Verdict.BELIEVED
+    expected = Belief.EPOCH if impossible or not first else Belief.BELIEVED
     assert judge(plausibility, odd, step=105) == expected
+
+
+@pytest.mark.parametrize(
+    ("steps", "metres", "speed"), [(1, 1.06, 4.4), (10, 7.2, 26.9), (40, 100.9, 101.9)]
+)
+def test_how_far_a_vehicle_may_have_come_grows_with_the_time_since_the_last_one(
+    steps: int, metres: float, speed: float
+) -> None:
+    """Noise, and 50 m/s² for 0.05 s a step: that far is believed, a fifth more is a jump."""
+    for p, v in ((metres, 0.0), (0.0, speed)):
+        for share, verdict in ((1.0, Belief.BELIEVED), (1.2, Belief.JUMP)):
+            plausibility = Plausibility(TERMS, 1)
+            still = {"state": np.zeros((2, 2))}
+            assert judge(plausibility, seen(100, still)) == Belief.BELIEVED
+            # A change of velocity takes the vehicle along by its mean.
+            gone = share * np.array([p + 0.5 * v * steps * TERMS.dt_s, v])
+            told = seen(100 + steps, {"state": np.array([gone, [0.0, 0.0]])})
+            assert judge(plausibility, told) == verdict
 
 
 @quick
@@ -261,7 +290,7 @@ def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit:
     told = seen(105)
     state = told.state.copy()
     state.view(np.uint64).ravel()[number] ^= np.uint64(1 << bit)
-    if np.isfinite(state).all() and judge(after(), told._replace(state=state)) == Verdict.BELIEVED:
+    if np.isfinite(state).all() and judge(after(), told._replace(state=state)) == Belief.BELIEVED:
         assert np.abs(state - told.state).max() < 5.0
     else:
         assert np.abs(state - told.state).max() > 0.9 or not np.isfinite(state).all()
@@ -272,18 +301,22 @@ def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit:
 
 def scenario(**changes: Any) -> Scenario:
     """The demo, with some keys changed."""
-    return config.check(config.to_table(config.load("demo")) | changes, "test")
+    return reading.check(reading.to_table(reading.load("demo")) | changes, "test")
 
 
-def flipped(monkeypatch: pytest.MonkeyPatch, share: float, seed: int) -> Flight:
-    """A flight with one bit flipped in a share of the packets to the server."""
-    rng = random.Random(seed)
+def flipped(share: float) -> list[Record]:
+    """Flights with one bit flipped in a share of the packets to the server."""
 
     class Flipping(Proxy):
         """Netem of a bad cable."""
 
+        def __init__(self, scenario: Scenario, **more: Any) -> None:
+            super().__init__(scenario, **more)
+            self._rng = random.Random(scenario.seed)
+
         def receive(self, datagram: Datagram, *, now_ns: int) -> None:
             """See `Endpoint`."""
+            rng = self._rng
             if datagram.socket == 0 and rng.random() < share:
                 payload = bytearray(datagram.payload)
                 bit = rng.randrange(8 * len(payload))
@@ -291,51 +324,51 @@ def flipped(monkeypatch: pytest.MonkeyPatch, share: float, seed: int) -> Flight:
                 datagram = datagram._replace(payload=bytes(payload))
             super().receive(datagram, now_ns=now_ns)
 
-    monkeypatch.setattr(sim.flight, "Proxy", Flipping)
-    return fly(scenario(seed=seed))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(skytether.sim.flight, "Proxy", Flipping)
+        return fly_batch(scenario(), SEEDS)
 
 
 SEEDS = range(1, 7)
 
 
-def rmse(flights: list[Flight]) -> float:
+def rmse(flights: list[Record]) -> float:
     """Mean RMSE xy of flights [m]."""
     errors = [summarise(scenario(), "test", flight.client).rmse_xy or 0.0 for flight in flights]
     return float(np.mean(errors))
 
 
-def believe(*_: Any) -> Verdict:
+def believe(*_: Any) -> Belief:
     """Ablation: the verdict of the credulous."""
-    return Verdict.BELIEVED
+    return Belief.BELIEVED
 
 
 def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """RMSE within a tenth of that of a good cable; if all is believed it is several times that."""
-    good = rmse([flipped(monkeypatch, 0.0, seed) for seed in SEEDS])
-    bad = [flipped(monkeypatch, 0.01, seed) for seed in SEEDS]
+    good, bad = rmse(flipped(0.0)), flipped(0.01)
     assert rmse(bad) == pytest.approx(good, rel=0.1)
-    counts = [flight.figures["server"]["counts"] for flight in bad]
-    assert sum(each.get("dropped: implausible: epoch", 0) for each in counts) > 0
+    dropped = bad[0].figures["server"]["dropped"]  # of all of them
+    assert dropped.get(Drop.IMPLAUSIBLE_EPOCH, 0) > 0
     assert all(flight.failure is None for flight in bad)
     monkeypatch.setattr(Plausibility, "judge", believe)
-    assert rmse([flipped(monkeypatch, 0.01, seed) for seed in SEEDS]) > 2.0 * good
+    assert rmse(flipped(0.01)) > 2.0 * good
 
 
 def oddly(
     monkeypatch: pytest.MonkeyPatch, number: int, field: str, value: int, *, feedback: bool = True
-) -> Flight:
+) -> Record:
     """A flight of which one observation, by its number from 0, has a field changed."""
-    send, said = vehicle.Client._send, iter(range(10**9))
+    send, said = ServerSession.send, iter(range(10**9))
 
-    def lie(self: vehicle.Client, message: Any) -> None:
+    def lie(self: ServerSession, message: Any) -> None:
         if isinstance(message, Observation) and next(said) == number:
             message = message._replace(**{field: getattr(message, field) + value})
         send(self, message)
 
-    monkeypatch.setattr(vehicle.Client, "_send", lie)
-    control = config.to_table(config.load("demo"))["control"] | {"feedback": feedback}
+    monkeypatch.setattr(ServerSession, "send", lie)
+    control = reading.to_table(reading.load("demo"))["control"] | {"feedback": feedback}
     network = {"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}
     return fly(scenario(control=control, network=network))
 
@@ -409,10 +442,29 @@ def test_a_server_whose_clock_steps_goes_on_planning(
         made = Clock(*numbers)
         return Stepped(made, 15 * S, by_ns) if next(ours) else made
 
-    monkeypatch.setattr(sim.flight, "Clock", clock)
+    monkeypatch.setattr(skytether.sim.flight, "Clock", clock)
     flown = scenario(network={"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}})
     flight = fly(flown)
     assert flight.failure is None
     covered = flight.client["covered"]
     assert covered[600:].all()
     assert np.linalg.norm(flight.client["state"][:, :, 0], axis=1).max() < 3.0
+
+
+def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """300 m in a step: the vehicle hovers from then on, and the server has not believed it."""
+    advance, steps = FirstOrderPlant.advance, count()
+
+    def leaping(self: FirstOrderPlant, command: Array) -> None:
+        advance(self, command)
+        if next(steps) == 400:
+            self.x = [(p + 300.0, v) for p, v in self.x]
+
+    monkeypatch.setattr(FirstOrderPlant, "advance", leaping)
+    flight = fly(reading.check(reading.to_table(reading.load("demo")) | {"duration": 40.0}, "test"))
+    said = [event for _, _, event in flight.events]
+    assert StateDoubted(vehicle=1) in said
+    changes = [(each.after, each.reason) for each in said if isinstance(each, ModeChanged)]
+    why = "its state has leapt as no vehicle can"
+    assert changes[-2:] == [("brake", why), ("hover", why)]
+    assert np.abs(flight.client["input"][-1]).max() == 0.0

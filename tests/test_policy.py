@@ -1,4 +1,4 @@
-"""`shared.policy`: a text is a trigger, or it is refused in one line; nothing in it is ever run."""
+"""Triggers as texts: one is a trigger, or it is refused in one line; nothing in it is ever run."""
 
 import string
 from typing import Any
@@ -7,9 +7,16 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shared import config, policy
-from shared.config import ConfigError
-from shared.policy import SIGNATURES, TEXT_MAX, Combination, Policy, PolicyError, policies
+from skytether.shared.base import errors
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import policies, reading
+from skytether.shared.scenario.policies import (
+    TEXT_MAX,
+    Combination,
+    Policy,
+    PolicyError,
+)
+from skytether.shared.scenario.registry import TRIGGERS
 
 FORM = "policies such as 'state_gap & budget(5, 2) | silence(1)'"
 STATE_GAP, ALWAYS = Policy("state_gap", ()), Policy("always", ())
@@ -69,7 +76,7 @@ REFUSED = {
     "state_gap | cost_gab": ("cost_gab", "a policy; did you mean cost_gap?"),
     "print(1)": (
         "print(1)",
-        f"a policy; there are {', '.join(SIGNATURES)}",
+        f"a policy; there are {', '.join(TRIGGERS)}",
     ),
     # Not its arguments.
     "always(1)": ("always(1)", "always"),
@@ -97,15 +104,15 @@ REFUSED = {
 def refusal(text: str) -> str:
     """What is said of a scenario with this trigger."""
     with pytest.raises(ConfigError) as caught:
-        config.check({"control": {"trigger": text}}, "mine")
+        reading.check({"control": {"trigger": text}}, "mine")
     return str(caught.value)
 
 
 @pytest.mark.parametrize(("text", "read"), READ.items(), ids=READ)
-def test_what_is_written_is_read(text: str, read: policy.Expression) -> None:
+def test_what_is_written_is_read(text: str, read: policies.Expression) -> None:
     """Names, numbers, &, | and parentheses, as Python reads them."""
-    assert policy.parse(text) == read
-    assert config.check({"control": {"trigger": text}}, "mine").control.trigger == text
+    assert policies.parse(text) == read
+    assert reading.check({"control": {"trigger": text}}, "mine").control.trigger == text
 
 
 @pytest.mark.parametrize(("text", "said"), REFUSED.items(), ids=REFUSED)
@@ -118,10 +125,10 @@ def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
     """However deep it is."""
     deep = "(" * 97 + "always" + ")" * 97
     assert len(deep) == TEXT_MAX
-    assert policy.parse(deep) == ALWAYS
+    assert policies.parse(deep) == ALWAYS
     assert refusal(deep + " ").endswith(", expected a text of length <= 200")
     longest = " | ".join(["state_gap"] * 16)
-    assert list(policies(policy.parse(longest))) == [STATE_GAP] * 16
+    assert list(policies.policies(policies.parse(longest))) == [STATE_GAP] * 16
 
 
 @pytest.mark.parametrize(
@@ -139,19 +146,19 @@ def test_what_is_compared_needs_a_scheme_that_has_it(name: str, needed: str, giv
     """Deep in an expression, too."""
     text = f"silence(1) | {name} & budget(5, 2)"
     control: dict[str, Any] = {"trigger": text, "scheme": given, "feedback": given != "none"}
-    with pytest.raises(config.ConfigError) as caught:
-        config.check({"control": control}, "mine")
+    with pytest.raises(errors.ConfigError) as caught:
+        reading.check({"control": control}, "mine")
     assert str(caught.value) == (
         f"mine: control.scheme: got {given!r}, expected {needed} with the trigger {name}"
     )
     for scheme in needed.replace("'", "").split(" or "):
         feedback = scheme == "dead_reckoning"
-        config.check({"control": control | {"scheme": scheme, "feedback": feedback}}, "mine")
+        reading.check({"control": control | {"scheme": scheme, "feedback": feedback}}, "mine")
 
 
 words = st.sampled_from(
     [
-        *SIGNATURES,
+        *TRIGGERS,
         *" &|(),.-",
         "1",
         "0.5",
@@ -184,8 +191,8 @@ def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
     """Nothing else: no other error, no warning of Python's, and nothing happens."""
     said, found = "", []
     try:
-        found = list(policies(policy.parse(text)))
-        config.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
+        found = list(policies.policies(policies.parse(text)))
+        reading.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
     except PolicyError:
         said = refusal(text)
         assert said.startswith("mine: control.trigger: got ")
@@ -194,7 +201,7 @@ def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
         assert said.endswith(("with the trigger tolerance", "with the trigger delta"))
     assert bool(said) or found
     assert len(said.splitlines()) == bool(said)
-    assert all(SIGNATURES[one.name].takes(one.values) for one in found)
+    assert all(TRIGGERS[one.name].takes(one.values) for one in found)
 
 
 def test_nothing_written_is_ever_run() -> None:
@@ -210,7 +217,7 @@ trees = st.recursive(
 )
 
 
-def written(tree: policy.Expression) -> str:
+def written(tree: policies.Expression) -> str:
     """With every parenthesis."""
     if isinstance(tree, Policy):
         values = ", ".join(map(repr, tree.values))
@@ -219,6 +226,6 @@ def written(tree: policy.Expression) -> str:
 
 
 @given(trees)
-def test_every_combination_can_be_written(tree: policy.Expression) -> None:
+def test_every_combination_can_be_written(tree: policies.Expression) -> None:
     """Each combination is read as it was meant."""
-    assert policy.parse(written(tree)) == tree
+    assert policies.parse(written(tree)) == tree

@@ -2,39 +2,65 @@
 
 import asyncio
 import os
+import resource
 import signal
+from pathlib import Path
 from typing import cast
 
 import msgspec
 import pytest
 
-from shared.events import (
+from skytether.cli.fly import _tell
+from skytether.cli.processes import Child, _read, started
+from skytether.shared.core.events import (
     Counted,
-    Event,
     Finished,
     FlowOpened,
     Flying,
     Listening,
+    Measured,
     ModeChanged,
+    NoFailsafe,
     Plaintext,
     RecordIncomplete,
 )
-from shell.command import CommandError
-from shell.log import Line
-from skytether.fly import _tell
-from skytether.processes import Child, _read, started
+from skytether.shell.command import CommandError
+from skytether.shell.log import LogLine
 
 
 async def test_a_child_is_known_by_its_events() -> None:
     """It listens where its first event says, and counts at its end, which is no last word."""
-    heard: list[Event] = []
+    heard: list[LogLine] = []
     argv = ("demo", "--bind", "0.0.0.0:0", "--insecure")
     async with started("server", *argv, on_event=heard.append) as server:
         host, port = server.address
         assert (host, port > 0) == ("0.0.0.0", True)
-    assert [type(event) for event in heard] == [Listening, Plaintext, Counted]
+    assert [type(line.event) for line in heard] == [Listening, Plaintext, Counted]
     assert server.process.returncode == 0
     assert server.last_words().startswith("server: PLAINTEXT, no keys: anybody on the network")
+
+
+@pytest.mark.parametrize("name", ["server", "client", "netem"])
+async def test_a_scenario_without_a_failsafe_is_warned_of(name: str) -> None:
+    """`paper` is one; `demo` has a failsafe, and netem flies nothing."""
+    argv = {"client": ("--server", "127.0.0.1:9")}.get(name, ("--bind", "127.0.0.1:0"))
+    for scenario in ("paper", "demo"):
+        heard: list[LogLine] = []
+        async with started(name, scenario, *argv, on_event=heard.append):
+            pass
+        warned = NoFailsafe() in [line.event for line in heard]
+        assert warned == (scenario == "paper" and name != "netem")
+
+
+async def test_metrics_that_others_can_read_are_warned_of() -> None:
+    """They have no password."""
+    for host, local in (("127.0.0.1", True), ("0.0.0.0", False)):
+        heard: list[LogLine] = []
+        argv = ("demo", "--bind", "127.0.0.1:0", "--metrics", f"{host}:0")
+        async with started("netem", *argv, on_event=heard.append):
+            pass
+        (told,) = [line.event for line in heard if isinstance(line.event, Measured)]
+        assert (told.host, told.local) == (host, local)
 
 
 @pytest.mark.ipv6
@@ -60,30 +86,48 @@ async def test_a_child_that_is_killed_leaves_its_last_event() -> None:
     assert netem.last_words().startswith("netem: listening on 127.0.0.1:")
 
 
-async def test_a_child_whose_record_is_incomplete_has_told_so() -> None:
+async def test_a_child_whose_record_is_incomplete_has_told_so(tmp_path: Path) -> None:
     """It is no failure of the child, which goes on and ends with 1."""
-    heard: list[Event] = []
-    argv = ("demo", "--bind", "127.0.0.1:0", "--record", "/dev/full")
-    async with started("netem", *argv, on_event=heard.append) as netem:
-        pass
-    assert RecordIncomplete(file="/dev/full", reason="No space left on device") in heard
+    heard: list[LogLine] = []
+    file = str(tmp_path / "netem")
+    argv = ("demo", "--bind", "127.0.0.1:0", "--record", file)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        async with started("netem", *argv, on_event=heard.append) as netem:
+            pass
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    told = RecordIncomplete(file=file, reason="File too large")
+    assert told in [line.event for line in heard]
     assert (netem.fell_short, netem.failed, netem.process.returncode) == (True, False, 1)
-    assert (
-        netem.last_words() == "netem: /dev/full: No space left on device: 0 of 0 rows are recorded"
-    )
+    assert netem.last_words() == f"netem: {file}: File too large: 0 of 0 rows are recorded"
 
 
 async def test_a_line_without_end_hides_nothing_that_follows() -> None:
     """Whatever a child prints, what it says later is heard."""
-    heard: list[Event] = []
+    heard: list[LogLine] = []
     stream = asyncio.StreamReader(limit=1000)
-    event = Flying(vehicle=1)
-    line = msgspec.json.encode(Line(process="client", time_ns=5, event=event))
-    stream.feed_data(b"x" * 5000 + b"\n" + line + b"\n")
+    line = LogLine(process="client", time_ns=5, event=Flying(vehicle=1))
+    stream.feed_data(b"x" * 5000 + b"\n" + msgspec.json.encode(line) + b"\n")
     stream.feed_eof()
     process = cast(asyncio.subprocess.Process, None)
     await _read(Child("client", process), stream, heard.append)
-    assert heard == [event]
+    assert heard == [line]
+
+
+async def test_a_line_that_is_nested_deeply_hides_nothing_that_follows() -> None:
+    """It is no event, and no reason to hear the child no more."""
+    heard: list[LogLine] = []
+    stream = asyncio.StreamReader(limit=100_000)
+    line = LogLine(process="client", time_ns=5, event=Counted(figures={"deep": [[]]}))
+    known = msgspec.json.encode(line)
+    stream.feed_data(known.replace(b"[[]]", b"[" * 50_000) + b"\n" + known + b"\n")
+    stream.feed_eof()
+    child = Child("client", cast(asyncio.subprocess.Process, None))
+    await _read(child, stream, heard.append)
+    assert heard == [line]
+    assert child.last_words().startswith('{"process":"client"')
 
 
 def test_a_flight_shows_what_happens_to_its_server_and_nothing_else(

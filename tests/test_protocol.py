@@ -9,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from shared import config, protocol
-from shared.events import Difference
-from shared.protocol import (
+from skytether.shared.law.terms import Difference, Terms
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.catalogue import differences
+from skytether.shared.wire import protocol
+from skytether.shared.wire.protocol import (
     FEEDBACK,
     INPUTS_MAX,
     NO_HORIZON,
@@ -32,10 +34,9 @@ from shared.protocol import (
     encode,
     encode_horizon,
 )
-from shared.terms import Terms
 
 TERMS = (
-    config.load("paper")
+    reading.load("paper")
     .terms()
     ._replace(dt_ns=50_000_000, horizon=40, axes=2, tau_s=(0.81, 0.7), u_max=(1.8, 2.5))
 )
@@ -56,6 +57,8 @@ terms = st.builds(
     horizon=st.integers(1, INPUTS_MAX),
     axes=st.integers(1, 3),
     tau_s=axes,
+    gain=axes,
+    dead_time_s=axes,
     u_max=axes,
     scheme=text,
     exhausted=text,
@@ -324,8 +327,8 @@ def test_the_table_of_messages_is_complete() -> None:
 @given(terms, terms)
 def test_terms_differ_in_keys_exactly_where_they_are_not_equal(one: Terms, other: Terms) -> None:
     """Both ends name the same keys, with the values changed over."""
-    assert bool(one.differences(other)) == (one != other)
-    assert one.differences(other) == tuple(
+    assert bool(differences(one, other)) == (one != other)
+    assert differences(one, other) == tuple(
         Difference(difference.key, here=difference.there, there=difference.here)
-        for difference in other.differences(one)
+        for difference in differences(other, one)
     )

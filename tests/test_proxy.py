@@ -7,14 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from netem import link as link_module
-from netem import proxy as proxy_module
-from netem.fate import Fates
-from netem.link import Link
-from netem.proxy import FLOWS_MAX, IDLE_NS, Flow, Proxy
-from shared.config import DirectionConfig, NetworkConfig, Scenario
-from shared.endpoint import MILLISECOND_NS, Datagram
-from shared.events import FlowOpened
+from skytether.netem import link as link_module
+from skytether.netem import proxy as proxy_module
+from skytether.netem.fate import Fates
+from skytether.netem.link import Link
+from skytether.netem.proxy import FLOWS_MAX, IDLE_NS, Flow, Proxy
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import FlowOpened
+from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 
 SERVER = ("192.0.2.9", 47001)
 ALICE, BOB, CAROL = (("192.0.2.1", 5000), ("192.0.2.1", 5001), ("192.0.2.2", 5000))
@@ -344,7 +345,7 @@ def test_the_figures_name_every_statistic() -> None:
     errors = ("error_ms_p50", "error_ms_p99", "error_ms_max")
 
     def within(count: int) -> dict[str, int]:
-        return dict.fromkeys([f"{edge} ms" for edge in (*link_module.DELAY_EDGES_MS, "inf")], count)
+        return dict.fromkeys([f"{edge}" for edge in (*link_module.DELAY_EDGES_MS, "inf")], count)
 
     assert proxy.figures() == {
         "flows": 1,
@@ -356,8 +357,8 @@ def test_the_figures_name_every_statistic() -> None:
             "lost": 1,
             "queue": 0,
             "queue_max": 0,
-            "delays": {},
-            "delays_within": within(0),
+            "delays_ms": {},
+            "delays_within_ms": within(0),
             **dict.fromkeys(errors, 0.0),
         },
         "downlink": {
@@ -367,8 +368,8 @@ def test_the_figures_name_every_statistic() -> None:
             "forwarded": 1,
             "queue": 1,
             "queue_max": 2,
-            "delays": {"20 ms": 1},
-            "delays_within": {**within(1), "20 ms": 0},
+            "delays_ms": {"20": 1},
+            "delays_within_ms": {**within(1), "20": 0},
             **dict.fromkeys(errors, 1.0),
         },
     }

@@ -1,4 +1,4 @@
-"""`shared.record`: what is written down is what is read back."""
+"""`shared.telemetry.record`: what is written down is what is read back."""
 
 import io
 import struct
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.record import (
+from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     Recorder,
     client_columns,
@@ -21,8 +21,8 @@ Columns = np.dtype[np.void]
 COLUMN_SETS = {
     "client in 2-D": client_columns(2),
     "client in 3-D": client_columns(3),
-    "server in 2-D": server_columns(2),
-    "server in 3-D": server_columns(3),
+    "server in 2-D": server_columns(2, "committed"),
+    "server in 3-D, dead reckoning": server_columns(3, "dead_reckoning"),
     "netem": PACKET_COLUMNS,
 }
 
@@ -84,6 +84,16 @@ def test_a_part_without_rows_is_read_as_none(columns: Columns) -> None:
     header = written(columns, 0)
     assert parse(header).size == parse(header + bytes(columns.itemsize - 1)).size == 0
     assert parse(header).dtype == columns
+
+
+@pytest.mark.parametrize(
+    "header",
+    [b"", b"3", b"[]", b"[" * 100_000, b'[["a"]]', b'[["a","f8,("]]', b'[["a","O"]]', b"\xff"],
+)
+def test_what_is_no_part_is_a_value_error(header: bytes) -> None:
+    """As numpy reads kinds of columns as Python, any error of Python's."""
+    with pytest.raises(ValueError, match="not a part of a record"):
+        parse(header + b"\n" + bytes(100))
 
 
 def test_a_part_begins_with_its_columns_in_a_line() -> None:

@@ -8,14 +8,15 @@ from typing import BinaryIO
 import numpy as np
 import pytest
 
-from shared.events import RecordIncomplete
-from shared.record import PACKET_COLUMNS, read
-from shell import recording
-from shell.command import CommandError, recorded, recorded_meanwhile
-from shell.recording import Recording
+from skytether.shared.base import files
+from skytether.shared.core.events import RecordIncomplete
+from skytether.shared.telemetry.record import PACKET_COLUMNS, read
+from skytether.shell import recording
+from skytether.shell.command import CommandError, recorded, recorded_meanwhile
+from skytether.shell.recording import RecordFile
 
 
-def append(to: Recording, count: int) -> None:
+def append(to: RecordFile, count: int) -> None:
     """Record rows, numbered from 0."""
     for number in range(count):
         to.recorder.append(1, number=number)
@@ -42,22 +43,30 @@ def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
         assert read(path)["number"].tolist() == list(range(10))
 
 
-def test_a_full_disk_is_said_once_and_ends_the_command_when_all_is_done() -> None:
+@pytest.fixture
+def full(monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file on a disk that is full."""
+    disk = Path("/dev/full")
+    monkeypatch.setattr(files, "create", lambda _, buffering: disk.open("r+b", buffering))
+    return Path("record")
+
+
+def test_a_full_disk_is_said_once_and_ends_the_command_when_all_is_done(full: Path) -> None:
     """With what there is of the record; the flight, which is the block, goes on to its end."""
     flown = []
 
     def fly() -> None:
-        with recorded(Path("/dev/full"), PACKET_COLUMNS) as part:
+        with recorded(full, PACKET_COLUMNS) as part:
             append(part, 3)
             part.end()
             flown.extend([part.news(), part.news(), len(part.rows())])
 
     with pytest.raises(CommandError) as error:
         fly()
-    told = RecordIncomplete(file="/dev/full", reason="No space left on device")
+    told = RecordIncomplete(file="record", reason="No space left on device")
     assert flown == [told, None, 0]
     assert error.value.code == 1
-    assert str(error.value) == "/dev/full: No space left on device: 0 of 3 rows are recorded"
+    assert str(error.value) == "record: No space left on device: 0 of 3 rows are recorded"
 
 
 def test_without_a_temporary_file_a_flight_is_flown_all_the_same(
@@ -94,7 +103,7 @@ def test_a_disk_that_is_too_slow_loses_whole_rows(monkeypatch: pytest.MonkeyPatc
         os.fdopen(reading, "rb", buffering=0) as slow,
         os.fdopen(writing, "wb", buffering=0) as file,
     ):
-        part = Recording("netem", PACKET_COLUMNS, file)
+        part = RecordFile("netem", PACKET_COLUMNS, file)
         append(part, 1000)
         assert part.news() == RecordIncomplete(file="netem", reason="the disk is too slow")
         part.end()
@@ -108,17 +117,17 @@ def test_a_disk_that_is_too_slow_loses_whole_rows(monkeypatch: pytest.MonkeyPatc
 
 def test_a_file_of_any_name_can_be_told_of() -> None:
     """Its name need not be Unicode, but a line of JSON is."""
-    part = Recording("netem\udcff", PACKET_COLUMNS, OSError(28, "No space left on device"))
+    part = RecordFile("netem\udcff", PACKET_COLUMNS, OSError(28, "No space left on device"))
     part.end()
     assert part.news() == RecordIncomplete(file="netem?", reason="No space left on device")
     part.close()
 
 
-def test_a_command_that_fails_otherwise_says_only_that() -> None:
+def test_a_command_that_fails_otherwise_says_only_that(full: Path) -> None:
     """A vehicle that was refused is the reason, whatever is in the record."""
 
     def fly() -> None:
-        with recorded(Path("/dev/full"), PACKET_COLUMNS) as part:
+        with recorded(full, PACKET_COLUMNS) as part:
             append(part, 3)
             raise CommandError("refused")
 

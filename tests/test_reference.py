@@ -9,8 +9,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from shared import reference
-from shared.config import ConfigError, check
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import reference
+from skytether.shared.scenario.reading import check
 
 quick = settings(max_examples=80, deadline=None)
 

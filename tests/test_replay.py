@@ -5,19 +5,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client.compensator import Compensator
-from server.clock import ClockMap
-from server.gain import feedback_gain
-from server.planner import Planner
-from server.replay import Replay
-from server.scheme import Foresight, foresight
-from shared import config, rule
-from shared.config import Scenario
-from shared.model import Array, Flags, Indices
-from shared.protocol import NO_HORIZON, Horizon, Mode, Observation
-from shared.record import UPLINK
-from shared.summary import summarise
-from sim.flight import Flight, fly, fly_batch
+from skytether.client.compensator import Compensator
+from skytether.server.control.clock import ClockMap
+from skytether.server.control.committed import Replay
+from skytether.server.control.gain import feedback_gain
+from skytether.server.control.planner import Planner
+from skytether.server.control.scheme import Foresight, foresight
+from skytether.shared.law import rule
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import UPLINK, Record
+from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observation
+from skytether.sim.flight import fly, fly_batch
 
 H, BOUND, MOST = 6, 4, 50
 ROW = np.array([0])
@@ -27,12 +28,12 @@ HORIZON_BYTES = 300
 
 def scenario(name: str = "paper", **changes: Any) -> Scenario:
     """A packaged scenario under the committed scheme, with some keys changed."""
-    table = config.to_table(config.load(name))
+    table = reading.to_table(reading.load(name))
     changes = {"control": {}, **changes}
     changes["control"] = {"scheme": "committed", **changes["control"]}
     for key, value in changes.items():
         table[key] = table[key] | value if isinstance(value, dict) else value
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
 def lossy(loss: float, down: float = 0.1) -> dict[str, Any]:
@@ -78,7 +79,7 @@ def see(
 def by_rule(replay: Replay, step: int, in_force: int) -> Array:
     """Input flown at a step with a horizon that was sent; zero without one, or with another's."""
     memory, brake = replay._memory, replay._settings.brake
-    bounds = replay._settings.rule["bound"].tolist()
+    bounds = replay._settings.laws["bound"].tolist()
     for slot in range(min(int(memory.seen["sent"][0]), memory.sent.shape[1])):
         made_for, _, length, speed = memory.sent[0, slot].tolist()
         if made_for == in_force:
@@ -146,13 +147,13 @@ def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:
     seen = foresee(replay, 106)
     np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(old[:, 6]))
     np.testing.assert_array_equal(seen.committed[0, :, 1], np.float32(late[:, 4]))
-    assert replay.counts["horizons lost"] == 1
+    assert replay.counts["horizons_lost"] == 1
     foresee(replay, 107)
-    assert replay.counts["horizons lost"] == 1
+    assert replay.counts["horizons_lost"] == 1
     see(replay, 108, np.zeros((2, 2)), 103, 108)
     seen = foresee(replay, 108)
     np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(late[:, 5]))
-    assert replay.counts["horizons lost"] == 1
+    assert replay.counts["horizons_lost"] == 1
 
 
 def test_a_vehicle_without_a_horizon_hovers() -> None:
@@ -271,22 +272,22 @@ def test_it_makes_no_difference_when_a_horizon_with_feedback_arrives() -> None:
     after.offer(Horizon(1, 1, 103, 0, 0, horizon, seen.feedback[0]), 103, 102)
     for step in range(103, 103 + BOUND):
         x = x + 0.03  # another
-        told = before.choose(step, x)
+        told = np.array(before.choose(step, x.tolist()))
         assert np.abs(told - inputs[:, step - 100]).max() > 0.03
-        np.testing.assert_allclose(after.choose(step, x), told, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(after.choose(step, x.tolist()), told, rtol=0, atol=1e-6)
 
 
 # -- in flight -----------------------------------------------------------------------------------
 
 
-def estimate_error(flight: Flight) -> Array:
+def estimate_error(flight: Record) -> Array:
     """|x̂ - x| at every tick whose step was flown, the largest of all axes [m, m/s]."""
     true = {int(row["step"]): row["state"] for row in flight.client}
     known = [row for row in flight.server if int(row["step"]) in true]
     return np.array([np.abs(row["estimate"] - true[int(row["step"])]).max() for row in known])
 
 
-def settled(flight: Flight, bound: int) -> Array:
+def settled(flight: Record, bound: int) -> Array:
     """Ticks at which every horizon has arrived, or is known not to have."""
     sent = flight.server["step"][flight.server["event"]]
     last = np.array([sent[sent < step].max(initial=-1) for step in flight.server["step"]])
@@ -294,7 +295,7 @@ def settled(flight: Flight, bound: int) -> Array:
 
 
 @pytest.fixture(scope="module")
-def sparse() -> tuple[Scenario, Flight]:
+def sparse() -> tuple[Scenario, Record]:
     """A horizon in three seconds, of which a third is lost."""
     flown = scenario(
         control={"trigger": "periodic(60)", "delay_bound": 0.8, "horizon": 70},
@@ -305,13 +306,13 @@ def sparse() -> tuple[Scenario, Flight]:
 
 
 def test_the_estimate_is_exact_once_every_horizon_has_arrived_or_is_known_lost(
-    sparse: tuple[Scenario, Flight], monkeypatch: pytest.MonkeyPatch
+    sparse: tuple[Scenario, Record], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without noise, to 1e-9; without acknowledgements it is not."""
     flown, flight = sparse
     certain = settled(flight, 16)
     assert certain.sum() > 300
-    assert flight.figures["server"]["counts"]["horizons lost"] > 3
+    assert flight.figures["server"]["counts"]["horizons_lost"] > 3
     assert estimate_error(flight)[certain].max() <= 1e-9
     assert estimate_error(flight).max() > 1e-3  # of others it cannot be
 
@@ -343,13 +344,13 @@ def test_a_packet_at_every_step_hides_what_is_lost() -> None:
     assert estimate_error(flight)[40:].max() <= 1e-9
 
 
-def test_every_lost_horizon_is_counted(sparse: tuple[Scenario, Flight]) -> None:
+def test_every_lost_horizon_is_counted(sparse: tuple[Scenario, Record]) -> None:
     """As many as netem has lost, but for those too young to be known."""
     _, flight = sparse
     netem = flight.netem[flight.netem["direction"] == UPLINK]
     horizons = netem[netem["bytes"] > HORIZON_BYTES]
     old = horizons[horizons["arrived_ns"] < horizons["arrived_ns"].max() - 2_000_000_000]
-    counted = flight.figures["server"]["counts"]["horizons lost"]
+    counted = flight.figures["server"]["counts"]["horizons_lost"]
     assert old["lost"].sum() <= counted <= horizons["lost"].sum()
 
 
@@ -371,7 +372,7 @@ FIRM = {
 """Less so, for wind."""
 
 
-def rmse(flown: Scenario, flight: Flight) -> float:
+def rmse(flown: Scenario, flight: Record) -> float:
     """RMSE xy [m]."""
     error = summarise(flown, "test", flight.client).rmse_xy
     assert error is not None
@@ -434,7 +435,7 @@ def test_a_mean_loss_of_half_each_way_is_flown_through() -> None:
         flown = scenario(
             control=control, network=lossy(loss, loss), vehicle={"wind": 0.1}, settle=5.0
         )
-        errors[loss] = np.mean([rmse(flown, flight) for flight in fly_batch(flown, range(1, 9))])
+        errors[loss] = np.mean([rmse(flown, flight) for flight in fly_batch(flown, range(1, 5))])
     assert errors[0.5] < 2.0 * errors[0.1]
 
 
@@ -449,7 +450,7 @@ def test_feedback_aboard_flies_in_wind_with_a_packet_a_second() -> None:
             **FIRM,
         }
         flown = scenario(control=control, vehicle={"wind": 0.1}, settle=5.0)
-        flights = fly_batch(flown, range(1, 5))
+        flights = fly_batch(flown, range(1, 3))
         errors[feedback] = np.mean([rmse(flown, flight) for flight in flights])
         packets[feedback] = np.mean([flight.server["event"].mean() for flight in flights])
     assert errors[True] < errors[False] / 3.0
@@ -467,7 +468,7 @@ def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
     }
     flown = scenario(control=control, network=lossy(0.33), duration=60.0)
     flight = fly(flown)
-    assert flight.figures["server"]["counts"]["horizons lost"] > 3
+    assert flight.figures["server"]["counts"]["horizons_lost"] > 3
     assert estimate_error(flight)[settled(flight, 16)].max() <= 1e-9
 
 

@@ -14,19 +14,19 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from lab import plates, report, studies
-from lab.calibration import TABLE_1
-from lab.studies import EVENT, EVERY, NONE, PERIODIC, Cell, Study
-from lab.sweep import Axis, Sweep
-from shared import config
-from shared.summary import Summary, summarise
-from sim import flight
 from skytether.__main__ import main
+from skytether.lab import plates, report, studies
+from skytether.lab.calibration import TABLE_1
+from skytether.lab.studies import EVENT, EVERY, NONE, PERIODIC, Cell, Study
+from skytether.lab.sweep import GridAxis, Sweep
+from skytether.shared.scenario import reading
+from skytether.shared.telemetry.summary import Summary, summarise
+from skytether.sim import flight
 
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parent.parent
-PAPER = config.load("paper")
+PAPER = reading.load("paper")
 
 (LINE,) = [
     line
@@ -63,7 +63,7 @@ def test_the_methods_are_the_papers_scenarios() -> None:
         ("paper-every-step", EVERY),
         ("paper", EVENT),
     ):
-        assert replace(plan.scenario_of(method), title="") == replace(config.load(name), title="")
+        assert replace(plan.scenario_of(method), title="") == replace(reading.load(name), title="")
 
 
 SUMMARY = summarise(PAPER, "paper", flight.fly(replace(PAPER, duration=6.0)).client)
@@ -87,7 +87,9 @@ def test_periodic_sends_at_the_nearest_rate(ratio: float, steps: int) -> None:
 
 def test_the_baseline_has_at_each_value_the_rate_that_the_trigger_had_there() -> None:
     """All else that belongs to the value is kept."""
-    axis = Axis("loss", (0.0, 0.5), ({"network.uplink.loss": 0.0}, {"network.uplink.loss": 0.5}))
+    axis = GridAxis(
+        "loss", (0.0, 0.5), ({"network.uplink.loss": 0.0}, {"network.uplink.loss": 0.5})
+    )
     study = Study("loss", "loss", PAPER, axis, 3, 0.0)
     second = study.second({(0.0, EVENT): runs(0.1), (0.5, EVENT): runs(0.25)})
     flown = [task.scenario for task in second.tasks()]
@@ -156,7 +158,7 @@ def test_a_curve_is_won_only_where_intervals_are_apart() -> None:
     cells = {}
     for value, errors in trigger.items():
         cells |= {(value, EVENT): Cell(errors), (value, PERIODIC): Cell(runs(0.1, 0.1), 10)}
-    study = Study("x", "x", PAPER, Axis("x", (0.0, 1.0, 2.0)), 2, 0.0)
+    study = Study("x", "x", PAPER, GridAxis("x", (0.0, 1.0, 2.0)), 2, 0.0)
     assert plates.against_periodic(study, cells) == (1, 1)
 
 

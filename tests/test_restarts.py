@@ -6,10 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import restarts
-from benchmarks.restarts import CLOSED, KILLED, STOPPED, Counts, Life, Outage, judge
-from shared.endpoint import SECOND_NS
-from shared.protocol import Mode
+from skytether.lab.benchmarks import restarts
+from skytether.lab.benchmarks.restarts import (
+    CLOSED,
+    KILLED,
+    STOPPED,
+    Outage,
+    ProcessLife,
+    RestartsCounts,
+    judge,
+)
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.wire.protocol import Mode
 
 pytestmark = pytest.mark.long
 
@@ -19,7 +27,7 @@ GONE = Outage("server", CLOSED, 10 * SECOND_NS, 14 * SECOND_NS)
 """Outage from 10 s to 14 s."""
 
 
-def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -> Life:
+def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -> ProcessLife:
     """A flight of 20 s at 1 m/s that brakes some time after 10 s and flies again after 14 s."""
     time_s = np.arange(400) * DT_S
     at, again = 10.0 + brakes_s, 14.0 + flies_s
@@ -29,7 +37,7 @@ def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -
     speed[0] = 1.0
     for i in range(len(speed) - 1):
         speed[i + 1] = commanded[i] + (speed[i] - commanded[i]) * np.exp(-DT_S / TAU_S)
-    return Life(
+    return ProcessLife(
         np.round(time_s * SECOND_NS).astype(np.int64),
         commanded,
         speed,
@@ -39,7 +47,7 @@ def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -
     )
 
 
-def verdict(flown: Life, outage: Outage = GONE) -> restarts.Verdict:
+def verdict(flown: ProcessLife, outage: Outage = GONE) -> restarts.RestartVerdict:
     """What is said of a flight."""
     return judge(outage, [flown], restarts.scenario())
 
@@ -66,7 +74,7 @@ def test_a_vehicle_that_brakes_in_time_is_inside() -> None:
     ],
 )
 def test_a_vehicle_that_brakes_late_or_softly_or_never_flies_again_is_outside(
-    flown: Life, figure: str
+    flown: ProcessLife, figure: str
 ) -> None:
     """By the figure that it is about."""
     found, good = verdict(flown), verdict(life())
@@ -101,7 +109,7 @@ def test_a_new_life_has_to_stand_until_it_flies() -> None:
     """From its first step on."""
     died = Outage("client", KILLED, 10 * SECOND_NS, 11 * SECOND_NS)
     old, born = life(), life(brakes_s=-10.0, flies_s=-2.0, brake_mps2=1e6)
-    old = Life(*(getattr(old, name)[:200] for name in old.__annotations__))
+    old = ProcessLife(*(getattr(old, name)[:200] for name in old.__annotations__))
     later = born.time_ns + 11 * SECOND_NS
     still = np.where(born.commanded > 0.0, born.speed, 0.0)
     born = replace(
@@ -117,7 +125,7 @@ def test_a_new_life_has_to_stand_until_it_flies() -> None:
 
 def test_processes_that_are_killed_under_way_come_back(tmp_path: Path) -> None:
     """The vehicle brakes along its curve, is at rest, and flies again, as a new life does."""
-    counts = Counts(kills=1, stops=0, flight_s=0.5, subjects=("server", "client"))
+    counts = RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("server", "client"))
     result = restarts.measure(counts)
     server, client = restarts.verdicts_of(result)
     for each in (server, client):

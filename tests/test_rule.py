@@ -1,21 +1,24 @@
 """The rule of flight: in plain numbers, and flown alike by the vehicle and the server's replay."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from client.compensator import Compensator
-from server import model as compiled
-from server.clock import ClockMap
-from server.gain import feedback_gain
-from server.replay import Replay
-from server.scheme import Foresight, foresight
-from shared import rule
-from shared.config import Scenario, check
-from shared.model import Array
-from shared.protocol import NO_HORIZON, Horizon, Mode, Observation
-from shared.rule import (
+from skytether.client.compensator import Compensator
+from skytether.server.control import law
+from skytether.server.control.clock import ClockMap
+from skytether.server.control.committed import Replay
+from skytether.server.control.gain import feedback_gain
+from skytether.server.control.scheme import Foresight, foresight
+from skytether.shared.base.kernel import part
+from skytether.shared.law import rule
+from skytether.shared.law.model import Array, Axis, advance
+from skytether.shared.law.rule import (
+    Held,
     bounded,
     entry,
     flown,
@@ -25,6 +28,9 @@ from shared.rule import (
     led_back,
     remaining,
 )
+from skytether.shared.scenario.reading import check
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observation
 
 quick = settings(max_examples=200, deadline=None)
 
@@ -98,7 +104,56 @@ def test_where_it_leads_is_blown_along_only_until_it_stands() -> None:
     assert leading(0.0, -0.25, 0.0) == 0.0
 
 
+def held(inputs: Sequence[float], *, feeds_back: bool = True, **changed: Any) -> Held:
+    """A horizon of some inputs, all of them flown; braked from its last one on."""
+    axis = Axis(a01=0.09, a11=0.88, b0=0.01, b1=0.12)
+    numbers = {"speed": abs(inputs[-1]), "brake": 0.125, "bound": 1.8, "disturbance": 0.25}
+    gain = {"gain_p": 3.0, "gain_v": 1.5}
+    given = {"length": len(inputs), "indexed": True, **numbers, **gain, **changed}
+    return Held(model=axis, inputs=inputs, feeds_back=feeds_back, **given)
+
+
+@pytest.mark.parametrize(
+    ("stage", "told", "along"),
+    [(0, 0.25, 0.5), (1, 0.5, 0.75), (2, 0.375, 0.625), (5, 0.0, 0.0)],
+)
+def test_a_step_flies_what_is_told_and_leads_on_along_it(
+    stage: int, told: float, along: float
+) -> None:
+    """Two inputs, then braked; x̄ goes on with the disturbance until it stands."""
+    u, without, *after = rule.step(held([0.25, 0.5]), stage, 1.0, 0.5, 0.75, 0.0)
+    assert (u, without) == (min(told + 3.0 * 0.25 + 1.5 * 0.5, 1.8), told)
+    assert tuple(after) == advance(held([0.0]).model, 1.0, 0.5, along)
+
+
+def test_a_step_without_feedback_or_before_the_first_stage_leads_nowhere() -> None:
+    """What is told is flown, and x̄ stays."""
+    state = (1.0, 0.5, 0.0, 0.0)
+    assert rule.step(held([0.25, 0.5], feeds_back=False), 1, *state) == (0.5, 0.5, 1.0, 0.5)
+    assert rule.step(held([0.25, 0.5]), -1, *state) == (0.25, 0.25, 1.0, 0.5)
+
+
+def test_a_horizon_that_is_not_indexed_tells_its_first_input_at_every_stage() -> None:
+    """As long as it lasts, whatever the others are."""
+    first = held([0.25, 0.5], indexed=False, length=10, feeds_back=False)
+    assert {rule.step(first, stage, 0.0, 0.0, 0.0, 0.0)[0] for stage in range(-1, 10)} == {0.25}
+
+
+def test_where_a_horizon_leads_is_that_step_by_step() -> None:
+    """From any stage to any later one; to an earlier one, or the same, it stays."""
+    horizon, lead = held([0.25, 0.5]), (1.0, 0.5)
+    for stage in range(6):
+        assert rule.lead_to(horizon, 0, stage, 1.0, 0.5) == lead
+        assert rule.lead_to(horizon, stage, stage, *lead) == lead
+        *_, lead_p, lead_v = rule.step(horizon, stage, *lead, 0.0, 0.0)
+        lead = lead_p, lead_v
+
+
 speeds = st.floats(-3.0, 3.0)
+COMPILED = {
+    each.__name__: part(each)
+    for each in (lasting, entry, bounded, remaining, leading, led_back, flown, rule.step)
+}
 
 
 @quick
@@ -113,13 +168,20 @@ def test_compiled_it_says_the_same(
     """To the last bit, each function."""
     told, back, speed, brake, bound = numbers
     share = remaining(stage, length, speed, brake)
-    assert compiled.remaining(stage, length, speed, brake) == share
-    assert compiled.leading(told, back, share) == leading(told, back, share)
-    assert compiled.flown(stage, told, back, bound) == flown(stage, told, back, bound)
-    assert compiled.led_back(*numbers[:4]) == led_back(*numbers[:4])
-    assert compiled.bounded(told, bound) == bounded(told, bound)
-    assert compiled.entry(stage, length) == entry(stage, length)
-    assert compiled.lasting(length, 100, 100 - stage, 20) == lasting(length, 100, 100 - stage, 20)
+    for function, *given_ in (
+        (remaining, stage, length, speed, brake),
+        (leading, told, back, share),
+        (flown, stage, told, back, bound),
+        (led_back, *numbers[:4]),
+        (bounded, told, bound),
+        (entry, stage, length),
+        (lasting, length, 100, 100 - stage, 20),
+    ):
+        assert COMPILED[function.__name__](*given_) == function(*given_)
+    inputs, states = np.linspace(told, back, length), (told, back, back, speed)
+    for feeds_back in (False, True):
+        horizon = held(inputs, feeds_back=feeds_back, speed=speed, brake=brake, bound=bound)
+        assert COMPILED["step"](horizon, stage, *states) == rule.step(horizon, stage, *states)
 
 
 # -- at both ends --------------------------------------------------------------------------------
@@ -242,7 +304,7 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
             horizon, last_seen = arriving[step]
             vehicle.offer(horizon, step, last_seen)
         states.append(x)
-        inputs.append(vehicle.choose(step, x))
+        inputs.append(np.array(vehicle.choose(step, x.tolist())))
         if step in {begin, seen}:
             told = Mode.TRACK, 1, x, inputs[-1]
             replay.observe(0, Observation(1, 1, step, 0, FIRST, begin, 0, 0, *told))
@@ -260,5 +322,5 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
 
 def test_the_server_compiles_the_very_functions_that_the_vehicle_calls() -> None:
     """There is one source of the rule."""
-    for name in ("lasting", "entry", "bounded", "remaining", "leading", "led_back", "flown"):
-        assert getattr(compiled, name).py_func is getattr(rule, name)
+    for name in ("lasting", "bounded", "lead_to", "step", "advance"):
+        assert getattr(law, name) is getattr(rule, name)

@@ -9,30 +9,38 @@ from itertools import count
 import pytest
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
-from client.secure import ATTEMPT_NS, Secure
-from server import secure as server_secure
-from server.gate import Call
-from server.secure import CHALLENGES_MAX, COOKIE_NS, HANDSHAKES, PENDING_MAX
-from server.secure import Secure as Gate
-from shared import channel as channels
-from shared import handshake, noise
-from shared.channel import DATA, FRESH_NS, LIFE_NS, OVERLAP_NS, VERSION
-from shared.endpoint import SECOND_NS, Address, Datagram, seconds_to_ns
-from shared.handshake import (
+from skytether.client.link import AGAIN_NS
+from skytether.client.secure import ATTEMPT_NS, SecureLink
+from skytether.server import secure as server_secure
+from skytether.server.gate import Call
+from skytether.server.secure import COOKIE_NS, FORMS, HANDSHAKES, OUT_MAX, PENDING_MAX
+from skytether.server.secure import SecureGate as Gate
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.scenario import reading
+from skytether.shared.wire import channel as channels
+from skytether.shared.wire import handshake, noise_nnpsk0
+from skytether.shared.wire.channel import DATA, FRESH_NS, LIFE_NS, OVERLAP_NS, VERSION
+from skytether.shared.wire.handshake import (
     CHALLENGE,
     CHALLENGE_BYTES,
     HELLO_BYTES_MAX,
     INITIATION,
     INITIATION_BYTES,
     RESPONSE,
+    RESPONSE_BYTES_MIN,
     WELCOME_BYTES_MAX,
+    check_place,
+    read_response,
+    write_response,
 )
-from shared.keys import Key, Keyring
-from shared.protocol import ProtocolError
+from skytether.shared.wire.keys import Keyring, VehicleKey
+from skytether.shared.wire.noise_nnpsk0 import MESSAGE_BYTES
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, ProtocolError, encode
 
 HERE, ELSEWHERE = ("vehicle", 1), ("elsewhere", 2)
 SECRETS = {1: bytes([1]) * 32, 2: bytes([2]) * 32}
-KEYS = {(vehicle, 5): Key.of(vehicle, 5, secret) for vehicle, secret in SECRETS.items()}
+KEYS = {(vehicle, 5): VehicleKey.of(vehicle, 5, secret) for vehicle, secret in SECRETS.items()}
 HELLO, WELCOME = b"\x95\x04\x01" + b"hello" * 60, b"\x98\x04\x02" + b"welcome" * 48
 OBSERVATION, HORIZON = b"\x9b\x04\x03observation", b"\x99\x04\x04horizon"
 """Messages that begin as they do on the wire."""
@@ -43,9 +51,9 @@ def gate(seed: int = 1) -> Gate:
     return Gate(Keyring("keys", KEYS), entropy=random.Random(seed).randbytes)
 
 
-def link(seed: int = 2, key: Key = KEYS[1, 5]) -> Secure:
+def link(seed: int = 2, key: VehicleKey = KEYS[1, 5]) -> SecureLink:
     """A vehicle; each seed is another life."""
-    return Secure(key, entropy=random.Random(seed).randbytes)
+    return SecureLink(key, entropy=random.Random(seed).randbytes)
 
 
 def called(server: Gate, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> Call:
@@ -55,7 +63,7 @@ def called(server: Gate, datagram: bytes, now_ns: int = 0, peer: Address = HERE)
     return call
 
 
-def refusal(end: Gate | Secure, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> str:
+def refusal(end: Gate | SecureLink, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> str:
     """Reason for which an end drops a datagram."""
     given = Datagram(datagram, peer) if isinstance(end, Gate) else datagram
     with pytest.raises(ProtocolError) as error:
@@ -63,7 +71,7 @@ def refusal(end: Gate | Secure, datagram: bytes, now_ns: int = 0, peer: Address 
     return error.value.reason
 
 
-def challenged(client: Secure, server: Gate, now_ns: int = 0) -> None:
+def challenged(client: SecureLink, server: Gate, now_ns: int = 0) -> None:
     """Give the client a cookie."""
     asked = Datagram(client.hello(HELLO, now_ns=now_ns), HERE)
     assert server.open(asked, now_ns=now_ns) is None
@@ -71,7 +79,7 @@ def challenged(client: Secure, server: Gate, now_ns: int = 0) -> None:
     assert client.open(challenge.payload, now_ns=now_ns) is None
 
 
-def welcomed(client: Secure, server: Gate, now_ns: int = 0) -> bytes:
+def welcomed(client: SecureLink, server: Gate, now_ns: int = 0) -> bytes:
     """RESPONSE to a client with a cookie, admitted and opened."""
     call = called(server, client.hello(HELLO, now_ns=now_ns), now_ns)
     assert (call.payload, call.vehicle, call.moves) == (HELLO, 1, False)
@@ -81,7 +89,7 @@ def welcomed(client: Secure, server: Gate, now_ns: int = 0) -> bytes:
     return response
 
 
-def joined(now_ns: int = 0) -> tuple[Secure, Gate]:
+def joined(now_ns: int = 0) -> tuple[SecureLink, Gate]:
     """Both ends of an open link, before the first packet in the channel."""
     client, server = link(), gate()
     challenged(client, server, now_ns)
@@ -133,6 +141,20 @@ def test_the_bytes_of_a_handshake() -> None:
     assert VERSION < 0x90
 
 
+def test_the_forms_that_are_admitted_are_those_on_the_wire() -> None:
+    """Packets of a channel, INITIATIONs, and HELLOs in plaintext, which the operator is told of."""
+    client, _ = joined()
+    plain = encode(Hello(1, 5, reading.load("demo").terms()))
+    sent = [client.seal(OBSERVATION), link().hello(HELLO, now_ns=0), plain]
+    for form, packet in zip(FORMS, sent, strict=True):
+        assert packet.startswith(form.head)
+        assert form.least <= len(packet) <= form.most
+    longest = client.seal(bytes(PAYLOAD_BYTES_MAX))
+    assert len(longest) == 1200 + 32
+    assert [form.most for form in FORMS] == [len(longest), INITIATION_BYTES, PAYLOAD_BYTES_MAX]
+    assert [form.least for form in FORMS] == [len(client.seal(b"")), INITIATION_BYTES, 1]
+
+
 def test_no_answer_is_longer_than_what_draws_it() -> None:
     """Even the longest; and the longest HELLO fits."""
     client, server = link(), gate()
@@ -174,6 +196,7 @@ def test_an_attempt_has_one_ephemeral_key() -> None:
     other = client.hello(HELLO + b"x", now_ns=ATTEMPT_NS + 1)
     assert len({first[21:53], later[21:53], other[21:53]}) == 3
     assert first[5:21] == later[5:21] == other[5:21] != bytes(16)
+    assert ATTEMPT_NS == 60 * SECOND_NS
 
 
 def test_a_repeated_hello_is_answered_with_other_keys() -> None:
@@ -218,14 +241,14 @@ def test_where_adopting_leaves_the_attempt_open_a_command_is_flown_twice(
     client, server = link(), gate()
     challenged(client, server)
     response = welcomed(client, server)
-    adopt = Secure.adopt
+    adopt = SecureLink.adopt
 
-    def without_end(self: Secure, *, now_ns: int) -> None:
+    def without_end(self: SecureLink, *, now_ns: int) -> None:
         attempt = self._attempt
         adopt(self, now_ns=now_ns)
         self._attempt = attempt
 
-    monkeypatch.setattr(Secure, "adopt", without_end)
+    monkeypatch.setattr(SecureLink, "adopt", without_end)
     client.adopt(now_ns=0)
     sent = called(server, client.seal(OBSERVATION)).line.seal(HORIZON)
     assert client.open(sent, now_ns=0) == HORIZON
@@ -241,12 +264,15 @@ def test_who_has_no_key_is_met_with_silence() -> None:
     """Plaintext, another key, an unknown vehicle or number of a key: nothing is sent or kept."""
     server = gate()
     strangers = {
-        "forged": Key.of(1, 5, b"x" * 32),
-        "unknown key": Key.of(3, 5, SECRETS[1]),
+        "forged": VehicleKey.of(1, 5, b"x" * 32),
+        "unknown key": VehicleKey.of(3, 5, SECRETS[1]),
     }
     for reason, key in strangers.items():
         assert refusal(server, link(key=key).hello(HELLO, now_ns=0)) == reason
-    assert refusal(server, link(key=Key.of(1, 6, SECRETS[1])).hello(b"", now_ns=0)) == "unknown key"
+    assert (
+        refusal(server, link(key=VehicleKey.of(1, 6, SECRETS[1])).hello(b"", now_ns=0))
+        == "unknown key"
+    )
     for end in (server, link()):
         assert refusal(end, b"") == refusal(end, b"\x95\x04\x01") == "not sealed"
         assert refusal(end, bytes([VERSION])) == "not sealed"
@@ -262,7 +288,7 @@ def test_who_has_no_key_is_met_with_silence() -> None:
 def test_the_key_of_another_vehicle_opens_nothing() -> None:
     """A vehicle that has a key is that vehicle, and no other."""
     server = gate()
-    renamed = link(key=Key.of(1, 5, SECRETS[2]))
+    renamed = link(key=VehicleKey.of(1, 5, SECRETS[2]))
     assert refusal(server, renamed.hello(HELLO, now_ns=0)) == "forged"
     client, server = joined()
     packet = bytearray(client.seal(OBSERVATION))
@@ -279,13 +305,13 @@ def changed(datagram: bytes, at: int) -> bytes:
 
 def exchanges(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """List that grows by an entry for each operation on the elliptic curve."""
-    exchange, found = noise._exchange, []
+    exchange, found = noise_nnpsk0._exchange, []
 
     def counted(private: X25519PrivateKey, public: bytes) -> bytes:
         found.append(1)
         return exchange(private, public)
 
-    monkeypatch.setattr(noise, "_exchange", counted)
+    monkeypatch.setattr(noise_nnpsk0, "_exchange", counted)
     return found
 
 
@@ -351,6 +377,100 @@ def test_a_challenge_answers_one_attempt_once() -> None:
     assert refusal(client, challenge[:-1]) == "length"
 
 
+OBSERVER = [("observer", port) for port in range(50)]
+"""Addresses of somebody who copies what a vehicle sends."""
+
+
+def asked(client: SecureLink, server: Gate, now_ns: int, *, foreign_first: bool) -> list[bytes]:
+    """What answers a HELLO that an observer has copied, and the challenges he was given.
+
+    Args:
+        foreign_first: whether his challenges come to the vehicle before its own, or behind it.
+    """
+    hello = client.hello(HELLO, now_ns=now_ns)
+    senders = [*OBSERVER, HERE] if foreign_first else [HERE, *OBSERVER]
+    for sender in senders:
+        assert server.open(Datagram(hello, sender), now_ns=now_ns) is None
+    for challenge in server.outbox():
+        assert client.open(challenge.payload, now_ns=now_ns) is None
+    return client.outbox()
+
+
+@pytest.mark.parametrize("foreign_first", [False, True])
+def test_foreign_challenges_keep_no_vehicle_from_its_own(*, foreign_first: bool) -> None:
+    """However many an observer hands on, before or behind: the vehicle is answered at once."""
+    client, server = link(), gate()
+    drawn = asked(client, server, 0, foreign_first=foreign_first)
+    calls = [server.open(Datagram(each, HERE), now_ns=0) for each in drawn]
+    (call,) = (each for each in calls if each is not None)
+    response = call.line.seal(WELCOME)
+    server.admit(call, now_ns=0)
+    assert client.open(response, now_ns=0) == WELCOME
+    # Every other one has drawn the vehicle's own challenge again, which was tried just now.
+    again = [each.payload for each in server.outbox()]
+    assert len(again) == len(OBSERVER)
+    assert {refusal(client, each) for each in again} == {"replayed"}
+
+
+def test_of_the_cookies_that_were_tried_the_newest_64_are_remembered() -> None:
+    """One more, and the first of them is tried again, however soon it comes."""
+    client, server = link(), gate()
+    hello = client.hello(HELLO, now_ns=0)
+    for port in range(65):
+        assert server.open(Datagram(hello, ("observer", port)), now_ns=0) is None
+    first, *others, last = (each.payload for each in server.outbox())
+    for challenge in (first, *others):
+        assert client.open(challenge, now_ns=0) is None
+    assert refusal(client, first) == "replayed"
+    assert client.open(last, now_ns=0) is None
+    assert client.open(first, now_ns=0) is None
+
+
+def test_a_genuine_challenge_is_tried_again_with_the_next_hello() -> None:
+    """Where its first answer is lost; foreign ones that came meanwhile change nothing."""
+    client, server = link(), gate()
+    asked(client, server, 0, foreign_first=False)  # all answers are lost
+    hello = client.hello(HELLO, now_ns=AGAIN_NS)
+    assert server.open(Datagram(hello, HERE), now_ns=AGAIN_NS) is None
+    (challenge,) = server.outbox()
+    assert client.open(challenge.payload, now_ns=AGAIN_NS) is None
+    (answer,) = client.outbox()
+    assert called(server, answer, AGAIN_NS).payload == HELLO
+
+
+def test_who_repeats_an_attempt_uses_up_no_answers() -> None:
+    """A vehicle that is answered no more as often as it asks gets the same answer again."""
+    client, server = link(), gate()
+    challenged(client, server)
+    hello = client.hello(HELLO, now_ns=0)
+    for _ in range(1 + HANDSHAKES):
+        call = called(server, hello)
+        response = call.line.seal(WELCOME)
+        server.admit(call, now_ns=0)
+    assert server.open(Datagram(hello, HERE), now_ns=0) is None
+    assert server.outbox() == [Datagram(response, HERE)]
+    assert client.open(response, now_ns=0) == WELCOME
+    client.adopt(now_ns=0)
+    assert called(server, client.seal(OBSERVATION)).payload == OBSERVATION
+    restarted = link(seed=3)  # whose attempt is another
+    challenged(restarted, server)
+    assert called(server, restarted.hello(HELLO, now_ns=0)).payload == HELLO
+
+
+def test_attempts_that_brought_a_channel_are_answered_no_more() -> None:
+    """Nor those before the last, which somebody has recorded: the newest 16."""
+    server, recorded = gate(), []
+    for seed in range(10, 27):
+        client, now_ns = link(seed=seed), seed * SECOND_NS
+        challenged(client, server, now_ns)
+        recorded.append(client.hello(HELLO, now_ns=now_ns))
+        welcomed(client, server, now_ns)
+        client.adopt(now_ns=now_ns)
+        called(server, client.seal(OBSERVATION), now_ns)
+    assert {refusal(server, each, 27 * SECOND_NS) for each in recorded[1:]} == {"replayed"}
+    assert called(server, recorded[0], 27 * SECOND_NS).payload == HELLO
+
+
 def test_without_cookies_a_recorded_hello_draws_handshakes_from_anywhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -404,11 +524,11 @@ def test_without_the_order_of_counters_a_late_packet_moves_the_address(
     client, server = joined()
     held, newer = client.seal(OBSERVATION), client.seal(OBSERVATION)
     called(server, newer)
-    monkeypatch.setattr(channels, "Opened", lambda payload, _: (payload, True))
+    monkeypatch.setattr(channels, "OpenedPacket", lambda payload, _: (payload, True))
     assert called(server, held, peer=ELSEWHERE).moves
 
 
-def rekeyed(client: Secure, server: Gate, now_ns: int) -> None:
+def rekeyed(client: SecureLink, server: Gate, now_ns: int) -> None:
     """A second handshake, up to its adoption."""
     challenged(client, server, now_ns)
     welcomed(client, server, now_ns)
@@ -692,6 +812,37 @@ def test_no_greeting_travels_in_a_channel(message: bytes) -> None:
     assert refusal(client, line.seal(message)) == "out of place"
 
 
+@pytest.mark.parametrize("in_handshake", [True, False])
+def test_what_does_not_begin_as_a_message_of_msgpack_travels_nowhere(*, in_handshake: bool) -> None:
+    """An array of up to 15, version and type, each in its shortest form; less is no message."""
+    type_ = b"\x01" if in_handshake else b"\x03"
+    other = b"\x03" if in_handshake else b"\x01"
+    for good in (b"\x90\x00", b"\x9f\x7f", b"\x95\x04"):
+        check_place(good + type_, in_handshake=in_handshake)
+        check_place(good + type_ + b"more", in_handshake=in_handshake)
+    odd = [b"\x8f\x04" + type_, b"\xa0\x04" + type_, b"\x95\x80" + type_, b"\x95\x04\x80"]
+    short = [b"", b"\x95", b"\x95\x04"]
+    for bad in (*odd, *short, b"\x95\x04" + other):
+        with pytest.raises(ProtocolError, match=r"^out of place$"):
+            check_place(bad, in_handshake=in_handshake)
+
+
+def test_the_shortest_and_the_longest_response_are_read() -> None:
+    """One with a WELCOME of no bytes, and one as long as an INITIATION."""
+    key, public = KEYS[1, 5], bytes(32)
+    for welcome, packet_bytes in (
+        (b"", RESPONSE_BYTES_MIN),
+        (bytes(WELCOME_BYTES_MAX), INITIATION_BYTES),
+    ):
+        message = bytes(range(MESSAGE_BYTES)) + welcome
+        packet = write_response(key, 7, message, public)
+        assert len(packet) == packet_bytes
+        assert read_response(key, packet, public) == (7, message)
+    for size in (RESPONSE_BYTES_MIN - 1, INITIATION_BYTES + 1):
+        with pytest.raises(ProtocolError, match=r"^length$"):
+            read_response(key, bytes(size), public)
+
+
 def test_a_response_with_another_message_opens_no_channel() -> None:
     """The vehicle has nothing to adopt, and goes on with its attempt."""
     client, server = link(), gate()
@@ -732,7 +883,7 @@ def test_a_flood_of_initiations_takes_no_memory() -> None:
     assert set(reasons) == {"forged", "unknown key", "too many handshakes"}
     assert len(server._vehicles) == len(KEYS)
     assert all(len(each.pending) == PENDING_MAX for each in server._vehicles.values())
-    assert len(server.outbox()) == CHALLENGES_MAX
+    assert len(server.outbox()) == OUT_MAX == 1024
     assert server.outbox() == []
 
 
@@ -781,7 +932,7 @@ def test_a_hello_whose_ephemeral_key_is_none_is_dropped() -> None:
     """Only who has the key can make one; the server drops it all the same."""
     key, server = KEYS[1, 5], gate()
     public = bytes(32)
-    state = noise._begin(key.psk, handshake.prologue(key)).mix_ephemeral(public)
+    state = noise_nnpsk0._begin(key.psk, handshake.prologue(key)).mix_ephemeral(public)
     message = public + state.seal(handshake.pad(HELLO))[1]
     datagram = handshake.write_initiation(key, server._cookie(HERE, 0), message)
     with pytest.raises(ProtocolError, match="forged"):

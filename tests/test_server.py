@@ -5,18 +5,20 @@ import math
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.endpoint import VEHICLES_MAX, Server
-from server.gate import Plain
-from server.sessions import SESSION_NS, WELCOME_NS, Sessions
-from shared import config
-from shared.chance import stream
-from shared.config import Scenario
-from shared.endpoint import MILLISECOND_NS, SECOND_NS, Address, Datagram
-from shared.events import (
-    Difference,
+from skytether.server.endpoint import VEHICLES_MAX, Server
+from skytether.server.gate import PlainGate
+from skytether.server.secure import SecureGate
+from skytether.server.sessions import SESSION_NS, WELCOME_NS, Sessions
+from skytether.server.tick import Grid
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Events
+from skytether.shared.core.events import (
+    Degraded,
     NumberTaken,
     PlanningResumed,
     PlanningStopped,
@@ -24,13 +26,17 @@ from shared.events import (
     SessionEnded,
     SessionOpened,
     SessionRefused,
+    Unauthenticated,
 )
-from shared.protocol import (
-    ACCEPTED,
-    FULL,
+from skytether.shared.law.terms import Difference
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, Rows, parse, server_columns
+from skytether.shared.wire.keys import Keyring
+from skytether.shared.wire.protocol import (
     NO_HORIZON,
-    OTHER_TERMS,
-    TAKEN,
+    Close,
+    Drop,
     Heartbeat,
     Hello,
     Horizon,
@@ -39,14 +45,14 @@ from shared.protocol import (
     Mode,
     Observation,
     ProtocolError,
+    Refusal,
     Welcome,
     decode,
     encode,
 )
-from shared.record import Recorder, Rows, parse, server_columns
 
 HERE: Address = ("vehicle", 1)
-LINE = Plain().open(Datagram(b"", ("", 0)), now_ns=0).line
+LINE = PlainGate().open(Datagram(b"", ("", 0)), now_ns=0).line
 SILENCE_NS = 1500 * MILLISECOND_NS
 """Time after which another life of a vehicle may take its number, in all of these tests."""
 DAY_NS = 86_400 * SECOND_NS
@@ -55,10 +61,10 @@ DAY_NS = 86_400 * SECOND_NS
 
 def scenario(**control: Any) -> Scenario:
     """The paper's, with some keys of `control` changed, and vehicles that are soon found silent."""
-    table = config.to_table(config.load("paper-every-step"))
+    table = reading.to_table(reading.load("paper-every-step"))
     table["control"] |= control
     table["link"]["timeout_s"] = SILENCE_NS / SECOND_NS
-    return config.check(table, "test")
+    return reading.check(table, "test")
 
 
 class Vehicles:
@@ -68,7 +74,7 @@ class Vehicles:
         self.terms = flown.terms()
         self.dt_ns = flown.dt_ns
         self.sink = io.BytesIO()
-        recorder = Recorder(server_columns(flown.model.axes), self.sink)
+        recorder = Recorder(server_columns(flown.model.axes, flown.control.scheme), self.sink)
         self.server = Server(
             flown, boot_id=boot_id, entropy=stream(1, "entropy").bytes, room=room, recorder=recorder
         )
@@ -96,7 +102,7 @@ class Vehicles:
     def open(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
         """A session, welcomed but not yet live."""
         welcome = self.ask(vehicle, boot_id, sender)
-        assert welcome.refusal == ACCEPTED
+        assert welcome.refusal == Refusal.ACCEPTED
         return welcome
 
     def observe(
@@ -164,11 +170,50 @@ def test_other_terms_open_no_session() -> None:
     ((welcome, _),) = vehicles.say(Hello(1, 5, other))
     assert isinstance(welcome, Welcome)
     assert welcome.terms == vehicles.terms
-    assert (welcome.refusal, welcome.session) == (OTHER_TERMS, 0)
+    assert (welcome.refusal, welcome.session) == (Refusal.OTHER_TERMS, 0)
     differences = (Difference("control.horizon", here="40", there="20"),)
     assert vehicles.server.events() == (SessionRefused(vehicle=1, differences=differences),)
     vehicles.observe(welcome, 0)
-    assert vehicles.server.counts["dropped: unknown session"] == 1
+    assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
+
+
+def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
+    """One of a vehicle that has been forgotten since is told again."""
+    vehicles = Vehicles(scenario())
+    other = vehicles.terms._replace(horizon=20)
+
+    def told(*boot_ids: int) -> int:
+        """Number of refusals that the operator is told of these lives of vehicle 1."""
+        for boot_id in boot_ids:
+            vehicles.say(Hello(1, boot_id, other))
+        return len(vehicles.server.events())
+
+    assert told(*range(64)) == 64
+    assert told(0, 63) == 0
+    assert told(64) == 1
+    assert told(1, 64) == 0
+    assert told(0) == 1
+
+
+def test_strangers_are_told_of_every_ten_seconds_with_their_number() -> None:
+    """At once of the first; the address and reason are those of the newest."""
+    gate = SecureGate(Keyring("keys", {}), entropy=stream(2, "gate").bytes)
+    server = Server(scenario(), boot_id=1, entropy=stream(1, "entropy").bytes, gate=gate)
+    told = []
+    for second in range(25):
+        peer = (f"stranger {second}", second)
+        server.receive(Datagram(b"?", peer), now_ns=(100 + second) * SECOND_NS)
+        told += [(second, event) for event in server.events()]
+    assert server.dropped == {Drop.NOT_SEALED: 25}
+    assert told == [
+        (
+            second,
+            Unauthenticated(
+                count=second + 1, host=f"stranger {second}", port=second, reason=Drop.NOT_SEALED
+            ),
+        )
+        for second in (0, 10, 20)
+    ]
 
 
 def test_an_idle_server_asks_for_no_wake() -> None:
@@ -216,13 +261,23 @@ def test_the_newest_observation_wins_after_reordering() -> None:
 
 
 def test_answers_follow_the_vehicle_to_its_new_address() -> None:
-    """A restarted netem has other ports: the newest observation says where the vehicle is."""
+    """A restarted netem has other ports: the newest observation says where the vehicle is.
+
+    Until it says HELLO there it is answered at home as well, for somebody may send on copies.
+    """
     vehicles = Vehicles(scenario())
     welcome = vehicles.open()
     vehicles.observe(welcome, 0)
+    assert [peer for _, peer in vehicles.tick()] == [HERE]
     vehicles.observe(welcome, 1, sender=("elsewhere", 9))
-    ((_, peer),) = vehicles.tick()
-    assert peer == ("elsewhere", 9)
+    (there, at), (here, home) = vehicles.tick()
+    assert (at, home) == (("elsewhere", 9), HERE)
+    assert isinstance(there, Horizon)
+    assert isinstance(here, Horizon)
+    np.testing.assert_array_equal(there.inputs, here.inputs)
+    vehicles.ask(sender=("elsewhere", 9))
+    vehicles.observe(welcome, 2, sender=("elsewhere", 9))
+    assert [peer for _, peer in vehicles.tick()] == [("elsewhere", 9)]
 
 
 def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None:
@@ -241,7 +296,7 @@ def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None
     assert isinstance(horizon, Horizon)
     assert (horizon.session, horizon.step) == (new.session, 0)
     vehicles.observe(old, 51)
-    assert vehicles.server.counts["dropped: unknown session"] == 1
+    assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
 
 
 def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing() -> None:
@@ -252,21 +307,21 @@ def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing
         vehicles.observe(first, step)
         if step % 20 == 0:
             refused = vehicles.ask(vehicle=3, boot_id=6, sender=("other", 2))
-            assert (refused.refusal, refused.session, refused.boot_id) == (TAKEN, 0, 6)
+            assert (refused.refusal, refused.session, refused.boot_id) == (Refusal.TAKEN, 0, 6)
         ((horizon, peer),) = vehicles.tick()
         assert isinstance(horizon, Horizon)
         assert (horizon.session, peer) == (first.session, HERE)
     taken = NumberTaken(vehicle=3, host="other", port=2, holder="vehicle:1")
     opened = SessionOpened(vehicle=3, host="vehicle", port=1)
     assert vehicles.server.events() == (opened, taken)
-    assert vehicles.server.counts["refused: taken"] == 5
+    assert vehicles.server.refused[Refusal.TAKEN] == 5
 
 
 def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
     """The second is refused before the first has come, and gets in if that never does."""
     vehicles = Vehicles(scenario())
     first = vehicles.open(boot_id=5)
-    assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == TAKEN
+    assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
     vehicles.observe(first, 0)
     ((horizon, _),) = vehicles.tick()
     assert isinstance(horizon, Horizon)
@@ -287,8 +342,8 @@ def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_hear
     second = vehicles.open(boot_id=6, sender=("other", 2))
     vehicles.observe(first, 61)
     vehicles.observe(second, 0, sender=("other", 2))
-    assert vehicles.server.counts["dropped: taken"] == 1
-    assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == TAKEN
+    assert vehicles.server.dropped[Drop.TAKEN] == 1
+    assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
     ((horizon, peer),) = vehicles.tick()
     assert isinstance(horizon, Horizon)
     assert (horizon.session, peer) == (first.session, HERE)
@@ -303,7 +358,7 @@ def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> No
     vehicles.now_ns += 2 * SECOND_NS
     vehicles.tick()
     assert len(vehicles.server.sessions) == 0
-    assert vehicles.ask(vehicle=2).refusal == FULL
+    assert vehicles.ask(vehicle=2).refusal == Refusal.FULL
     vehicles.observe(new, 0)
     assert [session.boot_id for session in vehicles.server.sessions] == [6]
 
@@ -313,7 +368,24 @@ def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None
     welcome = Vehicles(scenario(), boot_id=1).open()
     vehicles = Vehicles(scenario(), boot_id=2**63)
     vehicles.observe(welcome, 3)
-    assert vehicles.server.counts == {"dropped: unknown session": 1}
+    assert vehicles.server.dropped == {Drop.UNKNOWN_SESSION: 1}
+
+
+def test_a_close_ends_the_session_that_it_names_and_no_other() -> None:
+    """One of another session is dropped; after its own the vehicle is a stranger."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    vehicles.server.events()
+    assert vehicles.say(Close(1, welcome.session + 1)) == []
+    assert vehicles.say(Close(2, welcome.session)) == []
+    assert vehicles.server.dropped == {Drop.UNKNOWN_SESSION: 2}
+    assert len(vehicles.tick()) == 1
+    assert vehicles.say(Close(1, welcome.session)) == []
+    assert vehicles.server.events() == (SessionEnded(vehicle=1),)
+    assert vehicles.tick() == []
+    vehicles.observe(welcome, 2)
+    assert vehicles.server.dropped == {Drop.UNKNOWN_SESSION: 3}
 
 
 def test_ticks_slept_through_are_counted_and_skipped() -> None:
@@ -331,6 +403,35 @@ def test_ticks_slept_through_are_counted_and_skipped() -> None:
     assert horizon.step == 4
     assert vehicles.server.missed == 3
     assert vehicles.server.next_wake_ns() == due_ns + 4 * vehicles.dt_ns
+
+
+@pytest.mark.parametrize(
+    ("late", "degraded"),
+    [({5: 5}, []), ({1: 1, 7: 5}, [*range(7, 22)]), ({1: 1, 29: 6}, [*range(29, 50)])],
+    ids=["five", "six, a second from the first on", "six, and one of before"],
+)
+def test_more_than_five_ticks_missed_within_a_second_make_a_degraded_server(
+    late: dict[int, int], degraded: list[int]
+) -> None:
+    """To the tick; older ones count for nothing, and then it is in time again.
+
+    Args:
+        late: ticks of 50 ms that were missed just before each of these.
+        degraded: ticks at which the server is.
+    """
+    events, dt_ns = Events(), 50 * MILLISECOND_NS
+    grid = Grid(dt_ns, events)
+    grid.arm(0)
+    slept = {tick - back for tick, count in late.items() for back in range(1, count + 1)}
+    awake = [tick for tick in range(60) if tick not in slept]
+    found = []
+    for tick in awake:
+        assert grid.take(tick * dt_ns) == tick * dt_ns
+        found += [tick] * grid.degraded
+    assert found == degraded
+    assert grid.missed == sum(late.values())
+    told = [Degraded(degraded=True), Degraded(degraded=False)] if degraded else []
+    assert list(events) == told
 
 
 def test_a_wake_before_its_time_does_nothing() -> None:
@@ -394,10 +495,10 @@ def test_a_vehicle_too_many_is_told_that_the_server_is_full() -> None:
     vehicles.server.events()
     for _ in range(3):
         refused = vehicles.ask(vehicle=1000)
-        assert (refused.refusal, refused.session) == (FULL, 0)
+        assert (refused.refusal, refused.session) == (Refusal.FULL, 0)
     full = ServerFull(vehicle=1000, host="vehicle", port=1, room=VEHICLES_MAX)
     assert vehicles.server.events() == (full,)
-    assert vehicles.server.counts["refused: full"] == 3
+    assert vehicles.server.refused[Refusal.FULL] == 3
     assert vehicles.open(vehicle=7).vehicle == 7
 
 
@@ -409,7 +510,7 @@ def test_a_full_server_keeps_the_second_life_of_a_vehicle_from_a_stranger() -> N
     vehicles.now_ns += SILENCE_NS + 1
     second_life = vehicles.open(vehicle=1, boot_id=6)
     for _ in range(2):
-        assert vehicles.ask(vehicle=1000).refusal == FULL
+        assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
         vehicles.now_ns += WELCOME_NS + 1
     vehicles.observe(second_life, 0)
     assert [session.boot_id for session in vehicles.server.sessions] == [6, 5]
@@ -419,17 +520,17 @@ def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
     """Each that was told so gets its row; one that never came makes room for the next."""
     vehicles = Vehicles(scenario(), room=3)
     welcomes = [vehicles.open(vehicle=number) for number in range(3)]
-    assert vehicles.ask(vehicle=1000).refusal == FULL
+    assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
     vehicles.now_ns += WELCOME_NS
     vehicles.open(vehicle=0)  # says HELLO again: of the others, 1 has waited longest
-    assert vehicles.ask(vehicle=1000).refusal == FULL
+    assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
     vehicles.now_ns += 1
     late = vehicles.open(vehicle=1000)
     for welcome in (welcomes[0], welcomes[2], late):
         vehicles.observe(welcome, 0)
     assert len(vehicles.server.sessions) == 3
     vehicles.observe(welcomes[1], 0)
-    assert vehicles.server.counts["dropped: unknown session"] == 1
+    assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
 
 
 @given(
@@ -539,7 +640,7 @@ def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
     with np.errstate(all="ignore"):
         sent = vehicles.tick()
     assert [peer for _, peer in sent] == [("v", 1)]
-    assert vehicles.server.counts["unsolved"] == 1
+    assert vehicles.server.controller.counts["unsolved"] == 1
 
 
 def test_figures_of_many_vehicles_stay_readable() -> None:
@@ -547,8 +648,8 @@ def test_figures_of_many_vehicles_stay_readable() -> None:
     vehicles = Vehicles(scenario())
     for number in range(20):
         vehicles.observe(vehicles.open(vehicle=number), 0)
-    each = vehicles.server.figures()["each"]
-    assert (len(each), each["and more"]) == (17, 4)
+    figures = vehicles.server.figures()
+    assert (len(figures["by_vehicle"]), figures["vehicles"]) == (16, 20)
 
 
 def test_figures_tell_what_was_counted() -> None:
@@ -559,4 +660,4 @@ def test_figures_tell_what_was_counted() -> None:
     figures = vehicles.server.figures()
     assert (figures["vehicles"], figures["missed"]) == (1, 0)
     assert figures["counts"] == {"events": 1, "steps": 1, "unsolved": 0}
-    assert figures["each"] == {"vehicle 1": {"step": 0, "clock_bound_ms": 0.0}}
+    assert figures["by_vehicle"] == {"1": {"step": 0, "clock_bound_ms": 0.0}}

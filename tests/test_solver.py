@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import server.solver
-from server.mpc import LATER, make_mpc, pose
-from server.solver import OsqpSolver, SolverFailed
-from shared.config import ControlConfig, ModelConfig, Scenario
-from shared.model import Array
+import skytether.server.control.solver
+from skytether.server.control.mpc import LATER, make_mpc, pose
+from skytether.server.control.solver import OsqpSolver, SolverFailed
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 
 quick = settings(max_examples=40, deadline=None)
 
@@ -97,7 +97,7 @@ def test_nothing_bad_sticks() -> None:
 
 def test_iteration_limit_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """An unfinished iterate is not passed on: the guess comes back, marked as unsolved."""
-    monkeypatch.setattr(server.solver, "ITERATIONS_MAX", 1)
+    monkeypatch.setattr(skytether.server.control.solver, "ITERATIONS_MAX", 1)
     gradient, guess = problems(4, 2)
     u, solved = OsqpSolver(PROBLEM).solve(gradient, guess)
     assert solved.tolist() == [False, False]

@@ -1,6 +1,6 @@
 """Laps of a clock that somebody lends."""
 
-from shared.stopwatch import Stopwatch
+from skytether.shared.core.stopwatch import Stopwatch
 
 
 def test_laps_follow_each_other_and_add_up_by_name() -> None:

@@ -8,19 +8,21 @@ from typing import Any
 import msgspec
 import pytest
 
-from client.plant import FirstOrderPlant
-from client.vehicle import Client
-from lab.keys import flat, lay
-from server.endpoint import Server
-from shared import config
-from shared.chance import stream
-from shared.config import Scenario
-from shared.endpoint import SECOND_NS, Datagram
-from shared.events import Difference
-from shared.protocol import PAYLOAD_BYTES_MAX, Hello, encode
-from shared.terms import FREE, KEYS
+from skytether.client.endpoint import Client
+from skytether.client.simulated.vehicle import simulated
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.law.terms import Difference, Terms
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.catalogue import KEYS, TERMS, differences
+from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.owners import Owner
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, encode
 
-HERE = config.check(
+HERE = reading.check(
     {
         "model": {"axes": 2},
         "control": {"horizon": 50, "trigger": "state_gap | silence(1)"},
@@ -46,8 +48,20 @@ OTHER: dict[str, Any] = {
     "reference.velocity_mps": [0.1, 0.1],
     "reference.points_m": [[0.0, 0.0], [2.0, 0.0]],
     "reference.loop": True,
+    "vehicle.kind": "quadrotor",
+    "vehicle.address": "tcp:127.0.0.1:5760",
+    "vehicle.frame": "crazyflie",
+    "vehicle.battery": 0.5,
+    "fence.low_m": [-50.0, -50.0],
+    "fence.high_m": [50.0, 50.0],
+    "fence.radius_m": 50.0,
+    "fence.speed_mps": 10.0,
+    "mavlink.takeoff_m": 5.0,
+    "mavlink.origin": "autopilot",
     "vehicle.exhausted": "hold",
     "vehicle.tau_s": [0.5],
+    "vehicle.gain": 0.9,
+    "vehicle.dead_time_s": 0.1,
     "vehicle.start_m": [1.0, 1.0],
     "vehicle.steady_wind_mps": [0.1, 0.1],
     "network.uplink.delay": "none",
@@ -58,17 +72,17 @@ OTHER: dict[str, Any] = {
 """Another value of the keys that are no numbers, or that not every number may be."""
 
 
-ALL = dict(flat(config.to_table(HERE)))
+ALL = dict(flat(reading.to_table(HERE)))
 """Every key of a scenario with dots, and its value."""
 
 
 def with_(key: str, value: Any) -> Scenario:
     """The scenario with one key changed."""
-    table = config.to_table(HERE)
+    table = reading.to_table(HERE)
     lay({key: value}, table)
     if key == "model.axes":
         table["reference"]["points_m"] = ()
-    return config.check(table, "there")
+    return reading.check(table, "there")
 
 
 def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
@@ -78,9 +92,9 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
         for name, end in (("one", 1.0), ("other", 2.0)):
             file = folder / f"{name}.csv"
             file.write_text(f"t,x,y\n0,0,0\n9,{end},0\n")
-            table = config.to_table(HERE)
+            table = reading.to_table(HERE)
             table["reference"] |= {"shape": "csv", "file": str(file)}
-            made.append(config.check(table, name))
+            made.append(reading.check(table, name))
         return made[0], made[1]
     if key == "model.axes":
         return msgspec.structs.replace(
@@ -98,8 +112,7 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
 def shake_hands(ours: Scenario, theirs: Scenario) -> tuple[Server, Client]:
     """A server of one scenario and a client of another, after HELLO and WELCOME."""
     server = Server(ours, boot_id=7, entropy=stream(1, "entropy").bytes)
-    plant = FirstOrderPlant(theirs, stream(1, "wind"))
-    client = Client(theirs, plant, server=("server", 0), vehicle=1, boot_id=9)
+    client = Client(theirs, simulated(theirs, 1), server=("server", 0), vehicle=1, boot_id=9)
     client.wake(now_ns=0)
     for payload, _, _ in client.outbox():
         server.receive(Datagram(payload, ("vehicle", 1)), now_ns=SECOND_NS)
@@ -109,17 +122,19 @@ def shake_hands(ours: Scenario, theirs: Scenario) -> tuple[Server, Client]:
 
 
 def test_every_key_is_a_term_or_free_to_differ() -> None:
-    """There is no third kind, and none is both."""
-    assert set(ALL) == set(KEYS.values()) | set(FREE)
-    assert not set(KEYS.values()) & set(FREE)
+    """There is no third kind: a key of both ends is a term, and each term has one key."""
+    assert set(ALL) == set(KEYS)
+    of_both = [name for name, key in KEYS.items() if key.owner is Owner.BOTH]
+    assert sorted(TERMS.values()) == sorted(of_both)
+    assert set(TERMS) == set(Terms._fields)
 
 
-@pytest.mark.parametrize("key", [key for key in ALL if key in KEYS.values()])
+@pytest.mark.parametrize("key", list(TERMS.values()))
 def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Path) -> None:
     """Both operators read the key and both values; no session is opened."""
     ours, theirs = differing(key, tmp_path)
     server, client = shake_hands(ours, theirs)
-    (difference,) = ours.terms().differences(theirs.terms())[:1]
+    (difference,) = differences(ours.terms(), theirs.terms())[:1]
     assert key in (difference.key, "model.axes")
     assert difference.here != difference.there
     for told in (" ".join(map(str, server.events())), " ".join(map(str, client.events()))):
@@ -131,7 +146,7 @@ def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Pat
     assert not server.figures()["vehicles"]
 
 
-@pytest.mark.parametrize("key", [key for key in ALL if key in FREE])
+@pytest.mark.parametrize("key", sorted(KEYS.keys() - TERMS.values()))
 def test_ends_may_differ_in_what_is_free(key: str, tmp_path: Path) -> None:
     """The vehicle flies."""
     ours, theirs = differing(key, tmp_path)
@@ -149,7 +164,7 @@ def test_a_trajectory_is_compared_by_what_stands_in_its_file(tmp_path: Path) -> 
         file = tmp_path / f"{name}.csv"
         file.write_text("t,x,y\n0,0,0\n9,1,0\n")
         reference = {"shape": "csv", "file": str(file)}
-        scenarios.append(config.check({"reference": reference}, name))
+        scenarios.append(reading.check({"reference": reference}, name))
     assert scenarios[0].terms() == scenarios[1].terms()
 
 
@@ -157,7 +172,7 @@ def test_a_difference_is_told_as_the_scenario_writes_it() -> None:
     """Seconds for the step, lists for axes, true and false."""
     here = HERE.terms()
     there = here._replace(dt_ns=20_000_000, tau_s=(0.5, 0.6), loop=True)
-    assert here.differences(there) == (
+    assert differences(here, there) == (
         Difference("control.dt", "0.05", "0.02"),
         Difference("model.tau_s", "[0.84, 0.84]", "[0.5, 0.6]"),
         Difference("reference.loop", "false", "true"),
@@ -171,10 +186,34 @@ def test_the_longest_terms_fit_one_datagram() -> None:
     assert len(encode(Hello(2**16 - 1, 2**64 - 1, terms))) <= PAYLOAD_BYTES_MAX
 
 
-def test_the_documented_tables_name_every_key() -> None:
-    """The terms in the order on the wire, and all others with whose they are."""
+def test_the_documented_table_names_every_term() -> None:
+    """In the order on the wire."""
     text = (Path(__file__).parent.parent / "docs" / "protocol.md").read_text()
-    terms, free = text.split("## Terms")[1].split("## Rules")[0].split("All other keys")
-    assert re.findall(r"^\| `([a-z_.0-9]+)` \|", terms, re.MULTILINE) == list(KEYS.values())
-    rows = re.findall(r"^\| (`.*`) \| (.*) \|$", free, re.MULTILINE)
-    assert {key: whose for keys, whose in rows for key in re.findall("`(.*?)`", keys)} == FREE
+    table = text.split("## Terms")[1].split("## Rules")[0]
+    named = re.findall(r"^\| `([a-z_.0-9]+)` \|", table, re.MULTILINE)
+    assert named == [TERMS[field] for field in Terms._fields]
+
+
+@pytest.mark.parametrize(
+    ("scheme", "indexed", "commits", "reckons", "planned", "reach"),
+    [
+        ("none", False, False, False, 40, 40),
+        ("predictive", True, False, False, 40, 40),
+        ("committed", True, True, False, 40, 40),
+        ("dead_reckoning", False, False, True, 1, 60),
+    ],
+)
+def test_what_follows_from_the_terms_of_a_scheme(
+    scheme: str, indexed: bool, commits: bool, reckons: bool, planned: int, reach: int
+) -> None:
+    """Steps of 50 ms, H = 40, and an age bound of 3 s: 60 steps; it brakes at 2 m/s²."""
+    agreed = (
+        reading.load("demo")
+        .terms()
+        ._replace(scheme=scheme, dt_ns=50_000_000, horizon=40, age_max_s=3.0, brake_mps2=2.0)
+    )
+    assert (agreed.indexed, agreed.commits, agreed.reckons) == (indexed, commits, reckons)
+    assert (agreed.planned, agreed.reach, agreed.age_max) == (planned, reach, 60)
+    assert agreed.dt_s == 0.05
+    assert agreed._replace(exhausted="brake").brake == pytest.approx(0.1)
+    assert agreed._replace(exhausted="hold").brake == 0.0

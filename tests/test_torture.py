@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,26 +14,37 @@ import pytest
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-import client.compensator
-import client.failsafe
-import client.vehicle
-import lab.torture
-import server.plausibility
-import shared.channel
-import skytether.torture
-from client.compensator import Compensator
-from client.failsafe import LOCKING, TABLE
-from lab.faults import RANGES, Fault, Kind, Trial, dumps, loads
-from lab.invariants import Violation, check_bounds
-from lab.torture import CLOCK_NS, fly, long_trial, make_scenario, short_trial, shrunk
-from netem.proxy import Proxy
-from server.endpoint import Server
-from shared.endpoint import SECOND_NS, Datagram, Endpoint
-from shared.model import Array
-from shared.protocol import Mode
-from shared.record import Reason
-from shell.command import CommandError
+import skytether.client.compensator
+import skytether.client.endpoint
+import skytether.client.failsafe
+import skytether.client.pilot
+import skytether.client.secure
+import skytether.lab.commands.torture
+import skytether.lab.torture
+import skytether.server.plausibility
+import skytether.shared.wire.channel
 from skytether.__main__ import main
+from skytether.client.failsafe import LOCKING, TABLE
+from skytether.lab.faults import RANGES, Kind, ScheduledFault, Trial, dumps, loads
+from skytether.lab.invariants import Violation, check_bounds
+from skytether.lab.torture import (
+    CLOCK_NS,
+    Outcome,
+    fly,
+    long_trial,
+    make_scenario,
+    short_trial,
+    shrunk,
+)
+from skytether.netem.proxy import Proxy
+from skytether.server.sessions import Session
+from skytether.server.tick import Ticker
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.law import rule
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Mode
+from skytether.shell.command import CommandError
 
 SEEDS = Path(__file__).with_name("torture_seeds.txt")
 FAILED = [line for line in SEEDS.read_text().splitlines() if not line.startswith("#")]
@@ -41,9 +53,13 @@ LONG = pytest.mark.skipif("SKYTETHER_LONG" not in os.environ, reason="long: set 
 Patch = Callable[[pytest.MonkeyPatch], None]
 
 
-def fault(kind: Kind, where: str, start_s: float, length_s: float, amount: float = 1.0) -> Fault:
+def fault(
+    kind: Kind, where: str, start_s: float, length_s: float, amount: float = 1.0
+) -> ScheduledFault:
     """A fault, in seconds."""
-    return Fault(kind, where, round(start_s * SECOND_NS), round(length_s * SECOND_NS), amount)
+    return ScheduledFault(
+        kind, where, round(start_s * SECOND_NS), round(length_s * SECOND_NS), amount
+    )
 
 
 # -- what is flown ---------------------------------------------------------------------------
@@ -65,6 +81,7 @@ def test_trials_differ_in_scheme_step_axes_and_vehicles() -> None:
     assert {scenario.control.dt for scenario, _ in drawn} == {0.05, 0.1}
     assert {scenario.model.axes for scenario, _ in drawn} == {2, 3}
     assert {vehicles for _, vehicles in drawn} == {1, 2}
+    assert {any(scenario.terms().dead_time_s) for scenario, _ in drawn} == {False, True}
 
 
 @pytest.mark.parametrize("line", FAILED)
@@ -84,7 +101,7 @@ EFFECTS = [
     (fault(Kind.RESTART, "server", 5, 0.05), "brake: the server is silent"),
     (fault(Kind.RESTART, "client", 5, 1.0), "lives of client"),
     (fault(Kind.RESTART, "netem", 5, 1.5), "brake: the server is silent"),
-    (fault(Kind.FREEZE, "client", 5, 1.0), "brake: its own computer was asleep"),
+    (fault(Kind.FREEZE, "client", 5, 1.0), "brake: its own computer woke it too late"),
     (fault(Kind.FREEZE, "server", 5, 2.0), "brake: the server is silent"),
     (fault(Kind.SOLVER, "server", 5, 4), "brake: the solver has found none"),
     (fault(Kind.OVERLOAD, "server", 5, 6, 20.0), "brake: the server is silent"),
@@ -93,13 +110,21 @@ EFFECTS = [
     (fault(Kind.CORRUPTION, "both", 5, 4, 0.9), "brake: the server is silent"),
     (fault(Kind.FLOOD, "server", 5, 2, 500.0), "packets: flood"),
     (fault(Kind.FLOOD, "client", 5, 2, 500.0), "packets: flood"),
+    (fault(Kind.COPY, "both", 5, 6), "packets: copy"),
+    (fault(Kind.KEYS, "server", 5, 3), "brake: the server is silent"),
 ]
 
 
+@cache
+def undisturbed() -> Outcome:
+    """A trial without faults."""
+    return fly(Trial(1, ()))
+
+
 @pytest.mark.parametrize(("one", "effect"), EFFECTS)
-def test_each_fault_has_its_effect_and_is_survived(one: Fault, effect: str) -> None:
+def test_each_fault_has_its_effect_and_is_survived(one: ScheduledFault, effect: str) -> None:
     """The effect is something that was counted, and is not without the fault."""
-    assert not fly(Trial(1, ())).counts.get(effect)
+    assert not undisturbed().counts.get(effect)
     outcome = fly(Trial(1, (one,)))
     assert not outcome.failure
     assert outcome.counts[effect] > 0
@@ -108,7 +133,7 @@ def test_each_fault_has_its_effect_and_is_survived(one: Fault, effect: str) -> N
 @pytest.mark.parametrize("amount", [3600.0, -3600.0])
 def test_a_clock_that_is_set_costs_nothing(amount: float) -> None:
     """Nobody brakes for it, whichever clock it is."""
-    braked = "brake: its own computer was asleep"
+    braked = "brake: its own computer woke it too late"
     for where in ("client", "server"):
         outcome = fly(Trial(1, (fault(Kind.STEP, where, 5, 0, amount),)))
         assert not outcome.failure
@@ -138,62 +163,63 @@ class Unchecked:
 
 def no_clamp(patch: pytest.MonkeyPatch) -> None:
     """No last clamp aboard."""
-    patch.setattr(client.vehicle, "clamped", lambda wanted, *_, **__: list(wanted))
+    patch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: list(wanted))
 
 
 def no_feedback_at_the_end(patch: pytest.MonkeyPatch) -> None:
     """Feedback that stops after the last input, aboard."""
-    led_back = Compensator._led_back
+    step = rule.step
 
-    def end(self: Compensator, stage: int, state: Array) -> list[float]:
+    def end(held: rule.Held, stage: int, *states: float) -> tuple[float, float, float, float]:
         """Feedback up to the last input."""
-        ended = stage >= self._inputs.shape[1]
-        return self._nothing if ended else led_back(self, stage, state)
+        if stage >= held.length:
+            held = held._replace(gain_p=0.0, gain_v=0.0)
+        return step(held, stage, *states)
 
-    patch.setattr(Compensator, "_led_back", end)
+    patch.setattr(rule, "step", end)
 
 
 def no_window(patch: pytest.MonkeyPatch) -> None:
     """No replay window."""
-    patch.setattr(shared.channel.Window, "is_new", lambda *_: True)
+    patch.setattr(skytether.shared.wire.channel.ReplayWindow, "is_new", lambda *_: True)
 
 
 def no_tag(patch: pytest.MonkeyPatch) -> None:
     """No check of the tag of a packet."""
-    patch.setattr(shared.channel, "ChaCha20Poly1305", Unchecked)
+    patch.setattr(skytether.shared.wire.channel, "ChaCha20Poly1305", Unchecked)
 
 
 def no_age(patch: pytest.MonkeyPatch) -> None:
     """No bound on the age of the observation behind an input, aboard."""
-    patch.setattr(client.compensator, "lasting", lambda length, *_: length)
+    patch.setattr(skytether.client.compensator, "lasting", lambda length, *_: length)
 
 
 def no_brake_without_link(patch: pytest.MonkeyPatch) -> None:
     """No braking where the link is lost."""
     table = {(mode, cause): after for (mode, cause), after in TABLE.items() if cause != Reason.LOST}
-    patch.setattr(client.vehicle, "TABLE", table)
+    patch.setattr(skytether.client.endpoint, "TABLE", table)
 
 
 def no_lock_at_restart(patch: pytest.MonkeyPatch) -> None:
     """No dropping of horizons, and no waiting, when the server has restarted."""
-    dropping = client.vehicle.DROPPING - {Reason.RESTARTED}
-    patch.setattr(client.vehicle, "DROPPING", dropping)
-    patch.setattr(client.failsafe, "LOCKING", LOCKING - {Reason.RESTARTED})
+    dropping = skytether.client.pilot.DROPPING - {Reason.RESTARTED}
+    patch.setattr(skytether.client.pilot, "DROPPING", dropping)
+    patch.setattr(skytether.client.failsafe, "LOCKING", LOCKING - {Reason.RESTARTED})
 
 
 def no_stall(patch: pytest.MonkeyPatch) -> None:
     """No braking after sleep."""
-    patch.setattr(client.failsafe, "STALL_NS", 2**62)
+    patch.setattr(skytether.client.failsafe, "STALL_NS", 2**62)
 
 
 def no_lock(patch: pytest.MonkeyPatch) -> None:
     """No waiting for a good link once it was broken."""
-    patch.setattr(client.failsafe, "LOCKING", frozenset())
+    patch.setattr(skytether.client.failsafe, "LOCKING", frozenset())
 
 
 def no_good_link(patch: pytest.MonkeyPatch) -> None:
     """No waiting for a good link at all."""
-    patch.setattr(client.failsafe, "GOOD_NS", 0)
+    patch.setattr(skytether.client.failsafe, "GOOD_NS", 0)
 
 
 def no_steady(patch: pytest.MonkeyPatch) -> None:
@@ -202,21 +228,37 @@ def no_steady(patch: pytest.MonkeyPatch) -> None:
     def as_it_is(endpoint: Endpoint) -> Endpoint:
         return endpoint
 
-    patch.setattr(lab.torture, "Steady", as_it_is)
+    patch.setattr(skytether.lab.torture, "Steady", as_it_is)
 
 
 def no_latch(patch: pytest.MonkeyPatch) -> None:
     """No latch in LAND."""
-    patch.setattr(client.vehicle, "TABLE", {**TABLE, (Mode.LAND, Reason.HORIZON): Mode.TRACK})
+    patch.setattr(
+        skytether.client.endpoint, "TABLE", {**TABLE, (Mode.LAND, Reason.HORIZON): Mode.TRACK}
+    )
 
 
 def no_plausibility(patch: pytest.MonkeyPatch) -> None:
     """No doubt of observations at the server."""
-    judge = lambda *_: server.plausibility.BELIEVED  # noqa: E731
-    patch.setattr(server.plausibility.Plausibility, "judge", judge)
+    judge = lambda *_: skytether.server.plausibility.BELIEVED  # noqa: E731
+    patch.setattr(skytether.server.plausibility.Plausibility, "judge", judge)
 
 
-ABLATIONS: list[tuple[Patch, str, tuple[Fault, ...]]] = [
+def no_home(patch: pytest.MonkeyPatch) -> None:
+    """Packets go only where the newest observation came from."""
+
+    def sealed(self: Session, payload: bytes) -> tuple[Datagram]:
+        return (Datagram(self.line.seal(payload), self.address),)
+
+    patch.setattr(Session, "sealed", sealed)
+
+
+def no_second_try(patch: pytest.MonkeyPatch) -> None:
+    """A challenge is believed once, and the newest of all cookies is kept."""
+    patch.setattr(skytether.client.secure, "AGAIN_NS", skytether.client.secure.ATTEMPT_NS)
+
+
+ABLATIONS: list[tuple[Patch, str, tuple[ScheduledFault, ...]]] = [
     (no_clamp, "slew", ()),
     (no_window, "once", (fault(Kind.REPLAY, "downlink", 5, 2, 0.5),)),
     (no_window, "once", (fault(Kind.DUPLICATES, "uplink", 5, 2, 0.9),)),
@@ -231,6 +273,16 @@ ABLATIONS: list[tuple[Patch, str, tuple[Fault, ...]]] = [
     (no_steady, "recovers", (fault(Kind.STEP, "client", 5, 0, -3600.0),)),
     (no_steady, "recovers", (fault(Kind.STEP, "server", 5, 0, -3600.0),)),
     (no_latch, "table", (fault(Kind.PARTITION, "both", 5, 14),)),
+    (no_home, "recovers", (fault(Kind.COPY, "both", 3, 20), fault(Kind.COPY, "both", 5, 15))),
+    (
+        no_second_try,
+        "recovers",
+        (
+            fault(Kind.COPY, "both", 4, 20),
+            fault(Kind.RESTART, "server", 6, 0.5),
+            fault(Kind.LOSS, "both", 6, 3, 0.7),
+        ),
+    ),
 ]
 
 
@@ -245,7 +297,10 @@ def test_feedback_that_ends_too_early_is_caught(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize(("switch_off", "invariant", "faults"), ABLATIONS)
 def test_a_guard_that_is_switched_off_is_caught(
-    switch_off: Patch, invariant: str, faults: tuple[Fault, ...], monkeypatch: pytest.MonkeyPatch
+    switch_off: Patch,
+    invariant: str,
+    faults: tuple[ScheduledFault, ...],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """By its invariant; with the guard the same flight goes well."""
     trial = Trial(3, faults)
@@ -298,7 +353,7 @@ def test_an_endpoint_that_raises_has_failed(monkeypatch: pytest.MonkeyPatch) -> 
     def raise_(*_: Any, **__: Any) -> None:
         raise ValueError("no such thing")
 
-    monkeypatch.setattr(Server, "_tick", raise_)
+    monkeypatch.setattr(Ticker, "tick", raise_)
     outcome = fly(Trial(1, ()))
     assert outcome.invariant == "raises"
     assert "ValueError no such thing" in outcome.failure
@@ -385,14 +440,14 @@ def test_a_failure_is_printed_with_its_schedule_and_flies_again(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """Exit code 1, a command line to fly it again, and a file of schedules does as well."""
-    monkeypatch.setattr(skytether.torture, "crew", alone)
+    monkeypatch.setattr(skytether.lab.commands.torture, "crew", alone)
     no_stall(monkeypatch)
     file = tmp_path / "seeds.txt"
     frozen = Trial(1, (fault(Kind.FREEZE, "client", 5, 0.6),))
     file.write_text(f"# two\n{dumps(Trial(1, ()))}\n{dumps(frozen)}\n")
     for argv in (["--replay", str(file)], ["--schedule", dumps(frozen)]):
         with pytest.raises(CommandError, match=r"1 of [12] flights failed") as refused:
-            skytether.torture.torture(argv)
+            skytether.lab.commands.torture.torture(argv)
         assert refused.value.code == 1
         printed = capsys.readouterr().out
         assert "asleep: " in printed

@@ -1,10 +1,7 @@
 """When a horizon is worth a packet: policies against numbers worked out by hand, and combined."""
 
 import math
-import re
 from collections.abc import Iterator
-from dataclasses import astuple
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,13 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.planner import FIGURES, Figures
-from server.trigger import POLICIES, Combined, Situation, Trigger, Verdict, make_trigger
-from shared import config
-from shared.config import ControlConfig
-from shared.model import Flags, Indices
-from shared.policy import SIGNATURES
-from sim.flight import fly
+from skytether.server.control.planner import FIGURES, Figures
+from skytether.shared.law.model import Flags, Indices, discretise
+from skytether.shared.scenario.registry import TRIGGERS
+from skytether.shared.scenario.schema import ControlConfig
+from skytether.shared.scenario.triggers import (
+    Combined,
+    Compared,
+    Known,
+    Situation,
+    Trigger,
+    Verdict,
+    make_trigger,
+)
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -40,15 +43,28 @@ def figures_of(
 ) -> Figures:
     """What is known of n vehicles alike."""
     figures = np.zeros(n, dtype=FIGURES)
-    figures["step"], figures["error"], figures["fresh"] = step, error, fresh
+    figures["step"], figures["state_gap"], figures["fresh"] = step, error, fresh
     figures["cost_gap"], figures["deviation_m"] = cost_gap, deviation_m
     return figures
+
+
+KNOWN = Known(
+    model=discretise((0.84, 0.84), 0.1),
+    dt_s=0.1,
+    planned=3,
+    ahead=np.array([2, 0]),
+    horizons=np.arange(20, dtype=np.float32).reshape(2, 2, 5),
+    held=np.arange(12.0).reshape(2, 2, 3),
+    sent_step=np.array([40, -1]),
+    desired=lambda rows, *_: np.zeros((len(rows), 2, 4, 2)),
+)
+"""What is known of two vehicles at most."""
 
 
 def facing(rows: Indices, figures: Figures) -> Situation:
     """A situation of vehicles that are where they were planned to be."""
     states = np.zeros((len(rows), 2, 2))
-    return Situation(rows, figures, states, states)
+    return Situation(rows, figures, states, states, KNOWN)
 
 
 def ask(trigger: Trigger, step: int, error: float, *, fresh: bool = False) -> Verdict:
@@ -260,7 +276,7 @@ def test_budget_binds_a_vehicle_that_begins_anew_too() -> None:
         assert verdict.event.tolist() == [True]
 
 
-@pytest.mark.parametrize("text", [name for name in POLICIES if name != "budget"] + ["budget(5, 2)"])
+@pytest.mark.parametrize("text", [name for name in TRIGGERS if name != "budget"] + ["budget(5, 2)"])
 def test_a_forgotten_vehicle_is_as_one_that_was_never_there(text: str) -> None:
     """A new life owes nothing to events, packets and tokens of the old one; others keep theirs."""
     text = {"silence": "silence(1)"}.get(text, text)
@@ -268,11 +284,9 @@ def test_a_forgotten_vehicle_is_as_one_that_was_never_there(text: str) -> None:
     rows = np.array([0, 1])
     for step in range(5000, 5004):
         old.sent(rows, figures_of(2, step=step, error=1e6))
-    kept = astuple(old.test(facing(rows[1:], figures_of(step=5003))))
+    kept = old.test(facing(rows[1:], figures_of(step=5003)))
     old.forget(0)
-    for one, other in zip(
-        astuple(old.test(facing(rows[1:], figures_of(step=5003)))), kept, strict=True
-    ):
+    for one, other in zip(old.test(facing(rows[1:], figures_of(step=5003))), kept, strict=True):
         assert one == other
     assert events(old, 2, 30) == events(new, 2, 30)
 
@@ -379,11 +393,11 @@ def test_eq_16_counts_from_v_whichever_figure_is_recorded() -> None:
         assert ask(trigger, 25, error).event.tolist() == [event]
 
 
-class Listener:
+class Listener(Trigger):
     """A trigger with a figure of its own, which keeps what it is told."""
 
     def __init__(self, figure: float, *, compares: bool) -> None:
-        self.compares, self.doubts = compares, False
+        self._compared = Compared.COST_GAP if compares else Compared.NOTHING
         self.told: list[int] = []
         self._figure = figure
 
@@ -394,7 +408,7 @@ class Listener:
     def test(self, situation: Situation) -> Verdict:
         """Fire where the figure is positive."""
         figure = np.full(len(situation.rows), self._figure)
-        return Verdict(figure > 0.0, figure, figure)
+        return Verdict(figure > 0.0, figure, figure, self._compared)
 
     def sent(self, rows: Indices, figures: Figures) -> None:  # noqa: ARG002
         """Keep the rows told."""
@@ -415,7 +429,6 @@ def test_both_sides_are_told_whichever_is_recorded(compares: tuple[bool, bool]) 
 
 def test_scenario_names_its_trigger() -> None:
     """Every policy that a scenario may name is made, with the scenario's keys for its arguments."""
-    assert POLICIES.keys() == SIGNATURES.keys()
     control = ControlConfig(
         period=4, epsilon=2.0, decay_rate=0.0, cost_gap=7.0, deviation_m=8.0, tolerance_m=9.0
     )
@@ -461,7 +474,7 @@ def encounters(rng: np.random.Generator, n: int, ticks: int) -> Iterator[Figures
         step = np.where(rng.random(n) < 0.05, 0, step + rng.integers(1, 6, n))
         figures["step"] = step
         figures["fresh"] = (rng.random(n) < 0.1) | (tick == 0) | (step == 0)
-        for name in ("error", "cost_gap", "deviation_m", "left_m", "moved_m"):
+        for name in ("state_gap", "cost_gap", "deviation_m", "left_m", "moved_m"):
             figures[name] = rng.uniform(0.0, 2.0, n)
         yield figures
 
@@ -482,7 +495,7 @@ def test_combination_fires_as_its_parts_say(tree: Any, seed: int) -> None:
 
     for figures in encounters(rng, 3, 25):
         verdict, again = whole.test(facing(rows, figures)), whole.test(facing(rows, figures))
-        for one, other in zip(astuple(verdict), astuple(again), strict=True):
+        for one, other in zip(verdict, again, strict=True):
             np.testing.assert_array_equal(one, other)
         verdicts = {leaf: part.test(facing(rows, figures)) for leaf, part in parts.items()}
         assert verdict.event.tolist() == expected(tree, verdicts).tolist()
@@ -504,29 +517,7 @@ def test_batch_is_judged_as_its_singles(tree: Any, seed: int) -> None:
         together.sent(rows[sent], figures[sent])
         for i, single in enumerate(singles):
             alone = single.test(facing(ROW, figures[i : i + 1]))
-            for one, all_ in zip(astuple(alone), astuple(verdict), strict=True):
+            for one, all_ in zip(alone[:3], verdict[:3], strict=True):
                 assert one[0] == all_[i]
             if alone.event[0]:
                 single.sent(ROW, figures[i : i + 1])
-
-
-def test_documented_trigger_flies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The example of docs/triggers.md, as it stands there, alone and combined."""
-    for table in (POLICIES, SIGNATURES):
-        monkeypatch.setitem(table, "slip", None)  # taken out again in the end
-    text = (Path(__file__).parent.parent / "docs" / "triggers.md").read_text()
-    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    exec(example, {})
-    estimate = np.array([[[9.0, 0.3], [9.0, 0.5]]])
-    situation = Situation(ROW, figures_of(), estimate, np.zeros((1, 2, 2)))
-    verdict = trigger_of("slip(0.5)").test(situation)
-    assert verdict.event.tolist() == [True]
-    assert verdict.figure == pytest.approx([math.hypot(0.3, 0.5)])
-    control = {"scheme": "predictive", "trigger": "slip(0.1) & budget(4, 1) | silence(1)"}
-    flown = config.check({"duration": 10.0, "control": control}, "test")
-    server = fly(flown).server
-    sent_s = server["step"][server["event"]] * flown.control.dt
-    assert len(sent_s) > 10
-    assert np.diff(sent_s).max() <= 1.0 + 1e-9
-    with pytest.raises(config.ConfigError, match=r"slip\(mps\) with 0 <= mps"):
-        config.check({"control": {"trigger": "slip(-1)"}}, "test")

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.endpoint import SECOND_NS, Address, Datagram, Endpoint
-from shared.events import Event, Flying
-from sim import world as world_module
-from sim.world import Clock, World
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.events import Event, Flying
+from skytether.sim import world as world_module
+from skytether.sim.world import Clock, World
 
 offsets = st.integers(-(10**15), 10**15)
 drifts = st.integers(-1_000_000, 1_000_000)
@@ -47,6 +48,16 @@ class Probe(Endpoint):
 def never() -> bool:
     """Until nothing is left to happen."""
     return False
+
+
+def test_what_lies_behind_the_limit_happens_when_time_goes_on() -> None:
+    """A world that is run a second time has lost nothing."""
+    world, probe = World(), Probe([10, 20])
+    world.add("probe", probe)
+    world.run(never, limit_ns=15)
+    assert probe.log == [("wake", 10)]
+    world.run(never, limit_ns=25)
+    assert probe.log == [("wake", 10), ("wake", 20)]
 
 
 @given(offsets, drifts, times)

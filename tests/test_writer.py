@@ -8,7 +8,7 @@ from typing import IO
 
 import pytest
 
-from shell.writer import Writer
+from skytether.shell.writer import Writer
 
 PATIENCE_S = 30.0
 

@@ -1,0 +1,287 @@
+"""The client as an endpoint: one vehicle, which at every step flies, tells its state, and listens.
+
+`session` is its conversation with the server, `pilot` flies it, and `failsafe` decides what it does
+at all, by what either of them meets. Here they are put together. A lost server changes nothing in
+the flight's clock, which is the client's own.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from skytether.client.failsafe import CLOSING, HOLD, TABLE, Failsafe
+from skytether.client.link import ClientLink, PlainLink
+from skytether.client.pilot import Pilot
+from skytether.client.session import ServerSession
+from skytether.client.vehicle import Vehicle
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Address, Datagram, Endpoint, by_name
+from skytether.shared.core.events import (
+    Failure,
+    FenceHolds,
+    Finished,
+    Flying,
+    ModeChanged,
+    NotFlown,
+)
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason, Recorder
+from skytether.shared.wire.protocol import CLOSES, Close, Drop, Mode, ProtocolError
+
+VEHICLE_SOCKET = 1
+"""Number of the socket through which the vehicle's own port talks; the server's is 0."""
+HELD_AGAIN_NS = 5 * SECOND_NS
+"""Time after which it is said again that the fence holds the vehicle back [ns]."""
+PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
+"""Reasons that do not say why there is no newer horizon."""
+
+
+class Client(Endpoint):
+    """One vehicle.
+
+    Args:
+        scenario: the server's, as far as it makes the terms of a flight.
+        flies: what flies.
+        server: address of the server, or of the netem before it.
+        vehicle: number of the vehicle, unlike that of any other vehicle of the server.
+        boot_id: number that no other life of this vehicle has had.
+        link: how messages become datagrams.
+        recorder: takes one row a step.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        flies: Vehicle,
+        *,
+        server: Address,
+        vehicle: int,
+        boot_id: int,
+        link: ClientLink | None = None,
+        recorder: Recorder | None = None,
+    ) -> None:
+        super().__init__()
+        terms = scenario.terms()
+        self.vehicle, self._server = vehicle, server
+        self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
+        self._flies, self._port = flies, flies.port
+        self.changeable = flies.changeable | keys_of(InFlight.ARMED)
+        self._failsafe = Failsafe(
+            HOLD if terms.exhausted == "hold" else TABLE,
+            armed=scenario.armed,
+            timeout_ns=self._timeout_ns,
+            land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
+            changed=self._mode_changed,
+        )
+        self._session = ServerSession(
+            terms,
+            vehicle=vehicle,
+            boot_id=boot_id,
+            server=server,
+            connect_s=scenario.link.connect_s,
+            link=link or PlainLink(),
+            failsafe=self._failsafe,
+            out=self._out,
+            events=self._events,
+        )
+        self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
+        self._not_flown: NotFlown | None = None
+        """Event with which a flight ends that has had no plan."""
+        self._held_ns = 0
+        """Time before which it is not said again that the fence holds the vehicle."""
+        self.horizons = 0
+        """Number of horizons received."""
+        self.dropped: Counter[Drop] = Counter()
+        """Number of datagrams dropped, by reason."""
+
+    @property
+    def failure(self) -> Failure | None:
+        """Event after which there can be no flight, or that has ended it."""
+        return self._flies.failure or self._session.failure or self._not_flown
+
+    @property
+    def finished(self) -> bool:
+        """Whether the flight has ended and the vehicle is down, or cannot begin."""
+        pilot = self._pilot
+        if pilot.next_ns is not None:
+            return pilot.step >= pilot.steps and self._flies.is_down
+        return self.failure is not None and self._flies.is_down
+
+    @property
+    def missed(self) -> int:
+        """Steps slept through."""
+        return self._pilot.missed
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Take what is said in this session; drop and count anything else.
+
+        What comes to the socket of the vehicle's own port is for that.
+        """
+        if datagram.socket == VEHICLE_SOCKET and self._port is not None:
+            self._port.receive(datagram, now_ns=now_ns)
+            self._attend(self._port, now_ns)
+            return
+        if datagram.peer != self._server:
+            self.dropped[Drop.ELSEWHERE] += 1
+            return
+        try:
+            horizon = self._session.hear(datagram.payload, now_ns=now_ns)
+            if self._pilot.next_ns is None:
+                self._begin(now_ns)
+            elif horizon is not None:
+                self._pilot.offer(horizon, now_ns=now_ns)
+                self.horizons += 1
+        except ProtocolError as error:
+            self.dropped[error.reason] += 1
+
+    def _begin(self, now_ns: int) -> None:
+        """Begin the flight once its first session is open and the vehicle can be flown."""
+        if self._session.number is not None and self._flies.take_off(now_ns=now_ns):
+            self._pilot.begin(now_ns=now_ns)
+            self._events.append(Flying(vehicle=self.vehicle))
+            self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """Start of the next step, before the first the time of the next HELLO, or the port's."""
+        due_ns = self._due_ns()
+        if self._port is None or self.finished:
+            return due_ns
+        port_ns = self._port.next_wake_ns()
+        return port_ns if due_ns is None else min(due_ns, port_ns or due_ns)
+
+    def _due_ns(self) -> int | None:
+        """Time at which the flight itself needs to be woken."""
+        pilot = self._pilot
+        if pilot.next_ns is not None:
+            return pilot.next_ns if pilot.step < pilot.steps else None
+        if self.failure is not None or not self._flies.is_ready:
+            return None
+        return self._session.hello_ns
+
+    def wake(self, *, now_ns: int) -> None:
+        """Fly the step that is due, and say HELLO where nobody is heard."""
+        if self._port is not None:
+            port_ns = self._port.next_wake_ns()
+            if port_ns is not None and port_ns <= now_ns:
+                self._port.wake(now_ns=now_ns)
+        due_ns = self._due_ns()
+        if due_ns is not None and due_ns <= now_ns:
+            if self._pilot.next_ns is not None:
+                self._fly(now_ns)
+            elif not self._session.wait(now_ns=now_ns):
+                return
+            self._session.ask(now_ns=now_ns)
+            if self._pilot.next_ns is None:
+                self._session.rest(now_ns=now_ns)
+        if self._port is not None:
+            self._attend(self._port, now_ns)
+
+    def _attend(self, port: Endpoint, now_ns: int) -> None:
+        """Hand on what the vehicle's port wants sent and said; its vehicle may be up now."""
+        if self._pilot.next_ns is None:
+            self._begin(now_ns)
+        self._out += [Datagram(said, peer, VEHICLE_SOCKET) for said, peer, _ in port.outbox()]
+        self._events += port.events()
+
+    def _fly(self, now_ns: int) -> None:
+        """Fly a step, and tell the server."""
+        session, pilot = self._session, self._pilot
+        pilot.fly(now_ns=now_ns)
+        if pilot.is_held and now_ns >= self._held_ns:
+            self._held_ns = now_ns + HELD_AGAIN_NS
+            self._events.append(FenceHolds(vehicle=self.vehicle))
+        if pilot.step >= pilot.steps:
+            self._end(now_ns)
+        assert session.number is not None
+        observation = pilot.observation(session.number, session.echo)
+        if observation is not None:
+            session.send(observation)
+
+    def _end(self, now_ns: int) -> None:
+        """Say how the flight ended, and see the vehicle down."""
+        self._flies.land()
+        pilot, vehicle = self._pilot, self.vehicle
+        if pilot.covered and pilot.without_ns <= self._timeout_ns:
+            finished = Finished(vehicle=vehicle, steps=pilot.steps, missed=pilot.missed)
+            self._events.append(finished)
+        else:
+            covered, why = pilot.covered, self._why_no_plan(now_ns)
+            self._not_flown = NotFlown(vehicle=vehicle, covered=covered, steps=pilot.steps, why=why)
+            self._events.append(self._not_flown)
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+        """See `Endpoint`."""
+        self._failsafe.armed = scenario.armed
+        if keys & self._flies.changeable:
+            self._flies.change(scenario)
+
+    def close(self, *, now_ns: int) -> None:
+        """Tell the server that the vehicle ends, and let it land by itself where it can."""
+        if self._port is not None:
+            self._port.close(now_ns=now_ns)
+            self._attend(self._port, now_ns)
+        if self._session.number is not None:
+            for _ in range(CLOSES):
+                self._session.send(Close(self.vehicle, self._session.number))
+
+    def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
+        """Do and say what goes with another mode or reason.
+
+        That it coasts for a while is not said: where an event sends a horizon, that is as usual.
+        """
+        self._pilot.mode_changed(cause)
+        if self._failsafe.mode is Mode.LAND:
+            self._flies.land()
+        if cause in CLOSING:
+            self._session.close()
+        if cause is Reason.OLD or (was, cause) == (Reason.OLD, Reason.HORIZON):
+            return
+        reason, after = self._failsafe.reason, str(self._failsafe.mode)
+        why = self._why_no_plan(now_ns) if reason is Reason.ENDED else str(reason)
+        changed = ModeChanged(vehicle=self.vehicle, before=str(before), after=after, reason=why)
+        self._events.append(changed)
+
+    def _why_no_plan(self, now_ns: int) -> str:
+        """Why there is no newer horizon, as far as the vehicle knows."""
+        reason = self._failsafe.reason
+        if reason not in PLANLESS:
+            return str(reason)
+        return str(Reason.LOST) if self._failsafe.is_lost(now_ns) else self._session.idle
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`."""
+        return figures([self])
+
+    def told(self) -> dict[str, Any]:
+        """Figures of the vehicle; ages are there while a horizon is in force."""
+        pilot = self._pilot
+        told = {
+            "mode": str(self._failsafe.mode),
+            "step": pilot.step,
+            "steps": pilot.steps,
+            "missed": pilot.missed,
+            "horizons": self.horizons,
+            "dropped": by_name(self.dropped),
+        }
+        compensator = pilot.compensator
+        if compensator.observed_ns >= 0:
+            now_ns = pilot.starts_ns(pilot.flown)
+            planned_ns = pilot.starts_ns(compensator.in_force)
+            told["age_ms"] = (now_ns - compensator.observed_ns) / MILLISECOND_NS
+            told["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
+        if self._port is not None:
+            told["autopilot"] = self._port.figures()
+        return told
+
+
+def figures(clients: Sequence[Client]) -> dict[str, Any]:
+    """Figures of some clients in one process, as in `Endpoint.figures`."""
+    return {
+        "vehicles": len(clients),
+        "missed": sum(client.missed for client in clients),
+        "by_vehicle": {
+            str(client.vehicle): client.told() for client in clients[:VEHICLES_TOLD_MAX]
+        },
+    }

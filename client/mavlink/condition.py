@@ -1,0 +1,137 @@
+"""Condition of the vehicle, as its autopilot has told it last."""
+
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+
+ASTRAY_NS = 500 * MILLISECOND_NS
+"""Time for which the estimate has to be bad [ns]: flags flicker where a receiver changes
+satellites."""
+LOW_NS = 2 * SECOND_NS
+"""Time for which the battery has to be low [ns]: its voltage sags where thrust is wanted."""
+FRESH_NS = 2500 * MILLISECOND_NS
+"""Age up to which a heartbeat tells of now [ns]: one may be lost."""
+KNOWS = dialect.ESTIMATOR_VELOCITY_HORIZ
+"""Flag of an estimate that knows its velocity."""
+PLACED = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_POS_HORIZ_REL
+"""Flags of an estimate that knows its position; one is enough."""
+STANDS_IN = dialect.ESTIMATOR_CONST_POS_MODE
+"""Flag of an estimate that takes the vehicle for standing still, for want of anything better."""
+UNKNOWN_MV, UNKNOWN_PERCENT = 65535, -1
+BATTERY_BAD = range(
+    int(dialect.MAV_BATTERY_CHARGE_STATE_LOW), int(dialect.MAV_BATTERY_CHARGE_STATE_UNHEALTHY) + 1
+)
+"""Charge states in which the autopilot itself calls a battery low, or worse."""
+
+
+class Condition:
+    """What is known of the autopilot and its vehicle.
+
+    Args:
+        battery_min: share of the battery's charge below which it is low.
+        battery_min_v: voltage below which it is low [V]; 0: none is.
+    """
+
+    def __init__(self, battery_min: float, battery_min_v: float) -> None:
+        self._battery_min, self._battery_min_v = battery_min, battery_min_v
+        self.heard_ns: int | None = None
+        """Time of the newest message of the autopilot."""
+        self.heartbeat_ns: int | None = None
+        """Time of its newest heartbeat."""
+        self.mode = -1
+        """Number of its mode; -1 before it is known."""
+        self.armed = False
+        self.landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
+        """MAV_LANDED_STATE."""
+        self.charge: float | None = None
+        """Charge of the battery, from 0 to 1; None where nobody knows."""
+        self.voltage: float | None = None
+        """Voltage of the battery [V]."""
+        self.home: tuple[float, float, float] | None = None
+        """Latitude and longitude of home [°], and its altitude above the sea [m]."""
+        self._is_bad: dict[str, bool] = {}
+        """Whether the estimate is bad, by the message that says so."""
+        self._astray_ns: int | None = None
+        """Time since which the estimate is bad."""
+        self._is_low: dict[str, bool] = {}
+        """Whether the battery is low, by the message that says so."""
+        self._low_ns: int | None = None
+        """Time since which the battery is low."""
+
+    def hear(self, message: Message, *, now_ns: int) -> None:
+        """Take a message of the autopilot."""
+        self.heard_ns = now_ns
+        match message.get_type():
+            case "HEARTBEAT":
+                self.heartbeat_ns = now_ns
+                self.mode = message.custom_mode
+                self.armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+            case "EXTENDED_SYS_STATE":
+                self.landed = message.landed_state
+            case "SYS_STATUS":
+                self._hear_status(message, now_ns)
+            case "BATTERY_STATUS" if message.id == 0:
+                self._low("BATTERY_STATUS", message.charge_state in BATTERY_BAD, now_ns)
+            case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS":
+                flags = message.flags
+                knows = flags & KNOWS and flags & PLACED and not flags & STANDS_IN
+                self._bad("ESTIMATE", not knows, now_ns)
+            case "HOME_POSITION":
+                self.home = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+
+    def _hear_status(self, message: Message, now_ns: int) -> None:
+        percent, millivolts = message.battery_remaining, message.voltage_battery
+        self.charge = None if percent == UNKNOWN_PERCENT else percent / 100.0
+        self.voltage = None if millivolts in (0, UNKNOWN_MV) else millivolts / 1000.0
+        low = self.charge is not None and self.charge < self._battery_min
+        weak = self.voltage is not None and self.voltage < self._battery_min_v
+        self._low("SYS_STATUS", low or weak, now_ns)
+        used = message.onboard_control_sensors_present & message.onboard_control_sensors_enabled
+        sick = used & ~message.onboard_control_sensors_health
+        self._bad("SYS_STATUS", bool(sick & dialect.MAV_SYS_STATUS_AHRS), now_ns)
+
+    def _low(self, source: str, low: bool, now_ns: int) -> None:
+        self._is_low[source] = low
+        self._low_ns = _since(self._low_ns, any(self._is_low.values()), now_ns)
+
+    def _bad(self, source: str, bad: bool, now_ns: int) -> None:
+        self._is_bad[source] = bad
+        self._astray_ns = _since(self._astray_ns, any(self._is_bad.values()), now_ns)
+
+    @property
+    def battery_is_weak(self) -> bool:
+        """Whether the battery is low now, if only for a moment."""
+        return self._low_ns is not None
+
+    def battery_is_low(self, *, now_ns: int) -> bool:
+        """Whether the battery has been low for LOW_NS."""
+        return self._low_ns is not None and now_ns - self._low_ns >= LOW_NS
+
+    def is_astray(self, *, now_ns: int) -> bool:
+        """Whether the autopilot has said for ASTRAY_NS that it does not know where it is."""
+        return self._astray_ns is not None and now_ns - self._astray_ns >= ASTRAY_NS
+
+    def is_fresh(self, *, now_ns: int) -> bool:
+        """Whether mode and arming are those of now, as far as heartbeats tell."""
+        return self.heartbeat_ns is not None and now_ns - self.heartbeat_ns <= FRESH_NS
+
+    @property
+    def is_airborne(self) -> bool:
+        """Whether the autopilot says that it is in the air."""
+        return self.landed in (
+            dialect.MAV_LANDED_STATE_IN_AIR,
+            dialect.MAV_LANDED_STATE_TAKEOFF,
+            dialect.MAV_LANDED_STATE_LANDING,
+        )
+
+    @property
+    def is_flying(self) -> bool:
+        """Whether it is armed and in the air, neither climbing nor landing by itself."""
+        return self.armed and self.landed == dialect.MAV_LANDED_STATE_IN_AIR
+
+
+def _since(before_ns: int | None, now_so: bool, now_ns: int) -> int | None:
+    """Time since which something is so; None where it is not."""
+    if not now_so:
+        return None
+    return now_ns if before_ns is None else before_ns

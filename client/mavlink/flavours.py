@@ -1,0 +1,151 @@
+"""What ArduCopter and PX4 do differently: numbers and names of modes, and the way into the air."""
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+
+CUSTOM = float(dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
+AIRBORNE = frozenset(
+    {
+        int(dialect.MAV_TYPE_QUADROTOR),
+        int(dialect.MAV_TYPE_COAXIAL),
+        int(dialect.MAV_TYPE_HELICOPTER),
+        int(dialect.MAV_TYPE_HEXAROTOR),
+        int(dialect.MAV_TYPE_OCTOROTOR),
+        int(dialect.MAV_TYPE_TRICOPTER),
+        int(dialect.MAV_TYPE_DODECAROTOR),
+        int(dialect.MAV_TYPE_DECAROTOR),
+    }
+)
+"""Types of vehicles that hover, and so can be flown."""
+
+
+class Step(Enum):
+    """A step on the way into the air."""
+
+    HOLD = auto()
+    """Be in a mode that flies by itself, and not in one of a pilot's."""
+    GUIDE = auto()
+    """Be in the mode that follows setpoints."""
+    ARM = auto()
+    """Be armed."""
+    LIFT = auto()
+    """Have heard the command to take off."""
+    CLIMB = auto()
+    """Be at the altitude of take-off."""
+
+
+@dataclass(frozen=True)
+class Flavour:
+    """An autopilot, as far as it is unlike the other."""
+
+    name: str
+    guided: int
+    """Number of the mode that follows setpoints."""
+    land: int
+    """Number of the mode that lands."""
+    hold: int
+    """Number of the mode that stays where it is."""
+    own: frozenset[int]
+    """Numbers of the modes that the vehicle is in between arming and following setpoints."""
+    steps: tuple[Step, ...]
+    """Way into the air."""
+    streams_first: bool
+    """Whether setpoints must be coming before it goes into its guided mode."""
+    above_sea: bool
+    """Whether the altitude of take-off is told above the sea, and not above home."""
+    bytewise: bool
+    """Whether a parameter's bits are sent, see `mavlink.parameters`."""
+    submodes: bool
+    """Whether a mode's number has two parts."""
+    modes: dict[int, str]
+    """Names of modes."""
+
+    def mode_name(self, mode: int) -> str:
+        """Name of a mode."""
+        return self.modes.get(mode, f"mode {mode}")
+
+    def mode_parts(self, mode: int) -> tuple[float, float, float]:
+        """Parameters of the command that goes into a mode."""
+        if self.submodes:
+            return CUSTOM, float(mode >> 16 & 0xFF), float(mode >> 24)
+        return CUSTOM, float(mode), 0.0
+
+
+def _px4(main: int, sub: int = 0) -> int:
+    return main << 16 | sub << 24
+
+
+ARDUPILOT = Flavour(
+    name="ArduCopter",
+    guided=4,
+    land=9,
+    hold=17,
+    own=frozenset({4}),
+    steps=(Step.GUIDE, Step.ARM, Step.LIFT, Step.CLIMB),
+    streams_first=False,
+    above_sea=False,
+    bytewise=False,
+    submodes=False,
+    modes={
+        0: "STABILIZE",
+        1: "ACRO",
+        2: "ALT_HOLD",
+        3: "AUTO",
+        4: "GUIDED",
+        5: "LOITER",
+        6: "RTL",
+        7: "CIRCLE",
+        9: "LAND",
+        11: "DRIFT",
+        13: "SPORT",
+        15: "AUTOTUNE",
+        16: "POSHOLD",
+        17: "BRAKE",
+        18: "THROW",
+        20: "GUIDED_NOGPS",
+        21: "SMART_RTL",
+    },
+)
+PX4 = Flavour(
+    name="PX4",
+    guided=_px4(6),
+    land=_px4(4, 6),
+    hold=_px4(4, 3),
+    own=frozenset({_px4(4, 1), _px4(4, 2), _px4(4, 3), _px4(6)}),
+    steps=(Step.HOLD, Step.ARM, Step.LIFT, Step.CLIMB, Step.GUIDE),
+    streams_first=True,
+    above_sea=True,
+    bytewise=True,
+    submodes=True,
+    modes={
+        _px4(1): "MANUAL",
+        _px4(2): "ALTCTL",
+        _px4(3): "POSCTL",
+        _px4(4, 1): "AUTO.READY",
+        _px4(4, 2): "AUTO.TAKEOFF",
+        _px4(4, 3): "AUTO.LOITER",
+        _px4(4, 4): "AUTO.MISSION",
+        _px4(4, 5): "AUTO.RTL",
+        _px4(4, 6): "AUTO.LAND",
+        _px4(5): "ACRO",
+        _px4(6): "OFFBOARD",
+        _px4(7): "STABILIZED",
+    },
+)
+FLAVOURS = {
+    int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA): ARDUPILOT,
+    int(dialect.MAV_AUTOPILOT_PX4): PX4,
+}
+"""Flavours by the MAV_AUTOPILOT of a heartbeat."""
+
+
+def unfit(heartbeat: Message) -> str:
+    """Why the vehicle of a heartbeat cannot be flown; empty where it can."""
+    if heartbeat.autopilot not in FLAVOURS:
+        return f"its autopilot is number {heartbeat.autopilot}, expected ArduPilot (3) or PX4 (12)"
+    if heartbeat.type not in AIRBORNE:
+        return f"it is of MAV_TYPE {heartbeat.type}, expected one that hovers, as a quadrotor (2)"
+    return ""

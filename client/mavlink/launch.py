@@ -1,0 +1,327 @@
+"""Into the air and down again: mode, arming, take-off and landing, all of them the autopilot's own.
+
+    GROUND → CLIMBING (the steps of its flavour, one after another) → FLYING → LANDING → down
+
+A step is done when the autopilot's own state says so, and its command is repeated until then. We
+arm only what stands on the ground and whose scenario is armed, and leave a mode of a pilot to him:
+once the vehicle is armed, its mode is never changed but from one of ours.
+"""
+
+from enum import Enum, auto
+
+from skytether.client.mavlink.condition import Condition
+from skytether.client.mavlink.flavours import Flavour, Step
+from skytether.client.mavlink.positions import Positions
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.aboard import AutopilotRefused, NotTakenOff
+from skytether.shared.core.endpoint import Events
+
+AGAIN_NS = SECOND_NS
+"""Time after which a command is repeated [ns]."""
+STREAM_NS = 500 * MILLISECOND_NS
+"""Time for which setpoints run before a mode is asked for that needs them [ns]."""
+FRESH_NS = 500 * MILLISECOND_NS
+"""Age up to which a position tells where the vehicle is now [ns]."""
+LAND_MAX_NS = 120 * SECOND_NS
+"""Longest time that a landing is waited for [ns]."""
+SILENT_MAX_NS = 10 * SECOND_NS
+"""Longest silence of the autopilot in a landing that is waited for [ns]."""
+THERE_M = 0.3
+"""Distance from the altitude of take-off within which it is there [m]."""
+STILL_MPS = 0.3
+"""Vertical speed below which the climb is over [m/s]."""
+SET_MODE = int(dialect.MAV_CMD_DO_SET_MODE)
+ARM = int(dialect.MAV_CMD_COMPONENT_ARM_DISARM)
+TAKE_OFF = int(dialect.MAV_CMD_NAV_TAKEOFF)
+ACCEPTED, IN_PROGRESS = int(dialect.MAV_RESULT_ACCEPTED), int(dialect.MAV_RESULT_IN_PROGRESS)
+RESULTS = {
+    number: entry.name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
+    for number, entry in dialect.enums["MAV_RESULT"].items()
+}
+"""Names of answers to commands."""
+WORDS = {SET_MODE: "change its mode", ARM: "arm", TAKE_OFF: "take off"}
+NOT_DONE = {
+    Step.HOLD: "not in a mode that holds",
+    Step.GUIDE: "not in the mode that obeys us",
+    Step.ARM: "not armed",
+    Step.LIFT: "not taken off",
+    Step.CLIMB: "not at the altitude of take-off",
+}
+
+
+class Phase(Enum):
+    """Where a flight stands."""
+
+    GROUND = auto()
+    CLIMBING = auto()
+    FLYING = auto()
+    LANDING = auto()
+
+
+class Launch:
+    """Takes one vehicle into the air and down again.
+
+    Args:
+        vehicle: number of the vehicle, for what is told.
+        flavour: which autopilot.
+        target: numbers of its system and component.
+        altitude: altitude to take off to, above the ground [m].
+        patience_ns: time that each step may take [ns].
+        from_takeoff: whether our origin is where the vehicle is armed.
+        condition: what the autopilot says of itself.
+        positions: what it measures.
+        events: takes what is told.
+    """
+
+    def __init__(
+        self,
+        vehicle: int,
+        flavour: Flavour,
+        target: tuple[int, int],
+        *,
+        altitude: float,
+        patience_ns: int,
+        from_takeoff: bool,
+        condition: Condition,
+        positions: Positions,
+        events: Events,
+    ) -> None:
+        self._vehicle, self._flavour, self._target = vehicle, flavour, target
+        self._altitude, self._patience_ns = altitude, patience_ns
+        self._from_takeoff = from_takeoff
+        self._condition, self._positions, self._events = condition, positions, events
+        self.phase = Phase.GROUND
+        self._step = 0
+        """Number of the step of the climb."""
+        self._since_ns: int | None = None
+        """Time since which the present step is waited for."""
+        self._asked_ns: int | None = None
+        """Time at which its command was sent last."""
+        self._accepted = False
+        """Whether the take-off was accepted."""
+        self._closed = False
+        """Whether nothing is to begin any more."""
+        self._words = ""
+        """Newest reason that the autopilot gave in this step."""
+        self._refused: set[tuple[int, int]] = set()
+        """Refusals of this step that were told: command and result."""
+        self.failure: NotTakenOff | None = None
+
+    # -- into the air ------------------------------------------------------------------------
+
+    def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
+        """Go on with the take-off; returns whether the vehicle can be flown.
+
+        Args:
+            may_arm: whether a vehicle on the ground is armed.
+            now_ns: time now.
+        """
+        if self._is_flying:
+            return self._is_placed(now_ns)
+        if self.failure or self._closed or self.phase is Phase.LANDING:
+            return False
+        if self.phase is Phase.GROUND:
+            self._begin(may_arm, now_ns)
+        if self.phase is Phase.CLIMBING:
+            self._climb(now_ns)
+        return self._is_flying
+
+    @property
+    def _is_flying(self) -> bool:
+        return self.phase is Phase.FLYING
+
+    def _is_placed(self, now_ns: int) -> bool:
+        """Whether it is known where the vehicle is now."""
+        came_ns = self._positions.came_ns
+        return came_ns is not None and now_ns - came_ns <= FRESH_NS
+
+    def _begin(self, may_arm: bool, now_ns: int) -> None:
+        """Begin the climb once that can be, or find it to be over."""
+        condition, flavour = self._condition, self._flavour
+        mode, guided = flavour.mode_name(condition.mode), flavour.mode_name(flavour.guided)
+        if not condition.is_fresh(now_ns=now_ns) or not condition.landed:
+            self._wait("not ready", "it does not say whether it is on the ground", now_ns)
+        elif not self._is_placed(now_ns):
+            self._wait("not ready", "it does not tell where it is", now_ns)
+        elif condition.is_flying and condition.mode == flavour.guided:
+            self._enter(Phase.FLYING, now_ns)
+        elif condition.armed and condition.is_airborne:
+            expected = f"expected it on the ground, or in {guided}"
+            self._wait("not flown", f"it is in the air in {mode}; {expected}", now_ns)
+        elif condition.armed and condition.mode not in flavour.own:
+            expected = f"expected it disarmed, or in {guided}"
+            self._wait("not flown", f"somebody has armed it in {mode}; {expected}", now_ns)
+        elif may_arm and condition.battery_is_weak:
+            self._wait("not armed", "its battery is low, see mavlink.battery_min", now_ns)
+        elif may_arm:
+            self._enter(Phase.CLIMBING, now_ns)
+        else:
+            self._since_ns = None
+
+    def _enter(self, phase: Phase, now_ns: int) -> None:
+        self.phase = phase
+        self._begin_step(0, now_ns)
+
+    def _begin_step(self, step: int, now_ns: int) -> None:
+        self._step, self._since_ns, self._asked_ns = step, now_ns, None
+        self._words = ""
+        self._refused.clear()
+
+    def _climb(self, now_ns: int) -> None:
+        """Go on to the first step that is not done."""
+        condition, steps = self._condition, self._flavour.steps
+        while self._step < len(steps):
+            armed_before = steps.index(Step.ARM) < self._step
+            if armed_before and not condition.armed:
+                self._fail("not taken off", self._words or "it was disarmed", now_ns)
+                return
+            begun = self._step > 0 or condition.armed
+            if begun and condition.mode not in self._flavour.own:
+                mode = self._flavour.mode_name(condition.mode)
+                self._fail("not taken off", f"it was taken over: it is in {mode}", now_ns)
+                return
+            step = steps[self._step]
+            if not self._is_done(step):
+                at = f"it is at {self._positions.altitude:.1f} m"
+                self._wait(NOT_DONE[step], at if step is Step.CLIMB else "no answer", now_ns)
+                return
+            if step is Step.ARM and self._from_takeoff:
+                self._positions.begin()
+            self._begin_step(self._step + 1, now_ns)
+        self._enter(Phase.FLYING, now_ns)
+
+    def _is_done(self, step: Step) -> bool:
+        condition = self._condition
+        match step:
+            case Step.HOLD:
+                return condition.mode in self._flavour.own
+            case Step.GUIDE:
+                return condition.mode == self._flavour.guided
+            case Step.ARM:
+                return condition.armed
+            case Step.LIFT:
+                return self._accepted or condition.is_airborne
+            case Step.CLIMB:
+                there = self._positions.altitude >= self._altitude - THERE_M
+                return there and abs(self._positions.velocity[2]) < STILL_MPS
+
+    def _wait(self, doing: str, why: str, now_ns: int) -> None:
+        """Wait for the autopilot, but no longer than it may take."""
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        if now_ns - self._since_ns > self._patience_ns:
+            waited = f"{doing} in {self._patience_ns / SECOND_NS:g} s"
+            self._fail(waited, self._words or why, now_ns)
+
+    def _fail(self, doing: str, why: str, now_ns: int) -> None:
+        self.failure = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)
+        self._events.append(self.failure)
+        self.land(now_ns=now_ns)
+
+    @property
+    def streams_zeros(self) -> bool:
+        """Whether setpoints of zero have to run, for the next mode needs a stream of them."""
+        if self.phase is not Phase.CLIMBING or not self._flavour.streams_first:
+            return False
+        return self._flavour.steps[self._step] is Step.GUIDE
+
+    # -- down again --------------------------------------------------------------------------
+
+    def land(self, *, now_ns: int) -> None:
+        """Land from now on, where the vehicle is ours and in the air."""
+        if self.phase in (Phase.CLIMBING, Phase.FLYING):
+            self._enter(Phase.LANDING, now_ns)
+
+    def close(self, *, now_ns: int) -> list[Message]:
+        """Let nothing begin any more; messages that make it land, where it is ours now."""
+        self._closed = True
+        if self.phase is Phase.GROUND or not self._is_ours(now_ns):
+            return []
+        return [self._mode_command(self._flavour.land)]
+
+    def _is_ours(self, now_ns: int) -> bool:
+        """Whether it is armed and in a mode of ours, as far as is known now."""
+        condition = self._condition
+        in_ours = condition.mode in self._flavour.own and condition.armed
+        return in_ours and condition.is_fresh(now_ns=now_ns)
+
+    def is_down(self, *, now_ns: int) -> bool:
+        """Whether the vehicle needs no more care, or is out of our hands."""
+        condition = self._condition
+        if self.phase is Phase.GROUND or not condition.armed:
+            return True
+        if self.phase is not Phase.LANDING:
+            return False
+        assert self._since_ns is not None
+        lost = condition.heard_ns is None or now_ns - condition.heard_ns > SILENT_MAX_NS
+        obeys = condition.mode in self._flavour.own or condition.mode == self._flavour.land
+        return lost or not obeys or now_ns - self._since_ns > LAND_MAX_NS
+
+    # -- what is asked and heard -------------------------------------------------------------
+
+    def ask(self, *, now_ns: int) -> list[Message]:
+        """Commands that are due now."""
+        if self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS:
+            return []
+        command = self._command(now_ns)
+        if command is None:
+            return []
+        self._asked_ns = now_ns
+        return [command]
+
+    def _command(self, now_ns: int) -> Message | None:
+        if self.phase is Phase.LANDING:
+            return self._mode_command(self._flavour.land) if self._is_ours(now_ns) else None
+        if self.phase is not Phase.CLIMBING or self._closed:
+            return None
+        step = self._flavour.steps[self._step]
+        if step is Step.GUIDE and self._flavour.streams_first:
+            assert self._since_ns is not None
+            if now_ns - self._since_ns < STREAM_NS:
+                return None
+        modes = {Step.HOLD: self._flavour.hold, Step.GUIDE: self._flavour.guided}
+        if step in modes:
+            return self._mode_command(modes[step])
+        if step is Step.ARM:
+            return self._long(ARM, 1.0)
+        return self._lift() if step is Step.LIFT else None
+
+    def _lift(self) -> Message | None:
+        altitude = self._altitude
+        if self._flavour.above_sea:
+            if self._condition.home is None:
+                self._words = "it does not know where home is"
+                return None
+            altitude += self._condition.home[2]
+        nan = float("nan")
+        return self._long(TAKE_OFF, 0.0, 0.0, 0.0, nan, nan, nan, altitude)
+
+    def _mode_command(self, mode: int) -> Message:
+        return self._long(SET_MODE, *self._flavour.mode_parts(mode))
+
+    def _long(self, command: int, *given: float) -> Message:
+        padded = (*given, *(0.0,) * (7 - len(given)))
+        return dialect.MAVLink_command_long_message(*self._target, command, 0, *padded)
+
+    def hear(self, message: Message) -> None:
+        """Take the answer to one of our commands."""
+        command, result = message.command, message.result
+        if command not in WORDS or result == IN_PROGRESS:
+            return
+        if result == ACCEPTED:
+            climbing = self.phase is Phase.CLIMBING
+            if command == TAKE_OFF and climbing and self._flavour.steps[self._step] is Step.LIFT:
+                self._accepted = True
+            return
+        answer = RESULTS.get(result, f"result {result}")
+        if (command, result) not in self._refused:
+            self._refused.add((command, result))
+            asked = WORDS[command]
+            self._events.append(AutopilotRefused(vehicle=self._vehicle, asked=asked, answer=answer))
+        self._words = self._words or answer
+
+    def heard_words(self, text: str) -> None:
+        """Note what the autopilot has said in words: it is why a step is not done."""
+        self._words = text

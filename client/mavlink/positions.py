@@ -1,0 +1,120 @@
+"""Measurements from LOCAL_POSITION_NED: in our axes and by our clock, each once, and in order."""
+
+import math
+from collections import Counter, deque
+
+from skytether.client.mavlink.clock import BootClock
+from skytether.client.vehicle import Measurement
+from skytether.mavlink.codec import Message
+from skytether.mavlink.frames import turned
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.scenario.reference import FAR_M
+
+WAITING_MAX = 64
+"""Measurements that wait to be taken; the oldest give way."""
+AHEAD_NS = 20 * MILLISECOND_NS
+"""Time by which a stamp may lie ahead, for the clock is known only so well [ns]; more is
+impossible."""
+OLD_NS = SECOND_NS
+"""Age of a measurement above which it is not taken, of an autopilot aboard [ns]."""
+SPEED_MAX = 1e3
+"""Largest speed on an axis that is believed [m/s]."""
+
+Vector = tuple[float, float, float]
+
+
+class Positions:
+    """Positions and velocities as the autopilot tells them.
+
+    Args:
+        axes: number of axes that are flown, 2 or 3.
+        clock: the autopilot's clock.
+        old_ns: age of a measurement above which it is not taken [ns].
+    """
+
+    def __init__(self, axes: int, clock: BootClock, old_ns: int = OLD_NS) -> None:
+        self._axes, self._clock, self._old_ns = axes, clock, old_ns
+        self._waiting: deque[Measurement] = deque(maxlen=WAITING_MAX)
+        self._newest_boot_ms = -1
+        self._newest_ns: int | None = None
+        """Stamp of the newest measurement."""
+        self._jumps = 0
+        self.origin: Vector = (0.0, 0.0, 0.0)
+        """Our origin in the autopilot's own local frame, in our axes [m]."""
+        self.position: Vector | None = None
+        """Newest position in that frame, in our axes [m]."""
+        self.velocity: Vector = (0.0, 0.0, 0.0)
+        """Newest velocity, in our axes [m/s]."""
+        self.came_ns: int | None = None
+        """Time at which the newest measurement came."""
+        self.taken = 0
+        """Number of measurements taken."""
+        self.dropped: Counter[str] = Counter()
+        """Number of those that were dropped, by reason."""
+
+    @property
+    def altitude(self) -> float:
+        """Altitude above our origin [m]; 0 before anything was measured."""
+        return self.position[2] - self.origin[2] if self.position else 0.0
+
+    def hear(self, message: Message, *, now_ns: int) -> None:
+        """Take a message, or drop and count it."""
+        reason = self._wrong(message, now_ns)
+        if reason:
+            self.dropped[reason] += 1
+            return
+        boot_ms = message.time_boot_ms
+        stamp_ns = min(self._stamp_ns(boot_ms), now_ns)
+        if self._newest_ns is not None:  # the map has moved by less than what lies between them
+            stamp_ns = max(stamp_ns, self._newest_ns + 1)
+        self._newest_boot_ms, self._newest_ns = boot_ms, stamp_ns
+        self.position = turned((message.x, message.y, message.z))
+        self.velocity = turned((message.vx, message.vy, message.vz))
+        self.came_ns = now_ns
+        self.taken += 1
+        place = [at - zero for at, zero in zip(self.position, self.origin, strict=True)]
+        self._waiting.append(
+            Measurement(stamp_ns, place[: self._axes], list(self.velocity[: self._axes]))
+        )
+
+    def _stamp_ns(self, boot_ms: int) -> int:
+        # What was measured in this millisecond was so in the middle of it.
+        return self._clock.local_ns(boot_ms * MILLISECOND_NS + MILLISECOND_NS // 2)
+
+    def _wrong(self, message: Message, now_ns: int) -> str:
+        """Reason for which a message is dropped; empty of one that is taken."""
+        if self._jumps != self._clock.jumps:
+            self._jumps = self._clock.jumps
+            self._newest_boot_ms, self._newest_ns = -1, None
+        numbers = (message.x, message.y, message.z, message.vx, message.vy, message.vz)
+        if not all(map(math.isfinite, numbers)):
+            return "not_finite"
+        if max(map(abs, numbers[:3])) > FAR_M or max(map(abs, numbers[3:])) > SPEED_MAX:
+            return "far"
+        return self._untimely(message.time_boot_ms, now_ns)
+
+    def _untimely(self, boot_ms: int, now_ns: int) -> str:
+        """What is wrong with a stamp; empty where nothing is."""
+        if not self._clock.is_known:
+            return "unsynchronised"
+        if boot_ms == self._newest_boot_ms:
+            return "doubled"
+        stamp_ns = self._stamp_ns(boot_ms)
+        if stamp_ns > now_ns + AHEAD_NS:
+            return "impossible"
+        if stamp_ns < now_ns - self._old_ns:
+            return "old"
+        return "late" if boot_ms < self._newest_boot_ms else ""
+
+    def begin(self) -> None:
+        """Let our origin be where the vehicle is."""
+        if self.position is not None:
+            self.origin = self.position
+            self._waiting.clear()
+
+    def take(self, *, now_ns: int) -> list[Measurement]:
+        """Measurements of up to now that were not taken before, the oldest first."""
+        told = []
+        while self._waiting and self._waiting[0].stamp_ns <= now_ns:
+            told.append(self._waiting.popleft())
+        return told

@@ -1,0 +1,235 @@
+"""Parameters that decide what an autopilot does in silence: what they mean, and which are safe.
+
+**Safe is what ends by itself.** Without setpoints the vehicle may fly on for a second at most, and
+once our process is gone it has to come down; to hover or to fly on for ever is not safe.
+
+A parameter that must be known is refused where the autopilot does not have it; of any other it is
+told that it is missing.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from skytether.shared.core.aboard import Parameter
+
+SILENCE_MAX_S = 1.0
+"""Longest time for which a vehicle may fly on without setpoints [s]."""
+SILENCE_MIN_S = 0.2
+"""Shortest time-out with which it flies at all where setpoints come at 10 Hz [s]."""
+TOLERANCE = 1e-6
+"""What a float of 32 bits makes of a decimal number."""
+
+
+class Rule(NamedTuple):
+    """What is asked of a parameter."""
+
+    names: tuple[str, ...]
+    """Its names, the newest last: an autopilot has one of them."""
+    meaning: Callable[[float], str]
+    """Meaning of a value, in words."""
+    is_safe: Callable[[float], bool] = lambda _: True
+    wanted: str = ""
+    """Values that are safe, in words."""
+    value: float = 0.0
+    """Value that is set where it is not."""
+    required: bool = False
+    """Whether it must be known."""
+
+
+def _table(meanings: Mapping[int, str], other: str) -> Callable[[float], str]:
+    return lambda value: meanings.get(round(value), other)
+
+
+def _among(*values: int) -> Callable[[float], bool]:
+    return lambda value: round(value) in values
+
+
+def _timeout(value: float) -> bool:
+    return SILENCE_MIN_S - TOLERANCE <= value <= SILENCE_MAX_S + TOLERANCE
+
+
+_STATION_ACTIONS = {
+    0: "once we are gone it hovers for ever",
+    1: "once we are gone it returns home and lands",
+    2: "once we are gone it goes on with a mission, or returns home and lands",
+    3: "once we are gone it returns home the way it came, and lands",
+    4: "once we are gone it returns home the way it came, or lands",
+    5: "once we are gone it lands where it is",
+    6: "once we are gone it returns home or to a landing of its mission",
+    7: "once we are gone it brakes and hovers for ever",
+}
+_SILENCE_ACTIONS = {
+    0: "without setpoints it hovers for ever where there is a remote control (position mode)",
+    1: "without setpoints it drifts with the wind where there is a remote control (altitude mode)",
+    2: "without setpoints it needs a pilot at once (manual mode)",
+    3: "without setpoints it returns home and lands",
+    4: "without setpoints it lands where it is",
+    5: "without setpoints it hovers for ever",
+    6: "without setpoints it is terminated: it falls",
+    7: "without setpoints it is disarmed: it falls",
+}
+_OLD_SILENCE_ACTIONS = {
+    0: "without setpoints and remote control it lands",
+    1: "without setpoints and remote control it hovers for ever",
+    2: "without setpoints and remote control it returns home and lands",
+}
+_LINK_ACTIONS = {
+    0: "a lost ground station changes nothing",
+    1: "without a ground station it hovers",
+    2: "without a ground station it returns home",
+    3: "without a ground station it lands",
+    5: "without a ground station it is terminated: it falls",
+    6: "without a ground station it is disarmed: it falls",
+}
+_FENCES = {0: "its own fence is off", 1: "its own fence is on"}
+
+
+def _fence_types(value: float) -> str:
+    kinds = {1: "altitude", 2: "a circle around home", 4: "a polygon", 8: "least altitude"}
+    held = [words for bit, words in kinds.items() if round(value) & bit]
+    return f"its fence holds {', '.join(held) or 'nothing'}"
+
+
+def _options(value: float) -> str:
+    kinds = {
+        2: "a mission goes on without a ground station",
+        4: "GUIDED goes on without a remote control",
+        8: "a landing goes on, whatever fails",
+        16: "a pilot's modes go on without a ground station",
+    }
+    held = [words for bit, words in kinds.items() if round(value) & bit]
+    return "; ".join(held) or "every failsafe acts at once"
+
+
+def ardupilot(system: int) -> tuple[Rule, ...]:
+    """Rules for ArduCopter.
+
+    Args:
+        system: number of our own system.
+    """
+    return (
+        Rule(
+            ("GUID_TIMEOUT",),
+            lambda v: f"without setpoints for {v:g} s it brakes, and stands",
+            _timeout,
+            f"{SILENCE_MIN_S:g} to {SILENCE_MAX_S:g} s: set 1",
+            SILENCE_MAX_S,
+            required=True,
+        ),
+        Rule(
+            ("FS_GCS_ENABLE",),
+            _table(_STATION_ACTIONS, "nobody knows what it does once we are gone"),
+            _among(1, 2, 3, 4, 5, 6),
+            "one that lands: set 5",
+            5.0,
+            required=True,
+        ),
+        Rule(
+            ("SYSID_MYGCS", "MAV_GCS_SYSID"),
+            lambda v: f"it notices that system {v:g} is gone; ours is {system}",
+            _among(system),
+            f"that of mavlink.system: set {system}",
+            float(system),
+            required=True,
+        ),
+        Rule(
+            ("FS_GCS_TIMEOUT",),
+            lambda v: f"it does so {v:g} s after our last heartbeat",
+            lambda v: v <= 10.0,
+            "up to 10 s: set 5",
+            5.0,
+        ),
+        Rule(("FS_OPTIONS",), _options),
+        Rule(
+            ("FS_EKF_ACTION",),
+            _table(
+                {1: "without an estimate it lands", 3: "without an estimate it lands"},
+                "without an estimate it does not land by itself",
+            ),
+        ),
+        Rule(
+            ("BATT_FS_LOW_ACT",),
+            _table({0: "a low battery is only told"}, "with a low battery it acts by itself"),
+        ),
+        Rule(("FENCE_ENABLE",), _table(_FENCES, "its own fence is on")),
+        Rule(("FENCE_TYPE",), _fence_types),
+        Rule(
+            ("FENCE_ACTION",),
+            _table(
+                {0: "beyond its fence it only says so", 4: "beyond its fence it brakes"},
+                "beyond its fence it returns home or lands",
+            ),
+        ),
+        Rule(("FENCE_ALT_MAX",), lambda v: f"its fence is {v:g} m high"),
+        Rule(("FENCE_RADIUS",), lambda v: f"its fence is {v:g} m around home"),
+    )
+
+
+def px4() -> tuple[Rule, ...]:
+    """Rules for PX4."""
+    return (
+        Rule(
+            ("COM_OF_LOSS_T",),
+            lambda v: f"it leaves OFFBOARD after {v:g} s without setpoints",
+            _timeout,
+            f"{SILENCE_MIN_S:g} to {SILENCE_MAX_S:g} s: set 1",
+            SILENCE_MAX_S,
+            required=True,
+        ),
+        Rule(
+            ("COM_OBL_RC_ACT",),
+            _table(_SILENCE_ACTIONS, "nobody knows what it does without setpoints"),
+            _among(3, 4),
+            "3 (return) or 4 (land): set 4",
+            4.0,
+            required=True,
+        ),
+        Rule(
+            ("COM_OBL_ACT",),
+            _table(_OLD_SILENCE_ACTIONS, "without setpoints and remote control it flies on"),
+            _among(0, 2),
+            "0 (land) or 2 (return): set 0",
+            0.0,
+        ),
+        Rule(
+            ("NAV_DLL_ACT",),
+            _table(_LINK_ACTIONS, "nobody knows what it does without a ground station"),
+            _among(0, 1, 2, 3),
+            "one with which it does not fall: set 0",
+            0.0,
+        ),
+        Rule(("COM_DL_LOSS_T",), lambda v: f"a ground station is lost after {v:g} s"),
+        Rule(
+            ("COM_LOW_BAT_ACT",),
+            _table({0: "a low battery is only told"}, "with a low battery it acts by itself"),
+        ),
+        Rule(
+            ("GF_ACTION",),
+            _table(
+                {0: "beyond its fence it goes on", 1: "beyond its fence it only says so"},
+                "beyond its fence it acts by itself",
+            ),
+        ),
+        Rule(("GF_MAX_HOR_DIST",), lambda v: _limit(v, "around home")),
+        Rule(("GF_MAX_VER_DIST",), lambda v: _limit(v, "above home")),
+    )
+
+
+def _limit(value: float, where: str) -> str:
+    return f"its fence is {value:g} m {where}" if value > 0.0 else f"its fence has no limit {where}"
+
+
+def judged(rule: Rule, values: Mapping[str, float]) -> Parameter:
+    """Parameter of a rule, and what is wrong with it.
+
+    Args:
+        values: values of the parameters that the autopilot has, by name.
+    """
+    for name in rule.names:
+        value = values.get(name)
+        if value is not None:
+            wanted = "" if rule.is_safe(value) else rule.wanted
+            return Parameter(name=name, value=value, meaning=rule.meaning(value), wanted=wanted)
+    meaning = "its autopilot does not have it, or does not tell"
+    wanted = rule.wanted if rule.required else ""
+    return Parameter(name=rule.names[0], value=None, meaning=meaning, wanted=wanted)

@@ -1,0 +1,195 @@
+"""Setting up: which autopilot it is, and whether what it does in silence is safe.
+
+    heartbeat → version → parameters, read one by one → all safe, or refused, or set and read again
+
+Every question is asked again until it is answered, as often as a bad line needs; a parameter of
+which nothing is heard then is one that the autopilot does not have.
+"""
+
+from collections.abc import Mapping
+
+from skytether.client.mavlink import safety
+from skytether.client.mavlink.flavours import ARDUPILOT, Flavour
+from skytether.client.mavlink.safety import Rule
+from skytether.mavlink import parameters
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.core.aboard import (
+    AutopilotFound,
+    Parameter,
+    ParametersRead,
+    ParametersSet,
+    ParametersUnsafe,
+)
+from skytether.shared.core.endpoint import Events
+
+AGAIN_NS = 400 * MILLISECOND_NS
+"""Time after which a question is asked again [ns]."""
+TRIES = 10
+"""Times that a question is asked; with a tenth lost each way, one in ten million stays open."""
+AT_ONCE = 4
+"""Questions that wait for their answers at once: a serial line takes no more."""
+VERSION = int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+BYTEWISE = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+CONVERTED = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+
+
+class Setup:
+    """Judges, and where it may, sets the parameters of an autopilot.
+
+    Args:
+        vehicle: number of the vehicle, for what is told.
+        flavour: which autopilot.
+        target: numbers of its system and component.
+        system: number of our own system.
+        sets: whether parameters that are not safe are set.
+        events: takes what is told.
+    """
+
+    def __init__(
+        self,
+        vehicle: int,
+        flavour: Flavour,
+        target: tuple[int, int],
+        system: int,
+        *,
+        sets: bool,
+        events: Events,
+    ) -> None:
+        self._vehicle, self._flavour, self._target = vehicle, flavour, target
+        self._sets, self._events = sets, events
+        self._rules = safety.ardupilot(system) if flavour is ARDUPILOT else safety.px4()
+        self._bytewise = flavour.bytewise
+        self._version: str | None = None
+        """Name and version; None until it is known, or not told."""
+        self._version_tries = 0
+        self._tries: dict[str, int] = {name: 0 for rule in self._rules for name in rule.names}
+        """Times that each parameter was asked for, or set, that is not known yet."""
+        self._values: dict[str, float] = {}
+        self._kinds: dict[str, int] = {}
+        """Types of the parameters that are known."""
+        self._setting: dict[str, tuple[float, float]] = {}
+        """Values before and after of parameters that are being set."""
+        self._changed: list[tuple[str, float, float]] = []
+        self._asked_ns: int | None = None
+        self.is_done = False
+        """Whether all is safe."""
+        self.failure: ParametersUnsafe | None = None
+
+    @property
+    def fence(self) -> dict[str, float]:
+        """What is known of the autopilot's own fence: values of parameters by name."""
+        return {name: value for name, value in self._values.items() if name[:3] in ("FEN", "GF_")}
+
+    # What is heard
+
+    def hear(self, message: Message) -> None:
+        """Take a message of the autopilot."""
+        match message.get_type():
+            case "AUTOPILOT_VERSION" if self._version is None:
+                can, number = message.capabilities, message.flight_sw_version
+                if can & (BYTEWISE | CONVERTED):
+                    self._bytewise = bool(can & BYTEWISE)
+                version = f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}"
+                self._found(f"{self._flavour.name} {version}")
+            case "PARAM_VALUE":
+                self._hear_parameter(message)
+
+    def _hear_parameter(self, message: Message) -> None:
+        name, kind = message.param_id, message.param_type
+        value = parameters.from_wire(message.param_value, kind, bytewise=self._bytewise)
+        if name not in self._tries or value is None or self._version is None:
+            return
+        if name in self._setting:
+            before, wanted = self._setting[name]
+            if abs(value - wanted) > safety.TOLERANCE:
+                return  # an answer to an earlier question, or a refusal: it is set again
+            del self._setting[name]
+            self._changed.append((name, before, value))
+        self._values[name], self._kinds[name] = value, kind
+        for rule in self._rules:
+            if name in rule.names:  # it has no other name beside this one
+                for each in rule.names:
+                    self._tries.pop(each, None)
+
+    def _found(self, name: str) -> None:
+        self._version = name
+        self._events.append(
+            AutopilotFound(vehicle=self._vehicle, name=name, system=self._target[0])
+        )
+
+    # What is asked
+
+    def ask(self, *, now_ns: int) -> list[Message]:
+        """Questions that are due now."""
+        if self.is_done or self.failure:
+            return []
+        if self._version is not None and not self._tries:
+            self._judge()
+            if self.is_done or self.failure:
+                return []
+        elif self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS:
+            return []
+        self._asked_ns = now_ns
+        if self._version is None:
+            return self._ask_version()
+        asked = []
+        for name in list(self._tries)[:AT_ONCE]:
+            self._tries[name] += 1
+            if self._tries[name] > TRIES:
+                del self._tries[name]
+            else:
+                asked.append(self._question(name))
+        return asked
+
+    def _ask_version(self) -> list[Message]:
+        self._version_tries += 1
+        if self._version_tries > TRIES:
+            self._found(f"{self._flavour.name} of an unknown version")
+        command = dialect.MAV_CMD_REQUEST_MESSAGE
+        number = float(VERSION)
+        return [
+            dialect.MAVLink_command_long_message(
+                *self._target, command, 0, number, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            )
+        ]
+
+    def _question(self, name: str) -> Message:
+        """Message that asks for a parameter, or sets it; either is answered by its value."""
+        if name not in self._setting:
+            return dialect.MAVLink_param_request_read_message(*self._target, name.encode(), -1)
+        kind, (_, wanted) = self._kinds[name], self._setting[name]
+        value = int(wanted) if kind in parameters.INTEGERS else wanted
+        sent = parameters.to_wire(value, bytewise=self._bytewise)
+        return dialect.MAVLink_param_set_message(*self._target, name.encode(), sent, kind)
+
+    # What follows
+
+    def _judge(self) -> None:
+        """Say what has been read, and go on, set what is not safe, or fail."""
+        judged = {rule: safety.judged(rule, self._values) for rule in self._rules}
+        told = tuple(judged.values())
+        unsafe = {rule: parameter for rule, parameter in judged.items() if parameter.wanted}
+        self._say(told)
+        if not unsafe:
+            self.is_done = True
+        elif self._sets and not self._setting and not self._changed:
+            self._begin_setting(unsafe)
+        if not self.is_done and not self._tries:
+            wrong = tuple(unsafe.values())
+            self.failure = ParametersUnsafe(vehicle=self._vehicle, parameters=wrong)
+            self._events.append(self.failure)
+
+    def _begin_setting(self, unsafe: Mapping[Rule, Parameter]) -> None:
+        for rule, parameter in unsafe.items():
+            if parameter.value is not None:
+                self._setting[parameter.name] = (parameter.value, rule.value)
+                self._tries[parameter.name] = 0
+
+    def _say(self, told: tuple[Parameter, ...]) -> None:
+        if self._changed:
+            changes = tuple(self._changed)
+            self._events.append(ParametersSet(vehicle=self._vehicle, changes=changes))
+        elif not self._setting:
+            self._events.append(ParametersRead(vehicle=self._vehicle, parameters=told))

@@ -1,0 +1,79 @@
+"""Streams of messages that are asked for, and asked for again where they do not come."""
+
+from collections.abc import Mapping
+
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base.units import SECOND_NS
+
+SET_INTERVAL = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
+SHARE = 0.7
+"""Share of the rate asked for with which a stream counts as coming."""
+WINDOW_NS = 2 * SECOND_NS
+"""Time over which messages are counted [ns], and at least that of LEAST of them."""
+LEAST = 3.0
+BACK_OFF_MAX = 8
+"""Longest window, in shortest ones: some streams have nothing to tell for long."""
+
+
+class _Stream:
+    """One stream.
+
+    Args:
+        rate: rate asked for [Hz].
+    """
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+        self.count = 0
+        """Messages in this window."""
+        self.least_ns = max(WINDOW_NS, round(LEAST / rate * SECOND_NS))
+        """Shortest window [ns]."""
+        self.window_ns = 0
+        """Length of this window [ns]; 0 before the first."""
+        self.until_ns = 0
+        """End of this window: it is asked for then, unless enough came."""
+
+
+class Streams:
+    """Streams of one autopilot.
+
+    Args:
+        rates: rate of each message [Hz], by its number.
+        target: numbers of the autopilot's system and component.
+    """
+
+    def __init__(self, rates: Mapping[int, float], target: tuple[int, int]) -> None:
+        self._target = target
+        self._streams = {number: _Stream(rate) for number, rate in rates.items()}
+
+    def hear(self, number: int) -> None:
+        """Count a message."""
+        if number in self._streams:
+            self._streams[number].count += 1
+
+    def ask(self, *, now_ns: int) -> list[Message]:
+        """Command for the next stream that does not come, if there is one."""
+        for number, stream in self._streams.items():
+            if now_ns < stream.until_ns:
+                continue
+            expected = stream.rate * stream.window_ns / SECOND_NS
+            comes = stream.window_ns > 0 and stream.count >= SHARE * expected
+            longer_ns = min(2 * stream.window_ns, BACK_OFF_MAX * stream.least_ns)
+            stream.window_ns = stream.least_ns if comes else max(stream.least_ns, longer_ns)
+            stream.until_ns, stream.count = now_ns + stream.window_ns, 0
+            if not comes:
+                command = dialect.MAVLink_command_long_message(
+                    *self._target,
+                    SET_INTERVAL,
+                    0,
+                    float(number),
+                    1e6 / stream.rate,
+                    0.0,
+                    0.0,
+                    0.0,
+                    0.0,
+                    0.0,
+                )
+                return [command]
+        return []

@@ -1,0 +1,104 @@
+"""A vehicle whose autopilot speaks MAVLink: velocities in, measurements out."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from skytether.client.mavlink.port import Port
+from skytether.client.vehicle import Measurement, Vehicle
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.aboard import AboardFailure
+from skytether.shared.core.line import parse_line
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason
+
+PLANE_ALTITUDE_M = 3.0
+"""Altitude at which a vehicle flies that is flown in the plane [m]."""
+ALTITUDE_MIN_M = 0.5
+"""Least altitude of take-off [m]."""
+
+
+class MavlinkVehicle(Vehicle):
+    """A vehicle that an autopilot flies.
+
+    Args:
+        scenario: what is flown.
+        number: number of the vehicle.
+
+    Raises:
+        ConfigError: the line to the autopilot is none, or the flight begins on the ground.
+    """
+
+    changeable = keys_of(InFlight.ARMED)
+
+    def __init__(self, scenario: Scenario, number: int) -> None:
+        line = parse_line("vehicle.address", scenario.vehicle.address)
+        self._may_arm = scenario.armed
+        self._port = self.port = Port(scenario, number, line, altitude(scenario))
+
+    @property
+    def failure(self) -> AboardFailure | None:  # type: ignore[override] # it comes of itself
+        """See `Vehicle`."""
+        return self._port.failure
+
+    def set_parameters(self) -> bool:
+        """See `Vehicle`."""
+        self._port.sets_parameters = True
+        return True
+
+    def fly(self, velocity: Array) -> None:
+        """See `Vehicle`; in the plane it stays at its altitude."""
+        x, y, *up = velocity.tolist()
+        self._port.fly((x, y, up[0] if up else 0.0))
+
+    def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
+        """See `Vehicle`."""
+        return self._port.positions.take(now_ns=now_ns)
+
+    @property
+    def is_ready(self) -> bool:
+        """See `Vehicle`."""
+        return self._port.is_ready
+
+    def take_off(self, *, now_ns: int) -> bool:
+        """See `Vehicle`; a vehicle on the ground is armed only where its scenario is."""
+        return self._port.take_off(may_arm=self._may_arm, now_ns=now_ns)
+
+    def hindrance(self, *, now_ns: int) -> Reason | None:
+        """See `Vehicle`."""
+        return self._port.hindrance(now_ns=now_ns)
+
+    def land(self) -> bool:
+        """See `Vehicle`; the autopilot's own landing."""
+        self._port.land()
+        return True
+
+    @property
+    def is_down(self) -> bool:
+        """See `Vehicle`."""
+        return self._port.is_down
+
+    def change(self, scenario: Scenario) -> None:
+        """See `Vehicle`; whoever arms the scenario lets the vehicle take off."""
+        self._may_arm = scenario.armed
+
+
+def altitude(scenario: Scenario) -> float:
+    """Altitude to take off to [m].
+
+    Raises:
+        ConfigError: the flight would begin on the ground.
+    """
+    given = scenario.mavlink.takeoff_m
+    if given != "auto":
+        return float(given)
+    if scenario.model.axes == 2:
+        return PLANE_ALTITUDE_M
+    start = float(scenario.make_reference()(np.zeros(()))[2, 0])
+    if start < ALTITUDE_MIN_M:
+        expected = f"a desired trajectory that begins {ALTITUDE_MIN_M:g} m or more above the ground"
+        raise ConfigError(f"mavlink.takeoff_m: got 'auto' at altitude {start:g} m, {expected}")
+    return start

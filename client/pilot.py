@@ -1,0 +1,296 @@
+"""The pilot: at every step it flies the input that was chosen, and writes down what it did.
+
+The client's clock is the flight's clock: the epoch is the moment its session opened, step k begins
+at epoch + k Δt, and every stamp that control uses is read here. What the vehicle does at all,
+`client.failsafe` decides; which input of a horizon it flies, `client.compensator`; and
+`client.clamp` lets nothing pass that the vehicle must never do.
+"""
+
+import math
+from itertools import chain
+
+import numpy as np
+
+from skytether.client.clamp import clamped
+from skytether.client.compensator import Compensator
+from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe
+from skytether.client.fence import Fence
+from skytether.client.navigation import Navigation
+from skytether.client.vehicle import Vehicle
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason, Recorder
+from skytether.shared.wire.protocol import (
+    NO_HORIZON,
+    Drop,
+    Horizon,
+    Mode,
+    Observation,
+    ProtocolError,
+)
+
+LAND_MPS = 0.5
+"""Speed at which the vehicle descends to land [m/s]."""
+ALTITUDE = 2
+"""Axis of the altitude, where there is one."""
+STOPPED = (Mode.FAULT, Mode.MANUAL)
+"""Modes in which nothing but zero is flown, at once."""
+IMPOSSIBLE = frozenset({Drop.FROM_THE_FUTURE, Drop.OBSERVATION})
+"""Reasons for which a horizon is dropped that is made for an impossible time."""
+
+
+class Pilot:
+    """Flies one vehicle by the horizons that come, and without them.
+
+    Args:
+        scenario: what is flown.
+        number: number of the vehicle.
+        vehicle: what flies.
+        failsafe: what the vehicle does at all.
+        recorder: takes one row a step.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        number: int,
+        vehicle: Vehicle,
+        failsafe: Failsafe,
+        recorder: Recorder | None,
+    ) -> None:
+        self._terms = scenario.terms()
+        self._dt_ns = self._terms.dt_ns
+        self.steps = scenario.steps
+        """Steps of the flight."""
+        self._number, self._vehicle = number, vehicle
+        self._navigation = Navigation(scenario)
+        self._failsafe = failsafe
+        self._recorder = recorder
+        self.compensator = Compensator(self._terms)
+        """What chooses the input."""
+        self._fence = Fence(scenario) if scenario.fence.is_there else None
+        self._change_max = (
+            math.inf
+            if self._terms.exhausted == "hold"
+            else scenario.vehicle.slew_mps2 * self._terms.dt_s
+        )
+        """Largest change of the input from step to step [m/s]."""
+        self._epoch_ns: int | None = None
+        self.next_ns: int | None = None
+        """Time at which the next step begins; None before the flight."""
+        self.step = 0
+        """Step that comes next."""
+        self.flown = 0
+        """Step that is flown; up to its begin measurements were taken."""
+        self._flown_ns = 0
+        """Time at which it began."""
+        self._takes_from: int | None = None
+        """Step of the first observation that said that horizons are flown; None while they are
+        not."""
+        self._input = np.zeros(self._terms.axes)
+        """Desired velocity flown now [m/s]; shape (axes,)."""
+        self._speed = 0.0
+        """Magnitude of the part of it that is no feedback [m/s]."""
+        self.covered = 0
+        """Number of steps for which there was an input planned."""
+        self._covered_last = 0
+        """Step after the last of these."""
+        self.missed = 0
+        """Steps slept through."""
+
+    @property
+    def without_ns(self) -> int:
+        """Time for which there has been no input planned [ns]."""
+        return (self.step - self._covered_last) * self._dt_ns
+
+    def starts_ns(self, step: int) -> int:
+        """Time at which a step begins; the flight must have begun."""
+        assert self._epoch_ns is not None
+        return self._epoch_ns + step * self._dt_ns
+
+    def begin(self, *, now_ns: int) -> None:
+        """Begin the flight: step 0 is now."""
+        self._epoch_ns = self.next_ns = now_ns
+        self._navigate(0)
+
+    # -- horizons ----------------------------------------------------------------------------
+
+    def offer(self, horizon: Horizon, *, now_ns: int) -> None:
+        """Hold a horizon from now on, if it is the newest and may be flown.
+
+        One that was planned when the vehicle had not yet said that it would fly it begins where the
+        vehicle is not: the server reckoned with none.
+
+        Raises:
+            ProtocolError: it is dropped.
+        """
+        terms = self._terms
+        if horizon.step > self.compensator.newest:
+            passed = self.step - horizon.step - (horizon.inputs.shape[1] - terms.planned)
+            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
+        observed = self._step_at(horizon.observed_ns)
+        if self._takes_from is None or 0 <= observed < self._takes_from:
+            raise ProtocolError(Drop.NOT_TAKEN)
+        try:
+            is_held = self.compensator.offer(horizon, self.step, observed)
+        except ProtocolError as error:
+            if error.reason in IMPOSSIBLE:
+                self._failsafe.future(now_ns=now_ns)
+            raise
+        if is_held:
+            self._failsafe.horizon_taken(now_ns=now_ns)
+
+    def _step_at(self, stamp_ns: int) -> int:
+        """Step of one of the vehicle's own stamps, or -1 where it is none."""
+        step, off_ns = divmod(stamp_ns - self.starts_ns(0), self._dt_ns)
+        return -1 if off_ns else step
+
+    def mode_changed(self, cause: Reason) -> None:
+        """Do what goes with another mode, or another reason for it."""
+        if not self._failsafe.takes:
+            self._takes_from = None
+        if cause in DROPPING:
+            self.compensator.drop(self.step - 1, self._input)
+            self._speed = math.hypot(*self._input.tolist())
+
+    # -- steps -------------------------------------------------------------------------------
+
+    def fly(self, *, now_ns: int) -> None:
+        """Advance to the present step; one that was slept through was flown with the old input."""
+        assert self._epoch_ns is not None
+        assert self.next_ns is not None
+        present = min((now_ns - self._epoch_ns) // self._dt_ns, self.steps - 1)
+        self.missed += present - self.step
+        for step in range(self.flown, present):
+            self._navigate(step + 1)
+        late_ns = now_ns - self.next_ns
+        self.flown = self.step = present
+        self._flown_ns = self._epoch_ns + present * self._dt_ns
+        hindrance = self._vehicle.hindrance(now_ns=now_ns)
+        self._failsafe.step(late_ns=late_ns, hindrance=hindrance, now_ns=now_ns)
+        self._input = self._choose(now_ns)
+        self._vehicle.fly(self._input)
+        if not self._failsafe.takes:
+            self._takes_from = None
+        elif self._takes_from is None:
+            self._takes_from = present
+        self.step, self.next_ns = present + 1, self._flown_ns + self._dt_ns
+        if self.compensator.covered:
+            self.covered += 1
+            self._covered_last = self.step
+        self._record()
+
+    def _navigate(self, step: int) -> None:
+        """Take what was measured up to the begin of a step."""
+        now_ns = self.starts_ns(step)
+        measurements = self._vehicle.measurements(now_ns=now_ns)
+        self._navigation.advance(measurements, self._input, now_ns=now_ns)
+
+    def _choose(self, now_ns: int) -> Array:
+        """Input of the present step [m/s], shape (axes,), and what follows from it."""
+        failsafe, compensator = self._failsafe, self.compensator
+        known = self._navigation
+        if not self._navigation.is_known:
+            failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
+        if self._navigation.leapt:
+            failsafe.leapt(now_ns=now_ns)
+        had_plan = compensator.covered
+        wanted = compensator.choose(self.step, known.predicted)
+        if failsafe.mode is Mode.LAND:
+            wanted = [0.0] * self._terms.axes
+            if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE][0] > 0.0:
+                wanted[ALTITUDE] = -LAND_MPS
+        told = compensator.told if compensator.feeds_back else wanted
+        speed_max = self._speed_max(had_plan)
+        flown = clamped(
+            wanted,
+            self._input.tolist(),
+            self._terms.u_max,
+            self._change_max,
+            told=told,
+            speed_max=speed_max,
+        )
+        if flown is None:
+            failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
+        elif compensator.in_force != NO_HORIZON and not compensator.covered:
+            failsafe.meet(Reason.ENDED, now_ns=now_ns)
+        if flown is None or failsafe.mode in STOPPED:
+            flown = told = [0.0] * self._terms.axes
+        elif self._fence is not None:
+            flown = self._fenced(self._fence, flown)
+        if compensator.feeds_back:
+            self._speed = min(math.hypot(*told), speed_max)
+        else:
+            self._speed = math.hypot(*flown)
+        if not self._speed:
+            failsafe.meet(Reason.STILL, now_ns=now_ns)
+        return np.array(flown)
+
+    def _fenced(self, fence: Fence, flown: list[float]) -> list[float]:
+        """Input that the fence lets pass; down to the ground it lets a vehicle that lands."""
+        within = fence.limited(flown, self._navigation.predicted, self._terms.u_max)
+        if self._failsafe.mode is Mode.LAND and self._terms.axes > ALTITUDE:
+            within[ALTITUDE] = flown[ALTITUDE]
+        return within
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the fence holds the vehicle back."""
+        return self._fence is not None and self._fence.holds
+
+    def _speed_max(self, had_plan: bool) -> float:
+        """Largest speed of what is told [m/s]: without a plan what was flown is braked along."""
+        brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
+        if self.compensator.covered or not brakes:
+            return math.inf
+        return max(0.0, self._speed - (0.0 if had_plan else self._terms.brake))
+
+    # -- what is told of a step --------------------------------------------------------------
+
+    def observation(self, session: int, echo: tuple[int, int]) -> Observation | None:
+        """Observation of the step that has just begun; None where the state is none.
+
+        Args:
+            session: number of the session.
+            echo: newest stamp of the server [server's clock], and when it came.
+        """
+        failsafe, compensator = self._failsafe, self.compensator
+        if not self._navigation.is_known:
+            return None
+        server_ns, received_ns = echo
+        return Observation(
+            self._number,
+            session,
+            self.flown,
+            self._flown_ns,
+            compensator.in_force,
+            compensator.since,
+            server_ns,
+            received_ns,
+            failsafe.mode,
+            int(failsafe.takes),
+            np.array(self._navigation.predicted),
+            self._input,
+        )
+
+    def _record(self) -> None:
+        if self._recorder is None:
+            return
+        compensator, failsafe, known = self.compensator, self._failsafe, self._navigation
+        truth = self._vehicle.truth()
+        observed_ns = compensator.observed_ns
+        self._recorder.append_row(
+            self._number,
+            self.flown,
+            *chain.from_iterable(known.estimate if truth is None else truth.tolist()),
+            *chain.from_iterable(known.measured),
+            *chain.from_iterable(known.predicted),
+            *self._input.tolist(),
+            compensator.covered,
+            compensator.in_force,
+            -1 if observed_ns < 0 else self._flown_ns - observed_ns,
+            compensator.stale,
+            self.missed,
+            failsafe.mode,
+            failsafe.reason,
+        )

@@ -1,0 +1,57 @@
+"""A quadrotor as what flies in simulation: its rigid body, rotors, loops and air, see `quadrotor`.
+
+In the plane it keeps its altitude by itself.
+"""
+
+import numpy as np
+
+from skytether.quadrotor.frames import FRAMES
+from skytether.quadrotor.loops import ARDUPILOT, CRAZYFLIE, PX4
+from skytether.quadrotor.quadrotor import Quadrotor
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario, VehicleConfig
+
+GAINS = {"crazyflie": CRAZYFLIE, "1.5kg": ARDUPILOT, "sih": PX4}
+"""Gains of the autopilot that flies each frame."""
+ALTITUDE_M = 5.0
+"""Altitude of a flight in the plane [m]."""
+
+
+class QuadrotorPlant:
+    """A quadrotor of a scenario, in hover at the start.
+
+    Args:
+        rng: chance of its gusts, for this vehicle alone.
+    """
+
+    def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
+        vehicle, self._dt_ns = scenario.vehicle, scenario.dt_ns
+        self._axes = scenario.model.axes
+        frame = "1.5kg" if vehicle.frame == "auto" else vehicle.frame
+        start = np.array(vehicle.start_m or scenario.make_reference()(np.zeros(()))[:, 0])
+        if self._axes == 2:
+            start = np.append(start, ALTITUDE_M)
+        self._quadrotor = Quadrotor(
+            FRAMES[frame], GAINS[frame], rng, position=start, charge=vehicle.battery
+        )
+        self.change(vehicle)
+
+    @property
+    def x(self) -> list[tuple[float, float]]:
+        """Position [m] and velocity [m/s] now, of each axis."""
+        position, velocity = self._quadrotor.position(), self._quadrotor.velocity()
+        return list(zip(position.tolist(), velocity.tolist(), strict=True))[: self._axes]
+
+    def state(self) -> Array:
+        """Position [m] and velocity [m/s] now, as an array; shape (axes, 2)."""
+        return np.array(self.x)
+
+    def advance(self, command: Array) -> None:
+        """Fly one step with this desired velocity [m/s]; shape (axes,)."""
+        if self._axes == 2:
+            command = np.append(command, ALTITUDE_M - self._quadrotor.position()[2])
+        self._quadrotor.advance(command, self._dt_ns)
+
+    def change(self, vehicle: VehicleConfig) -> None:
+        """Let other winds blow from the next step on."""
+        self._quadrotor.blow(vehicle.steady_wind_mps, vehicle.turbulence_mps)

@@ -1,0 +1,87 @@
+"""Wind and gusts: what the air does to a simulated vehicle over each step.
+
+    w      steady wind [m/s]
+    a      gusts [m/s²], constant over a step: they begin and end by chance, each blowing one way
+    white  acceleration of the strength `vehicle.wind` [m/s per √s]
+
+A constant acceleration a acts like the input τ a. The covariance of the white part over a step has
+a closed form, see `shared.law.model.white_acceleration`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.shared.law.model import Array, white_acceleration
+from skytether.shared.scenario.schema import Scenario, VehicleConfig
+
+
+class Air(NamedTuple):
+    """What the air does over one step."""
+
+    push: list[float]
+    """Push w + τ a on each axis, which acts like an input [m/s]."""
+    shoves: list[tuple[float, float]]
+    """What white acceleration adds to position [m] and velocity [m/s] of each axis; empty without
+    any."""
+
+
+class Weather:
+    """Weather of a scenario.
+
+    Args:
+        rng: chance of wind and gusts, for one vehicle alone.
+    """
+
+    def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._dt_s = scenario.control.dt
+        self._tau = scenario.true_tau_s
+        self._gust: Array | None = None
+        """Way that the gust blows, of any length; shape (axes,). None between gusts."""
+        self.change(scenario.vehicle)
+
+    def change(self, vehicle: VehicleConfig) -> None:
+        """Let other winds blow from the next step on."""
+        white = vehicle.wind * white_acceleration(self._tau, self._dt_s)
+        self._wind = white.tolist() if vehicle.wind else []
+        self._gust_mps2 = vehicle.gust_mps2
+        self._gust_end_chance = float(-np.expm1(-self._dt_s / vehicle.gust_s))
+        self._gust_start_chance = float(-np.expm1(-self._dt_s / vehicle.gust_every_s))
+        self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(self._tau)))
+        if self._gust_mps2 == 0.0:
+            self._gust = None
+        self._calm = self._pushed()
+        """The air over a step, but for white acceleration."""
+
+    def blow(self) -> Air:
+        """The air over the next step."""
+        self._gusts()
+        if not self._wind:
+            return self._calm
+        drawn = self._rng.standard_normal((len(self._wind), 2)).tolist()
+        shoves = [
+            (L[0][0] * n, L[1][0] * n + L[1][1] * m)
+            for L, (n, m) in zip(self._wind, drawn, strict=True)
+        ]
+        return Air(self._calm.push, shoves)
+
+    def _gusts(self) -> None:
+        """Gusts begin and end by chance, each blowing one way all along."""
+        if self._gust_mps2 == 0.0:
+            return
+        chance = self._rng.random()
+        if self._gust is not None:
+            if chance < self._gust_end_chance:
+                self._gust = None
+                self._calm = self._pushed()
+        elif chance < self._gust_start_chance:
+            self._gust = self._rng.standard_normal(len(self._tau))
+            self._calm = self._pushed()
+
+    def _pushed(self) -> Air:
+        """The air now, but for white acceleration."""
+        if self._gust is None:
+            return Air(self._steady_mps.tolist(), [])
+        gust_mps2 = self._gust_mps2 * self._gust / np.linalg.norm(self._gust)
+        return Air((self._steady_mps + self._tau * gust_mps2).tolist(), [])

@@ -1,0 +1,1 @@
+"""The algorithm of the server: clock maps, estimates, plans, solvers and triggers."""

@@ -1,0 +1,267 @@
+"""The algorithm of the server: what is computed at a step of n vehicles, and knows no datagram.
+
+    observations → x̂(k), x̂(k+d) (`replay` or `estimator`) → X_p(k+d), U(k+d), V, cost gap, deviation
+    (`planner`) → event? (`trigger`) → what is sent, remembered.
+
+With the schemes "predictive" and "none" d is 0; with "dead_reckoning" nothing is planned, and
+`reckoning` stands in place of estimator and planner. Every vehicle is planned for at every step,
+for planning is a small part of what a step costs.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
+from skytether.server.control.committed import Replay
+from skytether.server.control.dead_reckoning import Reckoning
+from skytether.server.control.desired import Desired
+from skytether.server.control.gain import feedback_gain
+from skytether.server.control.planner import Figures, Planner
+from skytether.server.control.predictive import Estimator
+from skytether.server.control.scheme import DOUBTS, Foresight, Scheme, foresight
+from skytether.shared.base.kernel import B1, I1, kernel
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.scenario.triggers import Known, Situation, Verdict, make_trigger
+from skytether.shared.wire.protocol import Idle, Observation, committed_max
+
+PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
+"""As kernels take them."""
+BLOCK = 128
+"""Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
+so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decisions:
+    """What was decided of n vehicles at a step; valid until the next decisions are made."""
+
+    rows: Indices
+    """The vehicles; shape (n,)."""
+    step: Indices
+    """Step k of each; shape (n,)."""
+    found: Foresight
+    """What was foreseen, and the horizons; the n vehicles come first."""
+    figures: Figures
+    """What the plans are worth; shape (n,)."""
+    planned: Array
+    """Planned state x_p(k+d|k-1) [m, m/s]; shape (n, axes, 2)."""
+    verdict: Verdict
+    """What the trigger says."""
+    event: Flags
+    """Which are sent their horizon; shape (n,)."""
+    sent: Indices
+    """Indices of those that are sent theirs."""
+    solve_ns: int
+    """How long planning took for all of them, or -1 where nobody measures it."""
+
+
+class Controller:
+    """Algorithms 1 and 2 of the paper for up to `room` vehicles.
+
+    Args:
+        scenario: what to fly, and how to plan.
+        terms: the same, as far as both ends agree on it.
+        clock: knows half of the smallest round trip of each vehicle.
+        stopwatch: measures the parts; the core has no clock of its own.
+        references: see `Desired`.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        terms: Terms,
+        room: int,
+        clock: ClockMap,
+        stopwatch: Stopwatch,
+        references: Callable[[int], Reference] | None = None,
+    ) -> None:
+        control = scenario.control
+        block = min(room, BLOCK)
+        self._age_max = terms.age_max
+        self._clock = clock
+        most = committed_max(terms)
+        self._uplink_max_ns = (most if terms.commits else terms.horizon) * terms.dt_ns
+        """Longest delay to a vehicle that a horizon has room for [ns]."""
+        if not terms.indexed:
+            self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
+        self.desired = Desired(scenario, terms, room, block, references)
+        """What is known of the desired trajectories."""
+        gain = feedback_gain(scenario)
+        self._scheme: Scheme
+        self.planner: Planner | Reckoning
+        """Plans of every vehicle, or what is sent in place of a plan."""
+        if terms.reckons:
+            self._scheme = self.planner = Reckoning(terms, gain, self.desired, room, block)
+        else:
+            self._scheme = (
+                Replay(terms, control, gain, room, clock)
+                if terms.commits
+                else Estimator(terms, control, gain, room)
+            )
+            self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
+        self._terms, self._room, self._block = terms, room, block
+        self.faults: list[str] = []
+        """Tracebacks of mistakes in plug-ins' policies, one for each policy, to be told."""
+        self._sent_step = np.full(room, -1, dtype=np.int64)
+        """Step at which each vehicle was sent a horizon last, or -1; shape (room,)."""
+        self.change_trigger(control)
+        self._stopwatch = stopwatch
+        self.last_step = np.full(room, -1, dtype=np.int64)
+        """Step of each vehicle that was decided last, or -1; shape (room,)."""
+        self.observed_step = self._scheme.observed_step
+        """Step of the newest observation of each vehicle, or -1; shape (room,)."""
+        self.idle = np.zeros(room, dtype=np.int64)
+        """Why there was no plan for each vehicle, or none sent, one of `Idle`; shape (room,)."""
+        self._takes = np.ones(room, dtype=np.bool_)
+        """Whether each vehicle flies horizons, as it said last; shape (room,)."""
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Events that were counted, by name."""
+        return Counter({**self._counts, **self._scheme.counts})
+
+    def change_trigger(self, control: ControlConfig) -> None:
+        """Ask another trigger from the next step on; it knows of nothing that was sent before."""
+        terms = self._terms
+        self._trigger = make_trigger(control, self._room, self.faults.append)
+        doubts = DOUBTS if self._trigger.doubts else 0
+        self._found = found = foresight(
+            self._block, terms.axes, terms.planned, committed_max(terms), doubts
+        )
+        self._known = Known(
+            model=terms.model,
+            dt_s=terms.dt_s,
+            planned=terms.planned,
+            ahead=found.ahead,
+            horizons=found.horizons,
+            held=found.held if terms.commits else None,
+            sent_step=self._sent_step,
+            desired=self.desired.states,
+        )
+
+    def forget(self, row: int) -> None:
+        """Begin anew with a vehicle in this row, or with a new life of it."""
+        self.last_step[row] = self._sent_step[row] = -1
+        self.idle[row] = Idle.PLANS
+        self._takes[row] = True
+        self._scheme.forget(row)
+        self.planner.forget(row)
+        self._trigger.forget(row)
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """Keep an observation, unless a newer one is known (E11); whether it was kept."""
+        kept = self._scheme.observe(row, observation)
+        if kept:
+            self._takes[row] = bool(observation.takes)
+        return kept
+
+    def able(self, rows: Indices, step: Indices) -> Flags:
+        """Which vehicles can be decided on: their step is new, and `idle` names no reason."""
+        able = np.empty(len(rows), dtype=np.bool_)
+        _able(
+            rows,
+            step,
+            self.last_step,
+            self.observed_step,
+            self._age_max,
+            self._clock.seen,
+            self._uplink_max_ns,
+            self.idle,
+            able,
+        )
+        return able
+
+    def decide(self, rows: Indices, step: Indices) -> Decisions:
+        """Plan for vehicles that are able, and decide which are sent their horizon.
+
+        Args:
+            rows: the vehicles, no more than BLOCK; shape (n,).
+            step: k of each; shape (n,).
+        """
+        n, found, stopwatch = len(rows), self._found, self._stopwatch
+        self.last_step[rows] = step
+        self._scheme.foresee(rows, step, found)  # (13)
+        stopwatch.lap("estimate")
+        self.planner.plan(rows, step, found)  # (14), (15)
+        figures, planned = self.planner.figures[:n], self.planner.planned[:n]
+        situation = Situation(rows, figures, found.start[:n], planned, self._known)
+        verdict = self._trigger.test(situation)  # (16)
+        # A vehicle flies no horizon that was planned before it said that it would.
+        event = verdict.event & self._takes[rows]
+        unsolved = _withhold(
+            rows, step, found.ahead, self.observed_step, self._age_max, figures, self.idle, event
+        )
+        sent = event.nonzero()[0]
+        self._scheme.remember(rows, step, found, event)  # (12)
+        if len(sent):
+            told = rows[sent]
+            self._trigger.sent(told, figures[sent])
+            self._sent_step[told] = step[sent]
+        self._counts["steps"] += n
+        self._counts["events"] += len(sent)
+        self._counts["unsolved"] += unsolved
+        stopwatch.lap("trigger")
+        solve_ns = self.planner.solve_ns
+        return Decisions(rows, step, found, figures, planned, verdict, event, sent, solve_ns)
+
+
+@kernel
+def _able(
+    rows: I1,
+    steps: I1,
+    last_step: I1,
+    observed_step: I1,
+    age_max: int,
+    seen: Seen,
+    uplink_max: int,
+    idle: I1,
+    able: B1,
+) -> None:
+    """Fill in `Controller.able`, and `Controller.idle` for vehicles whose step is new."""
+    for i in range(len(rows)):
+        row, step = rows[i], steps[i]
+        able[i] = False
+        if step <= last_step[row] or observed_step[row] < 0:
+            continue
+        idle[row] = PLANS
+        if step - observed_step[row] > age_max:
+            idle[row] = OBSERVATION
+        elif shortest_ns(seen, row) > uplink_max:
+            idle[row] = DELAY
+        able[i] = idle[row] == PLANS
+
+
+@kernel
+def _withhold(
+    rows: I1,
+    steps: I1,
+    ahead: I1,
+    observed_step: I1,
+    age_max: int,
+    figures: Figures,
+    idle: I1,
+    event: B1,
+) -> int:
+    """Take back events whose plan is none, with the reason in `idle`; the number of the unsolved.
+
+    A plan that would begin when its observation has become too old is not flown.
+    """
+    unsolved = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        if not figures[i].solved:
+            unsolved += 1
+            idle[row] = UNSOLVED
+            event[i] = False
+        elif steps[i] + ahead[i] - observed_step[row] > age_max:
+            idle[row] = OBSERVATION
+            event[i] = False
+    return unsolved

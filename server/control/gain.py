@@ -1,0 +1,55 @@
+"""Gain of feedback aboard: K of u = -K x, the linear-quadratic regulator.
+
+It is the K on position and velocity, the same at every step, that makes the cost
+
+    xᵀ Q x + (R + S) u²                     at every step, in flight for ever without bounds
+
+smallest: what (9) comes to without end and bounds. The model's gain is in it. A dead time is not:
+feedback is on the state in which the next input meets the vehicle, for which there is none
+(`shared.law.dead_time`).
+"""
+
+import numpy as np
+
+from skytether.shared.law.model import Array, Model
+from skytether.shared.scenario.schema import ControlConfig, Scenario
+
+ROUNDS = 10_000
+"""Largest number of rounds of the recursion, for weights with which it hardly settles."""
+
+
+def feedback_gain(scenario: Scenario) -> Array:
+    """K of a scenario; 0 without feedback.
+
+    Returns:
+        on position [1/s] and velocity; shape (axes, 2).
+    """
+    model, control = scenario.terms().model, scenario.control
+    if not control.feedback:
+        return np.zeros_like(model.B)
+    return stationary_gain(model, control)
+
+
+def stationary_gain(model: Model, control: ControlConfig) -> Array:
+    """K for the model (4).
+
+    Args:
+        model: eq. (4).
+        control: the weights; S counts like R.
+
+    Returns:
+        on position [1/s] and velocity; shape (axes, 2).
+    """
+    Q, R = np.diag(control.state_weight), control.input_weight + control.change_weight
+    A, B = model.A, model.B
+    cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 2, 2))
+    gain = np.zeros_like(B)
+    for _ in range(ROUNDS):
+        if np.allclose(cost, before, rtol=1e-12, atol=0.0):
+            break
+        ahead = np.einsum("ai,aij->aj", B, cost)
+        weight = R + np.einsum("aj,aj->a", ahead, B)
+        gain = np.einsum("ai,aij->aj", ahead, A) / weight[:, None]
+        left = A - B[:, :, None] * gain[:, None, :]
+        cost, before = Q + np.einsum("aji,ajk,akl->ail", A, cost, left), cost
+    return gain

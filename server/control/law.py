@@ -1,0 +1,69 @@
+"""Eq. (4) and the rule of flight, compiled: the functions of `shared`, for the server's kernels."""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.base.kernel import inline, record, records, shared
+from skytether.shared.law import model, rule
+from skytether.shared.law.model import Array, Axis, Model
+from skytether.shared.law.terms import Terms
+
+AXIS = record(Axis)
+Axes = Annotated[NDArray[np.void], records(AXIS, 1)]
+"""A model as kernels take it; shape (axes,)."""
+
+
+class AxisLaw(Axis):
+    """Record: what a vehicle flies by on one axis. The fields of `Axis` come first."""
+
+    bound: float
+    """Bound u_max of the input [m/s]."""
+    gain_p: float
+    """K on position [1/s]; 0 without feedback."""
+    gain_v: float
+    """K on velocity; 0 without feedback."""
+
+
+AXIS_LAW = record(AxisLaw)
+Laws = Annotated[NDArray[np.void], records(AXIS_LAW, 1)]
+"""An `AxisLaw` for each axis; shape (axes,)."""
+
+advance = shared(model.advance)
+bounded, lasting = shared(rule.bounded), shared(rule.lasting)
+shared(rule.entry), shared(rule.remaining), shared(rule.tell)
+shared(rule.leading), shared(rule.lead_on), shared(rule.led_back), shared(rule.flown)
+lead_to, step = shared(rule.lead_to), shared(rule.step)
+
+
+@inline
+def axis_of(record: Axis) -> Axis:
+    """Eq. (4) of a record that has it, in numbers of its own that stay in registers."""
+    return Axis(record.a01, record.a11, record.b0, record.b1)
+
+
+@inline
+def axis_at(model: Axes, axis: int) -> Axis:
+    """Eq. (4) on one axis of a model."""
+    return axis_of(model[axis])
+
+
+def axes_of(model: Model) -> Axes:
+    """A model as kernels take it; shape (axes,)."""
+    return np.array([tuple(axis) for axis in model.axes()], dtype=AXIS)
+
+
+def laws_of(terms: Terms, gain: Array) -> Laws:
+    """What a vehicle flies by, with K as the vehicle will be told it.
+
+    Args:
+        terms: the rule of flight.
+        gain: K of feedback aboard, 0 without; shape (axes, 2).
+    """
+    laws = np.zeros(terms.axes, dtype=AXIS_LAW)
+    for name, numbers in terms.model._asdict().items():
+        laws[name] = numbers
+    laws["bound"] = terms.u_max
+    laws["gain_p"], laws["gain_v"] = gain.T.astype("f4")
+    return laws

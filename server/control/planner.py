@@ -1,0 +1,490 @@
+"""Hierarchical MPC of section 4.1: trajectory generator (14), and tracker (15) behind it.
+
+Both are the MPC of (9) in closed succession: each starts from its own horizon of the step before.
+The generator plans from its own last prediction and never looks at the UAV (E17); the tracker leads
+the UAV's estimated state along the generator's plan. What the new plan is worth is found out on the
+way: V of eq. (16), and the cost and the deviation of flying on with what was sent.
+
+With the exact solver, all of that is one compiled pass over a vehicle, which touches no more memory
+than a horizon takes. Another solver, or one that has to help out, takes the same moves in turn with
+it: pose the generator's problem, solve; pose the tracker's, solve; conclude.
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.server.control.desired import Desired, Window
+from skytether.server.control.exact import ExactSolver, Workspace, active_set
+from skytether.server.control.law import advance, axis_at
+from skytether.server.control.mpc import (
+    FIRST,
+    LATER,
+    MPC,
+    Problem,
+    add_cost,
+    follow,
+    gradient,
+    lead,
+    make_mpc,
+    pose,
+    shifted,
+    slope,
+)
+from skytether.server.control.scheme import Foresight
+from skytether.server.control.solver import OsqpSolver, Solver
+from skytether.shared.base.kernel import (
+    F1,
+    F2,
+    F3,
+    F4,
+    I1,
+    inline,
+    kernel,
+    part,
+    record,
+    records,
+)
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.model import Indices
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schema import ControlConfig
+
+GENERATOR, TRACKER, CONCLUDE = 0, 1, 2
+"""First index of what both MPCs have; the last is the move behind both."""
+
+
+class PlanFigures:
+    """Record: what is known of a vehicle once its plan is made; a cost is that of (9)."""
+
+    row: int
+    """Row of the vehicle."""
+    step: int
+    """Step k."""
+    start: int
+    """Step k + d, where planning starts."""
+    gap: int
+    """Steps since planning started before."""
+    state_gap: float
+    """V(k) of eq. (16): square of how far x̂ is from x_p, weighted by P [cost]."""
+    cost_gap: float
+    """Cost of flying on with what was sent above that of the plan [cost]."""
+    expected_gap: float
+    """Mean of that cost where packets in flight may be lost [cost]."""
+    deviation_m: float
+    """Largest distance between what was sent and the generator's plan before [m]; 0 where fresh."""
+    left_m: float
+    """Dead reckoning: how far the target is from where both ends expect it [m]."""
+    moved_m: float
+    """Dead reckoning: how far the target has moved since it was sent last [m]; 0 where fresh."""
+    fresh: bool
+    """Whether it is at its first step, or behind a gap that no plan reached over."""
+    solved: bool
+    """Whether the plan is new and right, so that it may be sent."""
+
+
+FIGURES = record(PlanFigures)
+Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
+"""Shape (n,)."""
+
+
+class PlanMemory(NamedTuple):
+    """What both MPCs remember of every vehicle."""
+
+    inputs: F4
+    """U(k-1), the horizon computed last [m/s]; shape (2, capacity, axes, H)."""
+    states: F4
+    """X(k-1) of the generator, behind where it was computed from [m, m/s]; shape
+    (capacity, axes, H + 1, 2)."""
+    step: I1
+    """Step that they were computed for, or -1; shape (capacity,)."""
+
+
+class Draft(NamedTuple):
+    """The plans of a block of vehicles in the making."""
+
+    planned: F3
+    """Planned state x_p(k|k-1), where the generator starts [m, m/s]; shape (block, axes, 2)."""
+    gradient: F3
+    """Gradient g of the problem to be solved; shape (block, axes, H)."""
+    guess: F3
+    """Horizon of the step before, shifted [m/s]; shape (block, axes, H)."""
+    inputs: F4
+    """U(k) of both MPCs [m/s]; shape (2, block, axes, H)."""
+    states: F4
+    """X(k) of the generator [m, m/s]; shape (block, axes, H + 1, 2)."""
+    drift: F2
+    """Scratch of `gradient`; shape (H, 2)."""
+    distance: F1
+    """Scratch: squares of distances [m²]; shape (H + 1,)."""
+
+
+class Batch(NamedTuple):
+    """A block of vehicles, and all that their plans are made of."""
+
+    mpc: MPC
+    """The problem."""
+    terminal_weight: F1
+    """P, on position and velocity; shape (2,)."""
+    compares: bool
+    """Whether what was sent before is known, so that a plan can be compared with it."""
+    memory: PlanMemory
+    """What is remembered of all vehicles."""
+    draft: Draft
+    """The plans in the making."""
+    desired: Window
+    """The desired trajectory, as far as plans go."""
+    found: Foresight
+    """What is foreseen of the vehicles."""
+    figures: Figures
+    """What their plans are worth."""
+
+
+def make_solver(control: ControlConfig, problem: Problem) -> Solver:
+    """The solver that a scenario names."""
+    return ExactSolver(problem) if control.solver == "exact" else OsqpSolver(problem)
+
+
+class Planner:
+    """Trajectory generator and tracker of up to `capacity` vehicles, `block` of them at a time."""
+
+    def __init__(
+        self,
+        control: ControlConfig,
+        terms: Terms,
+        desired: Desired,
+        capacity: int,
+        block: int,
+        stopwatch: Stopwatch,
+    ) -> None:
+        axes, H = terms.axes, terms.horizon
+        self._desired = desired
+        mpc = make_mpc(terms, control)
+        self._mpc = mpc
+        self._terminal_weight = np.array(control.terminal_weight)
+        self._compares = terms.commits
+        self.solvers = [
+            make_solver(control, pose(terms.model, mpc, which)) for which in (FIRST, LATER)
+        ]
+        """Solvers of a vehicle's first plan, and of later ones; others may take their places."""
+        self._stopwatch = stopwatch
+        self._memory = PlanMemory(
+            inputs=np.zeros((2, capacity, axes, H)),
+            states=np.zeros((capacity, axes, H + 1, 2)),
+            step=np.full(capacity, -1, dtype=np.int64),
+        )
+        self._draft = Draft(
+            planned=np.zeros((block, axes, 2)),
+            gradient=np.zeros((block, axes, H)),
+            guess=np.zeros((block, axes, H)),
+            inputs=np.zeros((2, block, axes, H)),
+            states=np.zeros((block, axes, H + 1, 2)),
+            drift=np.zeros((H, 2)),
+            distance=np.zeros(H + 1),
+        )
+        self.figures: Figures = np.zeros(block, dtype=FIGURES)
+        """What the last plans are worth; those of a block come first."""
+        self.planned = self._draft.planned
+        """Planned states x_p(k+d|k-1) of the last plans [m, m/s]; shape (block, axes, 2)."""
+        self.inputs = self._memory.inputs[TRACKER]
+        """U of the last plan of each vehicle [m/s]; shape (capacity, axes, H)."""
+        self.solve_ns = -1
+        """How long planning for the last block took, or -1 where nobody measures it."""
+
+    def forget(self, row: int) -> None:
+        """Make the next plan of this vehicle its first."""
+        self._memory.step[row] = -1
+
+    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
+        """Plan for vehicles, eq. (14), then (15); fills in `found.horizons`, `figures`, `planned`.
+
+        Args:
+            rows: the vehicles; shape (n,).
+            step: k of each; shape (n,).
+            found: what is foreseen of them.
+        """
+        batch = Batch(
+            mpc=self._mpc,
+            terminal_weight=self._terminal_weight,
+            compares=self._compares,
+            memory=self._memory,
+            draft=self._draft,
+            desired=self._desired.window(rows, step, found.ahead),
+            found=found,
+            figures=self.figures,
+        )
+        left = np.arange(len(rows))
+        solver = self.solvers[LATER]
+        if type(solver) is ExactSolver:
+            undone = _plan(batch, rows, step, solver.work)
+            left = np.flatnonzero(~self.figures["solved"][: len(rows)]) if undone else left[:0]
+        if len(left):
+            for which in (GENERATOR, TRACKER):
+                _move(batch, rows, step, left, which)
+                self._solve(which, left)
+            _move(batch, rows, step, left, CONCLUDE)
+        took_ns = self._stopwatch.lap("plan")
+        self.solve_ns = took_ns if self._stopwatch.runs else -1
+
+    def _solve(self, which: int, left: Indices) -> None:
+        """Solve the problems posed in the draft for some vehicles of the block, by index."""
+        draft = self._draft
+        fresh = self.figures["fresh"][left]
+        for some, solver in zip((left[fresh], left[~fresh]), self.solvers, strict=True):
+            if len(some):
+                inputs, solved = solver.solve(draft.gradient[some], draft.guess[some])
+                draft.inputs[which, some] = inputs
+                self.figures["solved"][some] &= solved
+
+
+@part
+def _rounded(u: F1) -> None:
+    """Round inputs to float32: planning goes on with what the vehicle will really be told."""
+    for i in range(len(u)):
+        u[i] = np.float64(np.float32(u[i]))
+
+
+@inline
+def _begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -> None:
+    """Note what a plan starts from, in its record of FIGURES, and whether it begins anew."""
+    last, start = memory.step[row], k + ahead
+    plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
+    plan.solved = True
+    plan.fresh = last < 0 or not 0 <= start - last <= memory.inputs.shape[3]
+
+
+@inline
+def _pose_generator(
+    mpc: MPC,
+    memory: PlanMemory,
+    draft: Draft,
+    desired: Window,
+    found: Foresight,
+    plan: PlanFigures,
+    i: int,
+    at: int,
+    axis: int,
+) -> None:
+    """Pose the generator's problem (14) on one axis of vehicle `i` of the block, at draft `at`."""
+    row, gap, fresh, H = plan.row, plan.gap, plan.fresh, memory.inputs.shape[3]
+    if fresh:
+        x = (found.start[i, axis, 0], found.start[i, axis, 1])
+    else:
+        x = (memory.states[row, axis, gap, 0], memory.states[row, axis, gap, 1])
+    draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
+    place, first = desired.place[i], desired.first[i]
+    target = desired.states[place, axis, first : first + H + 1]
+    previous, g = memory.inputs[GENERATOR, row, axis], draft.gradient[at, axis]
+    # The generator plans for no vehicle in particular, and so for no disturbance.
+    lead(mpc, axis, x, 0.0, target, draft.drift)
+    which = FIRST if fresh else LATER
+    gradient(mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
+
+
+@inline
+def _pose_tracker(
+    mpc: MPC,
+    memory: PlanMemory,
+    draft: Draft,
+    found: Foresight,
+    plan: PlanFigures,
+    i: int,
+    at: int,
+    axis: int,
+) -> None:
+    """Pose the tracker's problem (15) on one axis, behind the generator's answer in the draft."""
+    u, states = draft.inputs[GENERATOR, at, axis], draft.states[at, axis]
+    _rounded(u)
+    x = (found.start[i, axis, 0], found.start[i, axis, 1])
+    planned = (draft.planned[i, axis, 0], draft.planned[i, axis, 1])
+    previous, g = memory.inputs[TRACKER, plan.row, axis], draft.gradient[at, axis]
+    which, w, gap = FIRST if plan.fresh else LATER, found.disturbance[i, axis], plan.gap
+    follow(mpc, axis, x, w, planned, u, states, draft.drift)
+    gradient(mpc, axis, which, w, states, previous, gap, plan.fresh, draft.drift, g)
+
+
+@inline
+def _deviate(
+    mpc: MPC,
+    memory: PlanMemory,
+    found: Foresight,
+    plan: PlanFigures,
+    i: int,
+    axis: int,
+    distance: F1,
+) -> None:
+    """Add the squares of how far `held` leads away from the generator's last plan on one axis.
+
+    Args:
+        distance: what is added to, stage by stage, as far as that plan goes and a new one would be
+            flown [m²]; shape (H + 1,).
+    """
+    held, flown = found.held[i, axis], found.flown[i]
+    model, w, H = axis_at(mpc.model, axis), found.disturbance[i, axis], len(held)
+    p, v = found.start[i, axis, 0], found.start[i, axis, 1]
+    for stage in range(min(H - plan.gap, flown) + 1):
+        away = p - memory.states[plan.row, axis, stage + plan.gap, 0]
+        distance[stage] += away * away
+        if stage < flown:
+            p, v = advance(model, p, v, held[stage] + w)
+
+
+@inline
+def _add_gap(
+    mpc: MPC,
+    axis: int,
+    x: tuple[float, float],
+    held: F1,
+    u: F1,
+    steep: F1,
+    change: F1,
+    cost: float,
+) -> float:
+    """Add to `cost` what flying on with other inputs costs above the optimum, twice, on one axis.
+
+    Args:
+        x: by how much the state at stage 0 is another then [m, m/s].
+        held: the other inputs [m/s]; shape (H,).
+        u: the optimal ones [m/s]; shape (H,).
+        steep: `slope` there, by which the cost rises where a bound is active; shape (H,).
+        change: scratch, as long as inputs are compared; shape (flown,).
+    """
+    for stage in range(len(change)):
+        change[stage] = held[stage] - u[stage]
+        cost += 2.0 * max(0.0, steep[stage] * change[stage])
+    return add_cost(mpc, axis, x, change, cost)
+
+
+@inline
+def _conclude(
+    mpc: MPC,
+    terminal_weight: F1,
+    compares: bool,
+    memory: PlanMemory,
+    draft: Draft,
+    found: Foresight,
+    plan: PlanFigures,
+    i: int,
+    at: int,
+) -> None:
+    """Appraise the plan of vehicle `i`, whose answers are in the draft, and remember it."""
+    axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
+    row, d, state_gap, cost = plan.row, found.ahead[i], 0.0, 0.0
+    # Beyond that a plan is never flown: what was sent would seem to end too early at every step.
+    change = draft.guess[at, 0, : found.flown[i]]
+    distance, furthest = draft.distance, 0.0
+    which = FIRST if plan.fresh else LATER
+    sure, doubted = 1.0, 0.0
+    if compares:
+        distance[:] = 0.0
+    for axis in range(axes):
+        u = draft.inputs[TRACKER, at, axis]
+        _rounded(u)
+        off_p = found.start[i, axis, 0] - draft.planned[i, axis, 0]
+        off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
+        state_gap += off_p * off_p * P[0] + off_v * off_v * P[1]
+        if compares:
+            steep = draft.gradient[at, axis]
+            slope(mpc, axis, which, u, steep, draft.drift)
+            x = (0.0, 0.0)
+            cost = _add_gap(mpc, axis, x, found.held[i, axis], u, steep, change, cost)
+            for j in range(found.doubt.shape[1]):
+                share = found.doubt[i, j]
+                if share > 0.0:
+                    x = (
+                        found.doubted_start[i, j, axis, 0] - found.start[i, axis, 0],
+                        found.doubted_start[i, j, axis, 1] - found.start[i, axis, 1],
+                    )
+                    held = found.doubted[i, j, axis]
+                    doubted += share * _add_gap(mpc, axis, x, held, u, steep, change, 0.0)
+            if not plan.fresh:
+                _deviate(mpc, memory, found, plan, i, axis, distance)
+        for stage in range(d):
+            found.horizons[i, axis, stage] = found.committed[i, axis, stage]
+        for stage in range(H):
+            found.horizons[i, axis, d + stage] = u[stage]
+    if compares:
+        furthest = np.sqrt(distance.max())
+    for j in range(found.doubt.shape[1]):
+        sure -= found.doubt[i, j]
+    plan.state_gap, plan.cost_gap, plan.deviation_m = state_gap, cost, furthest
+    plan.expected_gap = sure * cost + doubted
+    for axis in range(axes):
+        memory.inputs[GENERATOR, row, axis] = draft.inputs[GENERATOR, at, axis]
+        memory.inputs[TRACKER, row, axis] = draft.inputs[TRACKER, at, axis]
+        memory.states[row, axis] = draft.states[at, axis]
+    # A first plan that failed is no plan to go on from.
+    memory.step[row] = plan.start if plan.solved or not plan.fresh else -1
+
+
+@inline
+def _solve_exactly(
+    mpc: MPC,
+    memory: PlanMemory,
+    draft: Draft,
+    plan: PlanFigures,
+    which: int,
+    axis: int,
+    work: Workspace,
+) -> bool:
+    """Solve a problem posed at draft 0; whether that came to an end."""
+    previous, u = memory.inputs[which, plan.row, axis], draft.inputs[which, 0, axis]
+    weights, gap, fresh = FIRST if plan.fresh else LATER, plan.gap, plan.fresh
+    g = draft.gradient[0, axis]
+    return active_set(mpc, axis, weights, work, g, previous, gap, fresh, u) > 0
+
+
+@kernel
+def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
+    """Plan for vehicles with the exact solver, see `Planner.plan`; how many have to be left.
+
+    Those have no `solved` in their figures, and are as they were.
+    """
+    mpc, terminal_weight, compares, memory, draft, desired, found, figures = batch
+    undone = 0
+    for i in range(len(rows)):
+        plan = figures[i]
+        _begin(memory, found.ahead[i], plan, rows[i], steps[i])
+        for axis in range(len(mpc.model)):
+            _pose_generator(mpc, memory, draft, desired, found, plan, i, 0, axis)
+            if not _solve_exactly(mpc, memory, draft, plan, GENERATOR, axis, work):
+                plan.solved = False
+                break
+            _pose_tracker(mpc, memory, draft, found, plan, i, 0, axis)
+            if not _solve_exactly(mpc, memory, draft, plan, TRACKER, axis, work):
+                plan.solved = False
+                break
+        if plan.solved:
+            _conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, 0)
+        else:
+            undone += 1
+    return undone
+
+
+@part
+def _guess(memory: PlanMemory, plan: PlanFigures, which: int, guess: F2) -> None:
+    """Fill in the guess of a solver that is no part of the pass: the horizon before, shifted."""
+    for axis in range(len(guess)):
+        previous = memory.inputs[which, plan.row, axis]
+        for stage in range(guess.shape[1]):
+            guess[axis, stage] = shifted(previous, plan.gap, plan.fresh, stage)
+
+
+@kernel
+def _move(batch: Batch, rows: I1, steps: I1, left: I1, move: int) -> None:
+    """Make one move for those `left` in a block, by index: pose for an MPC, or CONCLUDE."""
+    mpc, terminal_weight, compares, memory, draft, desired, found, figures = batch
+    for i in left:
+        plan = figures[i]
+        if move == CONCLUDE:
+            _conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, i)
+            continue
+        if move == GENERATOR:
+            _begin(memory, found.ahead[i], plan, rows[i], steps[i])
+        _guess(memory, plan, move, draft.guess[i])
+        for axis in range(len(mpc.model)):
+            if move == GENERATOR:
+                _pose_generator(mpc, memory, draft, desired, found, plan, i, i, axis)
+            else:
+                _pose_tracker(mpc, memory, draft, found, plan, i, i, axis)

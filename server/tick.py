@@ -1,0 +1,257 @@
+"""The server's tick: which step each vehicle is at, what to send it, and what is written down.
+
+Ticks lie on a grid of Δt with absolute deadlines; one whose time has passed is skipped and counted,
+never caught up with.
+"""
+
+from collections import deque
+
+import numpy as np
+
+from skytether.server.control.clock import ClockMap
+from skytether.server.control.controller import BLOCK, Controller, Decisions
+from skytether.server.control.scheme import in_a_row
+from skytether.server.sessions import Sessions
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.endpoint import Datagram, Events
+from skytether.shared.core.events import Degraded, Fault, PlanningResumed, PlanningStopped
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.model import Array
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.triggers import Compared
+from skytether.shared.telemetry.histogram import Histogram
+from skytether.shared.telemetry.record import FIGURES, Recorder
+from skytether.shared.wire.protocol import FEEDBACK, LED, Heartbeat, Idle, encode, encode_horizon
+
+MISSES_MAX = 5
+"""Number of ticks that may be missed in a second before the server calls itself degraded."""
+EXPECTED_GAP, OWN = str(Compared.EXPECTED_GAP), str(Compared.OWN)
+"""Columns of the record that may be empty."""
+TICK_BIN_NS = MILLISECOND_NS // 20
+"""Resolution at which the length of a tick is counted [ns]."""
+
+
+class Grid:
+    """When ticks are due.
+
+    Args:
+        dt_ns: time from one tick to the next [ns].
+        events: takes what the operator is told.
+    """
+
+    def __init__(self, dt_ns: int, events: Events) -> None:
+        self._dt_ns = dt_ns
+        self._events = events
+        self.due_ns: int | None = None
+        """When the next tick is due; None while there is nobody to tick for."""
+        self.missed = 0
+        """Number of ticks that were slept through."""
+        self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)
+        """Times of the newest ticks that were missed."""
+        self.degraded = False
+        """Whether more ticks are missed than may be."""
+
+    def arm(self, now_ns: int) -> None:
+        """Let a tick be due, for there is a vehicle to tick for."""
+        dt_ns = self._dt_ns
+        if self.due_ns is None or self.due_ns > now_ns + dt_ns:  # also where our clock went back
+            self.due_ns = -(-now_ns // dt_ns) * dt_ns  # the next, or now
+
+    def rest(self) -> None:
+        """Let no tick be due."""
+        self.due_ns = None
+
+    def take(self, now_ns: int) -> int | None:
+        """Time of the tick that is due, if one is; those that were slept through are counted."""
+        if self.due_ns is None or now_ns < self.due_ns:
+            return None
+        late = (now_ns - self.due_ns) // self._dt_ns
+        self.missed += late
+        self._note_missed(late, now_ns)
+        tick_ns = self.due_ns + late * self._dt_ns
+        self.due_ns = tick_ns + self._dt_ns
+        return tick_ns
+
+    def _note_missed(self, count: int, now_ns: int) -> None:
+        """Note the ticks that were missed, and whether these are too many in a second."""
+        self._missed_ns += [now_ns] * min(count, MISSES_MAX + 1)
+        many = len(self._missed_ns) > MISSES_MAX and now_ns - self._missed_ns[0] <= SECOND_NS
+        if many != self.degraded:
+            self.degraded = many
+            self._events.append(Degraded(degraded=many))
+
+
+class Ticker:
+    """Decides for all vehicles in session, sends them horizons and heartbeats, and records.
+
+    Args:
+        terms: what is agreed upon with every vehicle.
+        sessions: who flies.
+        clock: tells the step of each.
+        controller: plans.
+        grid: tells how many ticks were missed.
+        stopwatch: measures the parts of a tick.
+        out: takes what is sent.
+        events: takes what the operator is told.
+        recorder: takes one row a tick and vehicle.
+        plans: takes one row for each horizon that is sent.
+    """
+
+    def __init__(
+        self,
+        terms: Terms,
+        sessions: Sessions,
+        clock: ClockMap,
+        controller: Controller,
+        grid: Grid,
+        stopwatch: Stopwatch,
+        *,
+        out: list[Datagram],
+        events: Events,
+        recorder: Recorder | None,
+        plans: Recorder | None,
+    ) -> None:
+        self._terms = terms
+        self._heartbeat_ns = seconds_to_ns(terms.heartbeat_s)
+        self._sessions = sessions
+        self._clock = clock
+        self._controller = controller
+        self._grid = grid
+        self._stopwatch = stopwatch
+        self._out = out
+        self._events = events
+        self._recorder, self._plans = recorder, plans
+        self._columns = [str(each) for each in FIGURES[terms.scheme]]
+        """Columns of the record that figures of plans are written to."""
+        self.durations = Histogram(TICK_BIN_NS)
+        """How long each tick took, as far as the stopwatch runs."""
+
+    def tick(self, tick_ns: int, now_ns: int) -> None:
+        """One tick.
+
+        Args:
+            tick_ns: time that it was due at.
+            now_ns: time now.
+        """
+        self._stopwatch.start()
+        before_ns = self._stopwatch.spent_ns.total()
+        rows = self._sessions.rows
+        step = self._clock.steps(rows, tick_ns)
+        self._controller.desired.tick(tick_ns)
+        able = self._controller.able(rows, step)
+        if not able.all():
+            rows, step = rows[able], step[able]
+        for first in range(0, len(rows), BLOCK):
+            block = slice(first, first + BLOCK)
+            decisions = self._controller.decide(rows[block], step[block])
+            self._send_horizons(decisions, now_ns)
+            self._stopwatch.lap("encode")
+            self._record(decisions)
+        self._tell_idle()
+        self._events += [Fault(traceback=said) for said in self._controller.faults]
+        self._controller.faults.clear()
+        self._send_heartbeats(now_ns)
+        self._stopwatch.lap("encode")
+        self.durations.add(self._stopwatch.spent_ns.total() - before_ns)
+
+    def _tell_idle(self) -> None:
+        """Say where planning has stopped, and where it goes on."""
+        idle = self._controller.idle
+        for row in np.flatnonzero(idle != self._sessions.idle).tolist():
+            self._sessions.idle[row] = idle[row]
+            vehicle, why = self._sessions.at(row).vehicle, Idle(idle[row])
+            if why == Idle.PLANS:
+                self._events.append(PlanningResumed(vehicle=vehicle))
+            else:
+                self._events.append(PlanningStopped(vehicle=vehicle, why=str(why)))
+
+    def _send_horizons(self, decisions: Decisions, now_ns: int) -> None:
+        sent, found = decisions.sent, decisions.found
+        if not len(sent):
+            return
+        # Bytes of one input on all axes, and of what goes with a horizon.
+        width = 4 * self._terms.axes
+        feedback, told = found.feedback.data.cast("B"), 0
+        if self._terms.feedback:
+            told = width * FEEDBACK
+        inputs, begin = in_a_row(found, sent), 0
+        columns = (sent, decisions.rows[sent], decisions.step[sent], found.ahead[sent])
+        for i, row, step, d in zip(*(column.tolist() for column in columns), strict=True):
+            session, end = self._sessions.at(row), begin + width * (d + self._terms.planned)
+            payload = encode_horizon(
+                session.vehicle,
+                session.number,
+                step,
+                now_ns,
+                session.observed_ns,
+                inputs[begin:end],
+                feedback[i * told : (i + 1) * told],
+            )
+            session.sent_ns, begin = now_ns, end
+            self._out += session.sealed(payload)
+
+    def _send_heartbeats(self, now_ns: int) -> None:
+        """Let vehicles that were sent nothing for a while know that the server lives."""
+        for session in self._sessions:
+            if now_ns - session.sent_ns >= self._heartbeat_ns:
+                session.sent_ns = now_ns
+                idle = int(self._sessions.idle[session.row])
+                degraded = int(self._grid.degraded)
+                beat = Heartbeat(session.vehicle, session.number, now_ns, idle, degraded)
+                self._out += session.sealed(encode(beat))
+
+    def _record(self, decisions: Decisions) -> None:
+        if self._plans is not None and len(decisions.sent):
+            self._record_plans(self._plans, decisions)
+        if self._recorder is None:
+            return
+        rows, found, figures = decisions.rows, decisions.found, decisions.figures
+        n = len(rows)
+        self._recorder.append(
+            n,
+            vehicle=self._sessions.vehicle[rows],
+            step=decisions.step,
+            reference=self._controller.desired.now(rows, decisions.step),
+            estimate=found.estimate[:n],
+            ahead=found.ahead[:n],
+            planned=decisions.planned,
+            input=found.horizons[:n, :, 0],
+            observed_step=self._controller.observed_step[rows],
+            **self._figures(decisions),
+            threshold=decisions.verdict.threshold,
+            compared=decisions.verdict.compared,
+            event=decisions.event,
+            solved=figures["solved"],
+            solve_ns=decisions.solve_ns,
+            stale=[self._sessions.at(row).stale for row in rows.tolist()],
+            missed=self._grid.missed,
+        )
+        self._stopwatch.lap("record")
+
+    def _figures(self, decisions: Decisions) -> dict[str, Array | float]:
+        """Figures of plans for the record: NaN where there is none."""
+        figures, verdict, nothing = decisions.figures, decisions.verdict, float("nan")
+        told: dict[str, Array | float] = {column: figures[column] for column in self._columns}
+        solved = figures["solved"]
+        if not solved.all():
+            told = {name: np.where(solved, figure, nothing) for name, figure in told.items()}
+        if EXPECTED_GAP in told and not decisions.found.doubt.size:
+            told[EXPECTED_GAP] = nothing
+        told[OWN] = verdict.figure if verdict.compared is Compared.OWN else nothing
+        return told
+
+    def _record_plans(self, plans: Recorder, decisions: Decisions) -> None:
+        sent, found = decisions.sent, decisions.found
+        step, ahead = decisions.step[sent], found.ahead[sent]
+        # Behind d committed inputs, another d of each vehicle.
+        stages = ahead[:, None] + np.arange(self._terms.planned)
+        reckons = self._terms.reckons
+        plans.append(
+            len(sent),
+            vehicle=self._sessions.vehicle[decisions.rows[sent]],
+            step=step,
+            begins=step + ahead,
+            state=found.feedback[sent][:, :, LED] if reckons else found.start[sent],
+            inputs=np.take_along_axis(found.horizons[sent], stages[:, None], axis=2),
+            disturbance=found.disturbance[sent],
+        )

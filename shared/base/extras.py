@@ -1,0 +1,56 @@
+"""Extras: what `pip install skytether` leaves out, and which extra of pyproject.toml brings it."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import util
+
+
+class ExtraMissing(ModuleNotFoundError):
+    """Error: what was asked for needs an extra; the message says which, and how to install it."""
+
+    def __init__(self, module: str, extra: str) -> None:
+        command = f"pip install 'skytether[{extra}]'"
+        super().__init__(f"{module} is not installed, expected it: {command}", name=module)
+
+
+@contextmanager
+def named() -> Iterator[None]:
+    """Name the smallest extra that brings a module which is missing in this block.
+
+    Raises:
+        ExtraMissing: in place of a ModuleNotFoundError, where an extra has the module.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        module = str(error.name).partition(".")[0]
+        extras = _extras()
+        having = [extra for extra in extras if module in extras[extra]]
+        if isinstance(error, ExtraMissing) or not having:
+            raise
+        smallest = min(having, key=lambda extra: len(extras[extra]))
+        raise ExtraMissing(module, smallest) from None
+
+
+def need(extra: str) -> None:
+    """Refuse what would miss a module of an extra later.
+
+    Raises:
+        ExtraMissing: the extra is not installed, or not all of it.
+    """
+    for module in _extras()[extra]:
+        if util.find_spec(module) is None:
+            raise ExtraMissing(module, extra)
+
+
+def _extras() -> dict[str, list[str]]:
+    """Packages of each extra, each of which is called as its module."""
+    from importlib import metadata  # a tenth of what flies; wanted where something is missing
+
+    extras: dict[str, list[str]] = {}
+    for requirement in metadata.requires("skytether") or ():
+        package, _, extra = requirement.partition("; extra == ")
+        if extra:
+            extras.setdefault(extra.strip("'\""), []).append(re.split("[^a-z0-9_-]", package)[0])
+    return extras

@@ -1,0 +1,238 @@
+"""Compiled kernels: loops along a horizon, compiled by numba when they are called first.
+
+A kernel's signature is read off its annotations, so that mypy and numba check the same words: an
+array is annotated with one of the types below, an array of records with one made of its dtype, and
+arrays that travel together with their NamedTuple. A record is told by a class, a line a field; none
+is ever made of it, but it names the type of a record to mypy. A part is a function that only
+kernels call; it is compiled into each of them.
+
+What must not wait in flight compiles them before: `missing` tells which have no machine code yet,
+`load` has all of them ready. Importing them compiles nothing.
+
+Machine code is kept on disk, beside the sources or where NUMBA_CACHE_DIR says. Numba looks at the
+kernel's own file to see whether it is still right; here every function and constant that a kernel
+reaches counts, in whichever module it stands, so that no kernel flies by a rule that has changed.
+"""
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Annotated, Any, TypeVar, get_type_hints
+
+import numba
+import numpy as np
+from numba.core import caching, config
+from numba.core.compiler_lock import global_compiler_lock
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+F1 = Annotated[NDArray[np.float64], numba.float64[::1]]
+F2 = Annotated[NDArray[np.float64], numba.float64[:, ::1]]
+R1 = Annotated[NDArray[np.float64], numba.types.Array(numba.float64, 1, "C", readonly=True)]
+R2 = Annotated[NDArray[np.float64], numba.types.Array(numba.float64, 2, "C", readonly=True)]
+F3 = Annotated[NDArray[np.float64], numba.float64[:, :, ::1]]
+F4 = Annotated[NDArray[np.float64], numba.float64[:, :, :, ::1]]
+F5 = Annotated[NDArray[np.float64], numba.float64[:, :, :, :, ::1]]
+I1 = Annotated[NDArray[np.int64], numba.int64[::1]]
+I2 = Annotated[NDArray[np.int64], numba.int64[:, ::1]]
+I3 = Annotated[NDArray[np.int64], numba.int64[:, :, ::1]]
+S1 = Annotated[NDArray[np.float32], numba.float32[::1]]
+S3 = Annotated[NDArray[np.float32], numba.float32[:, :, ::1]]
+S4 = Annotated[NDArray[np.float32], numba.float32[:, :, :, ::1]]
+B1 = Annotated[NDArray[np.bool_], numba.boolean[::1]]
+"""Contiguous arrays of float64 (F; R where they are only read), int64 (I), float32 (S) and bool
+(B), by number of axes."""
+
+SCALARS = {int: numba.int64, float: numba.float64, bool: numba.boolean}
+
+
+CODES = {int: "i8", float: "f8", bool: "?"}
+"""Numpy's code of the field of a record, by its annotation."""
+
+
+def record(kind: type) -> np.dtype[np.void]:
+    """Dtype of records: numbers that travel together, as the annotations of a class name them."""
+    fields = [(name, CODES[hint]) for name, hint in get_type_hints(kind).items()]
+    return np.dtype(fields, align=True)
+
+
+def records(dtype: np.dtype[np.void], ndim: int) -> Any:
+    """The numba type of a contiguous array of such records, for an annotation."""
+    return numba.types.Array(numba.from_dtype(dtype), ndim, "C")
+
+
+def kernel(function: F) -> F:
+    """A function, compiled at its first call for the types that its annotations name."""
+    dispatcher = numba.njit(error_model="numpy")(function)
+
+    def at_first_call(*_: Any) -> Any:
+        _compile(dispatcher)
+        return dispatcher
+
+    dispatcher._compile_for_args = at_first_call
+    KERNELS.append(dispatcher)
+    compiled: F = dispatcher
+    return compiled
+
+
+KERNELS: list[Any] = []
+"""Kernels whose modules are imported, compiled or not."""
+
+
+def missing() -> list[Callable[[], None]]:
+    """What compiles each kernel that has no machine code yet, neither in memory nor on disk."""
+    return [partial(_compile, each) for each in KERNELS if not (each.overloads or _is_kept(each))]
+
+
+def load() -> None:
+    """Have every kernel in memory, so that none has to be compiled in flight."""
+    for each in KERNELS:
+        _compile(each)
+
+
+def _is_kept(dispatcher: Any) -> bool:
+    """Whether the machine code of a kernel is on disk."""
+    _keep(dispatcher)
+    cache = dispatcher._cache
+    if isinstance(cache, caching.NullCache):
+        return False
+    key = cache._index_key(_signature(dispatcher), dispatcher.targetctx.codegen())
+    return cache._cache_file.load(key) is not None
+
+
+@global_compiler_lock  # type: ignore[untyped-decorator]
+def _compile(dispatcher: Any) -> None:
+    """Take the machine code of a kernel from the disk, or make it, once."""
+    if dispatcher.overloads:
+        return
+    _keep(dispatcher)
+    signature = _signature(dispatcher)
+    try:
+        dispatcher.compile(signature)
+    except OSError:  # the disk is full, say: it is compiled, and not kept
+        dispatcher._cache = caching.NullCache()
+        dispatcher.compile(signature)
+    dispatcher.disable_compile()
+
+
+def _keep(dispatcher: Any) -> None:
+    """Let machine code come from and go to the disk, where there is a place for it."""
+    before, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, ",".join(LOCATORS)
+    with suppress(RuntimeError):  # no place can be written to
+        dispatcher.enable_caching()
+    config.CACHE_LOCATOR_CLASSES = before
+
+
+def _signature(dispatcher: Any) -> tuple[Any, ...]:
+    """Numba's types of the parameters, as they are annotated."""
+    hints = get_type_hints(dispatcher.py_func, include_extras=True)
+    hints.pop("return", None)
+    return tuple(map(_type, hints.values()))
+
+
+def _type(hint: Any) -> Any:
+    """Numba's type for an annotation."""
+    if hasattr(hint, "__metadata__"):
+        return hint.__metadata__[0]
+    if hasattr(hint, "_fields"):
+        fields = get_type_hints(hint, include_extras=True)
+        return numba.types.BaseTuple.from_types([*map(_type, fields.values())], hint)
+    return SCALARS[hint]
+
+
+def part(function: F) -> F:
+    """A function that kernels call, once for a vehicle or an axis."""
+    compiled: F = numba.njit(error_model="numpy")(function)
+    return compiled
+
+
+def inline(function: F) -> F:
+    """A function of a few numbers that kernels call at every stage."""
+    compiled: F = numba.njit(error_model="numpy", inline="always")(function)
+    return compiled
+
+
+def shared(function: F) -> F:
+    """A function of `shared` as it is, which kernels may call from now on as Python does."""
+    callable_: F = register_jitable(error_model="numpy")(function)
+    return callable_
+
+
+def plain(function: F) -> F:
+    """The function that a kernel or part was made of, to be called from Python now and then."""
+    original: F = function.py_func  # type: ignore[attr-defined]
+    return original
+
+
+class Reaching:
+    """Makes one of numba's cache locators mind everything that a kernel reaches."""
+
+    def get_source_stamp(self) -> str:
+        """What must be as it was for machine code on disk to be used."""
+        return self.stamp
+
+    def get_disambiguator(self) -> str:
+        """Part of the file's name: a file that another stamp belongs to is not even opened."""
+        return self.stamp[:16]
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        """The locator of a kernel, or None where this place cannot be written to."""
+        locator = super().from_function(py_func, py_file)  # type: ignore[misc]
+        if locator is not None:
+            locator.stamp = stamp(py_func)
+        return locator
+
+    stamp: str
+
+
+class Given(Reaching, caching.UserProvidedCacheLocator):  # type: ignore[misc]
+    """The folder that NUMBA_CACHE_DIR names."""
+
+
+class Beside(Reaching, caching.InTreeCacheLocator):  # type: ignore[misc]
+    """The folder `__pycache__` beside the source."""
+
+
+class OfUser(Reaching, caching.UserWideCacheLocator):  # type: ignore[misc]
+    """The user's own cache."""
+
+
+LOCATORS = [f"{each.__module__}.{each.__qualname__}" for each in (Given, Beside, OfUser)]
+
+
+def stamp(function: Callable[..., Any]) -> str:
+    """A digest of a kernel, and of all types, compiled functions and constants that it reaches."""
+    hints = get_type_hints(function, include_extras=True)
+    found = {"types": repr([_type_name(hint) for hint in hints.values()])}
+    waiting = [function]
+    while waiting:
+        each = waiting.pop()
+        place = f"{each.__module__}.{each.__qualname__}"
+        if place in found:
+            continue
+        found[place] = inspect.getsource(each)
+        for name in each.__code__.co_names:
+            value: Any = each.__globals__.get(name)
+            if hasattr(value, "py_func"):
+                waiting.append(plain(value))
+            elif inspect.isfunction(value):
+                waiting.append(value)
+            elif isinstance(value, type) and hasattr(value, "_fields"):
+                found[f"{place}: {name}"] = _type_name(value)
+            elif isinstance(value, int | float | str | tuple | np.dtype):
+                found[f"{place}: {name}"] = repr(value)
+    return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()
+
+
+def _type_name(hint: Any) -> str:
+    """A type in words that differ where the type does, wherever it is defined."""
+    if not hasattr(hint, "_fields"):
+        return repr(hint)
+    fields = get_type_hints(hint, include_extras=True)
+    names = (f"{name}: {_type_name(field)}" for name, field in fields.items())
+    return f"{hint.__module__}.{hint.__qualname__}({', '.join(names)})"

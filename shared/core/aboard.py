@@ -1,0 +1,132 @@
+"""Events of a vehicle's own autopilot, as who flies it hears and judges what it says."""
+
+import msgspec
+
+
+class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """Base of the events of one vehicle."""
+
+    vehicle: int
+    """Number of the vehicle."""
+
+
+class Parameter(msgspec.Struct, frozen=True, kw_only=True):
+    """Parameter of an autopilot, and what it means for who flies the vehicle."""
+
+    name: str
+    value: float | None
+    """Value; None of a parameter that the autopilot does not have."""
+    meaning: str
+    """Meaning of the value, in words."""
+    wanted: str = ""
+    """Values that would be safe, and the one to set; empty where this one is."""
+
+    def __str__(self) -> str:
+        value = "missing" if self.value is None else f"{self.value:g}"
+        expected = f"; expected {self.wanted}" if self.wanted else ""
+        return f"{self.name} = {value}: {self.meaning}{expected}"
+
+
+class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has heard its autopilot for the first time."""
+
+    name: str
+    """Name and version."""
+    system: int
+    """Number of its system in MAVLink."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} has {self.name}, system {self.system}"
+
+
+class ParametersRead(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has read the parameters that decide what its autopilot does in silence."""
+
+    parameters: tuple[Parameter, ...]
+
+    def __str__(self) -> str:
+        lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
+        return "\n".join(lines)
+
+
+class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has set parameters of its autopilot, and read them back."""
+
+    changes: tuple[tuple[str, float, float], ...]
+    """Name, value before and value after of each."""
+
+    def __str__(self) -> str:
+        lines = [
+            f"vehicle {self.vehicle}: {name} is {after:g} from now on, it was {before:g}"
+            for name, before, after in self.changes
+        ]
+        return "\n".join(lines)
+
+
+class AutopilotRefused(VehicleEvent, frozen=True, kw_only=True):
+    """An autopilot has refused a command."""
+
+    asked: str
+    """Command, in words."""
+    answer: str
+    """Its answer: the name of a MAV_RESULT."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: its autopilot refuses to {self.asked}: {self.answer}"
+
+
+class AutopilotText(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle's autopilot has said something in words."""
+
+    text: str
+    severity: int
+    """Severity as MAVLink has it, from 0, an emergency, to 7."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}, its autopilot: {self.text}"
+
+
+class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle's autopilot is in another mode, or has been armed or disarmed."""
+
+    mode: str
+    armed: bool
+
+    def __str__(self) -> str:
+        armed = "armed" if self.armed else "disarmed"
+        return f"vehicle {self.vehicle}: its autopilot is in {self.mode}, {armed}"
+
+
+class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle is not armed, for its autopilot would do what is not safe in silence."""
+
+    parameters: tuple[Parameter, ...]
+    """Parameters that are not safe, or that could not be set."""
+
+    def __str__(self) -> str:
+        lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
+        return "\n".join(lines)
+
+
+class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle is not flown, for its autopilot has not come into the air with it."""
+
+    doing: str
+    """What it has not come to do."""
+    why: str
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: {self.doing}: {self.why}"
+
+
+AboardFailure = ParametersUnsafe | NotTakenOff
+"""Events after which a vehicle is not flown."""
+AboardEvent = (
+    AutopilotFound
+    | ParametersRead
+    | ParametersSet
+    | AutopilotRefused
+    | AutopilotText
+    | AutopilotMode
+    | AboardFailure
+)

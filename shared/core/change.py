@@ -1,0 +1,167 @@
+"""Changes in flight: some keys of a scenario get other values while it is flown.
+
+    values by key → may these change? → checked as a scenario is → `Endpoint.change` → `Changed`
+
+All values of a request take effect together, between two steps of the endpoint, or none does. A
+request is an object of JSON, values by key; one without keys asks which may change. The answer is
+an `Answer`. `shell.control` has the socket that both pass through, and `sim.flight` makes the same
+changes in virtual time.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.hint import hint
+from skytether.shared.core.endpoint import Endpoint
+from skytether.shared.core.events import Changed, ChangeRefused
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+
+REQUEST_BYTES_MAX = 4096
+"""Largest size of a request [B]."""
+KEY_SHOWN_MAX = 60
+"""Largest number of characters that a message repeats of a key that there is not."""
+
+
+class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What is answered to a request."""
+
+    refused: str = ""
+    """Why nothing was changed, in a line; empty where the request was heeded."""
+    changed: tuple[Changed, ...] = ()
+    """What has got another value."""
+    values: dict[str, Any] = {}
+    """Keys that may change and their present values, where the request has none."""
+
+
+class Running:
+    """A scenario that an endpoint is flying, and may be changed in.
+
+    Args:
+        endpoint: what flies it.
+        scenario: the scenario that the endpoint was made with.
+    """
+
+    def __init__(self, endpoint: Endpoint, scenario: Scenario) -> None:
+        self._endpoint = endpoint
+        self._scenario = scenario
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario with all that was changed so far."""
+        return self._scenario
+
+    @property
+    def changeable(self) -> frozenset[str]:
+        """Keys that may change."""
+        return self._endpoint.changeable
+
+    def change(self, values: Mapping[str, Any], *, now_ns: int) -> tuple[Changed, ...]:
+        """Give keys other values, and say so in events of the endpoint.
+
+        Args:
+            values: plain values by key, as a scenario's file has them.
+            now_ns: time on the endpoint's clock [ns].
+
+        Returns:
+            What has got another value.
+
+        Raises:
+            ConfigError: nothing was changed, as an event tells, too.
+        """
+        before = reading.to_table(self._scenario)
+        try:
+            scenario = self._checked(values, before)
+        except ConfigError as error:
+            self.refuse(str(error))
+            raise
+        self._endpoint.change(scenario, frozenset(values), now_ns=now_ns)
+        self._scenario, after = scenario, reading.to_table(scenario)
+        changed = tuple(
+            Changed(key=key, before=was, after=becomes)
+            for key in values
+            if (was := _text(_at(before, key))) != (becomes := _text(_at(after, key)))
+        )
+        for event in changed:
+            self._endpoint.tell(event)
+        return changed
+
+    def refuse(self, reason: str) -> None:
+        """Let the endpoint say that a change is refused."""
+        self._endpoint.tell(ChangeRefused(reason=reason))
+
+    def answer(self, request: bytes, *, now_ns: int) -> bytes:
+        """Heed a request, whatever it is, and make the answer to it.
+
+        Args:
+            request: what has come, or as much of it as shows that it is too long.
+            now_ns: time on the endpoint's clock [ns].
+        """
+        if len(request) > REQUEST_BYTES_MAX:
+            return self._refusal(f"got more than {REQUEST_BYTES_MAX} B, expected a shorter request")
+        try:
+            values = _DECODER.decode(request)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            return self._refusal("got no JSON object, expected values by key")
+        if not values:
+            table = reading.to_table(self._scenario)
+            values = {key: _at(table, key) for key in sorted(self.changeable)}
+            return msgspec.json.encode(Answer(values=values))
+        try:
+            return msgspec.json.encode(Answer(changed=self.change(values, now_ns=now_ns)))
+        except ConfigError as error:
+            return msgspec.json.encode(Answer(refused=str(error)))
+
+    def _refusal(self, reason: str) -> bytes:
+        self.refuse(reason)
+        return msgspec.json.encode(Answer(refused=reason))
+
+    def _checked(self, values: Mapping[str, Any], table: Mapping[str, Any]) -> Scenario:
+        """The scenario with these values laid over it.
+
+        Raises:
+            ConfigError: a key may not change, or the scenario cannot be flown so.
+        """
+        may = sorted(self.changeable)
+        for key in values:
+            if key in may:
+                continue
+            try:
+                _at(table, key)
+            except (KeyError, TypeError):
+                shown = key[:KEY_SHOWN_MAX]
+                shown = shown if shown.isprintable() else repr(shown)
+                raise ConfigError(f"{shown}: no such key; {hint(key, may)}") from None
+            what = f"what can be here: {', '.join(may)}"
+            raise ConfigError(f"{key}: cannot be changed in flight; {what}")
+        laid = reading.to_table(self._scenario)
+        for key, value in values.items():
+            *sections, name = key.split(".")
+            _at(laid, ".".join(sections))[name] = value
+        try:
+            return reading.check(laid, known=self._scenario)
+        except RecursionError:
+            raise ConfigError("got values that are nested too deeply") from None
+
+
+_DECODER = msgspec.json.Decoder(dict[str, Any])
+
+
+def _at(table: Any, key: str) -> Any:
+    """What a table has under a key with dots.
+
+    Raises:
+        KeyError: nothing, at some point of the way.
+        TypeError: something that is no table.
+    """
+    for name in filter(None, key.split(".")):
+        table = table[name]
+    return table
+
+
+def _text(value: Any) -> str:
+    """A value as a scenario's file has it."""
+    return msgspec.json.encode(value).decode()

@@ -1,0 +1,155 @@
+"""The one idea: server, client and netem are endpoints, driven by datagrams and time only.
+
+An endpoint opens no socket, reads no clock, draws no unseeded number and prints nothing. It
+speaks in three ways: by datagrams (`outbox`), by typed events (`events`), and by numbers when it
+is asked for them (`figures`). `shell.driver` drives one on real UDP sockets; `sim.world` drives
+many in virtual time.
+"""
+
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, Self
+
+from skytether.shared.core.events import Event, Omitted
+from skytether.shared.scenario.schema import Scenario
+
+Address = tuple[str, int]
+"""Host and port of a UDP socket. The host is a name, an IPv4 address or an IPv6 address without
+brackets, as in `fe80::1%eth0` where it needs a scope."""
+
+EVENTS_MAX = 1024
+"""Events kept until the driver reads them; older ones give way, and are counted."""
+
+VEHICLES_TOLD_MAX = 16
+"""Vehicles that `figures` tells of one by one."""
+
+
+class Datagram(NamedTuple):
+    """One UDP datagram as an endpoint sees it."""
+
+    payload: bytes
+    """UDP payload."""
+    peer: Address
+    """Address of the sender, or of the receiver."""
+    socket: int = 0
+    """Number of the endpoint's own socket that it uses; 0 is the one that is bound."""
+
+
+class Form(NamedTuple):
+    """What the packets of one kind have in common, as far as anybody can see it."""
+
+    head: bytes
+    """Bytes that they begin with."""
+    least: int
+    """Size of the shortest [B]."""
+    most: int
+    """Size of the longest [B]."""
+
+
+def by_name(counts: Mapping[Any, int]) -> dict[str, int]:
+    """A group of figures: counts by the names of what is counted."""
+    return {str(each): count for each, count in counts.items()}
+
+
+class Events(deque[Event]):
+    """Events that wait for the driver."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._omitted: Counter[str] = Counter()
+
+    def append(self, event: Event) -> None:
+        """Append an event; where there are too many, the oldest is only counted."""
+        if len(self) == EVENTS_MAX:
+            self._omitted[type(self.popleft()).__name__] += 1
+        super().append(event)
+
+    def __iadd__(self, events: Iterable[Event]) -> Self:
+        for event in events:
+            self.append(event)
+        return self
+
+    def take(self) -> Sequence[Event]:
+        """All of them, and before them how many were left out; none remain."""
+        omitted = (Omitted(kind=kind, count=count) for kind, count in self._omitted.items())
+        events = (*omitted, *self)
+        self.clear()
+        self._omitted.clear()
+        return events
+
+
+class Endpoint(ABC):
+    """Something that talks UDP. `now_ns` is always the driver's monotonic clock [ns]."""
+
+    changeable: frozenset[str] = frozenset()
+    """Keys of its scenario that may change in flight, see `shared.core.change`."""
+
+    def __init__(self) -> None:
+        # Both are handed to the parts that an endpoint is made of: they stay the same objects.
+        self._out: list[Datagram] = []
+        self._events = Events()
+
+    @abstractmethod
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Take a datagram that arrived. Never raises for anything a peer can put into it."""
+
+    @abstractmethod
+    def wake(self, *, now_ns: int) -> None:
+        """Do what is due now (drivers may be late, and may be early)."""
+
+    @abstractmethod
+    def next_wake_ns(self) -> int | None:
+        """Time of the next wake, or None: only a datagram matters now."""
+
+    def close(self, *, now_ns: int) -> None:  # noqa: B027 - most have nothing to say
+        """Say what peers must know before the driver ends; nothing else is called after it."""
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+        """Fly another scenario from now on; called between two steps. Never fails.
+
+        Args:
+            scenario: the scenario with all that was changed so far, checked.
+            keys: keys that were given a value just now, all of them `changeable`.
+            now_ns: time now.
+        """
+        assert not keys  # there are none that may change
+
+    def send(self, payload: bytes, peer: Address, socket: int = 0) -> None:
+        """Put a datagram into the outbox.
+
+        Args:
+            payload: UDP payload.
+            peer: address of the receiver.
+            socket: number of the endpoint's own socket that sends it.
+        """
+        self._out.append(Datagram(payload, peer, socket))
+
+    def tell(self, event: Event) -> None:
+        """Say something that was done to it from outside."""
+        self._events.append(event)
+
+    def figures(self) -> dict[str, Any]:
+        """Numbers counted so far, by name; a nested dictionary is a group of them.
+
+        Names are those of fields, or what a group is told by: a vehicle's number in `by_vehicle`, a
+        reason in `dropped`, an edge [ms] in `ticks_within_ms`.
+        """
+        return {}
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left to do, so that the driver may end."""
+        return False
+
+    def outbox(self) -> list[Datagram]:
+        """Datagrams to be sent; each is handed out once."""
+        if not self._out:
+            return []
+        out = self._out.copy()
+        self._out.clear()
+        return out
+
+    def events(self) -> Sequence[Event]:
+        """Events since the last call; each is handed out once."""
+        return self._events.take() if self._events else ()

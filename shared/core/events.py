@@ -1,0 +1,440 @@
+"""Events: what an endpoint, or the process around it, has to say, as typed values.
+
+An endpoint hands its events out (`Endpoint.events`); a driver gives them to whoever listens: a
+log, a flight in virtual time, a command that has started the process. `str(event)` is the
+operator's sentence. For a program an event is an object of JSON whose key `type` names the class.
+"""
+
+from typing import Any, Literal
+
+import msgspec
+
+from skytether.shared.core.aboard import AboardEvent, AboardFailure, VehicleEvent
+from skytether.shared.law.terms import Difference
+from skytether.shared.wire.protocol import Drop
+
+
+def address_text(host: str, port: int) -> str:
+    """HOST:PORT as a user writes it, with an IPv6 host in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process has bound its socket and is about to be driven."""
+
+    host: str
+    port: int
+    waiting_for: str
+    """Whose datagrams it waits for."""
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        return f"listening on {address}, waiting for {self.waiting_for}"
+
+
+class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A page can be looked at."""
+
+    address: str
+    """Address for a browser; with a token in it where that may change what flies."""
+    taken: str = ""
+    """HOST:PORT that it was to have, where somebody else has that."""
+
+    def __str__(self) -> str:
+        # Nothing but a space follows the address: it is copied, or clicked at.
+        return f"the page is at {self.address}" + (
+            f" ({self.taken} is taken)" if self.taken else ""
+        )
+
+
+class BrowserRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A page has turned browsers away, or has dropped what they have sent."""
+
+    why: str
+    count: int
+    """How often that has happened so far."""
+
+    def __str__(self) -> str:
+        return f"refused, {self.count} so far: {self.why}"
+
+
+class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process serves its figures over HTTP, as metrics."""
+
+    host: str
+    port: int
+    local: bool = True
+    """Whether no other machine can read them."""
+
+    def __str__(self) -> str:
+        whose = "" if self.local else ", WITHOUT A PASSWORD: anybody on the network can read them"
+        return f"metrics at http://{address_text(self.host, self.port)}/metrics{whose}"
+
+
+class NoFailsafe(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process is told to fly a vehicle that goes on for ever once it hears nothing any more."""
+
+    def __str__(self) -> str:
+        flown = "without a packet it holds its last input for ever"
+        return f'NO FAILSAFE: {flown}; vehicle.exhausted = "brake" has one'
+
+
+class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process has no keys: what it hears may be anybody's, and anybody may read what it says."""
+
+    local: bool
+    """Whether no other machine can reach it, nor be reached."""
+
+    def __str__(self) -> str:
+        who = "on this machine" if self.local else "on the network"
+        return f"PLAINTEXT, no keys: anybody {who} can fly the vehicle; see skytether keygen"
+
+
+class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process has been asked for its figures, or ends."""
+
+    figures: dict[str, Any]
+    """Numbers by name; a dictionary in it is a group of them."""
+
+    def __str__(self) -> str:
+        return "counted so far:"
+
+
+class Omitted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """More events of a kind have happened than are told one by one."""
+
+    kind: str
+    """Name of their class; "lines" where nobody has read what was printed."""
+    count: int
+    """Number of events that are not told."""
+
+    def __str__(self) -> str:
+        return f"… and {self.count:,} more {self.kind}".replace(",", " ")
+
+
+class RecordIncomplete(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process could not write all of its part of the record; the flight goes on."""
+
+    file: str
+    reason: str
+    """What the system says of it, such as "No space left on device"."""
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.reason}: the record is incomplete, the flight goes on"
+
+
+class Fault(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process has met a mistake in its own code, and goes on."""
+
+    traceback: str
+    """Traceback in Python's words."""
+
+    def __str__(self) -> str:
+        return f"a mistake in its code, the flight goes on\n{self.traceback.rstrip()}"
+
+
+class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """New client, heard by netem."""
+
+    flow: int
+    """Number of the flow, from 0."""
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"flow {self.flow} for {address_text(self.host, self.port)}"
+
+
+class AutopilotSaid(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """An autopilot has said something in words."""
+
+    text: str
+    severity: int
+    """Severity as MAVLink has it, from 0, an emergency, to 7."""
+
+    def __str__(self) -> str:
+        return self.text or "nothing in words"
+
+
+class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A server with keys has dropped datagrams: strangers made them, or they came twice or late."""
+
+    count: int
+    """Number of them so far."""
+    host: str
+    """Host that the newest came from."""
+    port: int
+    reason: Drop
+    """What is wrong with the newest."""
+
+    def __str__(self) -> str:
+        newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"
+        return f"{self.count} datagrams so far are not taken for a vehicle's, {newest}"
+
+
+class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """The server misses more of its ticks than it may, or has stopped doing so."""
+
+    degraded: bool
+
+    def __str__(self) -> str:
+        return "degraded: it misses ticks" if self.degraded else "it is in time again"
+
+
+class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A key of the scenario has another value from now on."""
+
+    key: str
+    before: str
+    """Value that it had, as a scenario's file has it."""
+    after: str
+    """Value that it has."""
+
+    def __str__(self) -> str:
+        return f"{self.key} is {self.after} from now on, it was {self.before}"
+
+
+class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """Somebody has asked for a change in flight that cannot be, and nothing is changed."""
+
+    reason: str
+    """Why it cannot be; names the key, what was given and what was expected."""
+
+    def __str__(self) -> str:
+        return f"a change is refused: {self.reason}"
+
+
+class SessionOpened(VehicleEvent, frozen=True, kw_only=True):
+    """The server has received the first observation of a vehicle's session."""
+
+    host: str
+    """Host that the vehicle's HELLO came from."""
+    port: int
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} flies, from {address_text(self.host, self.port)}"
+
+
+class SessionEnded(VehicleEvent, frozen=True, kw_only=True):
+    """The server has forgotten a vehicle that was silent for long."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} is gone"
+
+
+class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
+    """Server and vehicle fly different scenarios; each end says so from its own side."""
+
+    differences: tuple[Difference, ...]
+    """Keys of the scenario that differ."""
+
+    def __str__(self) -> str:
+        keys = "; ".join(
+            f"{difference.key} is {difference.here} here and {difference.there} at the other end"
+            for difference in self.differences
+        )
+        return f"vehicle {self.vehicle} is refused, it flies another scenario: {keys}"
+
+
+class ServerFull(VehicleEvent, frozen=True, kw_only=True):
+    """The server has refused a vehicle for which it has no room."""
+
+    host: str
+    """Host that the vehicle's HELLO came from."""
+    port: int
+    room: int
+    """Number of vehicles that there is room for."""
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        full = f"the server is full (room for {self.room}); see --vehicles"
+        return f"vehicle {self.vehicle} from {address} is refused: {full}"
+
+
+class NumberTaken(VehicleEvent, frozen=True, kw_only=True):
+    """The server has refused a vehicle whose number is that of another one, which it hears."""
+
+    host: str
+    """Host that the refused vehicle's HELLO came from."""
+    port: int
+    holder: str
+    """HOST:PORT that the other vehicle is heard from."""
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        taken = f"another client flies under this number, from {self.holder}; see --id"
+        return f"vehicle {self.vehicle} from {address} is refused: {taken}"
+
+
+class NoSession(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has heard why the server opens no session for it; it goes on asking."""
+
+    host: str
+    """Host that it says HELLO to."""
+    port: int
+    reason: Literal["full", "taken"]
+    """Whether the server has no room, or another client flies under the vehicle's number."""
+
+    def __str__(self) -> str:
+        why = {
+            "full": "the server is full; see its --vehicles",
+            "taken": "another client flies under this number; see --id",
+        }[self.reason]
+        return f"vehicle {self.vehicle} is refused by {address_text(self.host, self.port)}: {why}"
+
+
+class NoAnswer(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has given up, never having heard the server."""
+
+    host: str
+    """Host that it said HELLO to."""
+    port: int
+    waited_s: float
+    """Time since its first HELLO [s]."""
+    secure: bool = False
+    """Whether it has a key, so that an answer counts only of those who know it."""
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        if self.secure:
+            said = f"nobody who knows this key answers at {address} in {self.waited_s:.0f} s"
+            return f"vehicle {self.vehicle}: {said}"
+        return f"vehicle {self.vehicle}: no answer from {address} in {self.waited_s:.0f} s"
+
+
+class Flying(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle's first session has opened, and with it the flight has begun."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: session open, flying"
+
+
+class ModeChanged(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle does something else from now on, or the same for another reason.
+
+    That it coasts along a plan that still lasts is not told.
+    """
+
+    before: str
+    """Name of the mode that it was in, see `shared.wire.protocol.Mode`."""
+    after: str
+    """Name of the mode that it is in; the same where its reason alone has changed."""
+    reason: str
+
+    def __str__(self) -> str:
+        # Of another version, or somebody else's recording, the name may be one that is not known.
+        does = DOES.get(self.after, f"is in the mode {self.after}")
+        return f"vehicle {self.vehicle} {does}: {self.reason}"
+
+
+DOES = {
+    "init": "has no session",
+    "sync": "waits for a good link",
+    "ready": "waits for a plan",
+    "track": "flies a plan",
+    "coast": "holds its last input, as vehicle.exhausted says",
+    "brake": "brakes",
+    "hover": "hovers",
+    "land": "lands, and is not to be flown before somebody has seen to it",
+    "manual": "is left to whoever flies it now",
+    "fault": "stands still, and is not to be flown before somebody has seen to it",
+}
+"""What a vehicle does in each mode, as far as it is told: along a plan it coasts in silence."""
+
+
+class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
+    """The server makes no plan for a vehicle that it hears, or sends none."""
+
+    why: str
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} is sent no plan: {self.why}"
+
+
+class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
+    """The server does not believe the state that a vehicle reports, since it did so before."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} reports a state that it cannot have come to: not believed"
+
+
+class FenceHolds(VehicleEvent, frozen=True, kw_only=True):
+    """The fence lets less pass than the vehicle was told to fly."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} is held back by its fence"
+
+
+class PlanningResumed(VehicleEvent, frozen=True, kw_only=True):
+    """The server plans for a vehicle again."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} is planned for again"
+
+
+class NotFlown(VehicleEvent, frozen=True, kw_only=True):
+    """The time of a flight is over, and the vehicle has had no plan for long, or never had one."""
+
+    covered: int
+    """Number of steps for which it had an input planned."""
+    steps: int
+    """Number of all steps."""
+    why: str
+    """Reason for there being none, as far as the vehicle knows."""
+
+    def __str__(self) -> str:
+        flown = f"ended without a plan, after {self.covered} of {self.steps} steps with one"
+        return f"vehicle {self.vehicle} {flown if self.covered else 'was never flown'}: {self.why}"
+
+
+class Finished(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has begun the last step of its flight."""
+
+    steps: int
+    """Steps of the flight."""
+    missed: int
+    """Steps that it slept through."""
+
+    def __str__(self) -> str:
+        return (
+            f"vehicle {self.vehicle}: flown to the end, {self.missed} of {self.steps} steps missed"
+        )
+
+
+Failure = SessionRefused | NoSession | NoAnswer | NotFlown | AboardFailure
+"""Events after which a vehicle cannot fly, or has not."""
+
+Event = (
+    Listening
+    | PageServed
+    | BrowserRefused
+    | Measured
+    | Plaintext
+    | NoFailsafe
+    | Counted
+    | Omitted
+    | RecordIncomplete
+    | Fault
+    | FlowOpened
+    | AutopilotSaid
+    | AboardEvent
+    | Unauthenticated
+    | Degraded
+    | Changed
+    | ChangeRefused
+    | SessionOpened
+    | SessionEnded
+    | SessionRefused
+    | ServerFull
+    | NumberTaken
+    | NoSession
+    | NoAnswer
+    | Flying
+    | ModeChanged
+    | PlanningStopped
+    | StateDoubted
+    | FenceHolds
+    | PlanningResumed
+    | NotFlown
+    | Finished
+)

@@ -1,0 +1,82 @@
+"""Addresses as users write them: HOST:PORT of a UDP peer, and lines to a vehicle's own hardware.
+
+    udp:HOST:PORT       listen there, and talk to whoever speaks first
+    udpout:HOST:PORT    talk to this address
+    tcp:HOST:PORT       connect to it
+    serial:PATH:BAUD    a serial port, as in serial:/dev/ttyACM0:57600
+
+TCP and serial lines carry bytes without borders: an endpoint hears them in pieces, all of them from
+the peer `LINE`.
+"""
+
+import ipaddress
+from typing import Literal, NamedTuple
+
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.endpoint import Address
+
+HOST_PORT = "HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
+"""Form of an address, in messages."""
+LINE: Address = ("line", 0)
+"""Peer at the other end of a TCP or serial line."""
+FORMS = "udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
+"""Forms of a line, in messages."""
+
+
+class Line(NamedTuple):
+    """Where a vehicle's own hardware is reached."""
+
+    kind: Literal["udp", "udpout", "tcp", "serial"]
+    host: str
+    """Host, or path of a serial port."""
+    number: int
+    """Port, or bits a second of a serial port."""
+
+    @property
+    def address(self) -> Address:
+        """Host and port of the line."""
+        return self.host, self.number
+
+    @property
+    def peer(self) -> Address | None:
+        """Whoever is at the other end; None where it is whoever speaks first."""
+        return {"udp": None, "udpout": self.address}.get(self.kind, LINE)
+
+
+def parse_address(text: str) -> Address | None:
+    """Address in a text as HOST:PORT, with an IPv6 host in brackets; None where it is none."""
+    host, _, port = text.rpartition(":")
+    bracketed = host.startswith("[") and host.endswith("]")
+    host = host[1:-1] if bracketed else host
+    if not (
+        host
+        and bracketed == (":" in host)
+        and (not bracketed or _is_ipv6(host))
+        and (port.isascii() and port.isdigit() and int(port) < 65536)
+    ):
+        return None
+    return host, int(port)
+
+
+def parse_line(key: str, text: str) -> Line:
+    """Line in a text.
+
+    Raises:
+        ConfigError: it is none; `key` is who gave it.
+    """
+    kind, _, rest = text.partition(":")
+    if kind == "serial":
+        path, _, baud = rest.rpartition(":")
+        if path and baud.isascii() and baud.isdigit() and 0 < int(baud) <= 10_000_000:
+            return Line("serial", path, int(baud))
+    elif kind in ("udp", "udpout", "tcp") and (address := parse_address(rest)):
+        return Line(kind, *address)  # type: ignore[arg-type] # one of these three
+    raise ConfigError(f"{key}: got {text!r}, expected {FORMS}")
+
+
+def _is_ipv6(host: str) -> bool:
+    try:
+        ipaddress.IPv6Address(host)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,36 @@
+"""What no vehicle can do: come from one state to another within a time.
+
+The vehicle holds what it measures of itself against what it measured before, the server what it is
+told against what it was told; both by this, which is compiled into the server's kernel.
+"""
+
+ACCELERATION_MPS2 = 50.0
+"""Acceleration that no vehicle exceeds [m/s²]."""
+NOISE_M, NOISE_MPS = 1.0, 2.0
+"""What noise may add to a change of position [m] and of velocity [m/s]."""
+
+
+def velocity_leaps(v: float, after_v: float, time: float, noise: float) -> bool:
+    """Whether no vehicle can have changed its velocity so much.
+
+    Args:
+        v, after_v: velocity on one axis before and after [m/s].
+        time: between the two [s].
+        noise: what noise may add to the change [m/s].
+    """
+    return abs(after_v - v) > noise + ACCELERATION_MPS2 * time
+
+
+def position_leaps(
+    p: float, v: float, after_p: float, after_v: float, time: float, noise: float
+) -> bool:
+    """Whether no vehicle can have come from one place to another.
+
+    Args:
+        p, v: position [m] and velocity [m/s] on one axis before.
+        after_p, after_v: position [m] and velocity [m/s] after.
+        time: between the two [s].
+        noise: what noise may add to the change of position [m].
+    """
+    off = after_p - p - 0.5 * (v + after_v) * time
+    return abs(off) > noise + 0.5 * ACCELERATION_MPS2 * time * time

@@ -1,0 +1,135 @@
+"""The UAV as a first-order velocity loop per axis, eq. (1)-(4).
+
+Per axis the state is x = [p, v] (position [m], velocity [m/s]) and the input u the desired velocity
+[m/s]; v follows g u, with the gain g and the time constant tau; `shared.law.dead_time` says what a
+dead time changes. The axes do not couple, so the model of the whole vehicle is one 2 x 2 system an
+axis, and the same code flies in 2-D and 3-D:
+
+    p(k+1) = p(k) + a01 v(k) + b0 u(k)          A = [[1, a01],   B = [b0,
+    v(k+1) =        a11 v(k) + b1 u(k)               [0, a11]]        b1]
+
+`advance` is the one home of eq. (4). It takes the numbers of one axis or the arrays of all, and is
+compiled into every kernel that rolls a state along.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+"""Rows of vehicles or step indices, one per vehicle; shape (n,)."""
+Flags = NDArray[np.bool_]
+"""One yes or no per vehicle; shape (n,)."""
+
+
+class Axis(NamedTuple):
+    """Eq. (4) on one axis."""
+
+    a01: float
+    """How far the velocity carries the position within a step [s]."""
+    a11: float
+    """Share of the velocity that is left after a step."""
+    b0: float
+    """How far the input carries the position within a step [s]."""
+    b1: float
+    """Share of the input that the velocity has taken on after a step."""
+
+
+class Model(NamedTuple):
+    """Eq. (4) on every axis; each field has the shape (axes,)."""
+
+    a01: Array
+    """How far the velocity carries the position within a step [s]."""
+    a11: Array
+    """Share of the velocity that is left after a step."""
+    b0: Array
+    """How far the input carries the position within a step [s]."""
+    b1: Array
+    """Share of the input that the velocity has taken on after a step."""
+
+    def axes(self) -> list[Axis]:
+        """The model of each axis in plain numbers."""
+        columns = [field.tolist() for field in self]
+        return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
+
+    def step(self, x: Array, u: Array | float) -> Array:
+        """State a step later; x of shape (..., axes, 2), u of shape (..., axes)."""
+        return np.stack(advance(self, x[..., 0], x[..., 1], u), -1)
+
+    def roll(self, x: Array, inputs: Array) -> Array:
+        """States that inputs lead to one after the other, x among them; shape (n + 1, axes, 2).
+
+        Args:
+            x: state at the begin; shape (axes, 2).
+            inputs: one a step [m/s]; shape (axes, n).
+        """
+        paths = []
+        for axis, (p, v), along in zip(self.axes(), x.tolist(), inputs.tolist(), strict=True):
+            path = [(p, v)]
+            for u in along:
+                p, v = advance(axis, p, v, u)  # noqa: PLW2901 - rolled along
+                path.append((p, v))
+            paths.append(path)
+        return np.array(paths).swapaxes(0, 1)
+
+    @property
+    def A(self) -> Array:  # noqa: N802 - the paper's letter
+        """A of eq. (4); shape (axes, 2, 2)."""
+        one, zero = np.ones_like(self.a01), np.zeros_like(self.a01)
+        return np.stack([np.stack([one, self.a01], -1), np.stack([zero, self.a11], -1)], -2)
+
+    @property
+    def B(self) -> Array:  # noqa: N802 - the paper's letter
+        """B of eq. (4); shape (axes, 2)."""
+        return np.stack([self.b0, self.b1], -1)
+
+
+def advance(axis: Any, p: Any, v: Any, u: Any) -> tuple[Any, Any]:
+    """Position and velocity a step later, x(k+1) = A x(k) + B u(k), eq. (4).
+
+    Args:
+        axis: an `Axis` and numbers, or a `Model` and arrays whose last axis is the spatial one.
+        p, v, u: position [m], velocity and input [m/s].
+    """
+    return p + axis.a01 * v + axis.b0 * u, axis.a11 * v + axis.b1 * u
+
+
+def discretise(
+    tau_s: Array | Sequence[float], dt_s: float, gain: Array | Sequence[float] | float = 1.0
+) -> Model:
+    """Exact zero-order hold of eq. (1)-(3): the matrix exponential in closed form.
+
+    Args:
+        tau_s: time constant of each axis [s]; shape (axes,).
+        dt_s: length of a step [s].
+        gain: g, steady velocity over desired velocity, of each axis or of all.
+    """
+    tau, g = np.asarray(tau_s, dtype=np.float64), np.asarray(gain, dtype=np.float64)
+    # 1 - exp(-dt/tau), without cancellation where tau is long.
+    settled = -np.expm1(-dt_s / tau)
+    B = g * (dt_s - tau * settled), g * settled
+    return Model(tau * settled, np.exp(-dt_s / tau), *B)
+
+
+def white_acceleration(tau_s: Array, dt_s: float) -> Array:
+    """Square root L of a step's covariance under white acceleration, L Lᵀ = ∫ e^{As} G Gᵀ e^{Aᵀs}.
+
+    With G = [0, 1], e^{As}G = [τ(1 - e^{-s/τ}), e^{-s/τ}], and the integrals over [0, Δt] follow.
+
+    Args:
+        tau_s: shape (axes,).
+
+    Returns:
+        shape (axes, 2, 2).
+    """
+    tau = np.asarray(tau_s, dtype=np.float64)
+    one = -tau * np.expm1(-dt_s / tau)  # ∫ e^{-s/τ}
+    two = -0.5 * tau * np.expm1(-2.0 * dt_s / tau)  # ∫ e^{-2s/τ}
+    positions = tau**2 * (dt_s - 2.0 * one + two)
+    both = tau * (one - two)
+    covariance = np.stack([np.stack([positions, both], -1), np.stack([both, two], -1)], -2)
+    root: Array = np.linalg.cholesky(covariance).astype(np.float64)
+    return root

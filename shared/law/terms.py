@@ -1,0 +1,123 @@
+"""The terms of a flight: what server and client must agree on before it.
+
+Whatever both ends predict with is a term, and both build it from the terms alone, so that what is
+left out here cannot be used. Keys of a scenario that are no terms belong to one end, which may set
+them as it likes; `shared/scenario/schema.py` says of each whose it is.
+"""
+
+from typing import NamedTuple
+
+import msgspec
+
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.law.dead_time import DeadTime, dead_time
+from skytether.shared.law.model import Model, discretise
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """A term on which two ends disagree."""
+
+    key: str
+    """Key of the scenario."""
+    here: str
+    """Value at the end that tells it."""
+    there: str
+    """Value at the other end."""
+
+
+class Terms(NamedTuple):
+    """Values on which both ends must agree before a flight: plain numbers and texts."""
+
+    dt_ns: int
+    """Length of a step [ns]."""
+    horizon: int
+    """Steps planned ahead, H."""
+    axes: int
+    """Spatial axes, 2 or 3."""
+    tau_s: tuple[float, ...]
+    """Time constant of the model (2)-(3) of each axis [s]."""
+    gain: tuple[float, ...]
+    """Gain of the model of each axis: steady velocity over desired velocity."""
+    dead_time_s: tuple[float, ...]
+    """Dead time of the model of each axis [s]."""
+    u_max: tuple[float, ...]
+    """Bound (6) of the input on each axis [m/s]."""
+    scheme: str
+    """Delay compensation at both ends, as in `control.scheme`."""
+    feedback: bool
+    """Whether horizons bring feedback."""
+    exhausted: str
+    """What the vehicle does after a horizon's last input, "hold" or "brake"."""
+    brake_mps2: float
+    """How fast braking takes the desired velocity to zero [m/s²]."""
+    heartbeat_s: float
+    """Longest silence of the server [s]."""
+    age_max_s: float
+    """Largest age of the observation behind an input [s]."""
+    shape: str
+    """Shape of the desired trajectory."""
+    radius_m: float
+    """Half the width of circle, figure-eight and square [m]."""
+    period_s: float
+    """Time for one round of them [s]."""
+    altitude_m: float
+    """Their height in 3-D [m]."""
+    points: str
+    """Digest of the waypoints."""
+    speed_mps: float
+    """Speed between waypoints [m/s]."""
+    loop: bool
+    """Whether the waypoints are flown round and round."""
+    table: str
+    """Digest of what stands in the trajectory's CSV file, wherever the file lies."""
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a step [s]."""
+        return self.dt_ns / SECOND_NS
+
+    @property
+    def model(self) -> Model:
+        """The UAV as both ends know it."""
+        return discretise(self.tau_s, self.dt_s, self.gain)
+
+    @property
+    def dead_times(self) -> list[DeadTime]:
+        """Dead time of the model of each axis."""
+        axes = zip(self.tau_s, self.dead_time_s, self.gain, strict=True)
+        return [dead_time(tau_s, late_s, self.dt_ns, gain) for tau_s, late_s, gain in axes]
+
+    @property
+    def indexed(self) -> bool:
+        """Whether the vehicle reads a horizon by the step it is at, and not always its first."""
+        return self.scheme not in ("dead_reckoning", "none")
+
+    @property
+    def commits(self) -> bool:
+        """Whether horizons begin with committed inputs."""
+        return self.scheme == "committed"
+
+    @property
+    def reckons(self) -> bool:
+        """Whether horizons bring no plan, but the state that the vehicle goes on from."""
+        return self.scheme == "dead_reckoning"
+
+    @property
+    def planned(self) -> int:
+        """Number of a horizon's inputs behind the committed ones: H, or 1 without a plan."""
+        return 1 if self.reckons else self.horizon
+
+    @property
+    def reach(self) -> int:
+        """Steps behind the committed ones for which a horizon is good: H, or the age bound."""
+        return self.age_max if self.reckons else self.horizon
+
+    @property
+    def age_max(self) -> int:
+        """Largest age of the observation behind an input [steps]."""
+        return seconds_to_ns(self.age_max_s) // self.dt_ns
+
+    @property
+    def brake(self) -> float:
+        """Speed that braking takes away in a step [m/s]; 0 where the last input is held."""
+        return self.brake_mps2 * self.dt_s if self.exhausted == "brake" else 0.0

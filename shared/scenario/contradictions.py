@@ -1,0 +1,232 @@
+"""Contradictions: values of a scenario that are right one by one and impossible together."""
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from skytether.shared.scenario import policies
+from skytether.shared.scenario import reference as shapes
+from skytether.shared.scenario.fence import inner, margins
+from skytether.shared.scenario.registry import REFERENCES, TRIGGERS
+from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.scenario.triggers import make_trigger
+from skytether.shared.wire.protocol import INPUTS_MAX
+
+Contradiction = tuple[str, object, str]
+"""A key, the value that it was given, and what was expected."""
+
+TINY = 1e-9
+"""As much as floating point may make of 40 · 0.011."""
+
+FENCED_STEPS_MAX = 100_000
+"""Most steps of a trajectory that are held against the fence."""
+LOSSY = 0.3
+"""Share of lost packets to the vehicle above which horizons must be longer."""
+
+
+def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterator[Contradiction]:
+    """All that is wrong with a scenario whose values are right one by one.
+
+    Args:
+        known: a scenario with which nothing is wrong; a trajectory that it has is not made again.
+    """
+    model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
+    axes = model.axes
+    for key, values in (
+        ("model.tau_s", model.tau_s),
+        ("model.gain", model.gain),
+        ("model.dead_time_s", model.dead_time_s),
+        ("model.u_max", model.u_max),
+        ("vehicle.tau_s", vehicle.tau_s or (1.0,)),
+        ("vehicle.gain", (1.0,) if vehicle.gain == () else vehicle.gain),
+        ("vehicle.dead_time_s", (1.0,) if vehicle.dead_time_s == () else vehicle.dead_time_s),
+    ):
+        if isinstance(values, tuple) and len(values) not in (1, axes):
+            yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
+    for key, values in (
+        ("vehicle.start_m", vehicle.start_m),
+        ("reference.velocity_mps", scenario.reference.velocity_mps),
+        ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
+        ("fence.low_m", scenario.fence.low_m),
+        ("fence.high_m", scenario.fence.high_m),
+        ("sensor.position_bias_m", scenario.sensor.position_bias_m),
+        ("sensor.velocity_bias_mps", scenario.sensor.velocity_bias_mps),
+    ):
+        if len(values) not in (0, axes):
+            yield key, list(values), f"{axes} numbers with model.axes = {axes}"
+    if control.horizon * axes > INPUTS_MAX:
+        fit = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
+        yield "control.horizon", control.horizon, fit
+    link = scenario.link
+    if link.timeout_s <= link.heartbeat_s:
+        yield "link.timeout_s", link.timeout_s, f"more than link.heartbeat_s = {link.heartbeat_s:g}"
+    if vehicle.exhausted == "brake" and vehicle.slew_mps2 < vehicle.brake_mps2:
+        least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, for it to brake"
+        yield "vehicle.slew_mps2", vehicle.slew_mps2, least
+    sensor = scenario.sensor
+    if sensor.velocity_every_s == "never" and sensor.filter == "none":
+        yield (
+            "sensor.filter",
+            repr(sensor.filter),
+            "'kalman' with sensor.velocity_every_s = 'never'",
+        )
+    if control.scheme == "dead_reckoning" and not control.feedback:
+        yield "control.feedback", "false", "true with control.scheme = 'dead_reckoning'"
+    if control.scheme == "none" and control.feedback:
+        yield "control.feedback", "true", "false with control.scheme = 'none'"
+    yield from _too_slow(scenario)
+    yield from _too_short(scenario)
+    yield from _no_trigger(control)
+    if known is None or scenario.reference != known.reference or axes != known.model.axes:
+        yield from _no_shape(scenario) or _no_reference(scenario)
+    if scenario.fence.is_there:
+        yield from list(_no_room(scenario)) or _outside(scenario)
+
+
+def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why no horizon can come in time over the scenario's network."""
+    control, link, axes = scenario.control, scenario.link, scenario.model.axes
+    up, down = scenario.network.uplink, scenario.network.downlink
+    # As the server sees it, whose clock map knows no more than half of the smallest round trip.
+    delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
+    seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
+    H, dt, bound_s = control.horizon, control.dt, control.delay_bound
+    if control.scheme == "predictive" and H * dt < delay_s - TINY:
+        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to cover {seen}"
+    if control.commits:
+        if bound_s != "auto" and bound_s < delay_s - TINY:
+            yield "control.delay_bound", bound_s, f"at least {seen}"
+        steps = max(1, math.ceil((delay_s if bound_s == "auto" else bound_s) / dt - TINY))
+        most = INPUTS_MAX // axes - steps
+        if most < 1:
+            yield "control.dt", dt, f"more, for {seen} to take fewer than {steps} steps"
+        if most < H:
+            fit = f"at most {most} beside {steps} committed steps with {axes} axes"
+            yield "control.horizon", H, f"{fit}, to fit one datagram"
+    ahead_s = bound_s if control.commits and bound_s != "auto" else up.mean_s
+    trip_s = max(ahead_s, up.mean_s) + down.mean_s + 2 * dt
+    if link.age_max_s < trip_s - TINY:
+        yield "link.age_max_s", link.age_max_s, f"at least {trip_s:g} s, a round trip and two steps"
+
+
+def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why the vehicle would brake further than it follows plans; the more so, the more are lost."""
+    control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
+    covered_s, lossy = control.horizon * control.dt, scenario.network.uplink.loss > LOSSY
+    least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
+    plans = control.scheme in ("committed", "predictive")
+    if vehicle.exhausted == "brake" and plans and covered_s < least_s - TINY:
+        what = "what" if lossy else "half of what"
+        lost = f", with over {LOSSY:.0%} of the packets to the vehicle lost" if lossy else ""
+        least = f"at least {least_s:g} s, {what} braking from u_max takes{lost}"
+        yield (
+            "control.horizon",
+            control.horizon,
+            f"horizon · dt (now {covered_s:g} s) to be {least}",
+        )
+
+
+def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
+    """Why there can be no such trigger."""
+    try:
+        trigger = policies.parse(control.trigger)
+    except policies.PolicyError as error:
+        yield "control.trigger", repr(error.given), error.expected
+        return
+    try:
+        make_trigger(control, 1)
+    except Exception as error:
+        expected = f"a trigger that can be made ({type(error).__name__}: {error})"
+        yield "control.trigger", repr(control.trigger), expected
+    for name in (part.name for part in policies.policies(trigger)):
+        schemes = TRIGGERS[name].schemes
+        if schemes and control.scheme not in schemes:
+            expected = " or ".join(map(repr, schemes))
+            yield "control.scheme", repr(control.scheme), f"{expected} with the trigger {name}"
+
+
+def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why the desired trajectory cannot be made."""
+    ref, axes = scenario.reference, scenario.model.axes
+    least = {"waypoints": 2, "hover": 1}.get(ref.shape, 0)
+    if len(ref.points_m) < least:
+        yield "reference.points_m", list(ref.points_m), f"at least {least} with shape {ref.shape!r}"
+    for point in ref.points_m:
+        if len(point) != axes:
+            yield "reference.points_m", list(point), f"{axes} numbers a point"
+    if ref.shape in ("circle", "figure-eight", "square"):
+        most_m = shapes.FAST_MPS * ref.period_s / 8.0  # a square's round is eight radii long
+        if ref.radius_m > most_m:
+            most = f"at most {most_m:g} with reference.period_s = {ref.period_s:g}"
+            yield "reference.radius_m", ref.radius_m, most
+    route = ref.points_m + ref.points_m[:1] * ref.loop
+    if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
+        yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
+    elif ref.shape in ("waypoints", "csv"):
+        try:
+            scenario.make_reference()
+        except OSError as error:
+            yield "reference.file", repr(ref.file), f"a readable file ({error.strerror})"
+        except ValueError as error:
+            if ref.shape == "csv":
+                yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
+            else:
+                given = [list(point) for point in route]
+                yield "reference.points_m", given, "points that are further apart"
+
+
+def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why a fence has no room within it; asked once nothing else is wrong."""
+    fence = scenario.fence
+    low, high, radius = inner(scenario)
+    drawn = max(margins(scenario))
+    wind = f"fence.wind_mps = {fence.wind_mps:g}"
+    slowest = min(*scenario.model.u_max, fence.speed_mps or math.inf)
+    if fence.wind_mps >= slowest:
+        yield "fence.wind_mps", fence.wind_mps, f"less than {slowest:g}, the vehicle's speed"
+    if any(least >= most for least, most in zip(low, high, strict=True)):
+        room = f"more than {2 * drawn:.2g} m above fence.low_m, with {wind}"
+        yield "fence.high_m", list(fence.high_m), room
+    if radius <= 0.0:
+        yield "fence.radius_m", fence.radius_m, f"more than {drawn:.2g} m, with {wind}"
+
+
+def _outside(scenario: Scenario) -> Iterator[Contradiction]:
+    """Where the desired trajectory leads over the fence, or faster than it allows."""
+    fence, steps = scenario.fence, min(scenario.steps, FENCED_STEPS_MAX)
+    states = scenario.make_reference()(np.arange(steps + 1) * scenario.control.dt)
+    position, speed = states[..., 0], np.linalg.norm(states[..., 1], axis=1)
+    low, high, radius = inner(scenario)
+    home = np.array(scenario.vehicle.start_m or position[0])
+    far = np.linalg.norm(position - home, axis=1)
+    checks = (
+        ("fence.low_m", list(fence.low_m), (position < low).any(axis=1), "lower"),
+        ("fence.high_m", list(fence.high_m), (position > high).any(axis=1), "higher"),
+        ("fence.radius_m", fence.radius_m, far > radius, "more"),
+        ("fence.speed_mps", fence.speed_mps, speed > (fence.speed_mps or np.inf), "more"),
+    )
+    for key, value, over, more in checks:
+        if over.any():
+            at = int(over.argmax())
+            where = ", ".join(f"{each:.3g}" for each in position[at])
+            asked = f"at {at * scenario.control.dt:g} s ({where}) m at {speed[at]:.3g} m/s"
+            kept = f"{max(margins(scenario)):.2g} m inside"
+            yield key, value, f"{more}, for the trajectory asks {asked}, and the fence keeps {kept}"
+            return
+
+
+def _no_shape(scenario: Scenario) -> list[Contradiction]:
+    """Why there is no such shape, or a plug-in's that cannot be flown."""
+    ref = scenario.reference
+    try:
+        shape = policies.shape(ref.shape, REFERENCES)
+        if not REFERENCES[shape.name].is_ours:
+            shapes.sampled(scenario.make_reference(), scenario.model.axes)
+    except policies.PolicyError as error:
+        return [("reference.shape", repr(error.given), error.expected)]
+    except Exception as error:
+        expected = f"a trajectory that can be flown ({type(error).__name__}: {error})"
+        return [("reference.shape", repr(ref.shape), expected)]
+    return []

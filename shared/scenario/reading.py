@@ -1,0 +1,247 @@
+"""Reading a scenario: one TOML file, laid over those it extends, every value checked once.
+
+A scenario may say `extends = "other"` (a scenario's name, or a file beside it) and then holds only
+what differs. `skytether scenarios` lists those that come with Skytether.
+"""
+
+import math
+import re
+import tomllib
+import typing
+from collections.abc import Mapping
+from itertools import chain
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import msgspec
+
+from skytether import scenarios
+from skytether.shared.base import files
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.hint import hint
+from skytether.shared.scenario.contradictions import contradictions
+from skytether.shared.scenario.schema import Scenario
+
+SCENARIOS = Path(scenarios.__file__).parent
+"""Folder of the scenarios that come with Skytether."""
+FILE_BYTES_MAX = 1_000_000
+"""Largest size of a scenario's file [B]."""
+EXTENDS_MAX = 20
+"""Largest number of scenarios that a scenario is laid over, each over the next."""
+GIVEN_MAX = 200
+"""Largest number of characters that a message repeats of what was given."""
+COMPARED = "compare"
+"""The file of the scenarios that `skytether compare` flies."""
+
+
+def names(file: str = "") -> list[str]:
+    """Names of the scenarios that come with Skytether, or of those in a file of scenarios.
+
+    Args:
+        file: COMPARED, or the path of a file that holds a scenario in each of its tables.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    if file:
+        return [f"{file}/{name}" for name in _toml(_path(file), file)]
+    files = (each.name for each in SCENARIOS.iterdir())
+    known = {name.removesuffix(".toml") for name in files if name.endswith(".toml")}
+    return sorted(known - {COMPARED})
+
+
+def load(name: str) -> Scenario:
+    """Scenario by its name, or from a file by its path (anything that ends in .toml).
+
+    Behind the name or path of a file of scenarios stands the table: `compare/paper-event-gusts`.
+
+    Raises:
+        ConfigError: it does not exist, or something in it is wrong.
+    """
+    try:
+        return check(_read(name), name)
+    except RecursionError:
+        raise ConfigError(f"{name}: nested too deeply") from None
+
+
+def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = None) -> Scenario:
+    """The scenario in a table of plain values, every one of them checked.
+
+    Args:
+        source: the file or command line they come from, for the message.
+        known: a scenario that was checked before: where its trajectory is the same, no file of it
+            is read again.
+
+    Raises:
+        ConfigError: the first thing that is wrong.
+    """
+    where = f"{source}: " if source else ""
+    try:
+        scenario = msgspec.convert(raw, Scenario)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{where}{_explain(str(error), raw)}") from None
+    wrong = chain(_infinite(to_table(scenario)), contradictions(scenario, known))
+    for key, given, expected in wrong:
+        raise ConfigError(f"{where}{key}: got {_short(str(given))}, expected {expected}")
+    return scenario
+
+
+def to_table(scenario: Scenario) -> dict[str, Any]:
+    """The plain values of a scenario, from which `check` makes it again."""
+    table: dict[str, Any] = msgspec.to_builtins(scenario)
+    return table
+
+
+def to_toml(scenario: Scenario) -> bytes:
+    """The scenario as a file that `load` reads."""
+    return msgspec.toml.encode(scenario)
+
+
+def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})) -> dict[str, Any]:
+    """The raw table of a scenario, laid over those that it extends; `seen` extend it in turn."""
+    file, _, entry = name.rpartition("/")
+    if name.endswith(".toml") or name in names():
+        file, entry = name, ""
+    elif not (entry and (file == COMPARED or file.endswith(".toml"))):
+        raise ConfigError(f"{name}: no such scenario; {hint(name, names())}")
+    path = _path(file)
+    raw = _toml(path, file)
+    if entry:
+        if not isinstance(raw.get(entry), dict):
+            raise ConfigError(f"{name}: no such scenario; {hint(entry, raw)}")
+        raw = raw[entry]
+    if (path, entry) in seen:
+        circle = " → ".join([*seen.values(), name])
+        raise ConfigError(f"{seen[path, entry]}: extends: got a circle of {circle}")
+    if len(seen) > EXTENDS_MAX:
+        raise ConfigError(f"{name}: extends: got a chain of more than {EXTENDS_MAX} scenarios")
+    table = raw.get("reference")
+    if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
+        table["file"] = str((path.parent / table["file"]).absolute())
+    base = raw.pop("extends", None)
+    if base is None:
+        return raw
+    if not isinstance(base, str):
+        raise ConfigError(f"{name}: extends: got {base!r}, expected the name of a scenario")
+    if ".toml" in base:
+        base = str(path.parent / base)
+    return _overlay(_read(base, {**seen, (path, entry): name}), raw)
+
+
+def _path(file: str) -> Path:
+    """Where a file is, by its path or by the name of one that comes with Skytether."""
+    if not file.endswith(".toml"):
+        return SCENARIOS / f"{file}.toml"
+    try:
+        return Path(file).resolve()
+    except (ValueError, OSError, RuntimeError) as error:  # a zero byte, or a circle of links
+        raise ConfigError(f"{file}: cannot be read: {error}") from None
+
+
+def _toml(path: Path, file: str) -> dict[str, Any]:
+    """The raw table of a whole file, which the user calls `file`."""
+    try:
+        return tomllib.loads(files.read(path, FILE_BYTES_MAX).decode())
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+    except RecursionError:
+        raise ConfigError(f"{file}: no valid TOML: nested too deeply") from None
+    except ValueError as error:
+        raise ConfigError(f"{file}: no valid TOML: {error}") from None
+
+
+def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        both = isinstance(old, dict) and isinstance(value, dict)
+        merged[key] = _overlay(old, value) if both else value  # type: ignore[arg-type]
+    return merged
+
+
+_PLAIN = {
+    "Number out of range": "a number that is not as large",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "str": "a text",
+    "array": "a list",
+    "object": "a table",
+}
+"""Words of msgspec's messages, and what stands for them in ours."""
+
+_ERROR = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>[^`]*)`)?", re.DOTALL)
+
+
+def _explain(message: str, raw: Mapping[str, Any]) -> str:
+    """Message of msgspec, put as `key: got …, expected …`."""
+    # First, as a key may hold whatever msgspec puts behind it.
+    if strange := _strange(raw, Scenario):
+        return strange
+    found = _ERROR.fullmatch(message)
+    assert found is not None
+    what, path = found["what"], found["path"] or ""
+    section, given = Scenario, raw
+    for part in filter(None, path.split(".")):
+        key, *index = part.replace("]", "").split("[")
+        given = given[key] if isinstance(given, Mapping) else given
+        for digits in index:
+            given = given[int(digits)] if digits.isdigit() else given
+        section = typing.get_type_hints(section).get(key, section)
+    if what.startswith("Invalid enum value") or " | " in what:
+        return f"{path}: got {_written(given)}, expected {_choices(section)}"
+    expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
+    for theirs, ours in _PLAIN.items():
+        expected = re.sub(rf"^{theirs}\b", ours, expected)
+    return f"{path or 'the scenario'}: got {_written(given)}, expected {expected}"
+
+
+def _strange(table: object, section: Any, at: str = "") -> str | None:
+    """What to say of the first key of a table that its section does not have, if there is one."""
+    if not (isinstance(table, Mapping) and hasattr(section, "__struct_fields__")):
+        return None
+    kinds = typing.get_type_hints(section)
+    for key, value in table.items():
+        if key not in kinds:
+            return (
+                f"{at}{_short(str(key))}: no such key; {hint(str(key), section.__struct_fields__)}"
+            )
+        if below := _strange(value, kinds[key], f"{at}{key}."):
+            return below
+    return None
+
+
+def _written(given: object) -> str:
+    """A value as Python writes it, as far as a line has room for it."""
+    try:
+        return _short(repr(given))
+    except ValueError:  # Python writes no number of more than 4300 digits
+        return "a number of thousands of digits"
+
+
+def _short(given: str) -> str:
+    """What was given, as far as a line has room for it."""
+    return given if len(given) <= GIVEN_MAX else f"{given[:GIVEN_MAX]}…"
+
+
+def _choices(kind: Any) -> str:
+    """Values that are allowed: the words of a Literal, or one of several types."""
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple:
+        return _PLAIN["array"]
+    if typing.get_origin(kind) is Literal:
+        return " or ".join(map(repr, parts))
+    return " or ".join(map(_choices, parts)) if parts else _PLAIN[kind.__name__]
+
+
+def _infinite(value: object, key: str = "") -> typing.Iterator[tuple[str, object, str]]:
+    """Numbers that TOML knows and no flight has a use for: key, given, expected."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield key, value, "a finite number"
+    elif isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _infinite(inner, f"{key}.{name}" if key else name)
+    elif isinstance(value, list | tuple):
+        for index, inner in enumerate(value):
+            yield from _infinite(inner, f"{key}[{index}]")

@@ -1,0 +1,287 @@
+"""Desired trajectories x_d(t): position and velocity at any time (E6: the paper has positions).
+
+A reference is a function of time since the epoch [s; any shape] that gives the desired state
+[m, m/s; that shape + (axes, 2)] in the world frame, metres, third axis up.
+"""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.base import files
+from skytether.shared.law.model import Array
+
+FAR_M = 1e6
+"""Largest coordinate of a trajectory [m]."""
+FAST_MPS = 1e6
+"""Largest velocity along an axis of a trajectory that is given by its points [m/s]."""
+GRID_S = 0.05
+"""Time between two points at which the velocity of a target is drawn [s]; in between it is
+interpolated."""
+TURN_S = 3600.0
+"""Time after which a target goes its way back, and then forth again [s]: what is drawn of it stays
+bounded, whatever time it is asked for."""
+GRID_BLOCK = 1024
+"""Number of points that are drawn at a time."""
+FILE_BYTES_MAX = 16_000_000
+"""Largest size of a table [B]."""
+
+SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
+"""Times at which a plug-in's trajectory is looked at before a flight [s]: densely for two minutes,
+then ever more rarely up to a day; on no grid that a trajectory might have."""
+
+Reference = Callable[[NDArray[Any]], Array]
+
+
+def _planar(
+    x: Callable[[Array], tuple[Array, Array]],
+    y: Callable[[Array], tuple[Array, Array]],
+    axes: int,
+    altitude_m: float,
+) -> Reference:
+    """A plane curve from (position, velocity) of x and of y; in 3-D at constant altitude."""
+
+    def sample(t: Array) -> Array:
+        t = np.asarray(t, dtype=np.float64)
+        state = np.zeros((*t.shape, axes, 2))
+        for axis, curve in zip(range(axes), (x, y), strict=False):
+            state[..., axis, 0], state[..., axis, 1] = curve(t)
+        if axes == 3:
+            state[..., 2, 0] = altitude_m
+        return state
+
+    return sample
+
+
+def circle(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
+    """Circle around the origin, counter-clockwise, from (radius, 0)."""
+    w = 2.0 * np.pi / period_s
+    return _planar(
+        lambda t: (radius_m * np.cos(w * t), -radius_m * w * np.sin(w * t)),
+        lambda t: (radius_m * np.sin(w * t), radius_m * w * np.cos(w * t)),
+        axes,
+        altitude_m,
+    )
+
+
+def figure_eight(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
+    """Gerono's lemniscate: 2 radii wide, 1 radius high, from the crossing."""
+    w = 2.0 * np.pi / period_s
+    return _planar(
+        lambda t: (radius_m * np.sin(w * t), radius_m * w * np.cos(w * t)),
+        lambda t: (0.5 * radius_m * np.sin(2.0 * w * t), radius_m * w * np.cos(2.0 * w * t)),
+        axes,
+        altitude_m,
+    )
+
+
+def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Reference:
+    """Path of straight lines between points reached at given times.
+
+    Args:
+        times_s: rising, from 0; shape (n,).
+        points_m: shape (n, axes).
+        loop: start again at the end; otherwise stop at the last point and stay.
+
+    Raises:
+        ValueError: no vehicle can be told to be so far away, or so fast.
+    """
+    times_s, points_m = np.asarray(times_s, float), np.asarray(points_m, float)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        slopes = np.diff(points_m, axis=0) / np.diff(times_s)[:, None]
+    if not ((np.abs(points_m) <= FAR_M).all() and (np.abs(slopes) <= FAST_MPS).all()):
+        raise ValueError(f"expected at most {FAR_M:g} m from the origin, and {FAST_MPS:g} m/s")
+
+    def sample(t: Array) -> Array:
+        t = np.asarray(t, dtype=np.float64)
+        t = np.mod(t, times_s[-1]) if loop else t
+        leg = np.clip(np.searchsorted(times_s, t, side="right") - 1, 0, len(slopes) - 1)
+        moving = (t >= times_s[0]) & (t < times_s[-1])
+        velocity = np.where(moving[..., None], slopes[leg], 0.0)
+        held = np.clip(t, times_s[0], times_s[-1])
+        position = points_m[leg] + slopes[leg] * (held - times_s[leg])[..., None]
+        return np.stack([position, velocity], axis=-1)
+
+    return sample
+
+
+def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Reference:
+    """Path through the points at constant speed; `loop` flies back to the first, and on.
+
+    Raises:
+        ValueError: see `timed_path`; two points may be too close to each other, too.
+    """
+    points = np.asarray(points_m, dtype=np.float64)
+    if loop:
+        points = np.concatenate([points, points[:1]])
+    lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return timed_path(np.concatenate([[0.0], np.cumsum(lengths_m) / speed_mps]), points, loop=loop)
+
+
+def square(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
+    """Square with corners at (±radius, ±radius), one round a period, from (radius, -radius)."""
+    corners = np.zeros((4, axes))
+    corners[:, :2] = radius_m * np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]])
+    corners[:, 2:] = altitude_m
+    return waypoints(corners, 8.0 * radius_m / period_s, loop=True)
+
+
+def hover(point_m: Array) -> Reference:
+    """Rest at one point [m; shape (axes,)], for ever."""
+    point = np.asarray(point_m, dtype=np.float64)
+
+    def sample(t: Array) -> Array:
+        t = np.asarray(t, dtype=np.float64)
+        state = np.zeros((*t.shape, len(point), 2))
+        state[..., 0] = point
+        return state
+
+    return sample
+
+
+def target(
+    rng: np.random.Generator,
+    axes: int,
+    *,
+    agility: float,
+    speed_mps: float,
+    radius_m: float,
+    turn_every_s: float = 0.0,
+) -> Reference:
+    """Random walk from the origin: white acceleration, or turns, which nobody can foresee.
+
+    The velocity is reflected where it would become too large, and the position where it would leave
+    its bounds. Before time 0 the target rests at the origin, and after TURN_S it comes back the way
+    it went.
+
+    Args:
+        rng: chance of this walk alone; it is asked for more as later times are.
+        agility: strength of the acceleration [m/s per √s].
+        speed_mps: largest velocity along an axis [m/s].
+        radius_m: largest coordinate [m].
+        turn_every_s: mean time between two turns [s], at which alone the velocity changes, by as
+            much as it would have in that time; 0: it changes all the time.
+    """
+    walk = _Walk(rng, axes, turn_every_s)
+
+    def sample(t: Array) -> Array:
+        t = np.maximum(np.asarray(t, dtype=np.float64), 0.0)
+        legs = np.floor(t / TURN_S)
+        back = np.mod(legs, 2.0)
+        t = np.where(back, (legs + 1.0) * TURN_S - t, t - legs * TURN_S)
+        velocities, positions = walk.upto(
+            int(t.max(initial=0.0) / GRID_S) + 1, agility=agility, speed_mps=speed_mps
+        )
+        at = (t / GRID_S).astype(np.int64)
+        after = (t - at * GRID_S)[..., None]
+        v, rise = velocities[at], (velocities[at + 1] - velocities[at]) / GRID_S
+        p = positions[at] + after * (v + 0.5 * after * rise)
+        position, way = reflected(p, radius_m)
+        way *= 1.0 - 2.0 * back[..., None]
+        return np.stack([position, way * (v + after * rise)], axis=-1)
+
+    return sample
+
+
+class _Walk:
+    """Velocity and position of a target on a grid of GRID_S, drawn as far as they are asked for."""
+
+    def __init__(self, rng: np.random.Generator, axes: int, turn_every_s: float) -> None:
+        self._rng = rng
+        self._turns = min(GRID_S / turn_every_s, 1.0) if turn_every_s else 1.0
+        """Share of the points of the grid at which the velocity changes."""
+        self._free = np.zeros((1, axes))
+        self._velocities = np.zeros((1, axes))
+        self._positions = np.zeros((1, axes))
+
+    def upto(self, last: int, *, agility: float, speed_mps: float) -> tuple[Array, Array]:
+        """Velocities [m/s] and positions [m] up to a point of the grid; each (points, axes)."""
+        while len(self._free) <= last:
+            kicks = self._rng.standard_normal((GRID_BLOCK, self._free.shape[1]))
+            if self._turns < 1.0:
+                turned = self._rng.random((GRID_BLOCK, 1)) < self._turns
+                kicks *= turned / np.sqrt(self._turns)
+            free = self._free[-1] + np.cumsum(agility * np.sqrt(GRID_S) * kicks, axis=0)
+            v, _ = reflected(np.concatenate([self._free[-1:], free]), speed_mps)
+            p = self._positions[-1] + np.cumsum(0.5 * GRID_S * (v[:-1] + v[1:]), axis=0)
+            self._free = np.concatenate([self._free, free])
+            self._velocities = np.concatenate([self._velocities, v[1:]])
+            self._positions = np.concatenate([self._positions, p])
+        return self._velocities, self._positions
+
+
+def reflected(free: Any, bound: float) -> tuple[Any, Any]:
+    """Motion between walls that reflect it: where it is, and which way it goes (1 or -1).
+
+    Args:
+        free: where it would be without walls; a number or an array.
+        bound: the walls are at ±bound.
+    """
+    crossed = np.floor((free + bound) / (2.0 * bound))
+    way = 1.0 - 2.0 * (crossed % 2.0)
+    return way * (free - 2.0 * bound * crossed), way
+
+
+def sampled(reference: Reference, axes: int) -> bytes:
+    """States of a trajectory at SAMPLED_S to the mm and mm/s, the same on every computer.
+
+    Raises:
+        ValueError: it gives something else than finite states that can be flown.
+    """
+    for times in (np.zeros(()), SAMPLED_S):
+        states, shape = np.asarray(reference(times)), (*times.shape, axes, 2)
+        if states.shape != shape or states.dtype.kind != "f":
+            got = f"{states.dtype.name} of shape {states.shape}"
+            raise ValueError(f"got {got} at {times.size} times, expected floats of shape {shape}")
+        if not (np.abs(states) <= [FAR_M, FAST_MPS]).all():  # nor is NaN
+            raise ValueError(f"expected at most {FAR_M:g} m from the origin, and {FAST_MPS:g} m/s")
+    return np.rint(1000.0 * states).astype(np.int64).tobytes()
+
+
+def read(path: Path) -> bytes:
+    """The content of a table's file.
+
+    Raises:
+        OSError: it cannot be read, or is no table's.
+        ValueError: no file can have this name.
+    """
+    return files.read(path, FILE_BYTES_MAX)
+
+
+def from_csv(path: Path, axes: int) -> Reference:
+    """Path from a table with the columns t [s], x, y, z [m] (as many as there are axes).
+
+    Raises:
+        OSError: see `read`.
+        ValueError: with what is wrong, and in which line.
+    """
+    import csv  # for files alone
+
+    names = ["t", "x", "y", "z"][: axes + 1]
+    text = io.StringIO(read(path).decode("utf-8-sig"), newline="")
+    table = csv.DictReader(text, skipinitialspace=True)
+    rows: list[list[float]] = []
+    try:
+        if any(name not in (table.fieldnames or ()) for name in names):
+            raise ValueError(f"line 1: expected the columns {', '.join(names)}")
+        rows += (_numbers([row[name] for name in names], table.line_num) for row in table)
+    except csv.Error as error:
+        raise ValueError(f"line {table.reader.line_num}: {error}") from None
+    data = np.array(rows).reshape(-1, axes + 1)
+    if len(data) < 2 or not np.isfinite(data).all():
+        raise ValueError("expected at least two lines of finite numbers")
+    if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
+        raise ValueError("column t must start at 0 and rise from line to line")
+    return timed_path(data[:, 0], data[:, 1:])
+
+
+def _numbers(words: list[str | None], line: int) -> list[float]:
+    """The numbers of one line of a table."""
+    try:
+        return [float(word) for word in words]  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ValueError(f"line {line}: expected {len(words)} numbers") from None

@@ -1,0 +1,499 @@
+"""Keys of a scenario: everything about a flight, typed and frozen.
+
+A key is written in one place, here: its name, its owner (`owners.py`) and type with bounds, its
+default, and a sentence with its unit in brackets. The sentence is the flag's in `--help`, and the
+key's in docs/keys.md, which `make keys` writes. A `Term` belongs to both ends: it has a field in
+`shared/law/terms.py: Terms`, and is put there by `Scenario.terms`.
+
+`reading.py` reads a scenario from its TOML file, and `contradictions.py` finds values that are
+right one by one and impossible together.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.law.model import Array
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario import policies
+from skytether.shared.scenario import reference as shapes
+from skytether.shared.scenario.owners import (
+    InFlight,
+    Key,
+    OfEach,
+    OfImpairment,
+    OfNetem,
+    OfServer,
+    OfTrigger,
+    OfVehicle,
+    OfVirtualTime,
+    OfWind,
+    Owner,
+    Term,
+)
+from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, VEHICLES, Entry
+from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
+
+# Bounds of numbers lie far beyond any vehicle, and near enough that no time overflows its 63 bits
+# of nanoseconds, and no product of some of them a float.
+Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
+"""Property of a vehicle, from a thousandth of its unit to a thousand."""
+Factors = Factor | tuple[Factor, ...]
+"""Property of a vehicle on each axis: one for all axes, or one each."""
+DeadTime = Annotated[float, Meta(ge=0, le=2)]
+"""Dead time that both ends reckon with [s]."""
+TrueDeadTime = Annotated[float, Meta(ge=0, le=10)]
+"""Dead time that a vehicle has [s]."""
+Strength = Annotated[float, Meta(ge=0, le=1e3)]
+"""Property that may be missing: from nothing to a thousand of its unit."""
+Speed = Annotated[float, Meta(ge=-1e3, le=1e3)]
+"""Speed either way along an axis [m/s]."""
+Position = Annotated[float, Meta(ge=-shapes.FAR_M, le=shapes.FAR_M)]
+"""Coordinate [m]."""
+Amount = Annotated[float, Meta(ge=0, le=1e9)]
+"""Weight, cost or tolerance of any unit."""
+Duration = Annotated[float, Meta(ge=0, le=3600)]
+"""Time from nothing to an hour [s]."""
+Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
+"""Time from a millisecond to an hour [s]."""
+MeanTime = Annotated[float, Meta(ge=1e-9, le=1e9)]
+"""Mean of a random time [s]."""
+
+
+SHAPE_TOLD = 15
+"""Number of characters of a plug-in's shape that the other end is told, beside a digest."""
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of every table of a scenario."""
+
+
+class ModelConfig(Section, frozen=True):
+    """Model of the UAV, known to both ends, eq. (1)-(6)."""
+
+    axes: Term[Literal[2, 3]] = 2
+    """Number of axes: 2 to fly in the plane, 3 in space."""
+    tau_s: Term[tuple[Factor, ...]] = (0.84,)
+    """Time constant of the velocity loop [s]: one for all axes, or one each."""
+    u_max: Term[tuple[Factor, ...]] = (1.6,)
+    """Largest desired velocity [m/s]: one for all axes, or one each."""
+    gain: Term[Factors] = 1.0
+    """Gain of the velocity loop, steady velocity over desired velocity: one for all axes, or one
+    each."""
+    dead_time_s: Term[DeadTime | tuple[DeadTime, ...]] = 0.0
+    """Dead time before an input takes effect [s]: one for all axes, or one each."""
+
+
+class ControlConfig(Section, frozen=True):
+    """Planning by the server, eq. (5)-(16)."""
+
+    dt: Annotated[float, Meta(ge=0.001, le=1), Key(Owner.BOTH, term="dt_ns")] = 0.05
+    """Length of a step, Δt [s]."""
+    horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
+    """Number of steps planned ahead, H."""
+    scheme: Term[Literal["committed", "predictive", "dead_reckoning", "none"]] = "committed"
+    """Delay compensation: committed inputs; the paper's, eq. (11) and (13); dead reckoning, where
+    the server sends the state of the desired trajectory and the vehicle goes on from there without
+    a plan; or none."""
+    feedback: Term[bool] = True
+    """Whether a horizon carries the state that it starts from and a feedback gain, with which the
+    vehicle comes back to the predicted states. A vehicle that can only play inputs back needs
+    false, and an `input_weight` of 3, as in the scenario `playback`."""
+    delay_bound: OfServer[Duration | Literal["auto"]] = "auto"
+    """Longest time from making a horizon to flying it [s]; auto: as measured in flight."""
+    observer_s: OfServer[Duration] = 4.0
+    """Time constant of the disturbance observer, which learns steady wind and a wrong gain [s]; it
+    is longer where observations are old. 0, and the scheme "none": no observer."""
+    trigger: OfTrigger[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "cost_gap | silence(1)"
+    """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`."""
+    period: OfTrigger[Annotated[int, Meta(ge=1, le=policies.PERIOD_MAX)]] = 10
+    """Number of steps between two horizons of the policy `periodic`."""
+    solver: OfServer[Literal["exact", "osqp"]] = "exact"
+    """Solver of eq. (9): a Riccati active set, exact and fast, or OSQP, the reference."""
+    epsilon: OfTrigger[Amount] = 3.6
+    """Tolerance ε of eq. (16)."""
+    decay_rate: OfTrigger[Amount] = 1.5
+    """Decay rate λ of eq. (16) [1/s]."""
+    cost_gap: OfTrigger[Amount] = 1.0
+    """Extra cost of flying on with the horizon sent last, above which the policy `cost_gap` sends
+    a new one."""
+    deviation_m: OfTrigger[Amount] = 0.05
+    """Distance from the plan above which the policy `deviation` sends [m]."""
+    tolerance_m: OfTrigger[Amount] = 0.1
+    """Distance above which dead reckoning sends [m]: of the desired position from the predicted one
+    with the policy `tolerance`, from the one sent last with `delta`."""
+    state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
+    """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
+    terminal_weight: OfServer[tuple[Amount, Amount]] = (50.0, 20.0)
+    """Weight P of eq. (5) and (16) on the final position [1/m²] and velocity [s²/m²]."""
+    input_weight: OfServer[Annotated[float, Meta(ge=1e-9, le=1e9)]] = 1.0
+    """Weight R of eq. (5) on the input [s²/m²]."""
+    change_weight: OfServer[Amount] = 0.0
+    """Weight S of eq. (9) on the change from the previous horizon [s²/m²]."""
+    input_reference: OfServer[bool] = True
+    """Whether R weighs u - v_ref instead of u, so that R does not ask for standing still."""
+
+    @property
+    def commits(self) -> bool:
+        """Whether horizons begin with committed inputs."""
+        return self.scheme == "committed"
+
+
+class ReferenceConfig(Section, frozen=True):
+    """Desired trajectory."""
+
+    shape: Term[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "circle"
+    """Shape of the desired trajectory, see `skytether references`; target: a random walk that only
+    the server knows; live: a point that is moved in flight."""
+    preview: OfServer[Duration | Literal["all", "none"]] = "all"
+    """Time for which the server knows the desired trajectory ahead [s]; it predicts what lies
+    beyond, and always predicts a live point."""
+    agility: OfServer[Strength] = 0.3
+    """Strength of the white acceleration that moves a target [m/s per √s]."""
+    turn_every_s: OfServer[Duration] = 0.0
+    """Mean time between turns of a target [s]. Its velocity changes at turns alone, by as much as
+    `agility` would have changed it in that time; 0: it changes all the time."""
+    radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
+    """Half the width of circle, figure-eight and square, and of the area of a target [m]."""
+    period_s: Term[Annotated[float, Meta(ge=0.1, le=86400)]] = 27.5
+    """Time for one round of circle, figure-eight or square [s]."""
+    altitude_m: Term[Position] = 0.0
+    """Altitude of circle, figure-eight and square in space [m]."""
+    points_m: Annotated[
+        tuple[tuple[Position, ...], ...], Key(Owner.BOTH, InFlight.POINT, term="points")
+    ] = ()
+    """Waypoints [m], at least two; the one point to hover at; the first position of a live
+    point."""
+    velocity_mps: Annotated[tuple[Speed, ...], Key(Owner.SERVER, InFlight.POINT)] = ()
+    """Velocity of a live point [m/s]; left out: estimated from its moves."""
+    speed_mps: Term[Factor] = 1.0
+    """Speed between waypoints, and the largest of a target along an axis [m/s]."""
+    loop: Term[bool] = False
+    """Whether the vehicle returns from the last waypoint to the first and goes round again."""
+    file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
+    """CSV file with the columns t, x, y (and z), relative to the scenario's own folder."""
+
+
+class VehicleConfig(Section, frozen=True):
+    """The UAV, as far as it is simulated, and its failsafe without fresh horizons."""
+
+    kind: OfVehicle[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "simulated"
+    """What flies, see `skytether vehicles`."""
+    address: OfVehicle[str] = "udp:127.0.0.1:14550"
+    """Line to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
+    serial:PATH:BAUD."""
+    exhausted: Term[Literal["hold", "brake"]] = "brake"
+    """Action at the end of a horizon: hold its last input (the paper), or brake and hover."""
+    brake_mps2: Term[Factor] = 2.0
+    """Deceleration of the desired velocity when `brake` stops the vehicle [m/s²]."""
+    slew_mps2: OfVehicle[Factor] = 50.0
+    """Fastest change of the desired velocity on an axis [m/s²]; no limit where `exhausted` is
+    `hold`."""
+    land_after_s: OfVehicle[Duration] = 10.0
+    """Time of hovering with a silent server after which the vehicle lands [s]."""
+    tau_s: OfVehicle[tuple[Factor, ...]] = ()
+    """True time constant [s], one for all axes, or one each; left out: the model's."""
+    gain: OfVehicle[Factors] = ()
+    """True gain of the velocity loop, one for all axes, or one each; left out: the model's."""
+    dead_time_s: OfVehicle[TrueDeadTime | tuple[TrueDeadTime, ...]] = ()
+    """True dead time before an input takes effect [s], one for all axes, or one each; left out: the
+    model's."""
+    start_m: OfVehicle[tuple[Position, ...]] = ()
+    """Position at the start, at rest [m]; left out: that of the reference."""
+    wind: OfWind[Strength] = 0.0
+    """Strength of random wind, a white acceleration [m/s per √s]."""
+    steady_wind_mps: OfWind[tuple[Speed, ...]] = ()
+    """Velocity that steady wind adds in the long run, for each axis [m/s]; left out: none. For a
+    quadrotor, the wind's own velocity."""
+    turbulence_mps: OfWind[Strength] = 0.0
+    """Wind speed 6 m above ground whose turbulence a quadrotor flies in, by Dryden's model [m/s];
+    0: none."""
+    gust_mps2: OfWind[Strength] = 0.0
+    """Acceleration by a gust [m/s²]; 0: no gusts."""
+    gust_every_s: OfWind[MeanTime] = 10.0
+    """Mean time from the end of one gust to the next [s]."""
+    gust_s: OfWind[MeanTime] = 1.0
+    """Mean length of a gust [s]."""
+    frame: OfVehicle[Literal["auto", "crazyflie", "1.5kg", "sih"]] = "auto"
+    """Frame of a quadrotor, see docs/quadrotor.md; auto: 1.5kg, and of an autopilot the one that
+    its own simulator flies."""
+    battery: OfVehicle[Annotated[float, Meta(ge=0, le=1)] | Literal["endless"]] = 1.0
+    """Charge of a quadrotor's battery at the start, from 0 to 1; endless: it stays full."""
+
+
+class FenceConfig(Section, frozen=True):
+    """Fence: where the vehicle never goes, whatever it is told.
+
+    The vehicle goes by its own file; a server whose file has a fence refuses what leads over it.
+    """
+
+    low_m: OfEach[tuple[Position, ...]] = ()
+    """Lowest position on each axis [m]; left out: no bound. In space the third is the altitude."""
+    high_m: OfEach[tuple[Position, ...]] = ()
+    """Highest position on each axis [m]; left out: no bound."""
+    radius_m: OfEach[Strength] = 0.0
+    """Largest distance from where it started [m]; 0: no bound."""
+    speed_mps: OfEach[Strength] = 0.0
+    """Largest desired speed, over all axes [m/s]; 0: no bound but `model.u_max`."""
+    wind_mps: OfEach[Annotated[float, Meta(ge=0, le=100)]] = 1.0
+    """Velocity that wind, or an error of the gain, adds at most while the fence holds [m/s]: the
+    stronger, the further inside the vehicle is kept."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether anything is fenced in."""
+        return bool(self.low_m or self.high_m or self.radius_m or self.speed_mps)
+
+
+class SensorConfig(Section, frozen=True):
+    """Sensors of the vehicle, and the filter of their measurements."""
+
+    filter: OfVehicle[Literal["kalman", "none"]] = "kalman"
+    """Filter between sensors and flight: a Kalman filter, or none, where each measurement is taken
+    as it is. With perfect measurements both are the same."""
+    position_noise_m: OfVehicle[Strength] = 0.0
+    """Standard deviation of the noise of a position [m]."""
+    velocity_noise_mps: OfVehicle[Strength] = 0.0
+    """Standard deviation of the noise of a velocity [m/s]."""
+    position_bias_m: OfVehicle[tuple[Position, ...]] = ()
+    """Constant error of each position, for each axis [m]; left out: none."""
+    velocity_bias_mps: OfVehicle[tuple[Speed, ...]] = ()
+    """Constant error of each velocity, for each axis [m/s]; left out: none."""
+    position_every_s: OfVehicle[Duration] = 0.0
+    """Time from one measured position to the next [s]; 0: one at every step."""
+    velocity_every_s: OfVehicle[Duration | Literal["never"]] = 0.0
+    """Time from one measured velocity to the next [s]; 0: one at every step; never: positions
+    alone are measured."""
+    delay_s: OfVehicle[Annotated[float, Meta(ge=0, le=2)]] = 0.0
+    """Time from measuring to having the measurement [s]."""
+    process_noise: OfVehicle[Factor] = 0.1
+    """Strength of the white acceleration that the filter assumes [m/s per √s]: for wind, and for
+    all differences between vehicle and model."""
+
+
+class MavlinkConfig(Section, frozen=True):
+    """Autopilot that speaks MAVLink, of a vehicle of the kind `mavlink`."""
+
+    system: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 245
+    """Number of our own system in MAVLink; ArduPilot's ground-station failsafe must listen to
+    it."""
+    component: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 191
+    """Number of our own component in MAVLink; 191 is that of an onboard computer."""
+    autopilot: OfVehicle[Annotated[int, Meta(ge=0, le=255)]] = 0
+    """Number of the autopilot's system; 0: the first that is heard."""
+    setpoints_hz: OfVehicle[Annotated[int, Meta(ge=10, le=50)]] = 20
+    """Least number of velocity setpoints a second; there are 50 at most."""
+    positions_hz: OfVehicle[Annotated[int, Meta(ge=5, le=200)]] = 50
+    """Number of positions a second that the autopilot is asked for."""
+    silence_s: OfVehicle[Annotated[float, Meta(ge=0.2, le=5)]] = 0.5
+    """Time without a position of the autopilot after which the vehicle brakes [s]."""
+    battery_min: OfVehicle[Annotated[float, Meta(ge=0, le=1)]] = 0.2
+    """Charge of the battery below which the vehicle lands, from 0 to 1."""
+    battery_min_v: OfVehicle[Annotated[float, Meta(ge=0, le=100)]] = 0.0
+    """Voltage of the battery below which the vehicle lands [V]; 0: at none."""
+    takeoff_m: OfVehicle[Annotated[float, Meta(ge=0.5, le=100)] | Literal["auto"]] = "auto"
+    """Altitude to take off to [m]; auto: that at which the desired trajectory begins, and 3 m in
+    the plane."""
+    origin: OfVehicle[Literal["takeoff", "autopilot"]] = "takeoff"
+    """Origin of the flight: the point where we arm the vehicle, or the autopilot's own local
+    origin; that is taken as well where the vehicle is in the air already."""
+    patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
+    """Time that the autopilot may take until it is heard, and for each step on its way into the
+    air [s]."""
+
+
+class DirectionConfig(Section, frozen=True):
+    """One direction of the network."""
+
+    delay: OfImpairment[Literal["poisson", "constant", "none"]] = "poisson"
+    """Law of the delay: minimum_s + slot_s · Poisson(slots_mean) (17), just minimum_s, or none."""
+    minimum_s: OfImpairment[Duration] = 0.4
+    """Smallest delay [s]."""
+    slot_s: OfImpairment[Duration] = 0.02
+    """Length of a slot of the delay (17) [s]."""
+    slots_mean: OfImpairment[Annotated[float, Meta(ge=0, le=1e6)]] = 2.0
+    """Mean number of slots on top of the smallest delay."""
+    loss: OfImpairment[Annotated[float, Meta(ge=0, le=1)]] = 0.1
+    """Share of packets that are lost."""
+    burst_s: OfImpairment[Duration] = 0.0
+    """Mean length of a burst of losses [s]; 0: each packet is lost independently."""
+
+    @property
+    def least_s(self) -> float:
+        """Smallest delay [s]."""
+        return 0.0 if self.delay == "none" else self.minimum_s
+
+    @property
+    def mean_s(self) -> float:
+        """Mean delay [s]."""
+        return self.least_s + (self.slot_s * self.slots_mean if self.delay == "poisson" else 0.0)
+
+
+class NetworkConfig(Section, frozen=True):
+    """Impairments of the network, both ways."""
+
+    uplink: DirectionConfig = DirectionConfig()
+    """Direction from server to vehicle."""
+    downlink: DirectionConfig = DirectionConfig()
+    """Direction from vehicle to server."""
+    mtu: OfNetem[Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)]] = 1472
+    """Longest UDP payload that passes [B]: 1472 fill an Ethernet frame."""
+
+
+class LinkConfig(Section, frozen=True):
+    """Time limits of a session."""
+
+    heartbeat_s: Term[Interval] = 0.1
+    """Longest time between two packets of the server [s]."""
+    age_max_s: Term[Annotated[float, Meta(gt=0, le=60)]] = 5.0
+    """Largest age of the observation behind an input [s]; beyond it the vehicle brakes and hovers,
+    or holds its last input where `vehicle.exhausted` says so."""
+    timeout_s: OfEach[Interval] = 1.0
+    """Time of silence after which the other end is taken for gone [s]: the vehicle brakes and says
+    HELLO again; the server lets another client have the vehicle's number."""
+    connect_s: OfVehicle[Interval] = 15.0
+    """Time for which the vehicle waits for its first session before it gives up [s]."""
+
+
+class SimulationConfig(Section, frozen=True):
+    """Computing time and clocks in virtual time."""
+
+    compute_s: OfVirtualTime[Duration] = 0.001
+    """Time that the server takes for a step [s]."""
+    clock_offset_s: OfVirtualTime[Annotated[float, Meta(ge=-1e9, le=1e9)]] = 0.0
+    """Offset of the vehicle's clock from the server's at the start [s]."""
+    clock_drift_ppm: OfVirtualTime[Annotated[float, Meta(ge=-1000, le=1000)]] = 0.0
+    """Drift: how much faster the vehicle's clock runs than the server's [ppm]."""
+
+
+class Scenario(Section, frozen=True):
+    """Everything about a flight."""
+
+    title: OfEach[str] = ""
+    """Title: what the scenario shows, in a line."""
+    duration: OfVehicle[Annotated[float, Meta(gt=0, le=86400)]] = 60.0
+    """Length of the flight [s]."""
+    settle: OfVehicle[Annotated[float, Meta(ge=0, le=86400)]] = 0.0
+    """Time at the start that RMSE leaves out [s]; half of the duration where it is no shorter than
+    that."""
+    seed: OfEach[Annotated[int, Meta(ge=0, le=2**32 - 1)]] = 1
+    """Seed of everything random: delays, losses, wind."""
+    armed: Annotated[bool, Key(Owner.VEHICLE, InFlight.ARMED)] = True
+    """Whether plans may be flown; disarmed, the vehicle stays where it is."""
+    model: ModelConfig = ModelConfig()
+    control: ControlConfig = ControlConfig()
+    reference: ReferenceConfig = ReferenceConfig()
+    vehicle: VehicleConfig = VehicleConfig()
+    fence: FenceConfig = FenceConfig()
+    sensor: SensorConfig = SensorConfig()
+    mavlink: MavlinkConfig = MavlinkConfig()
+    network: NetworkConfig = NetworkConfig()
+    link: LinkConfig = LinkConfig()
+    simulation: SimulationConfig = SimulationConfig()
+
+    @property
+    def dt_ns(self) -> int:
+        """Length of a step [ns]."""
+        return seconds_to_ns(self.control.dt)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps in the whole flight."""
+        return max(1, round(self.duration / self.control.dt))
+
+    @property
+    def settled_s(self) -> float:
+        """Time of flight from which RMSE counts [s]."""
+        return self.settle if self.settle < self.duration else self.duration / 2.0
+
+    @property
+    def tau_s(self) -> Array:
+        """The model's time constants [s]; shape (axes,)."""
+        return self._per_axis(self.model.tau_s)
+
+    @property
+    def true_tau_s(self) -> Array:
+        """The vehicle's time constants [s]; shape (axes,)."""
+        return self._per_axis(self.vehicle.tau_s or self.model.tau_s)
+
+    @property
+    def u_max(self) -> Array:
+        """Bounds of the input [m/s]; shape (axes,)."""
+        return self._per_axis(self.model.u_max)
+
+    @property
+    def true_gain(self) -> Array:
+        """The vehicle's gains; shape (axes,)."""
+        return self._per_axis(self.model.gain if self.vehicle.gain == () else self.vehicle.gain)
+
+    @property
+    def true_dead_time_s(self) -> Array:
+        """The vehicle's dead times [s]; shape (axes,)."""
+        given = self.vehicle.dead_time_s
+        return self._per_axis(self.model.dead_time_s if given == () else given)
+
+    def _per_axis(self, values: float | tuple[float, ...]) -> Array:
+        return np.array(np.broadcast_to(values, self.model.axes), dtype=np.float64)
+
+    def terms(self) -> Terms:
+        """Terms that both ends must agree on before a flight."""
+        control, vehicle, reference = self.control, self.vehicle, self.reference
+        table = shapes.read(Path(reference.file)) if reference.shape == "csv" else b""
+        return Terms(
+            dt_ns=self.dt_ns,
+            horizon=control.horizon,
+            axes=self.model.axes,
+            tau_s=tuple(self.tau_s.tolist()),
+            gain=tuple(self._per_axis(self.model.gain).tolist()),
+            dead_time_s=tuple(self._per_axis(self.model.dead_time_s).tolist()),
+            u_max=tuple(self.u_max.tolist()),
+            scheme=control.scheme,
+            feedback=control.feedback,
+            exhausted=vehicle.exhausted,
+            brake_mps2=vehicle.brake_mps2,
+            heartbeat_s=self.link.heartbeat_s,
+            age_max_s=self.link.age_max_s,
+            shape=self._shape(),
+            radius_m=reference.radius_m,
+            period_s=reference.period_s,
+            altitude_m=reference.altitude_m,
+            points=_digest(repr(reference.points_m).encode() if reference.points_m else b""),
+            speed_mps=reference.speed_mps,
+            loop=reference.loop,
+            table=_digest(table),
+        )
+
+    def make_reference(self) -> shapes.Reference:
+        """The desired trajectory."""
+        shape = policies.shape(self.reference.shape, REFERENCES)
+        entry = REFERENCES[shape.name]
+        made: shapes.Reference = entry.make(self, *entry.numbers(shape.values, self.reference))
+        return made
+
+    def entries(self) -> Iterator[Entry]:
+        """Policies and shape that the scenario names."""
+        for policy in policies.policies(policies.parse(self.control.trigger)):
+            yield TRIGGERS[policy.name]
+        yield REFERENCES[policies.shape(self.reference.shape, REFERENCES).name]
+        flies = self.vehicle.kind.partition("(")[0].strip()
+        if flies in VEHICLES:  # ours are there once there is a client
+            yield VEHICLES[flies]
+
+    def _shape(self) -> str:
+        """Shape as a term; of a plug-in, its beginning and a digest of it and what it gives."""
+        shape = policies.shape(self.reference.shape, REFERENCES)
+        if REFERENCES[shape.name].is_ours:
+            return shape.name
+        given = shapes.sampled(self.make_reference(), self.model.axes)
+        return f"{str(shape)[:SHAPE_TOLD]} {_digest(f'{shape}'.encode() + given)}"
+
+
+def _digest(content: bytes) -> str:
+    """A short text that differs where the content does, "none" of nothing."""
+    return hashlib.blake2s(content, digest_size=8).hexdigest() if content else "none"

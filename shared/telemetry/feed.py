@@ -1,0 +1,149 @@
+"""The feed of a process: what it records and says, for whoever looks on while it flies.
+
+A feed is a stream of frames, each a length (`LENGTH_BYTES`, big-endian) and so many bytes of
+msgpack. The first is `Opened`; of the parts of the record it names, `Rows` follow as they are made.
+Whoever reads it late gets the last of what was, from a whole frame on. A reader that is too slow
+is dropped; the process never waits for one (`shell.feed`).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from skytether.shared.core.events import Event
+from skytether.shared.telemetry import record
+from skytether.shared.telemetry.record import Rows as Table
+
+LENGTH_BYTES = 4
+"""Size of a frame's length [B]."""
+FRAME_BYTES_MAX = 4 * 1024 * 1024
+"""Largest size of a frame [B]."""
+ROW_BYTES_MAX = 4096
+"""Largest size of a row [B]; a plan of 270 inputs has about 1200."""
+
+
+class FeedError(ValueError):
+    """Error: what is read is no feed."""
+
+
+class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A process and what it flies: the first frame of its feed."""
+
+    process: str
+    """Name of the process: server, netem or client; `server.N` is worker N of a server."""
+    name: str
+    """Name of the scenario."""
+    scenario: str
+    """The scenario as TOML, with what was changed in flight until now."""
+    parts: dict[str, str]
+    """Parts of the record that follow, by name: columns, as JSON of numpy's description."""
+    wall_ns: int
+    """Time of day at which `time_ns` was taken [ns since 1970]."""
+    time_ns: int
+    """Time of the process's clock at the beginning [ns; CLOCK_MONOTONIC]."""
+
+
+class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """Rows of a part of the record."""
+
+    part: str
+    """Name of the part: client, server, plan or netem."""
+    time_ns: int
+    """Time at which they were made [ns; CLOCK_MONOTONIC]."""
+    rows: bytes
+    """Rows as they are in memory."""
+
+
+class Said(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """An event."""
+
+    time_ns: int
+    """Time at which it was said [ns; CLOCK_MONOTONIC]."""
+    event: Event
+
+
+class Figures(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """Numbers counted so far, about once a second."""
+
+    time_ns: int
+    """Time at which they were taken [ns; CLOCK_MONOTONIC]."""
+    figures: dict[str, Any]
+    """Numbers by name, see `Endpoint.figures`."""
+
+
+Frame = Opened | Rows | Said | Figures
+
+_ENCODER = msgspec.msgpack.Encoder()
+_DECODER = msgspec.msgpack.Decoder(Frame)
+_UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
+"""Errors that the decoder has for what is no frame."""
+
+
+def encode(frame: Frame) -> bytes:
+    """A frame as bytes, its length first."""
+    body = _ENCODER.encode(frame)
+    return len(body).to_bytes(LENGTH_BYTES, "big") + body
+
+
+class Reader:
+    """Makes frames of bytes, however they are cut."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+
+    def read(self, piece: bytes) -> list[Frame]:
+        """The frames that are whole now.
+
+        Raises:
+            FeedError: these are no frames.
+        """
+        self._bytes += piece
+        frames: list[Frame] = []
+        begin = 0
+        while len(self._bytes) - begin >= LENGTH_BYTES:
+            body = begin + LENGTH_BYTES
+            size = int.from_bytes(self._bytes[begin:body], "big")
+            if size > FRAME_BYTES_MAX:
+                raise FeedError(f"got a frame of {size} B, expected at most {FRAME_BYTES_MAX} B")
+            if len(self._bytes) < body + size:
+                break
+            try:
+                frames.append(_DECODER.decode(self._bytes[body : body + size]))
+            except _UNDECODABLE as error:
+                raise FeedError(f"got no frame: {error}") from None
+            begin = body + size
+        del self._bytes[:begin]
+        return frames
+
+
+def described(columns: Mapping[str, np.dtype[np.void]]) -> dict[str, str]:
+    """Parts of the record as `Opened` names them, by their columns."""
+    return {part: msgspec.json.encode(kind.descr).decode() for part, kind in columns.items()}
+
+
+def columns_of(described: str) -> np.dtype[np.void]:
+    """Columns of a part.
+
+    Raises:
+        FeedError: these are none.
+    """
+    try:
+        columns = record.columns_of(msgspec.json.decode(described))
+    except (ValueError, RecursionError) as error:
+        raise FeedError(f"got no columns: {error}") from None
+    if columns.itemsize > ROW_BYTES_MAX:
+        raise FeedError(f"got rows of {columns.itemsize} B, expected at most {ROW_BYTES_MAX} B")
+    return columns
+
+
+def table(rows: bytes, columns: np.dtype[np.void]) -> Table:
+    """Rows as a structured array.
+
+    Raises:
+        FeedError: they are not whole.
+    """
+    if len(rows) % columns.itemsize:
+        raise FeedError(f"got {len(rows)} B, expected rows of {columns.itemsize} B")
+    return np.frombuffer(rows, columns)

@@ -1,0 +1,371 @@
+"""What a process writes down about a flight: rows of one numpy structured type.
+
+Each process keeps its own part: the client what flew, the server what it thought, netem the fate of
+every packet. A part is a line of JSON that names the columns, then the rows as they are in memory.
+So a part may end anywhere, as that of a process that is killed does: half a row is left out.
+"""
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from pathlib import Path
+from struct import Struct
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.core.events import Event, Failure, RecordIncomplete
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.triggers import Compared
+
+Rows = NDArray[np.void]
+
+_NUMBER = re.compile("[<|][biuf][1248]")
+"""Kinds of numbers, as numpy calls them: order of bytes, kind and size [B]."""
+RECORDING = ".mcap"
+"""Suffix of a file that is a recording of a flight, and not a part of the record."""
+
+
+class Reason(IntEnum):
+    """Cause of what a vehicle does, see `client.failsafe`."""
+
+    BEGUN = 0
+    OPENED = 1
+    GOOD = 2
+    UNARMED = 3
+    HORIZON = 4
+    OLD = 5
+    ENDED = 6
+    LOST = 7
+    CLOSED = 8
+    RESTARTED = 9
+    LATE = 10
+    MALFORMED = 11
+    RESYNC = 12
+    STALLED = 13
+    STILL = 14
+    ALONE = 15
+    NOT_FINITE = 16
+    LEAPT = 17
+    TAKEN = 18
+    DISARMED = 19
+    RETURNED = 20
+    BATTERY = 21
+    ASTRAY = 22
+    MUTE = 23
+
+    def __str__(self) -> str:
+        return REASON_TEXTS[self]
+
+
+REASON_TEXTS = {
+    Reason.BEGUN: "it has just begun",
+    Reason.OPENED: "its session is open",
+    Reason.GOOD: "the link has been good for a second",
+    Reason.UNARMED: "it is not armed",
+    Reason.HORIZON: "a horizon has come",
+    Reason.OLD: "no newer horizon has come",
+    Reason.ENDED: "its plan has ended",
+    Reason.LOST: "the server is silent",
+    Reason.CLOSED: "the server has closed the session",
+    Reason.RESTARTED: "the server has restarted",
+    Reason.LATE: "horizons come too late",
+    Reason.MALFORMED: "the server sends malformed messages",
+    Reason.RESYNC: "the server plans for impossible times",
+    Reason.STALLED: "its own computer woke it too late",
+    Reason.STILL: "it stands still",
+    Reason.ALONE: "the server has been silent for long",
+    Reason.NOT_FINITE: "its state or its input is not finite",
+    Reason.LEAPT: "its state has leapt as no vehicle can",
+    Reason.TAKEN: "a pilot, or its autopilot, has taken over",
+    Reason.DISARMED: "its motors are disarmed",
+    Reason.RETURNED: "its autopilot obeys again",
+    Reason.BATTERY: "its battery is low",
+    Reason.ASTRAY: "its autopilot does not know where it is",
+    Reason.MUTE: "its autopilot is silent",
+}
+
+
+def client_columns(axes: int) -> np.dtype[np.void]:
+    """Columns of the client's part: one row for each step of each vehicle."""
+    return np.dtype(
+        [
+            ("vehicle", "<u2"),
+            ("step", "<i8"),
+            (
+                "state",
+                "<f8",
+                (axes, 2),
+            ),  # true position [m] and velocity [m/s]; the estimate where nobody knows
+            ("measured", "<f8", (axes, 2)),  # had of it since the step before, NaN for nothing
+            ("estimate", "<f8", (axes, 2)),  # what is reported and flown by, see docs/noise.md
+            ("input", "<f8", (axes,)),  # desired velocity that is flown from here on [m/s]
+            ("covered", "?"),  # whether that is an input of a horizon, neither hovering nor braking
+            ("in_force", "<i8"),  # step that its horizon was made for, -1 for none
+            ("age_ns", "<i8"),  # since the observation behind that horizon, -1 for none
+            ("stale", "<i8"),  # horizons older than the one held, so far
+            ("missed", "<i8"),  # steps slept through, so far
+            ("mode", "<u1"),  # what it does from here on, a `shared.wire.protocol.Mode`
+            ("reason", "<u1"),  # and why, a `Reason`
+        ]
+    )
+
+
+FIGURES: Mapping[str, tuple[Compared, ...]] = MappingProxyType(
+    {
+        "committed": (
+            Compared.STATE_GAP,
+            Compared.COST_GAP,
+            Compared.EXPECTED_GAP,
+            Compared.DEVIATION_M,
+        ),
+        "predictive": (Compared.STATE_GAP,),
+        "none": (Compared.STATE_GAP,),
+        "dead_reckoning": (Compared.LEFT_M, Compared.MOVED_M),
+    }
+)
+"""Figures of plans that each scheme computes."""
+
+
+def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
+    """Columns of the server's part: one row for each vehicle and tick.
+
+    Of the figures that a trigger may compare it has those that the scheme computes; what they are
+    is said by `server.control.planner.PlanFigures`.
+
+    Args:
+        axes: spatial axes.
+        scheme: as in `control.scheme`.
+    """
+    return np.dtype(
+        [
+            ("vehicle", "<u2"),
+            ("step", "<i8"),
+            ("reference", "<f8", (axes, 2)),  # x_d(k), as the server knew it then
+            ("estimate", "<f8", (axes, 2)),  # x̂(k)
+            ("ahead", "<i8"),  # d: planning starts at k + d
+            ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
+            ("input", "<f8", (axes,)),  # û(k), or the committed input of k
+            ("observed_step", "<i8"),  # of the observation behind x̂
+            # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m], left_m [m],
+            # moved_m [m]; NaN where there is no plan, or no trigger that asks for expected_gap
+            *((str(figure), "<f8") for figure in FIGURES[scheme]),
+            (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, else NaN
+            ("threshold", "<f8"),  # what is compared, in its unit; 0 where nothing is
+            ("compared", "<u1"),  # figure that it is compared with, a `Compared`
+            ("event", "?"),
+            ("solved", "?"),
+            ("solve_ns", "<i8"),  # both MPCs, all vehicles of the tick; -1 where not measured
+            ("stale", "<i8"),  # observations older than the newest, so far
+            ("missed", "<i8"),  # ticks slept through, so far
+        ]
+    )
+
+
+def compared(rows: Rows) -> Array:
+    """Figure that the trigger compared in each row of the server's part; shape (n,).
+
+    Where nothing was compared it is V(k) of eq. (16), or NaN without one. Older
+    recordings have one column for all figures, `error`.
+    """
+    names = rows.dtype.names or ()
+    if "compared" not in names:
+        before: Array = rows["error"]
+        return before
+    figures = np.full(len(rows), np.nan)
+    for number in np.unique(rows["compared"]).tolist():
+        name = str(Compared(number) or Compared.STATE_GAP)
+        if name in names:
+            of_it = rows["compared"] == number
+            figures[of_it] = rows[name][of_it]
+    return figures
+
+
+def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
+    """Columns of the server's plans: one row for each horizon that it sends.
+
+    With dead reckoning there is no plan: the state is where the target is told to be, and the one
+    input the velocity at which it goes on from there.
+
+    Args:
+        planned: number of its inputs on each axis, see `shared.law.terms.Terms.planned`.
+    """
+    return np.dtype(
+        [
+            ("vehicle", "<u2"),
+            ("step", "<i8"),  # k, at which it was made
+            ("begins", "<i8"),  # step of the first of the inputs, k + d
+            ("state", "<f8", (axes, 2)),  # x̂(k+d), where they lead on from [m, m/s]
+            ("inputs", "<f4", (axes, planned)),  # desired velocities, one a step [m/s]
+            ("disturbance", "<f8", (axes,)),  # input that is reckoned with besides [m/s]
+        ]
+    )
+
+
+UPLINK, DOWNLINK = 0, 1
+
+PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
+    [
+        ("direction", "<u1"),  # UPLINK or DOWNLINK
+        ("flow", "<u4"),  # which client
+        ("number", "<u4"),  # of the packet in its flow and direction
+        ("bytes", "<u2"),  # UDP payload
+        ("arrived_ns", "<i8"),  # [netem's clock]
+        ("delay_ns", "<i8"),  # as drawn, also when lost
+        ("lost", "?"),
+        ("overtaken", "?"),  # by a later packet of the same flow
+    ]
+)
+"""Columns of netem's part: one row for each packet."""
+
+TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
+    [
+        ("time_ns", "<i8"),  # [the autopilot's clock]
+        ("state", "<f8", (3, 2)),  # true position [m] and velocity [m/s]
+    ]
+)
+"""Columns of a scripted autopilot's part: one row for each of its ticks."""
+
+
+class Sink(Protocol):
+    """What takes a part of the record, as a binary file does."""
+
+    def write(self, piece: bytes, /) -> object:
+        """Take the header, or whole rows."""
+
+
+class Recorder:
+    """Appends rows to sinks.
+
+    Args:
+        columns: those of the rows.
+        sink: takes the header first; None for a recorder whose rows only go to those that follow.
+    """
+
+    def __init__(self, columns: np.dtype[np.void], sink: Sink | None = None) -> None:
+        self.columns = columns
+        self._sinks: list[Sink] = []
+        self._row = _row(columns)
+        if sink is not None:
+            sink.write(json.dumps(columns.descr).encode() + b"\n")
+            self._sinks.append(sink)
+
+    def follow(self, sink: Sink) -> None:
+        """Have another sink take the rows from now on, and no header."""
+        self._sinks.append(sink)
+
+    def append(self, count: int, **values: Any) -> None:
+        """Append `count` rows; a value is one for all of them, or an array with the rows first."""
+        rows = np.zeros(count, self.columns)
+        for name, value in values.items():
+            rows[name] = value
+        self._write(rows.tobytes())
+
+    def append_row(self, *values: float) -> None:
+        """Append one row, faster: a value for every column in order, arrays number by number."""
+        self._write(self._row.pack(*values))
+
+    def _write(self, rows: bytes) -> None:
+        for sink in self._sinks:
+            sink.write(rows)
+
+
+def _row(columns: np.dtype[np.void]) -> Struct:
+    """Layout of a row in memory."""
+    formats = {"u1": "B", "u2": "H", "u4": "I", "i8": "q", "f4": "f", "f8": "d", "b1": "?"}
+    row = "<"
+    for name in columns.names or ():
+        kind = columns[name]
+        row += f"{math.prod(kind.shape)}{formats[kind.base.str[1:]]}"
+    return Struct(row)
+
+
+def columns_of(descr: Any) -> np.dtype[np.void]:
+    """Columns, of numpy's description of them as JSON has it: names, kinds of numbers and shapes.
+
+    Raises:
+        ValueError: it describes something else.
+    """
+    try:
+        fields = [(name, kind, *map(tuple, shape)) for name, kind, *shape in descr]
+        # numpy reads other kinds as Python does, and has any of its errors for what is none.
+        if not all(_NUMBER.fullmatch(kind) for _, kind, *_ in fields):
+            raise ValueError("some are no numbers")
+        columns = np.dtype(fields)
+    except TypeError as error:
+        raise ValueError(str(error)) from None
+    if not columns.itemsize:
+        raise ValueError("there are none")
+    return columns
+
+
+def parse(part: bytes) -> Rows:
+    """The rows of a part; half a row at its end (a killed writer's) is left out.
+
+    Raises:
+        ValueError: it is no part.
+    """
+    header, _, body = part.partition(b"\n")
+    try:
+        columns = columns_of(json.loads(header))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"not a part of a record: {error}") from None
+    return np.frombuffer(body[: len(body) - len(body) % columns.itemsize], columns)
+
+
+def read(path: Path) -> Rows:
+    """The rows of a part in a file.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no part.
+    """
+    return parse(path.read_bytes())
+
+
+class FlightEvent(NamedTuple):
+    """An event of a flight."""
+
+    time_ns: int
+    """Time in the flight [ns]: of the world, or over real UDP since the first event."""
+    host: str
+    """Name of the host that tells the event: "server", "netem SEED" or "client SEED.VEHICLE"; over
+    real UDP the name of the process."""
+    event: Event
+
+    @property
+    def process(self) -> str:
+        """Name of the process, "server", "netem" or "client", without seed and vehicle."""
+        return self.host.partition(" ")[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Record of a flight: the parts of its processes, and the events that were told."""
+
+    client: Rows
+    server: Rows
+    netem: Rows
+    failure: Failure | None = None
+    """Event after which a vehicle could not fly, the first vehicle's that has one."""
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); of a flight in a
+    batch, those at the end of the batch."""
+    events: tuple[FlightEvent, ...] = ()
+    """Events of the run's own endpoints, and those of the server about its vehicles, in their
+    order."""
+    incomplete: tuple[RecordIncomplete, ...] = ()
+    """What is missing in the record of a flight over real UDP, one for a part."""
+    plan: Rows = field(default_factory=lambda: np.empty(0, plan_columns(2, 1)))
+    """Plans that the server has sent; none of a flight in a batch, or over real UDP."""
+
+    def trace_hash(self) -> str:
+        """Hash of the record, equal for two flights that went the same to the last bit."""
+        parts = (self.client, self.server, self.netem)
+        return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()

@@ -1,0 +1,234 @@
+"""The figures of a flight, from the parts of its record; their names are used everywhere."""
+
+import math
+
+import msgspec
+import numpy as np
+
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows
+from skytether.shared.wire.protocol import NO_HORIZON, Mode
+
+AT_BOUND = 1.0 - 1e-6
+"""Share of the bound from which an input is at it: inputs are rounded on the wire."""
+
+
+class Summary(msgspec.Struct, frozen=True, kw_only=True):
+    """One vehicle's flight; None is what was not measured or whose part of the record is absent."""
+
+    scenario: str
+    seed: int
+    duration_s: float
+    steps: int
+    """Number of steps that the client flew."""
+    rmse_x: float | None
+    """Root mean square of the position error along x, from `settle` on [m]."""
+    rmse_y: float | None
+    rmse_z: float | None
+    """Root mean square of the altitude's error [m]; None in the plane."""
+    rmse_xy: float | None
+    error_max: float | None
+    """Largest distance from the desired trajectory, from `settle` on [m]."""
+    covered: float | None
+    """Share of the steps for which the vehicle had an input planned; in the others it hovered,
+    braked, or held the last."""
+    modes: dict[str, float]
+    """Time in each mode that occurred [s], see `shared.wire.protocol.Mode`."""
+    mode: str | None
+    """Mode that the vehicle was in last."""
+    reason: str | None
+    """Why it was in it."""
+    event_ratio: float | None
+    """Share of the server's steps that sent a horizon."""
+    uplink_horizons: int | None = None
+    """Number of packets with a horizon that the server sent; the other uplink packets are
+    heartbeats and the handshake's."""
+    uplink_packets: int | None
+    """Number of packets that entered the network from the server, lost ones included."""
+    uplink_bytes: int | None
+    """UDP payload of all uplink packets [B]."""
+    downlink_packets: int | None
+    downlink_bytes: int | None
+    lost: int | None
+    """Number of packets that the network lost, both ways."""
+    reordered: int | None
+    """Number of packets overtaken by a later one, both ways."""
+    stale: int
+    """Number of messages discarded at either end because something newer had come before."""
+    age_ms_p50: float | None
+    """Age of the observation behind the input being flown [ms], over all steps."""
+    age_ms_p99: float | None
+    aoi_s_mean: float | None
+    """Mean age of information, of that observation [s], over the steps from `settle` on."""
+    aoi_s_peak: float | None
+    """Mean of its peaks [s]: of the age at each step before one at which it is smaller."""
+    plan_age_s_mean: float | None
+    """Mean time since the horizon in force was made [s], over the steps from `settle` on: the age
+    of all that the server alone knows, as where its target is."""
+    effort_mps: float | None
+    """Root mean square of the change of the input from step to step, over all axes together, from
+    `settle` on [m/s]."""
+    saturated: float | None
+    """Share of the steps from `settle` on at which the input is at its bound on some axis."""
+    solve_ms_p50: float | None
+    """Wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
+    solve_ms_p99: float | None
+    deadline_misses: int
+    """Number of steps that the server or the client slept through."""
+    estimate_error_m: float | None = None
+    """Root mean square of how far the position that the vehicle flew by was from the true one, from
+    `settle` on [m]; None where it knew that."""
+    secure: bool = False
+    """Whether the link was authenticated and encrypted."""
+
+
+def summarise(
+    scenario: Scenario,
+    name: str,
+    client: Rows,
+    server: Rows | None = None,
+    netem: Rows | None = None,
+    *,
+    secure: bool = False,
+) -> Summary:
+    """The summary of one vehicle's flight.
+
+    Args:
+        name: of the scenario.
+        client: its rows, of one vehicle.
+        server: rows of the server, of any vehicles.
+        netem: rows of netem; all flows count.
+        secure: whether the link was sealed.
+    """
+    error = position_error(scenario, client, server)
+    counted = client["step"] * scenario.control.dt >= scenario.settled_s
+    settled, flown = error[counted], client[counted]
+    off = _estimate_error(scenario, client)[counted]
+    off = off[np.isfinite(off).all(axis=1)] if any(scenario.terms().dead_time_s) else off
+    squares = (settled**2).mean(axis=0) if len(settled) else np.array([np.nan])
+    rmse = [float(value) for value in np.sqrt(squares)] if np.isfinite(squares).all() else []
+    distances = np.linalg.norm(settled, axis=1)
+    age_ms = client["age_ns"][client["age_ns"] >= 0] / 1e6
+    aoi_s = flown["age_ns"][flown["age_ns"] >= 0] / 1e9
+    planned = flown[flown["in_force"] != NO_HORIZON]
+    plan_age_s = (planned["step"] - planned["in_force"]) * scenario.control.dt
+    changes = np.diff(client["input"], axis=0)[counted[1:]]
+    stale, missed = _last(client, "stale"), _last(client, "missed")
+    horizons, event_ratio, solve_ms = None, None, np.empty(0)
+    if server is not None:
+        rows = server[np.isin(server["vehicle"], client["vehicle"])]
+        horizons = int(rows["event"].sum())
+        event_ratio = float(rows["event"].mean()) if len(rows) else None
+        solve_ms = rows["solve_ns"][rows["solve_ns"] >= 0] / 1e6
+        stale, missed = stale + _last(rows, "stale"), missed + _last(rows, "missed")
+    return Summary(
+        scenario=name,
+        seed=scenario.seed,
+        duration_s=(_last(client, "step") + 1) * scenario.control.dt if len(client) else 0.0,
+        steps=len(client),
+        rmse_x=rmse[0] if rmse else None,
+        rmse_y=rmse[1] if rmse else None,
+        rmse_z=rmse[2] if len(rmse) == 3 else None,
+        rmse_xy=math.hypot(*rmse[:2]) if rmse else None,
+        error_max=float(distances.max()) if rmse else None,
+        covered=float(client["covered"].mean()) if len(client) else None,
+        modes={
+            str(mode): int((client["mode"] == mode).sum()) * scenario.control.dt
+            for mode in Mode
+            if (client["mode"] == mode).any()
+        },
+        mode=str(Mode(client["mode"][-1])) if len(client) else None,
+        reason=str(Reason(client["reason"][-1])) if len(client) else None,
+        event_ratio=event_ratio,
+        uplink_horizons=horizons,
+        uplink_packets=_count(netem, UPLINK),
+        uplink_bytes=_bytes(netem, UPLINK),
+        downlink_packets=_count(netem, DOWNLINK),
+        downlink_bytes=_bytes(netem, DOWNLINK),
+        lost=None if netem is None else int(netem["lost"].sum()),
+        reordered=None if netem is None else int(netem["overtaken"].sum()),
+        stale=stale,
+        age_ms_p50=_quantile(age_ms, 0.5),
+        age_ms_p99=_quantile(age_ms, 0.99),
+        aoi_s_mean=_mean(aoi_s),
+        aoi_s_peak=_mean(aoi_s[:-1][np.diff(aoi_s) < 0.0]),
+        plan_age_s_mean=_mean(plan_age_s),
+        effort_mps=math.sqrt((changes**2).sum(axis=1).mean()) if len(changes) else None,
+        saturated=_mean((np.abs(flown["input"]) >= AT_BOUND * scenario.u_max).any(axis=1)),
+        solve_ms_p50=_quantile(solve_ms, 0.5),
+        solve_ms_p99=_quantile(solve_ms, 0.99),
+        deadline_misses=missed,
+        estimate_error_m=_rms(off) if off.any() and np.isfinite(off).all() else None,
+        secure=secure,
+    )
+
+
+def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
+    """Desired position at every step of one vehicle [m]; shape (steps, axes).
+
+    Where a live point was, only the server knows: at a step that it has no row of, the point is
+    where it was before. What nobody knows is NaN.
+
+    Args:
+        client: rows of the vehicle.
+        server: rows of the server, of any vehicles.
+    """
+    if scenario.reference.shape != "live":
+        return scenario.make_reference()(client["step"] * scenario.control.dt)[..., 0]
+    known = client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]
+    if not len(known):
+        return np.full((len(client), scenario.model.axes), np.nan)
+    known = known[np.argsort(known["step"], kind="stable")]
+    at = np.searchsorted(known["step"], client["step"], side="right") - 1
+    positions: Array = known["reference"][np.maximum(at, 0), :, 0]
+    return positions
+
+
+def position_error(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
+    """Position minus desired position at every step [m]; shape (steps, axes); see `desired`."""
+    error: Array = client["state"][..., 0] - desired(scenario, client, server)
+    return error
+
+
+def _estimate_error(scenario: Scenario, client: Rows) -> Array:
+    """How far the position that was flown by is from the true one [m]; shape (steps, axes).
+
+    With a dead time it is that of a dead time later; NaN where the flight has ended by then.
+    """
+    known: Array = client["estimate"][..., 0]
+    true = client["state"][..., 0]
+    late, step = np.array(scenario.terms().dead_time_s) / scenario.control.dt, client["step"]
+    if not len(step) or not late.any():
+        return known - true
+    met = [
+        np.interp(step + steps, step, true[:, axis], right=np.nan)
+        for axis, steps in enumerate(late)
+    ]
+    error: Array = known - np.stack(met, axis=1)
+    return error
+
+
+def _rms(vectors: Array) -> float:
+    """Root mean square of the lengths of vectors; shape (n, axes)."""
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+
+
+def _last(rows: Rows, name: str) -> int:
+    return int(rows[name][-1]) if len(rows) else 0
+
+
+def _count(netem: Rows | None, direction: int) -> int | None:
+    return None if netem is None else int((netem["direction"] == direction).sum())
+
+
+def _bytes(netem: Rows | None, direction: int) -> int | None:
+    return None if netem is None else int(netem["bytes"][netem["direction"] == direction].sum())
+
+
+def _mean(values: Array) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+def _quantile(values: Array, share: float) -> float | None:
+    return float(np.quantile(values, share)) if len(values) else None

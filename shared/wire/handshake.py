@@ -1,0 +1,185 @@
+"""The packets of the handshake that opens a channel. Integers are little-endian.
+
+| type | packet     | sent by | header | then                                            | bytes |
+|------|------------|---------|--------|-------------------------------------------------|-------|
+| 1    | INITIATION | client  | 5      | cookie 16, Noise message 1 (475), MAC 16        | 512   |
+| 2    | CHALLENGE  | server  | 5      | cookie 16, MAC 16                               | 37    |
+| 3    | RESPONSE   | server  | 5      | channel u32, Noise message 2 (48 + WELCOME),    | < 512 |
+|      |            |         |        | MAC 16                                          |       |
+
+The header is version u8, type u8, vehicle u16 and the number of its key u8. The MAC is a keyed
+BLAKE2s over all that stands before it, and in an answer also over the ephemeral key that it
+answers: a packet of another peer, or for another attempt, is dropped before any costly mathematics.
+The HELLO in message 1 is padded, so that no answer is longer than what draws it.
+"""
+
+import hashlib
+import hmac
+import struct
+from typing import NamedTuple
+
+from skytether.shared.wire.channel import VERSION
+from skytether.shared.wire.keys import VehicleKey
+from skytether.shared.wire.noise_nnpsk0 import MESSAGE_BYTES
+from skytether.shared.wire.protocol import Drop, ProtocolError
+
+INITIATION, CHALLENGE, RESPONSE = 1, 2, 3
+"""Types of the packets."""
+
+HEADER = struct.Struct("<BBHB")
+"""Version, type, vehicle and number of the key."""
+CHANNEL = struct.Struct("<I")
+"""Number of a channel."""
+COOKIE_BYTES = 16
+MAC_BYTES = 16
+INITIATION_BYTES = 512
+"""Size of an INITIATION, which no answer exceeds [B]."""
+CHALLENGE_BYTES = HEADER.size + COOKIE_BYTES + MAC_BYTES
+RESPONSE_BYTES_MIN = HEADER.size + CHANNEL.size + MESSAGE_BYTES + MAC_BYTES
+NO_COOKIE = bytes(COOKIE_BYTES)
+"""Cookie of a client that was given none."""
+
+_GREETINGS = (1, 2)
+"""Types of the messages HELLO and WELCOME."""
+_PROLOGUE = b"skytether 1"
+_COOKIE_END = HEADER.size + COOKIE_BYTES
+_PADDED_BYTES = INITIATION_BYTES - _COOKIE_END - MESSAGE_BYTES - MAC_BYTES
+"""Size of a HELLO and its padding [B]."""
+HELLO_BYTES_MAX = _PADDED_BYTES - 1
+"""Largest size of a HELLO [B]."""
+WELCOME_BYTES_MAX = INITIATION_BYTES - RESPONSE_BYTES_MIN
+"""Largest size of a WELCOME [B]."""
+
+
+class Initiation(NamedTuple):
+    """Parts of an INITIATION."""
+
+    cookie: bytes
+    message: bytes
+    """First message of the handshake."""
+
+
+class Response(NamedTuple):
+    """Parts of a RESPONSE."""
+
+    channel: int
+    """Number of the channel."""
+    message: bytes
+    """Second message of the handshake."""
+
+
+def check_place(message: bytes, *, in_handshake: bool) -> None:
+    """Refuse a HELLO or WELCOME in a channel, and any other message in a handshake.
+
+    A packet of the handshake may be repeated by others, and what is agreed upon in a channel is no
+    handshake. Each message must begin in msgpack's shortest form, so that it is what it looks like.
+
+    Raises:
+        ProtocolError: even the holder of the key must not send it there.
+    """
+    array, version, type_ = message[:3] if len(message) >= 3 else bytes(3)
+    is_short = array & 0xF0 == 0x90 and version < 0x80 and type_ < 0x80
+    if not is_short or (type_ in _GREETINGS) != in_handshake:
+        raise ProtocolError(Drop.OUT_OF_PLACE)
+
+
+def prologue(key: VehicleKey) -> bytes:
+    """What both ends of a handshake have in common: this protocol, the vehicle and its key."""
+    return _PROLOGUE + _header(key, INITIATION)
+
+
+def pad(hello: bytes) -> bytes:
+    """A HELLO as message 1 carries it: behind it a byte 0x80, then zeros."""
+    assert len(hello) <= HELLO_BYTES_MAX
+    return (hello + b"\x80").ljust(_PADDED_BYTES, b"\0")
+
+
+def unpad(padded: bytes) -> bytes:
+    """The HELLO that was padded."""
+    return padded.rstrip(b"\0")[:-1]
+
+
+def write_initiation(key: VehicleKey, cookie: bytes, message: bytes) -> bytes:
+    """An INITIATION of its parts."""
+    packet = _sealed(key, _header(key, INITIATION) + cookie + message)
+    assert len(packet) == INITIATION_BYTES
+    return packet
+
+
+def write_challenge(key: VehicleKey, cookie: bytes, public: bytes) -> bytes:
+    """A CHALLENGE of its parts; `public` is the ephemeral key that it answers."""
+    return _sealed(key, _header(key, CHALLENGE) + cookie, public)
+
+
+def write_response(key: VehicleKey, channel: int, message: bytes, public: bytes) -> bytes:
+    """A RESPONSE of its parts; `public` is the ephemeral key that it answers."""
+    packet = _sealed(key, _header(key, RESPONSE) + CHANNEL.pack(channel) + message, public)
+    assert len(packet) <= INITIATION_BYTES
+    return packet
+
+
+def address(packet: bytes) -> tuple[int, int]:
+    """Numbers of the vehicle and of its key in an INITIATION.
+
+    Raises:
+        ProtocolError: it has another length.
+    """
+    if len(packet) != INITIATION_BYTES:
+        raise ProtocolError(Drop.LENGTH)
+    _, _, vehicle, number = HEADER.unpack_from(packet)
+    return vehicle, number
+
+
+def read_initiation(key: VehicleKey, packet: bytes) -> Initiation:
+    """Parts of an INITIATION, whose address is that of the key.
+
+    Raises:
+        ProtocolError: nobody who has the key made it.
+    """
+    if not is_authentic(key, packet):
+        raise ProtocolError(Drop.FORGED)
+    return Initiation(packet[HEADER.size : _COOKIE_END], packet[_COOKIE_END:-MAC_BYTES])
+
+
+def read_challenge(key: VehicleKey, packet: bytes, public: bytes) -> bytes:
+    """Cookie in a CHALLENGE that answers an ephemeral key.
+
+    Raises:
+        ProtocolError: it does not.
+    """
+    if len(packet) != CHALLENGE_BYTES:
+        raise ProtocolError(Drop.LENGTH)
+    if not is_authentic(key, packet, public):
+        raise ProtocolError(Drop.UNASKED)
+    return packet[HEADER.size : _COOKIE_END]
+
+
+def read_response(key: VehicleKey, packet: bytes, public: bytes) -> Response:
+    """Parts of a RESPONSE that answers an ephemeral key.
+
+    Raises:
+        ProtocolError: it does not.
+    """
+    if not RESPONSE_BYTES_MIN <= len(packet) <= INITIATION_BYTES:
+        raise ProtocolError(Drop.LENGTH)
+    if not is_authentic(key, packet, public):
+        raise ProtocolError(Drop.UNASKED)
+    (channel,) = CHANNEL.unpack_from(packet, HEADER.size)
+    return Response(channel, packet[HEADER.size + CHANNEL.size : -MAC_BYTES])
+
+
+def is_authentic(key: VehicleKey, packet: bytes, public: bytes = b"") -> bool:
+    """Whether who made a packet has the key; `public` is the ephemeral key that it answers."""
+    return hmac.compare_digest(packet[-MAC_BYTES:], _mac(key, packet[:-MAC_BYTES] + public))
+
+
+def _header(key: VehicleKey, type_: int) -> bytes:
+    return HEADER.pack(VERSION, type_, key.vehicle, key.number)
+
+
+def _sealed(key: VehicleKey, packet: bytes, public: bytes = b"") -> bytes:
+    return packet + _mac(key, packet + public)
+
+
+def _mac(key: VehicleKey, data: bytes) -> bytes:
+    return hashlib.blake2s(data, key=key.mac, digest_size=MAC_BYTES).digest()

@@ -1,0 +1,457 @@
+"""The wire: six messages, each one msgpack array in one UDP datagram, sealed or plain.
+
+    [version, type, vehicle, ...]
+
+| type | message     | sent by | fields after `vehicle`                                     |
+|------|-------------|---------|------------------------------------------------------------|
+| 1    | HELLO       | client  | boot_id, terms                                             |
+| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, refusal,      |
+|      |             |         | terms                                                      |
+| 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
+|      |             |         | received_ns, mode, takes, state, input                     |
+| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback    |
+| 5    | HEARTBEAT   | server  | session, server_ns, idle, degraded                         |
+| 6    | CLOSE       | both    | session                                                    |
+
+`docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
+Those that control uses are the client's; `server_ns` is the server's own, which the client only
+echoes. A datagram that is not exactly one of these messages is a `ProtocolError`: the peer's
+mistake, to be dropped and counted by its reason, never answered.
+"""
+
+import math
+from collections.abc import Callable
+from enum import IntEnum, StrEnum
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.law.model import Array
+from skytether.shared.law.terms import Terms
+
+VERSION = 5
+PAYLOAD_BYTES_MAX = 1200
+"""So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
+
+AXES_MAX = 3
+TEXT_MAX = 32
+"""Characters of a text in the terms."""
+INPUTS_MAX = 270
+"""Inputs of all axes in one horizon: what fits beside the other fields."""
+
+LED_P = 0
+"""Column of `Horizon.feedback`: position x̄ at the horizon's step [m]."""
+LED_V = 1
+"""Column of `Horizon.feedback`: velocity x̄ there [m/s]."""
+LED = [LED_P, LED_V]
+"""Both columns of x̄."""
+DISTURBANCE = 2
+"""Column of `Horizon.feedback`: disturbance ŵ that was reckoned with [m/s]."""
+GAIN_P = 3
+"""Column of `Horizon.feedback`: K on position [1/s]."""
+GAIN_V = 4
+"""Column of `Horizon.feedback`: K on velocity."""
+FEEDBACK = 5
+"""Number of columns of `Horizon.feedback`."""
+
+NO_FEEDBACK = np.empty((0, 0), np.float32)
+
+INPUT_TOLERANCE = 1.001
+"""How far over its bound an input may be (float32 rounds) before the packet is refused."""
+
+
+class Refusal(IntEnum):
+    """Why a server opens no session for a vehicle."""
+
+    ACCEPTED = 0
+    """It opens one."""
+    OTHER_TERMS = 1
+    """The vehicle has other terms."""
+    FULL = 2
+    """The server has no room."""
+    TAKEN = 3
+    """Another client flies under the vehicle's number."""
+
+    def __str__(self) -> str:
+        return self.name.lower().replace("_", " ")
+
+
+NO_HORIZON = -1
+"""`Observation.in_force` while no horizon has arrived yet."""
+
+
+class Drop(StrEnum):
+    """Why a datagram is dropped; the value is how people read it, and what metrics call it."""
+
+    # It is no message.
+    TOO_LONG = "too long"
+    NOT_MSGPACK = "not msgpack"
+    NOT_A_MESSAGE = "not a message"
+    VERSION = "version"
+    TYPE = "type"
+    FIELD = "field"
+    SHAPE = "shape"
+    NOT_FINITE = "not finite"
+    INPUT_OUT_OF_RANGE = "input out of range"
+
+    # It is not for this end, or not in this session.
+    ELSEWHERE = "not from the server's address"
+    NOT_FOR_A_SERVER = "not for a server"
+    NOT_FOR_A_CLIENT = "not for a client"
+    OF_ANOTHER_VEHICLE = "of another vehicle"
+    """It names another vehicle than the one whose key it is sealed with."""
+    FOR_ANOTHER_LIFE = "for another life"
+    """It answers a client that has ended."""
+    UNKNOWN_SESSION = "unknown session"
+    OTHER_TERMS = "other terms"
+    FULL = "full"
+    TAKEN = "taken"
+
+    # It is not sealed as it should be, see `wire.channel` and `wire.handshake`.
+    NOT_SEALED = "not sealed"
+    LENGTH = "length"
+    UNKNOWN_KEY = "unknown key"
+    UNKNOWN_CHANNEL = "unknown channel"
+    FORGED = "forged"
+    REPLAYED = "replayed"
+    EXPIRED = "expired"
+    UNASKED = "unasked"
+    OUT_OF_PLACE = "out of place"
+    TOO_MANY_HANDSHAKES = "too many handshakes"
+
+    # It is an observation that is impossible, see `server.plausibility`.
+    IMPLAUSIBLE_EPOCH = "implausible: epoch"
+    IMPLAUSIBLE_CLOCK = "implausible: clock"
+    IMPLAUSIBLE_HORIZON = "implausible: horizon"
+    IMPLAUSIBLE_JUMP = "implausible: jump"
+
+    # It is a horizon that is not flown, see `client.compensator`.
+    FROM_THE_FUTURE = "from the future"
+    OBSERVATION = "observation"
+    """It was planned from an observation that there cannot be."""
+    TOO_OLD = "too old"
+    TOO_LATE = "too late"
+    NOT_TAKEN = "not taken"
+
+
+class ProtocolError(Exception):
+    """Error of the peer: what it has sent is to be dropped."""
+
+    def __init__(self, reason: Drop) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class Hello(NamedTuple):
+    """A vehicle asks for a session."""
+
+    vehicle: int
+    boot_id: int
+    terms: Terms
+
+
+class Welcome(NamedTuple):
+    """The server opens it, or says why it opens none."""
+
+    vehicle: int
+    session: int
+    """Number of the session, 0 where there is none."""
+    boot_id: int
+    """The vehicle's own, echoed: an answer to another life of the vehicle is not for this one."""
+    server_boot_id: int
+    server_ns: int
+    refusal: int
+    """Why there is none, one of `Refusal`."""
+    terms: Terms
+
+
+class Mode(IntEnum):
+    """What a vehicle does, see `client.failsafe`."""
+
+    INIT = 0
+    """It has no session yet."""
+    SYNC = 1
+    """Its link is not good for long enough yet."""
+    READY = 2
+    """It waits for a horizon, and to be armed."""
+    TRACK = 3
+    """It flies a horizon."""
+    COAST = 4
+    """It flies on along a horizon for want of a newer one."""
+    BRAKE = 5
+    """It takes the input that it flew last to zero."""
+    HOVER = 6
+    """It stands still."""
+    LAND = 7
+    """It descends, and stays down."""
+    FAULT = 8
+    """Something is wrong aboard; it stands still, and flies nothing more."""
+    MANUAL = 9
+    """Somebody else flies it, or nobody: it is told nothing."""
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class Observation(NamedTuple):
+    """The vehicle's state at the start of one step, and what it does from there on."""
+
+    vehicle: int
+    session: int
+    step: int
+    stamp_ns: int
+    """When the state was sampled [client clock]."""
+    in_force: int
+    """Step that the horizon in force was made for, or NO_HORIZON."""
+    since: int
+    """First step that was flown with that horizon."""
+    server_ns: int
+    """Newest `server_ns` seen, echoed [server clock]."""
+    received_ns: int
+    """When that stamp came [client clock]."""
+    mode: int
+    """What the vehicle does, one of `Mode`."""
+    takes: int
+    """1 if a horizon that comes now would be flown, else 0."""
+    state: Array
+    """Position [m] and velocity [m/s]; shape (axes, 2)."""
+    input: Array
+    """Desired velocity that is flown from `step` on [m/s]; shape (axes,)."""
+
+
+class Horizon(NamedTuple):
+    """The control horizon U(k) of eq. (8), after the committed inputs where there are any."""
+
+    vehicle: int
+    session: int
+    step: int
+    """Step k of the first input, on the vehicle's grid."""
+    server_ns: int
+    observed_ns: int
+    """Stamp of the observation it was computed from, echoed [client clock]."""
+    inputs: NDArray[np.float32]
+    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`; or
+    (axes, 1) with dead reckoning, the velocity at which the vehicle goes on."""
+    feedback: NDArray[np.float32] = NO_FEEDBACK
+    """What feedback aboard takes, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
+    (axes, 0) where the inputs are to be flown as they are."""
+
+
+class Idle(IntEnum):
+    """Why the server makes no plan for a vehicle."""
+
+    PLANS = 0
+    """It makes them, and has sent what is worth sending."""
+    OBSERVATION = 1
+    """The newest observation is older than `link.age_max_s`, or would be before a plan began."""
+    DELAY = 2
+    """The delay to the vehicle is longer than a horizon has room for."""
+    UNSOLVED = 3
+    """The solver has found no plan."""
+
+    def __str__(self) -> str:
+        return IDLE_TEXTS[self]
+
+
+IDLE_TEXTS = {
+    Idle.PLANS: "no newer horizon has come",
+    Idle.OBSERVATION: "what is known of it at the server is older than link.age_max_s",
+    Idle.DELAY: "the delay to it is longer than a horizon has room for",
+    Idle.UNSOLVED: "the solver has found none",
+}
+
+
+class Heartbeat(NamedTuple):
+    """The server lives and has nothing else to say."""
+
+    vehicle: int
+    session: int
+    server_ns: int
+    idle: int
+    """Why no plan is made for the vehicle, one of `Idle`."""
+    degraded: int
+    """1 if the server sleeps through more of its ticks than it may, else 0."""
+
+
+class Close(NamedTuple):
+    """The sender is about to end; said `CLOSES` times."""
+
+    vehicle: int
+    session: int
+
+
+CLOSES = 3
+"""Number of times that CLOSE is said, for some of them may be lost."""
+
+Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close
+
+_Check = range | Callable[[object, Terms], object]
+"""The integers a field may be, or what makes the field of what was sent, or refuses it."""
+
+
+def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> list[object]:
+    """As many values as checks, each as its check makes it."""
+    for i, check in enumerate(checks):
+        if type(check) is range:
+            # `type`, not `isinstance`: True is no integer on this wire.
+            if type(values[i]) is not int or values[i] not in check:
+                raise ProtocolError(Drop.FIELD)
+        else:
+            values[i] = check(values[i], terms)
+    return values
+
+
+def _terms(value: object, ours: Terms) -> Terms:
+    """The peer's terms: they may differ from ours, but must be of the same kind."""
+    if type(value) is not tuple or len(value) != len(ours):
+        raise ProtocolError(Drop.FIELD)
+    for theirs, our in zip(value, ours, strict=True):
+        if type(theirs) is not type(our) or not _is_plain(theirs):
+            raise ProtocolError(Drop.FIELD)
+    return Terms._make(value)
+
+
+def _is_plain(value: object) -> bool:
+    """Whether a term is a finite number, a short text, yes or no, or a number for each axis."""
+    match value:
+        case float():
+            return math.isfinite(value)
+        case tuple():
+            numbers = all(type(number) is float and math.isfinite(number) for number in value)
+            return len(value) <= AXES_MAX and numbers
+        case str():
+            return len(value) <= TEXT_MAX
+    return True
+
+
+def _state(value: object, ours: Terms) -> Array:
+    state = _array(value, _FLOAT64, ours.axes, (2, 2))
+    if not all(map(math.isfinite, state.ravel().tolist())):
+        raise ProtocolError(Drop.NOT_FINITE)
+    return state
+
+
+def _input(value: object, ours: Terms) -> Array:
+    flown = _array(value, _FLOAT64, ours.axes, (1, 1))[:, 0]
+    for u, bound in zip(flown.tolist(), ours.u_max, strict=True):
+        if not math.isfinite(u):
+            raise ProtocolError(Drop.NOT_FINITE)
+        if abs(u) > bound * INPUT_TOLERANCE:
+            raise ProtocolError(Drop.INPUT_OUT_OF_RANGE)
+    return flown
+
+
+def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
+    most = ours.planned + (0 if ours.reckons else committed_max(ours))
+    inputs = _array(value, _FLOAT32, ours.axes, (ours.planned, most))
+    largest = np.abs(inputs).max(axis=1).tolist()  # NaN where there is one
+    if not all(map(math.isfinite, largest)):
+        raise ProtocolError(Drop.NOT_FINITE)
+    for most, bound in zip(largest, ours.u_max, strict=True):
+        if most > bound * INPUT_TOLERANCE:
+            raise ProtocolError(Drop.INPUT_OUT_OF_RANGE)
+    return inputs
+
+
+def _feedback(value: object, ours: Terms) -> NDArray[np.float32]:
+    feedback = _array(value, _FLOAT32, ours.axes, (0, FEEDBACK))
+    if feedback.shape[1] not in (0, FEEDBACK):
+        raise ProtocolError(Drop.SHAPE)
+    if not all(map(math.isfinite, feedback.ravel().tolist())):
+        raise ProtocolError(Drop.NOT_FINITE)
+    return feedback
+
+
+def committed_max(terms: Terms) -> int:
+    """Most committed steps that a horizon has room for beside those that are planned; 1 or more."""
+    return max(1, min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max))
+
+
+def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
+    """Array of `axes` rows, with at least and at most so many numbers each."""
+    if type(value) is not bytes:
+        raise ProtocolError(Drop.SHAPE)
+    count, rest = divmod(len(value), axes * dtype.itemsize)
+    if rest or not counts[0] <= count <= counts[1]:
+        raise ProtocolError(Drop.SHAPE)
+    return np.ndarray((axes, count), dtype, value)
+
+
+_FLOAT32 = np.dtype("<f4")
+_FLOAT64 = np.dtype("<f8")
+_FLAG = range(2)
+_U16 = range(2**16)
+_U32 = range(2**32)
+_U64 = range(2**64)
+_STAMP = range(2**63)
+_STEP = range(2**40 + 1)
+_STEP_OR_NONE = range(NO_HORIZON, 2**40 + 1)
+
+_TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
+    (Hello, (_U16, _U64, _terms)),
+    (Welcome, (_U16, _U32, _U64, _U64, _STAMP, range(len(Refusal)), _terms)),
+    (
+        Observation,
+        (
+            *(_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP),
+            *(range(len(Mode)), _FLAG, _state, _input),
+        ),
+    ),
+    (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback)),
+    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG)),
+    (Close, (_U16, _U32)),
+)
+"""Message of each type number (from 1) and the check of each of its fields."""
+
+_NUMBERS = {message: number for number, (message, _) in enumerate(_TYPES, start=1)}
+_PACKER = msgpack.Packer(default=np.ndarray.tobytes)
+
+
+def encode(message: Message) -> bytes:
+    """The datagram of a message; arrays travel as little-endian bytes."""
+    payload: bytes = _PACKER.pack([VERSION, _NUMBERS[type(message)], *message])
+    assert len(payload) <= PAYLOAD_BYTES_MAX
+    return payload
+
+
+def encode_horizon(
+    vehicle: int,
+    session: int,
+    step: int,
+    server_ns: int,
+    observed_ns: int,
+    inputs: memoryview,
+    feedback: memoryview,
+) -> bytes:
+    """Datagram of a `Horizon` whose arrays are bytes already, for a server that sends many."""
+    fields = (vehicle, session, step, server_ns, observed_ns, inputs, feedback)
+    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *fields))
+    assert len(payload) <= PAYLOAD_BYTES_MAX
+    return payload
+
+
+def decode(payload: bytes, terms: Terms) -> Message:
+    """The message in a datagram, every field checked against our own terms.
+
+    Raises:
+        ProtocolError: it is none of ours.
+    """
+    if len(payload) > PAYLOAD_BYTES_MAX:
+        raise ProtocolError(Drop.TOO_LONG)
+    try:
+        fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise ProtocolError(Drop.NOT_MSGPACK) from error
+    if type(fields) is not tuple or len(fields) < 2:
+        raise ProtocolError(Drop.NOT_A_MESSAGE)
+    version, number, *body = fields
+    if type(version) is not int or version != VERSION:
+        raise ProtocolError(Drop.VERSION)
+    if type(number) is not int or not 1 <= number <= len(_TYPES):
+        raise ProtocolError(Drop.TYPE)
+    message, checks = _TYPES[number - 1]
+    if len(body) != len(checks):
+        raise ProtocolError(Drop.NOT_A_MESSAGE)
+    return message._make(_checked(body, checks, terms))

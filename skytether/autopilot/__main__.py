@@ -1,0 +1,121 @@
+"""`python -m skytether.autopilot`: a simulated vehicle that speaks MAVLink, as a process."""
+
+import sys
+
+from skytether.shell.start import run
+
+if __name__ == "__main__":  # before the imports below, which take a while
+    sys.exit(run("skytether.autopilot.__main__:pilot", "autopilot"))
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from skytether.autopilot import faults
+from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.flavours import FlavourName
+from skytether.shared.base import kernel
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import TRUTH_COLUMNS
+from skytether.shell import command
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.log import LogFormat
+from skytether.shell.options import Argument
+from skytether.shell.udp import is_loopback, look_up
+
+BIND = "127.0.0.1:14550"
+
+
+@dataclass(frozen=True)
+class AutopilotOptions:
+    """Options of `skytether autopilot`."""
+
+    scenario: ScenarioName = "demo"
+    """A scenario's name (see `skytether scenarios`) or a .toml file; of it, `vehicle.frame`,
+    `vehicle.battery`, `vehicle.steady_wind_mps`, `vehicle.turbulence_mps` and `seed` are used."""
+    flavour: FlavourName = "ardupilot"
+    """Autopilot to be like: ArduCopter 4.5 or PX4 1.17."""
+    bind: str | None = None
+    """HOST:PORT to hear MAVLink at, 127.0.0.1:14550 unless given, or a free port with --to. Whoever
+    sends MAVLink there is answered."""
+    to: str | None = None
+    """HOST:PORT to send heartbeats to from the start, for a companion computer that waits for the
+    autopilot to speak first, as 127.0.0.1:14540 with PX4."""
+    ready: Annotated[float | None, Argument(metavar="SECONDS")] = None
+    """Time from the start until it may be armed [s]: 41.5 of ArduCopter and 4.6 of PX4 unless
+    given."""
+    fault: Annotated[
+        tuple[str, ...],
+        Argument(
+            metavar="NAME@SECONDS",
+            append=True,
+            help="Something that goes wrong so long after arming; may come several times. "
+            "silence@20-25: it sends nothing for 5 s; pilot@20: a pilot takes over; disarm@20: its "
+            "rotors stop; battery@20: 5 %% are left; estimate@20-25: it does not know where it is.",
+        ),
+    ] = ()
+    insecure: bool = False
+    """Listen even where other machines can reach it: MAVLink has no keys, anybody there can fly
+    it."""
+    log: LogFormat = "text"
+    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    record: Path | None = None
+    """File for the autopilot's part of the record: where the vehicle truly is, each 5 ms."""
+    json: Path | None = None
+    """File for what was counted, and the CPU time it took."""
+    control: Path | None = None
+    """Unix socket to make, through which the wind changes in flight, see `skytether set`."""
+    metrics: str | None = None
+    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
+    plugin: command.Plugins = ()
+    config: ScenarioFlags = Scenario()
+
+
+def pilot(argv: Sequence[str]) -> None:
+    """Be a vehicle with an autopilot that speaks MAVLink, until SIGINT or SIGTERM.
+
+    It answers velocities, silence, commands and parameters as ArduCopter or PX4 were measured to,
+    around a simulated quadrotor. SIGUSR1 prints what was counted so far.
+    """
+    options = command.parse(AutopilotOptions(), argv, "skytether autopilot", pilot.__doc__)
+    if options.ready is not None and not 0.0 <= options.ready <= 3600.0:
+        raise CommandError(f"--ready: got {options.ready:g}, expected 0 to 3600 s", 2)
+    to = command.optional_address("--to", options.to)
+    bind = command.optional_address("--bind", options.bind or (None if to else BIND))
+    if bind and not (options.insecure or is_loopback(look_up(bind))):
+        said = f"got {options.bind}, where other machines can reach it, and MAVLink has no keys"
+        raise CommandError(f"--bind: {said}: expected an address of 127.0.0.1, or --insecure", 2)
+    peers = [to] if to else []
+    record = options.record
+    with command.recorded(record, TRUTH_COLUMNS) if record else nullcontext() as recording:
+        endpoint = Autopilot(
+            options.config,
+            options.flavour,
+            peers=peers,
+            ready_s=options.ready,
+            faults=[faults.parse(each) for each in options.fault],
+            recorder=recording.recorder if recording else None,
+        )
+        command.drive(
+            "autopilot",
+            endpoint,
+            options,
+            bind=bind,
+            peers=peers,
+            waiting_for="MAVLink",
+            secure=None,
+            log=options.log,
+            json=options.json,
+            recording=recording,
+            control=options.control,
+            metrics=command.optional_address("--metrics", options.metrics),
+            ready=_ready,
+        )
+
+
+def _ready() -> None:
+    """Have what flies in memory before somebody waits for it."""
+    command.prepare(kernel.missing())
+    kernel.load()

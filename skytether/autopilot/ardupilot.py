@@ -1,0 +1,125 @@
+"""ArduCopter 4.5, as far as it is measured: it stands when setpoints stop, and stays in GUIDED."""
+
+from math import hypot
+
+from skytether.autopilot.flavours import Mode
+from skytether.autopilot.flight import Flight, Limits, Result, Setpoint, Severity
+from skytether.quadrotor.loops import Gains
+from skytether.shared.base.units import SECOND_NS
+
+LEAST = 0.1
+"""Least value that a gain or a limit has, whatever its parameter says."""
+LANDED_S = 2.0
+"""Time on the ground after which a landing is over [s], as measured."""
+STATION_ACTIONS = {1: Mode.RETURN, 3: Mode.RETURN, 4: Mode.RETURN, 5: Mode.LAND, 7: Mode.HOLD}
+"""Modes by the value of FS_GCS_ENABLE; without a path to return on, SmartRTL is RTL."""
+BATTERY_ACTIONS = {1: Mode.LAND, 2: Mode.RETURN, 3: Mode.RETURN, 4: Mode.LAND}
+"""Modes by the value of BATT_FS_LOW_ACT."""
+FENCE_ACTIONS = {1: Mode.RETURN, 2: Mode.LAND, 4: Mode.HOLD}
+"""Modes by the value of FENCE_ACTION."""
+
+
+class ArduPilot(Flight):
+    """Flight of ArduCopter."""
+
+    refusal = Result.FAILED
+    arming_word = "Arming"
+    lifts_off_by_setpoint = False
+
+    def why_not_armed(self) -> str:
+        """See `Flight`."""
+        if self.mode in (Mode.LAND, Mode.RETURN, Mode.HOLD):
+            return f"Arm: {self.mode_name} mode not armable"
+        if not self.ready and self.parameters["ARMING_CHECK"]:
+            return "PreArm: Need Position Estimate"
+        if self.quadrotor.battery().charge < self.low and self.parameters["ARMING_CHECK"]:
+            return "PreArm: Battery 1 below minimum arming voltage"
+        return ""
+
+    def why_not_guided(self) -> str:
+        """See `Flight`."""
+        return ""
+
+    def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
+        """See `Flight`; the first part is all of it."""
+        return main
+
+    def takes_setpoints(self) -> bool:
+        """See `Flight`."""
+        return self.mode is Mode.GUIDED
+
+    def altitude_of(self, told: float) -> float | None:
+        """See `Flight`; it is above home."""
+        return told
+
+    def enter_takeoff(self) -> bool:
+        """See `Flight`; GUIDED climbs by itself."""
+        return self.mode is Mode.GUIDED
+
+    def limits(self) -> Limits:
+        """See `Flight`."""
+        p = self.parameters
+        return Limits(
+            speed=p["WPNAV_SPEED"] / 100.0,
+            up=p["WPNAV_SPEED_UP"] / 100.0,
+            down=p["WPNAV_SPEED_DN"] / 100.0,
+            land=p["LAND_SPEED"] / 100.0,
+            p=max(p["PSC_POSXY_P"], LEAST),
+            p_up=max(p["PSC_POSZ_P"], LEAST),
+            acceleration=max(p["WPNAV_ACCEL"] / 100.0, LEAST),
+            acceleration_up=max(p["WPNAV_ACCEL_Z"] / 100.0, LEAST),
+        )
+
+    def gains(self) -> Gains:
+        """See `Flight`."""
+        p = self.parameters
+        return self.flavour.gains._replace(
+            jerk=max(p["PSC_JERK_XY"], LEAST),
+            acceleration=max(p["WPNAV_ACCEL"] / 100.0, LEAST),
+            jerk_up=max(p["PSC_JERK_Z"], LEAST),
+            acceleration_up=max(p["WPNAV_ACCEL_Z"] / 100.0, LEAST),
+            catch_up=max(p["PSC_POSXY_P"], LEAST),
+            p=max(p["PSC_VELXY_P"], LEAST),
+        )
+
+    def is_station(self, system: int, kind: int) -> bool:  # noqa: ARG002
+        """See `Flight`."""
+        return system == self.parameters["SYSID_MYGCS"]
+
+    def return_altitude(self, distance: float) -> float:
+        """See `Flight`; lower where home is near."""
+        cone = self.parameters["RTL_CONE_SLOPE"] * distance
+        return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
+
+    def silence(self, setpoint: Setpoint) -> bool:
+        """See `Flight`; it brakes after GUID_TIMEOUT, where what it flies has a velocity."""
+        past_s = (self.now_ns - setpoint.came_ns) / SECOND_NS
+        return past_s > self.parameters["GUID_TIMEOUT"]
+
+    def watch(self) -> None:
+        """See `Flight`."""
+        p = self.parameters
+        if self.station_ns is not None:
+            past_s = (self.now_ns - self.station_ns) / SECOND_NS
+            lost = past_s > p["FS_GCS_TIMEOUT"]
+            action = STATION_ACTIONS.get(int(p["FS_GCS_ENABLE"]))
+            if lost and action and self.mode is not Mode.PILOT and self.once("station"):
+                self.act(action, "GCS Failsafe")
+        if self.quadrotor.battery().charge < self.low and self.once("battery"):
+            action = BATTERY_ACTIONS.get(int(p["BATT_FS_LOW_ACT"]))
+            self.say("Battery 1 is low", Severity.WARNING)
+            if action:
+                self.act(action, "Battery Failsafe")
+        x, y, z = self.position()
+        high = int(p["FENCE_TYPE"]) & 1 and z > p["FENCE_ALT_MAX"]
+        far = int(p["FENCE_TYPE"]) & 2 and hypot(x, y) > p["FENCE_RADIUS"]
+        if p["FENCE_ENABLE"] and (high or far) and self.once("fence"):
+            self.say("Fence Breached", Severity.WARNING)
+            action = FENCE_ACTIONS.get(int(p["FENCE_ACTION"]))
+            if action:
+                self.act(action, f"Fence: {action.name.lower()}")
+
+    def idle_s(self) -> float:
+        """See `Flight`."""
+        landed = self.mode in (Mode.LAND, Mode.RETURN)
+        return LANDED_S if landed else self.parameters["DISARM_DELAY"]

@@ -1,0 +1,97 @@
+"""Faults that are scripted: what goes wrong, and when, counted from when the vehicle was armed."""
+
+import re
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, get_args
+
+from skytether.autopilot.flavours import Mode
+from skytether.autopilot.flight import Flight
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.hint import hint
+from skytether.shared.base.units import seconds_to_ns
+
+FaultName = Literal["silence", "pilot", "disarm", "battery", "estimate"]
+NAMES: tuple[str, ...] = get_args(FaultName)
+LASTING = ("silence", "estimate")
+"""Faults that may end."""
+LOW_CHARGE = 0.05
+"""Charge that `battery` leaves."""
+
+
+class Fault(NamedTuple):
+    """Something that goes wrong."""
+
+    name: str
+    """What: one of NAMES."""
+    from_ns: int
+    """When, counted from arming."""
+    until_ns: int | None
+    """When it is over; None: never."""
+
+
+def parse(text: str) -> Fault:
+    """Fault from NAME@SECONDS, or NAME@SECONDS-SECONDS of one that ends.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    number = r"(\d+(?:\.\d+)?)"
+    found = re.fullmatch(rf"(\w+)@{number}(?:-{number})?", text)
+    if found is None:
+        expected = "expected NAME@SECONDS, or NAME@SECONDS-SECONDS, after arming"
+        raise ConfigError(f"--fault: got {text!r}, {expected}")
+    name, begin, end = found.groups()
+    if name not in NAMES:
+        raise ConfigError(f"--fault: got {name!r}; {hint(name, NAMES)}")
+    if end is not None and (name not in LASTING or float(end) <= float(begin)):
+        expected = f"expected a later end, and one of {' and '.join(LASTING)} alone"
+        raise ConfigError(f"--fault: got {text!r}, {expected}")
+    return Fault(
+        name, seconds_to_ns(float(begin)), None if end is None else seconds_to_ns(float(end))
+    )
+
+
+class Script:
+    """Faults of a flight.
+
+    Args:
+        faults: what goes wrong.
+    """
+
+    def __init__(self, faults: Sequence[Fault]) -> None:
+        self._waiting = sorted(faults, key=lambda fault: fault.from_ns)
+        self._lasting: list[Fault] = []
+        self.silent = False
+        """Whether nothing is sent."""
+
+    def play(self, flight: Flight) -> None:
+        """Have go wrong what is due."""
+        if flight.armed_ns is None:
+            return
+        past_ns = flight.now_ns - flight.armed_ns
+        while self._waiting and self._waiting[0].from_ns <= past_ns:
+            fault = self._waiting.pop(0)
+            self._begin(fault, flight)
+            if fault.until_ns is not None:
+                self._lasting.append(fault)
+        for fault in list(self._lasting):
+            if fault.until_ns is not None and fault.until_ns <= past_ns:
+                self._lasting.remove(fault)
+                self._change(fault.name, flight, wrong=False)
+
+    def _begin(self, fault: Fault, flight: Flight) -> None:
+        match fault.name:
+            case "pilot":
+                flight.act(Mode.PILOT, "Pilot has taken over")
+            case "disarm":
+                flight.disarm(force=True)
+            case "battery":
+                flight.quadrotor.discharge(LOW_CHARGE)
+            case name:
+                self._change(name, flight, wrong=True)
+
+    def _change(self, name: str, flight: Flight, *, wrong: bool) -> None:
+        if name == "silence":
+            self.silent = wrong
+        else:
+            flight.estimates = not wrong

@@ -1,0 +1,197 @@
+"""Flavours: what ArduCopter and PX4 do differently, as tables.
+
+Parameters have the names, types and defaults of ArduCopter 4.5 and PX4 1.17. A parameter is here
+where it decides something in `flight.py`, or where who flies the vehicle should read it.
+"""
+
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Literal
+
+from skytether.mavlink.dialect import dialect
+from skytether.quadrotor.loops import ARDUPILOT, PX4, Gains
+
+FlavourName = Literal["ardupilot", "px4"]
+Parameters = dict[str, int | float]
+"""Values of parameters by name; those of whole numbers are ints."""
+
+
+class Mode(Enum):
+    """What the vehicle is doing, whatever its autopilot calls it."""
+
+    PILOT = auto()
+    """A pilot flies; with sticks at rest, it stays where it is."""
+    HOLD = auto()
+    """It brakes, and stays where it is."""
+    GUIDED = auto()
+    """It flies what a companion computer tells it: GUIDED, OFFBOARD."""
+    TAKEOFF = auto()
+    """It climbs to where it was told."""
+    RETURN = auto()
+    """It flies home, and lands."""
+    LAND = auto()
+    """It lands where it is."""
+
+
+@dataclass(frozen=True)
+class Flavour:
+    """An autopilot."""
+
+    title: str
+    """Name for people."""
+    version: tuple[int, int, int]
+    """Version that was measured."""
+    autopilot: int
+    """MAV_AUTOPILOT in its heartbeat."""
+    bytewise: bool
+    """Whether a parameter's bits are sent, see `mavlink.parameters`."""
+    gains: Gains
+    """Gains of its loop of velocity."""
+    frame: str
+    """Frame that its own simulator flies, or the nearest to it."""
+    ready_s: float
+    """Time from its start until it may be armed: position and filters settle [s]."""
+    spool_s: float
+    """Time from the command to take off until it climbs [s]."""
+    home: tuple[float, float, float]
+    """Latitude and longitude [°], and altitude above the sea [m], where it starts."""
+    modes: dict[int, tuple[str, Mode]]
+    """Name and meaning of each of its modes, by the number in its heartbeat."""
+    first: int
+    """Mode that it starts in."""
+    streams: dict[int, float]
+    """Rates of the messages that a link has without asking [Hz], by number."""
+    parameters: Parameters
+    """Its parameters when it starts."""
+
+    def number(self, mode: Mode) -> int:
+        """Number of its first mode of a kind."""
+        return next(number for number, (_, kind) in self.modes.items() if kind is mode)
+
+
+def _px4(main: int, sub: int = 0) -> int:
+    """Number of a mode of PX4."""
+    return main << 16 | sub << 24
+
+
+LOCAL_POSITION = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+FLAVOURS: dict[FlavourName, Flavour] = {
+    "ardupilot": Flavour(
+        title="ArduCopter",
+        version=(4, 5, 6),
+        autopilot=int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA),
+        bytewise=False,
+        gains=ARDUPILOT,
+        frame="1.5kg",
+        ready_s=41.5,
+        spool_s=3.4,
+        home=(-35.363262, 149.165237, 584.0),
+        modes={
+            5: ("LOITER", Mode.PILOT),
+            0: ("STABILIZE", Mode.PILOT),
+            2: ("ALT_HOLD", Mode.PILOT),
+            16: ("POSHOLD", Mode.PILOT),
+            4: ("GUIDED", Mode.GUIDED),
+            6: ("RTL", Mode.RETURN),
+            9: ("LAND", Mode.LAND),
+            17: ("BRAKE", Mode.HOLD),
+        },
+        first=0,
+        streams={},
+        parameters={
+            "ANGLE_MAX": 3000,
+            "ARMING_CHECK": 1,
+            "BATT_FS_CRT_ACT": 0,
+            "BATT_FS_LOW_ACT": 0,
+            "BATT_LOW_VOLT": 10.5,
+            "DISARM_DELAY": 10,
+            "FENCE_ACTION": 1,
+            "FENCE_ALT_MAX": 100.0,
+            "FENCE_ENABLE": 0,
+            "FENCE_RADIUS": 300.0,
+            "FENCE_TYPE": 7,
+            "FS_EKF_ACTION": 1,
+            "FS_GCS_ENABLE": 0,
+            "FS_GCS_TIMEOUT": 5.0,
+            "FS_OPTIONS": 16,
+            "FS_THR_ENABLE": 1,
+            "GUID_OPTIONS": 0,
+            "GUID_TIMEOUT": 3.0,
+            "LAND_SPEED": 50,
+            "PSC_JERK_XY": 5.0,
+            "PSC_JERK_Z": 5.0,
+            "PSC_POSXY_P": 1.0,
+            "PSC_POSZ_P": 1.0,
+            "PSC_VELXY_P": 2.0,
+            "RTL_ALT": 1500,
+            "RTL_CONE_SLOPE": 3.0,
+            "SYSID_MYGCS": 255,
+            "SYSID_THISMAV": 1,
+            "WPNAV_ACCEL": 250.0,
+            "WPNAV_ACCEL_Z": 100.0,
+            "WPNAV_SPEED": 1000.0,
+            "WPNAV_SPEED_DN": 150.0,
+            "WPNAV_SPEED_UP": 250.0,
+        },
+    ),
+    "px4": Flavour(
+        title="PX4",
+        version=(1, 17, 0),
+        autopilot=int(dialect.MAV_AUTOPILOT_PX4),
+        bytewise=True,
+        gains=PX4,
+        frame="sih",
+        ready_s=4.6,
+        spool_s=1.0,
+        home=(47.397742, 8.545594, 489.4),
+        modes={
+            _px4(3): ("POSCTL", Mode.PILOT),
+            _px4(1): ("MANUAL", Mode.PILOT),
+            _px4(2): ("ALTCTL", Mode.PILOT),
+            _px4(6): ("OFFBOARD", Mode.GUIDED),
+            _px4(4, 3): ("AUTO.LOITER", Mode.HOLD),
+            _px4(4, 2): ("AUTO.TAKEOFF", Mode.TAKEOFF),
+            _px4(4, 5): ("AUTO.RTL", Mode.RETURN),
+            _px4(4, 6): ("AUTO.LAND", Mode.LAND),
+        },
+        first=_px4(4, 3),
+        streams={
+            int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 1.0,
+            int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 1.0,
+            int(dialect.MAVLINK_MSG_ID_ATTITUDE): 15.0,
+            LOCAL_POSITION: 30.0,
+        },
+        parameters={
+            "BAT_CRIT_THR": 0.07,
+            "BAT_LOW_THR": 0.15,
+            "COM_DISARM_LAND": 2.0,
+            "COM_DISARM_PRFLT": 10.0,
+            "COM_DL_LOSS_T": 10,
+            "COM_LOW_BAT_ACT": 0,
+            "COM_OBL_RC_ACT": 0,
+            "COM_OF_LOSS_T": 1.0,
+            "COM_RC_IN_MODE": 3,
+            "GF_ACTION": 2,
+            "GF_MAX_HOR_DIST": 0.0,
+            "GF_MAX_VER_DIST": 0.0,
+            "MAV_SYS_ID": 1,
+            "MIS_TAKEOFF_ALT": 2.5,
+            "MPC_LAND_SPEED": 0.7,
+            "MPC_TILTMAX_AIR": 45.0,
+            "MPC_TKO_SPEED": 1.5,
+            "MPC_XY_CRUISE": 5.0,
+            "MPC_XY_P": 0.95,
+            "MPC_XY_VEL_I_ACC": 0.4,
+            "MPC_XY_VEL_MAX": 12.0,
+            "MPC_XY_VEL_P_ACC": 1.8,
+            "MPC_Z_P": 1.0,
+            "MPC_Z_VEL_MAX_DN": 1.5,
+            "MPC_Z_VEL_MAX_UP": 3.0,
+            "NAV_DLL_ACT": 0,
+            "NAV_RCL_ACT": 2,
+            "RTL_CONE_ANG": 45,
+            "RTL_RETURN_ALT": 60.0,
+        },
+    ),
+}
+"""Flavours by name."""

@@ -1,0 +1,463 @@
+"""A flight of a scripted autopilot: arming, modes, what each of them flies, and what ends them.
+
+Both flavours share what is in here; `ardupilot.py` and `px4.py` have what they do differently.
+Positions are x north, y east, altitude up, from where it was started. Times are those of its own
+clock [ns], which begins at 0.
+"""
+
+from abc import ABC, abstractmethod
+from enum import Enum, IntEnum
+from math import hypot, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.autopilot.flavours import Flavour, Mode, Parameters
+from skytether.mavlink.dialect import dialect
+from skytether.quadrotor.loops import Gains
+from skytether.quadrotor.quadrotor import Quadrotor
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+
+TICK_NS = 5_000_000
+"""Time between two rounds of all loops [ns]."""
+LANDED_NS = SECOND_NS
+"""Time for which it stands still until it takes itself for landed [ns]."""
+THERE_M = 0.1
+"""Distance within which it is there [m]."""
+STILL_MPS = 0.1
+"""Speed below which it stands [m/s]."""
+
+Vector = tuple[float, float, float]
+REST: Vector = (0.0, 0.0, 0.0)
+
+
+class Result(IntEnum):
+    """Answer to a command: MAV_RESULT."""
+
+    ACCEPTED = dialect.MAV_RESULT_ACCEPTED
+    REJECTED = dialect.MAV_RESULT_TEMPORARILY_REJECTED
+    DENIED = dialect.MAV_RESULT_DENIED
+    UNSUPPORTED = dialect.MAV_RESULT_UNSUPPORTED
+    FAILED = dialect.MAV_RESULT_FAILED
+
+
+class Severity(IntEnum):
+    """Severity of what it says: MAV_SEVERITY."""
+
+    CRITICAL = dialect.MAV_SEVERITY_CRITICAL
+    WARNING = dialect.MAV_SEVERITY_WARNING
+    INFO = dialect.MAV_SEVERITY_INFO
+
+
+class Landed(Enum):
+    """Whether it is on the ground: MAV_LANDED_STATE."""
+
+    ON_GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
+    IN_AIR = dialect.MAV_LANDED_STATE_IN_AIR
+    TAKEOFF = dialect.MAV_LANDED_STATE_TAKEOFF
+    LANDING = dialect.MAV_LANDED_STATE_LANDING
+
+
+class Setpoint(NamedTuple):
+    """What a companion computer wants flown."""
+
+    velocity: Vector
+    """Velocity, or what is added to the way to the position [m/s]."""
+    position: Vector | None
+    """Position [m]; None: the velocity alone."""
+    came_ns: int
+    """Time at which it came."""
+
+
+class Limits(NamedTuple):
+    """How fast it flies by itself."""
+
+    speed: float
+    """Largest speed in the plane [m/s]."""
+    up: float
+    """Largest speed upwards [m/s]."""
+    down: float
+    """Largest speed downwards [m/s]."""
+    land: float
+    """Speed of landing [m/s]."""
+    p: float
+    """Speed over the distance from a point in the plane [1/s]."""
+    p_up: float
+    """Speed over the distance from an altitude [1/s]."""
+    acceleration: float
+    """Deceleration towards a point in the plane [m/s²]."""
+    acceleration_up: float
+    """Deceleration towards an altitude [m/s²]."""
+
+
+class Flight(ABC):
+    """A vehicle with an autopilot.
+
+    Args:
+        flavour: which autopilot.
+        quadrotor: what it flies, standing on the ground at the origin.
+        ready_s: time from the start until it may be armed [s].
+    """
+
+    low = 0.15
+    """Charge of the battery below which it is low."""
+
+    def __init__(self, flavour: Flavour, quadrotor: Quadrotor, ready_s: float) -> None:
+        self.flavour, self.quadrotor = flavour, quadrotor
+        self.parameters: Parameters = dict(flavour.parameters)
+        self.number = flavour.first
+        """Number of its mode."""
+        self.armed = False
+        self.armed_ns: int | None = None
+        """Time at which it was armed first."""
+        self.flying = False
+        """Whether it has left the ground."""
+        self.estimates = True
+        """Whether it knows where it is, once it is ready."""
+        self.said: list[tuple[Severity, str]] = []
+        """What it says, until that is sent."""
+        self.now_ns = 0
+        self.station_ns: int | None = None
+        """Time of the newest heartbeat of its ground station; None: there is none to be lost."""
+        self._ready_ns = seconds_to_ns(ready_s)
+        self._setpoint: Setpoint | None = None
+        self._climb: float | None = None
+        """Altitude to climb to [m], while it does."""
+        self._climb_ns = 0
+        """Time from which it climbs."""
+        self._held: Vector | None = None
+        """Point at which it stays, once it has come to rest."""
+        self._stood_ns = 0
+        """Time since which it stands on the ground."""
+        self._landing = False
+        """Whether a return has become a landing."""
+        self._told: set[str] = set()
+        """Failsafes that have acted in this flight."""
+        quadrotor.on = False
+
+    @property
+    def mode(self) -> Mode:
+        """What it is doing."""
+        return self.flavour.modes[self.number][1]
+
+    @property
+    def mode_name(self) -> str:
+        """Its autopilot's name for that."""
+        return self.flavour.modes[self.number][0]
+
+    @property
+    def ready(self) -> bool:
+        """Whether it knows where it is."""
+        return self.estimates and self.now_ns >= self._ready_ns
+
+    @property
+    def landed(self) -> Landed:
+        """Whether it is on the ground."""
+        if not self.flying:
+            return Landed.ON_GROUND
+        if self._climb is not None:
+            return Landed.TAKEOFF
+        landing = self.mode is Mode.LAND or (self.mode is Mode.RETURN and self._landing)
+        return Landed.LANDING if landing else Landed.IN_AIR
+
+    def say(self, text: str, severity: Severity = Severity.INFO) -> None:
+        """Say something to whoever listens."""
+        self.said.append((severity, text))
+
+    # What it is told
+
+    def arm(self) -> Result:
+        """Turn its rotors on, where nothing speaks against that."""
+        if self.armed:
+            return Result.ACCEPTED
+        why = self.why_not_armed()
+        if why:
+            self.say(why, Severity.CRITICAL)
+            return self.refusal
+        self.armed, self._told = True, set()
+        self._stood_ns = self.now_ns
+        if self.armed_ns is None:
+            self.armed_ns = self.now_ns
+        self.say(f"{self.arming_word} motors" if self.arming_word else "Armed by external command")
+        return Result.ACCEPTED
+
+    def disarm(self, *, force: bool = False) -> Result:
+        """Turn its rotors off; in the air only if it must."""
+        if self.flying and not force:
+            return self.refusal
+        if self.armed:
+            self.say("Disarming motors" if self.arming_word else "Disarmed by external command")
+        self.armed = self.flying = False
+        self._climb = None
+        return Result.ACCEPTED
+
+    def switch(self, number: int) -> Result:
+        """Go into the mode with this number, where that is possible now."""
+        if number not in self.flavour.modes:
+            return Result.DENIED
+        name, kind = self.flavour.modes[number]
+        if kind in (Mode.GUIDED, Mode.TAKEOFF, Mode.RETURN, Mode.HOLD) and not self.ready:
+            self.say(f"Mode change to {name} failed: requires position", Severity.CRITICAL)
+            return self.refusal
+        if kind is Mode.GUIDED and (why := self.why_not_guided()):
+            self.say(why, Severity.CRITICAL)
+            return Result.REJECTED
+        self.enter(number)
+        return Result.ACCEPTED
+
+    def enter(self, number: int) -> None:
+        """Be in the mode with this number from now on."""
+        if number == self.number:
+            return
+        self.number = number
+        self._climb = self._held = None
+        self._landing = False
+        if self.flavour.modes[number][1] is Mode.GUIDED:
+            self.forget()
+        if self.mode in (Mode.LAND, Mode.RETURN) and not self.flying:
+            self.disarm()
+
+    def set(self, name: str, value: float) -> None:
+        """Give a parameter another value."""
+        self.parameters[name] = value
+        self.quadrotor.gains = self.gains()
+
+    def act(self, mode: Mode, why: str, severity: Severity = Severity.CRITICAL) -> None:
+        """Have a failsafe act: say why, and go into a mode unless it is in it."""
+        self.say(why, severity)
+        self.enter(self.flavour.number(mode))
+
+    def take_off(self, altitude: float) -> Result:
+        """Climb to an altitude, armed and on the ground.
+
+        Args:
+            altitude: as its autopilot counts it, see `altitude_of` [m].
+        """
+        to = self.altitude_of(altitude)
+        if not self.armed or self.flying or to is None or to <= 0.0 or not self.enter_takeoff():
+            return self.refusal
+        self._climb, self._climb_ns = to, self.now_ns + seconds_to_ns(self.flavour.spool_s)
+        return Result.ACCEPTED
+
+    def want(self, velocity: Vector, position: Vector | None) -> None:
+        """Take a setpoint of a companion computer."""
+        if not self.takes_setpoints():
+            return
+        if self.mode is Mode.GUIDED:
+            self._climb = self._held = None  # it ends a climb, as ArduCopter has it
+        self._setpoint = Setpoint(velocity, position, self.now_ns)
+
+    def forget(self) -> None:
+        """Forget what a companion computer wanted before."""
+        self._setpoint = None
+
+    # What differs between flavours
+
+    refusal: Result
+    """Answer to a command that cannot be obeyed now."""
+    arming_word: str
+    """Word for arming in what it says; empty for another sentence."""
+
+    @abstractmethod
+    def why_not_armed(self) -> str:
+        """Sentence that says why it cannot be armed; empty where it can."""
+
+    @abstractmethod
+    def why_not_guided(self) -> str:
+        """Sentence that says why it cannot be guided; empty where it can."""
+
+    @abstractmethod
+    def mode_number(self, main: int, sub: int) -> int:
+        """Number of the mode that a command names in two parts."""
+
+    @abstractmethod
+    def takes_setpoints(self) -> bool:
+        """Whether it heeds setpoints in its mode."""
+
+    @abstractmethod
+    def altitude_of(self, told: float) -> float | None:
+        """Altitude above home of one that a command tells [m]; None where it is none."""
+
+    @abstractmethod
+    def enter_takeoff(self) -> bool:
+        """Go into the mode that climbs; returns whether it can."""
+
+    @abstractmethod
+    def limits(self) -> Limits:
+        """How fast it flies by itself, by its parameters."""
+
+    @abstractmethod
+    def gains(self) -> Gains:
+        """Gains of its loop of velocity, by its parameters."""
+
+    @abstractmethod
+    def is_station(self, system: int, kind: int) -> bool:
+        """Whether heartbeats of this system and MAV_TYPE are those of its ground station."""
+
+    @abstractmethod
+    def return_altitude(self, distance: float) -> float:
+        """Altitude at which it flies home from a distance [m]."""
+
+    @abstractmethod
+    def silence(self, setpoint: Setpoint) -> bool:
+        """Whether setpoints have stopped, after which it does what its parameters say."""
+
+    @abstractmethod
+    def watch(self) -> None:
+        """Failsafes of battery, ground station and fence."""
+
+    @abstractmethod
+    def idle_s(self) -> float:
+        """Time on the ground after which it disarms [s]; less where it was to land."""
+
+    # What it flies
+
+    def tick(self) -> None:
+        """Fly for TICK_NS."""
+        self.now_ns += TICK_NS
+        if self.armed:
+            if self.flying:
+                if not self.estimates and self.once("estimate"):
+                    self.act(Mode.LAND, "EKF Failsafe: position estimate lost, landing")
+                self.watch()
+            velocity = self._guide()
+            self._lift(velocity)
+        else:
+            velocity = REST
+        self.quadrotor.on = self.armed and self.flying
+        self.quadrotor.advance(np.array(velocity), TICK_NS)
+        if self.armed:
+            self._settle(velocity)
+
+    def once(self, failsafe: str) -> bool:
+        """Whether a failsafe acts now for the first time in a flight."""
+        new = failsafe not in self._told
+        self._told.add(failsafe)
+        return new
+
+    def _lift(self, velocity: Vector) -> None:
+        """Leave the ground where it is to climb."""
+        if self.flying:
+            return
+        climbs = self._climb is not None and self.now_ns >= self._climb_ns
+        if climbs or (self.lifts_off_by_setpoint and velocity[2] > 0.0):
+            self.flying = True
+
+    lifts_off_by_setpoint: bool
+    """Whether a setpoint that points upwards is enough to leave the ground."""
+
+    def _settle(self, velocity: Vector) -> None:
+        """Find out that it has landed, and disarm after a time on the ground."""
+        if not self.quadrotor.stands() or velocity[2] > 0.0 or self._climb is not None:
+            self._stood_ns = self.now_ns
+        elif self.flying and self.now_ns - self._stood_ns >= LANDED_NS:
+            self.flying = False
+        elif not self.flying and self.now_ns - self._stood_ns >= seconds_to_ns(self.idle_s()):
+            self.disarm()
+
+    def _guide(self) -> Vector:
+        """Velocity that it wants now [m/s]."""
+        if self._climb is not None:
+            return self._climbing(self._climb)
+        match self.mode:
+            case Mode.GUIDED:
+                return self._guided()
+            case Mode.RETURN:
+                return self._returning()
+            case Mode.LAND:
+                return self._descending()
+            case _:
+                return self._staying()
+
+    def _climbing(self, altitude: float) -> Vector:
+        if self.now_ns < self._climb_ns:
+            return REST
+        x, y, z = self.position()
+        if altitude - z < THERE_M:
+            self._climb, self._held = None, (x, y, altitude)
+            if self.mode is Mode.TAKEOFF:
+                self.number = self.flavour.number(Mode.HOLD)
+        return self._toward((*self._stay_xy(), altitude))
+
+    def _stay_xy(self) -> tuple[float, float]:
+        """Point of the ground above which it climbs or lands."""
+        if self._held is None:
+            self._held = self.quadrotor_wants()
+        return self._held[:2]
+
+    def _guided(self) -> Vector:
+        setpoint = self._setpoint
+        if setpoint is None:
+            return self._staying()
+        if self.silence(setpoint):
+            if self.mode is not Mode.GUIDED:
+                return self._guide()
+            # A velocity ends with its stream; a position is flown to, whoever is still there.
+            return REST if setpoint.position is None else self._toward(setpoint.position)
+        if setpoint.position is None:
+            return setpoint.velocity
+        return self._toward(setpoint.position, setpoint.velocity)
+
+    def _staying(self) -> Vector:
+        """Brake, and stay where it has come to rest."""
+        if self._held is None:
+            if hypot(*self.velocity()) > STILL_MPS:
+                return REST
+            self._held = self.quadrotor_wants()
+        return self._toward(self._held)
+
+    def _returning(self) -> Vector:
+        x, y, z = self.position()
+        distance = hypot(x, y)
+        if self._landing:
+            return self._descending()
+        if distance < 0.5:
+            self._landing, self._held = True, (0.0, 0.0, z)
+        high = max(self.return_altitude(distance), z)
+        if self._held is None:
+            self._held = (x, y, high)
+        if z < self._held[2] - 0.5:
+            return self._toward(self._held)
+        return self._toward((0.0, 0.0, self._held[2]))
+
+    def _descending(self) -> Vector:
+        limits = self.limits()
+        _, _, z = self.position()
+        x, y, _ = self._toward((*self._stay_xy(), z))
+        return x, y, -(limits.land if z < 10.0 else limits.down)
+
+    def _toward(self, point: Vector, velocity: Vector = REST) -> Vector:
+        """Velocity towards a point, slower near it; on top of a velocity with which it moves."""
+        limits = self.limits()
+        x, y, z = (to - now for to, now in zip(point, self.quadrotor_wants(), strict=True))
+        distance = hypot(x, y)
+        speed = min(limits.speed, _approach(distance, limits.p, limits.acceleration))
+        share = speed / distance if distance > 0.0 else 0.0
+        up = _approach(abs(z), limits.p_up, limits.acceleration_up)
+        up = min(up, limits.up) if z > 0.0 else -min(up, limits.down)
+        return share * x + velocity[0], share * y + velocity[1], up + velocity[2]
+
+    # Where it is
+
+    def position(self) -> Vector:
+        """Position [m]."""
+        x, y, z = self.quadrotor.position().tolist()
+        return x, y, z
+
+    def velocity(self) -> Vector:
+        """Velocity [m/s]."""
+        x, y, z = self.quadrotor.velocity().tolist()
+        return x, y, z
+
+    def quadrotor_wants(self) -> Vector:
+        """Position where its loops want it to be now [m]: where it is, or where it should be."""
+        x, y, z = self.quadrotor.wanted_position().tolist()
+        return x, y, z
+
+
+def _approach(distance: float, p: float, acceleration: float) -> float:
+    """Speed with which a distance is made nothing: p times it, or its root far away."""
+    near = acceleration / (p * p)
+    if distance <= near:
+        return p * distance
+    return sqrt(2.0 * acceleration * (distance - 0.5 * near))

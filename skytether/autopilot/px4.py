@@ -1,0 +1,145 @@
+"""PX4 1.17, as far as it is measured: it leaves OFFBOARD when setpoints stop, and flies home."""
+
+from math import hypot, isfinite, radians, tan
+
+from skytether.autopilot.flavours import Mode
+from skytether.autopilot.flight import Flight, Limits, Result, Setpoint, Severity
+from skytether.mavlink.dialect import dialect
+from skytether.quadrotor.loops import Gains
+from skytether.shared.base.units import SECOND_NS
+
+LEAST = 0.1
+"""Least value that a gain has, whatever its parameter says."""
+SILENCE_LAG_S = 0.2
+"""Time from the end of COM_OF_LOSS_T until it acts [s], as measured."""
+OFFBOARD_ACTIONS = {4: Mode.LAND, 5: Mode.HOLD}
+"""Modes by the value of COM_OBL_RC_ACT; all others return, where nobody has a remote control."""
+STATION_ACTIONS = {1: Mode.HOLD, 2: Mode.RETURN, 3: Mode.LAND}
+"""Modes by the value of NAV_DLL_ACT."""
+BATTERY_ACTIONS = {2: Mode.LAND, 3: Mode.RETURN}
+"""Modes by the value of COM_LOW_BAT_ACT."""
+FENCE_ACTIONS = {2: Mode.HOLD, 3: Mode.RETURN, 5: Mode.LAND}
+"""Modes by the value of GF_ACTION."""
+
+
+class PX4(Flight):
+    """Flight of PX4."""
+
+    refusal = Result.REJECTED
+    arming_word = ""
+    lifts_off_by_setpoint = True
+
+    def why_not_armed(self) -> str:
+        """See `Flight`."""
+        if not self.ready:
+            return "Arming denied: Resolve system health failures first"
+        if self.quadrotor.battery().charge < self.parameters["BAT_LOW_THR"]:
+            return "Arming denied: low battery"
+        if self.mode is Mode.PILOT:
+            return "Arming denied: manual control signal lost"
+        return ""
+
+    def why_not_guided(self) -> str:
+        """See `Flight`; setpoints must be coming already."""
+        setpoint = self._setpoint
+        if setpoint is None or self._past_s(setpoint) > self.parameters["COM_OF_LOSS_T"]:
+            return "Switching to mode 'Offboard' is currently not possible"
+        return ""
+
+    def forget(self) -> None:
+        """See `Flight`; the stream that let it into OFFBOARD is what it flies."""
+
+    def mode_number(self, main: int, sub: int) -> int:
+        """See `Flight`."""
+        return main << 16 | max(sub, 0) << 24
+
+    def takes_setpoints(self) -> bool:
+        """See `Flight`."""
+        return True
+
+    def altitude_of(self, told: float) -> float | None:
+        """See `Flight`; it is told above the sea, or not at all."""
+        if isfinite(told):
+            return told - self.flavour.home[2]
+        return self.parameters["MIS_TAKEOFF_ALT"]
+
+    def enter_takeoff(self) -> bool:
+        """See `Flight`."""
+        if not self.ready:
+            return False
+        self.enter(self.flavour.number(Mode.TAKEOFF))
+        return True
+
+    def limits(self) -> Limits:
+        """See `Flight`."""
+        p, climbs = self.parameters, self.mode is Mode.TAKEOFF
+        guided = self.mode is Mode.GUIDED
+        return Limits(
+            speed=p["MPC_XY_VEL_MAX"] if guided else p["MPC_XY_CRUISE"],
+            up=p["MPC_TKO_SPEED"] if climbs else p["MPC_Z_VEL_MAX_UP"],
+            down=p["MPC_Z_VEL_MAX_DN"],
+            land=p["MPC_LAND_SPEED"],
+            p=max(p["MPC_XY_P"], LEAST),
+            p_up=max(p["MPC_Z_P"], LEAST),
+            acceleration=3.0,
+            acceleration_up=3.0,
+        )
+
+    def gains(self) -> Gains:
+        """See `Flight`."""
+        p = self.parameters
+        return self.flavour.gains._replace(
+            p=max(p["MPC_XY_VEL_P_ACC"], LEAST),
+            i=p["MPC_XY_VEL_I_ACC"],
+            tilt_max=radians(p["MPC_TILTMAX_AIR"]),
+        )
+
+    def is_station(self, system: int, kind: int) -> bool:  # noqa: ARG002
+        """See `Flight`."""
+        return kind == dialect.MAV_TYPE_GCS
+
+    def return_altitude(self, distance: float) -> float:
+        """See `Flight`; lower where home is near."""
+        cone = distance * tan(radians(self.parameters["RTL_CONE_ANG"]))
+        return min(self.parameters["RTL_RETURN_ALT"], cone)
+
+    def _past_s(self, setpoint: Setpoint) -> float:
+        """Time since a setpoint came [s]."""
+        return (self.now_ns - setpoint.came_ns) / SECOND_NS
+
+    def silence(self, setpoint: Setpoint) -> bool:
+        """See `Flight`; it leaves OFFBOARD after COM_OF_LOSS_T."""
+        if self._past_s(setpoint) <= self.parameters["COM_OF_LOSS_T"] + SILENCE_LAG_S:
+            return False
+        value = int(self.parameters["COM_OBL_RC_ACT"])
+        mode = OFFBOARD_ACTIONS.get(value, Mode.RETURN)
+        self.act(mode, "Failsafe activated: no offboard signal")
+        return True
+
+    def watch(self) -> None:
+        """See `Flight`."""
+        p = self.parameters
+        if self.station_ns is not None:
+            past_s = (self.now_ns - self.station_ns) / SECOND_NS
+            action = STATION_ACTIONS.get(int(p["NAV_DLL_ACT"]))
+            if past_s > p["COM_DL_LOSS_T"] and action and self.once("station"):
+                self.act(action, "Failsafe activated: no connection to ground station")
+        charge = self.quadrotor.battery().charge
+        if charge < p["BAT_LOW_THR"] and self.once("battery"):
+            self.say("Low battery level", Severity.WARNING)
+        action = BATTERY_ACTIONS.get(int(p["COM_LOW_BAT_ACT"]))
+        if charge < p["BAT_CRIT_THR"] and action and self.once("battery critical"):
+            self.act(action, "Failsafe activated: critical battery level")
+        x, y, z = self.position()
+        far = 0.0 < p["GF_MAX_HOR_DIST"] < hypot(x, y)
+        high = 0.0 < p["GF_MAX_VER_DIST"] < z
+        if (far or high) and self.once("fence"):
+            self.say("Geofence exceeded", Severity.WARNING)
+            action = FENCE_ACTIONS.get(int(p["GF_ACTION"]))
+            if action:
+                self.act(action, f"Failsafe activated: geofence, {action.name.lower()}")
+
+    def idle_s(self) -> float:
+        """See `Flight`."""
+        landed = self.mode in (Mode.LAND, Mode.RETURN)
+        return self.parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]

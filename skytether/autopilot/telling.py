@@ -1,0 +1,188 @@
+"""What an autopilot tells of itself: messages of MAVLink, made of a flight."""
+
+from collections.abc import Callable
+
+from skytether.autopilot.flight import Flight, Landed
+from skytether.mavlink import parameters
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+from skytether.mavlink.frames import turned
+from skytether.shared.base.units import MILLISECOND_NS
+
+HEARTBEAT = int(dialect.MAVLINK_MSG_ID_HEARTBEAT)
+SENSORS = int(
+    dialect.MAV_SYS_STATUS_SENSOR_GPS
+    | dialect.MAV_SYS_STATUS_AHRS
+    | dialect.MAV_SYS_STATUS_SENSOR_BATTERY
+    | dialect.MAV_SYS_STATUS_PREARM_CHECK
+)
+"""Parts whose health SYS_STATUS tells."""
+KNOWS_ALL, KNOWS_ATTITUDE = 831, 167
+"""Flags of an estimate with its position, and of one without: as ArduPilot's and PX4's."""
+UNKNOWN_MV = 65535
+"""Voltage of a cell that is not there [mV]."""
+
+
+class Telling:
+    """Makes messages of the state of a flight.
+
+    Args:
+        flight: whose state.
+    """
+
+    def __init__(self, flight: Flight) -> None:
+        self._flight = flight
+
+    @property
+    def _boot_ms(self) -> int:
+        return self._flight.now_ns // MILLISECOND_NS
+
+    def heartbeat(self) -> Message:
+        """Mode and whether it is armed."""
+        flight = self._flight
+        base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if flight.armed else 0
+        state = dialect.MAV_STATE_ACTIVE if flight.armed else dialect.MAV_STATE_STANDBY
+        return dialect.MAVLink_heartbeat_message(
+            dialect.MAV_TYPE_QUADROTOR, flight.flavour.autopilot, base, flight.number, state, 3
+        )
+
+    def local_position(self) -> Message | None:
+        """Position and velocity; none where they are not known."""
+        if not self._flight.ready:
+            return None
+        position = turned(self._flight.position())
+        velocity = turned(self._flight.velocity())
+        return dialect.MAVLink_local_position_ned_message(
+            self._boot_ms,
+            position[0],
+            position[1],
+            position[2],
+            velocity[0],
+            velocity[1],
+            velocity[2],
+        )
+
+    def attitude(self) -> Message:
+        """Attitude and rates."""
+        roll, pitch, yaw, rates = self._flight.quadrotor.attitude()
+        return dialect.MAVLink_attitude_message(
+            self._boot_ms, roll, pitch, yaw, rates[0], rates[1], rates[2]
+        )
+
+    def system_status(self) -> Message:
+        """Health and battery."""
+        battery = self._flight.quadrotor.battery()
+        healthy = SENSORS
+        if not self._flight.ready:
+            healthy &= ~int(dialect.MAV_SYS_STATUS_SENSOR_GPS | dialect.MAV_SYS_STATUS_AHRS)
+        if self._flight.why_not_armed():
+            healthy &= ~int(dialect.MAV_SYS_STATUS_PREARM_CHECK)
+        return dialect.MAVLink_sys_status_message(
+            SENSORS,
+            SENSORS,
+            healthy,
+            200,
+            round(1000.0 * battery.voltage),
+            round(100.0 * battery.current),
+            round(100.0 * battery.charge),
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+        )
+
+    def battery_status(self) -> Message:
+        """Battery, as one cell."""
+        battery = self._flight.quadrotor.battery()
+        voltages = [round(1000.0 * battery.voltage)] + [UNKNOWN_MV] * 9
+        return dialect.MAVLink_battery_status_message(
+            0,
+            dialect.MAV_BATTERY_FUNCTION_ALL,
+            dialect.MAV_BATTERY_TYPE_LIPO,
+            32767,
+            voltages,
+            round(100.0 * battery.current),
+            -1,
+            -1,
+            round(100.0 * battery.charge),
+        )
+
+    def extended_state(self) -> Message:
+        """Whether it is on the ground."""
+        landed: Landed = self._flight.landed
+        return dialect.MAVLink_extended_sys_state_message(
+            dialect.MAV_VTOL_STATE_UNDEFINED, landed.value
+        )
+
+    def home(self) -> Message | None:
+        """Position where it was started; none before it knows that."""
+        if not self._flight.ready:
+            return None
+        latitude, longitude, altitude = self._flight.flavour.home
+        return dialect.MAVLink_home_position_message(
+            round(1e7 * latitude),
+            round(1e7 * longitude),
+            round(1e3 * altitude),
+            0.0,
+            0.0,
+            0.0,
+            [1.0, 0.0, 0.0, 0.0],
+            0.0,
+            0.0,
+            0.0,
+        )
+
+    def version(self) -> Message:
+        """What it can do."""
+        can = dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+        can |= dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+        can |= dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+        if self._flight.flavour.bytewise:
+            can |= dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+        else:
+            can |= dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+        major, minor, patch = self._flight.flavour.version
+        software = major << 24 | minor << 16 | patch << 8 | 255
+        none = [0] * 8
+        return dialect.MAVLink_autopilot_version_message(
+            can, software, 0, 0, 0, none, none, none, 0, 0, 0
+        )
+
+    def estimate(self) -> Message:
+        """What it knows of its position, as its flavour tells it."""
+        knows = KNOWS_ALL if self._flight.ready else KNOWS_ATTITUDE
+        if self._flight.flavour.bytewise:
+            return dialect.MAVLink_estimator_status_message(
+                1000 * self._boot_ms, knows, 0.05, 0.05, 0.05, 0.05, 0.0, 0.0, 0.1, 0.1
+            )
+        return dialect.MAVLink_ekf_status_report_message(knows, 0.05, 0.05, 0.05, 0.05, 0.0)
+
+    def parameter(self, name: str) -> Message:
+        """Value of a parameter."""
+        values = self._flight.parameters
+        value, bytewise = values[name], self._flight.flavour.bytewise
+        return dialect.MAVLink_param_value_message(
+            name.encode(),
+            parameters.to_wire(value, bytewise=bytewise),
+            parameters.type_of(value),
+            len(values),
+            list(values).index(name),
+        )
+
+
+STREAMS: dict[int, Callable[[Telling], Message | None]] = {
+    HEARTBEAT: Telling.heartbeat,
+    int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED): Telling.local_position,
+    int(dialect.MAVLINK_MSG_ID_ATTITUDE): Telling.attitude,
+    int(dialect.MAVLINK_MSG_ID_SYS_STATUS): Telling.system_status,
+    int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): Telling.battery_status,
+    int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): Telling.extended_state,
+    int(dialect.MAVLINK_MSG_ID_HOME_POSITION): Telling.home,
+    int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION): Telling.version,
+    int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): Telling.estimate,
+    int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Telling.estimate,
+}
+"""Messages of its state, by number: sent at an interval, or once."""

@@ -1,0 +1,1 @@
+"""Commands that fly, show and mend flights; the laboratory has its own."""

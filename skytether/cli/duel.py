@@ -1,0 +1,141 @@
+"""`skytether duel`: two scenarios on the same network and seed, side by side on one page."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import tyro
+
+from skytether.cli import page_process, processes
+from skytether.shared.base import kernel
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import record
+from skytether.shared.telemetry.summary import summarise
+from skytether.shell import command, temporary
+from skytether.shell.command import CommandError
+from skytether.shell.options import read
+from skytether.sim import flight
+from skytether.view.browser.access import HOST_PORT
+from skytether.view.browser.flight import PageFlight
+from skytether.view.browser.replay import Player
+from skytether.view.browser.serve import until_told
+from skytether.view.frames import of_flight
+
+
+@dataclass(frozen=True)
+class DuelOptions:
+    """Options of `skytether duel`."""
+
+    one: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
+    """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    other: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
+    """Another one; it has the network, duration and seed of the first."""
+    duration: float | None = None
+    """Length of both flights [s]; the first scenario's unless given."""
+    seed: int | None = None
+    """Seed of both flights; the first scenario's unless given."""
+    virtual: bool = False
+    """Fly in virtual time, and show the flights afterwards, until Ctrl-C."""
+    page: str = HOST_PORT
+    """HOST:PORT to serve the page on; where that is taken, the next free port."""
+    plugin: command.Plugins = ()
+
+
+def duel(argv: Sequence[str]) -> None:
+    """Fly two scenarios side by side, and show both on one page.
+
+    They meet the same network, wind and seed, and are changed together by what is moved on the
+    page. Ctrl-C ends both.
+    """
+    missing = DuelOptions(tyro.MISSING, tyro.MISSING)
+    options = read(missing, argv, "skytether duel", duel.__doc__)
+    at = command.address("--page", options.page)
+    one, other = both(options)
+    names = titles(options.one, options.other)
+    command.prepare(kernel.missing())
+    if options.virtual:
+        flown = [flight.fly(each) for each in (one, other)]
+        frames = [
+            list(of_flight(scenario, name, each))
+            for scenario, name, each in zip((one, other), names, flown, strict=True)
+        ]
+        flights = [PageFlight(name) for name in names]
+        with closing(Player(flights, frames)) as player:
+            until_told(at, flights, now_ns=player.now_ns, more=player.controls)
+        return
+    with temporary.folder() as folder:
+        _really((one, other), names, folder, options.page)
+
+
+def both(options: DuelOptions) -> tuple[Scenario, Scenario]:
+    """The two scenarios, with the same network, duration and seed.
+
+    Raises:
+        ConfigError: one of them cannot be flown.
+    """
+    given = {"duration": options.duration, "seed": options.seed}
+    asked = {key: value for key, value in given.items() if value is not None}
+    one = msgspec.structs.replace(reading.load(options.one), **asked)
+    same = {key: getattr(one, key) for key in ("duration", "seed", "settle", "network")}
+    other = msgspec.structs.replace(reading.load(options.other), **same)
+    return checked(one, options.one), checked(other, options.other)
+
+
+def checked(scenario: Scenario, name: str) -> Scenario:
+    """A scenario, as it can be flown.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    return reading.check(reading.to_table(scenario), name)
+
+
+def titles(one: str, other: str) -> tuple[str, str]:
+    """Short names of two scenarios, which differ."""
+    names = Path(one).stem, Path(other).stem
+    return names if names[0] != names[1] else (f"{names[0]} 1", f"{names[1]} 2")
+
+
+def _really(scenarios: Sequence[Scenario], names: Sequence[str], folder: Path, page: str) -> None:
+    """Fly both over UDP at once, each with processes of its own."""
+    sockets, parts = [folder / name for name in names], [folder / f"{name}.d" for name in names]
+    for each in (*sockets, *parts):
+        each.mkdir(mode=0o700)
+
+    def say(line: object) -> None:
+        with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
+            print(line, file=sys.stderr)
+
+    def fly(place: int, on_second: Callable[[float], None]) -> None:
+        processes.run(
+            scenarios[place],
+            parts[place],
+            on_second=on_second,
+            interrupted=interrupted,
+            control=sockets[place],
+            feeds=sockets[place],
+        )
+
+    title = f"flying {' and '.join(names)}"
+    with (
+        page_process.beside(sockets, page, say),
+        command.interruptible() as interrupted,
+        command.progress(title, scenarios[0].duration) as on_second,
+        ThreadPoolExecutor(len(names)) as pool,
+    ):
+        flying = [pool.submit(fly, place, on_second) for place in range(len(names))]
+        for one in flying:
+            one.result()
+    for scenario, name, part in zip(scenarios, names, parts, strict=True):
+        rows = [record.read(part / each) for each in ("client", "server", "netem")]
+        if not len(rows[0]):
+            raise CommandError("interrupted before the first step", command.INTERRUPTED)
+        title = f"{name}, over UDP on loopback, seed {scenario.seed}"
+        command.finish(summarise(scenario, name, *rows), title)

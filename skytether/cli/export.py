@@ -1,0 +1,65 @@
+"""`skytether export`: a recording as tables for other programs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from skytether.cli import recordings
+from skytether.shared.base import files
+from skytether.shell import command
+from skytether.shell.command import CONFIGURATION, CommandError
+from skytether.shell.options import read
+from skytether.view import export as view
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of `skytether export`."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """The recording (.mcap)."""
+    csv: Path | None = None
+    """Folder for the tables as CSV."""
+    parquet: Path | None = None
+    """Folder for the tables as Parquet; takes pyarrow."""
+    plugin: command.Plugins = ()
+
+
+def export(argv: Sequence[str]) -> None:
+    """Write a recording as tables, one a part: client, server, plan, netem, and the events.
+
+    A column has its unit in its name, as in position_x_m; the folder is made where there is none.
+    """
+    options = read(ExportOptions(tyro.MISSING), argv, "skytether export", export.__doc__)
+    if not (options.csv or options.parquet):
+        said = "got neither --csv nor --parquet, expected a folder for the tables"
+        raise CommandError(said, CONFIGURATION)
+    to_parquet = view.parquet() if options.parquet else None
+    with recordings.opened(options.file) as recorded:
+        tables = view.tables(recorded)
+    for folder in filter(None, (options.csv, options.parquet)):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, columns in tables.items():
+        if options.csv:
+            path = options.csv / f"{name}.csv"
+            _write(path, view.csv(columns).encode())
+        if options.parquet and to_parquet:
+            path = options.parquet / f"{name}.parquet"
+            _write(path, to_parquet(columns))
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a table, and say where it is.
+
+    Raises:
+        CommandError: it cannot be written.
+    """
+    try:
+        files.write(path, content)
+    except OSError as error:
+        said = f"{path}: cannot be written: {error.strerror}"
+        raise CommandError(said, CONFIGURATION) from None
+    print(path)

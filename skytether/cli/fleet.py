@@ -1,0 +1,360 @@
+"""`skytether fleet`: many vehicles on one server, over real UDP or in virtual time."""
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, Self
+
+import msgspec
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from skytether.cli import page_process, processes
+from skytether.figures import flights as figures
+from skytether.shared.base import kernel
+from skytether.shared.core.events import Event, NotFlown
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import record
+from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.summary import summarise
+from skytether.shell import command, temporary
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.sim import flight
+
+STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
+"""Stages of the server's work, in their order; `record`, the price of watching, is left out."""
+
+
+@dataclass(frozen=True)
+class FleetOptions:
+    """Options of `skytether fleet`."""
+
+    scenario: ScenarioName = "fleet"
+    """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
+    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 20
+    """Number of vehicles."""
+    workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Number of the server's processes, which share the vehicles."""
+    secure: bool = False
+    """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
+    virtual: bool = False
+    """Fly in virtual time: everything in this process, as fast as it can."""
+    page: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """HOST:PORT of a page with all of the vehicles, as `skytether fly` has one; none unless given,
+    for what is measured here is what the flight costs. Not in virtual time."""
+    json: Path | None = None
+    """File for the summary of the flight."""
+    figure: Path | None = None
+    """File for a picture of the flight (.png, .pdf or .svg)."""
+    plugin: command.Plugins = ()
+    config: ScenarioFlags = Scenario()
+
+
+class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """Summary of a fleet's flight, and of what it cost; None is what was not measured."""
+
+    scenario: str
+    seed: int
+    vehicles: int
+    workers: int
+    duration_s: float
+    """Time flown by the vehicle that flew longest [s]."""
+    steps: int
+    """Steps flown by all vehicles."""
+    secure: bool
+    """Whether the link was authenticated and encrypted."""
+    server_steps: int
+    """Steps that the server has planned for."""
+    event_ratio: float
+    rmse_xy: tuple[float, float, float] | None
+    """Smallest, median and largest RMSE of the vehicles [m]."""
+    uplink_packets_per_s: float
+    """Packets from the server into the network [1/s]."""
+    downlink_packets_per_s: float
+    """Packets from the vehicles into the network [1/s]."""
+    lost: int
+    """Packets that the network lost, both ways."""
+    dropped: int
+    """Packets that kernels and full queues dropped, which no scenario asks for."""
+    tick_ms_p50: float
+    """Time that a tick of the server took, all vehicles together, in the slowest worker [ms]."""
+    tick_ms_p99: float
+    """Time that one tick in a hundred exceeded, in the slowest worker [ms]."""
+    server_missed: int
+    """Ticks that workers slept through."""
+    client_missed: int
+    """Steps that vehicles slept through."""
+    machine_missed: int | None
+    """Steps that a thread which only sleeps slept through in the same time."""
+    machine_late_ms_max: float | None
+    """Largest delay with which that thread woke [ms]."""
+    server_cpu_us: dict[str, float]
+    """Time of the server for a vehicle and step [µs]: stages on the wall clock, `total` of CPU."""
+    client_cpu_us: float | None
+    """CPU time of the vehicles' process for a vehicle and step [µs]."""
+    netem_cpu_us: float | None
+    """CPU time of netem for a packet [µs]."""
+    vehicle_steps_per_core_s: float | None
+    """Steps of vehicles flown in a second of CPU time, everything included; in virtual time."""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetFlight:
+    """A fleet's flight: what the vehicles recorded, and the figures of each process."""
+
+    client: Rows
+    servers: list[dict[str, Any]]
+    """Figures of each worker of the server."""
+    netem: dict[str, Any]
+    """Figures of netem."""
+    processes: dict[str, dict[str, Any]]
+    """Figures of "client" and "netem", where these are processes."""
+    failure: Event | None = None
+    """Event of the first vehicle that was not flown, or not to the end."""
+    machine: "Metronome | None" = None
+    """Measure of what the machine took, over real UDP."""
+    cpu_s: float | None = None
+    """CPU time of everything together [s], in virtual time."""
+    server: Rows | None = None
+    """What the server recorded, in virtual time."""
+
+
+def fleet(argv: Sequence[str]) -> None:
+    """Fly many vehicles on one server, each over a network of its own.
+
+    Server, netem and all vehicles are three processes on loopback, or everything flies in virtual
+    time in one. The cost of the server's work is shown for one vehicle and one step. Every key of
+    the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight and still shows
+    what was flown.
+    """
+    options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
+    command.check_count("--vehicles", options.vehicles, 65_535)
+    command.check_count("--workers", options.workers, 64)
+    if options.virtual and options.workers > 1:
+        raise CommandError("--workers: got --virtual as well, where there is but one", 2)
+    if options.page:
+        command.address("--page", options.page)
+        if options.virtual:
+            raise CommandError("--page: got --virtual as well, which nobody can follow", 2)
+    if options.figure:
+        figures.check(options.figure)
+    where = "in virtual time" if options.virtual else "over UDP on loopback"
+    title = f"{options.vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
+    command.prepare(kernel.missing())
+    with (
+        command.interruptible() as interrupted,
+        command.progress(f"flying {title}", options.config.duration) as on_second,
+    ):
+        flown = (_virtually if options.virtual else _really)(options, on_second, interrupted)
+    if not len(flown.client):
+        raise CommandError("interrupted before the first step", command.INTERRUPTED)
+    summary = _summarise(options, flown)
+    _show(summary, title)
+    if options.json:
+        command.write(options.json, msgspec.json.encode(summary))
+    if options.figure:
+        figures.fleet(options.figure, title, options.config, flown.client, flown.server)
+    if flown.failure:
+        raise CommandError(str(flown.failure))
+
+
+def _virtually(
+    options: FleetOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> FleetFlight:
+    kernel.load()
+    began_s = time.process_time()
+    flown = flight.fly(
+        options.config,
+        vehicles=options.vehicles,
+        secure=options.secure,
+        stopwatch=Stopwatch(time.perf_counter_ns),
+        on_second=on_second,
+        stopped=interrupted,
+    )
+    if flown.failure and not isinstance(flown.failure, NotFlown):
+        raise CommandError(str(flown.failure))
+    return FleetFlight(
+        client=flown.client,
+        servers=[flown.figures["server"]],
+        netem=flown.figures["netem"],
+        processes={},
+        failure=flown.failure,
+        cpu_s=time.process_time() - began_s,
+        server=flown.server,
+    )
+
+
+@contextmanager
+def _paged(options: FleetOptions) -> Iterator[Path | None]:
+    """Serve a page, if there is to be one; yields the folder of its sockets."""
+    if options.page is None:
+        yield None
+        return
+    with (
+        temporary.folder() as folder,
+        page_process.beside([folder], options.page, page_process.say),
+    ):
+        yield folder
+
+
+def _really(
+    options: FleetOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> FleetFlight:
+    with (
+        temporary.folder() as parts,
+        _paged(options) as sockets,
+        Metronome(options) as machine,
+    ):
+        shortfalls = processes.run(
+            options.config,
+            parts,
+            on_second=on_second,
+            interrupted=interrupted,
+            vehicles=options.vehicles,
+            workers=options.workers,
+            watched=False,
+            secure=options.secure,
+            control=sockets,
+            feeds=sockets,
+        )
+        incomplete = [each for each in shortfalls if not isinstance(each, NotFlown)]
+        if incomplete:
+            raise CommandError("; ".join(map(str, incomplete)))
+        servers = [json.loads(part.read_bytes()) for part in parts.glob("server.json*")]
+        rest = {
+            name: json.loads((parts / f"{name}.json").read_bytes()) for name in ("netem", "client")
+        }
+        failure = next(iter(shortfalls), None)
+        client = record.read(parts / "client")
+        return FleetFlight(client, servers, rest["netem"], rest, failure, machine)
+
+
+class Metronome:
+    """A thread that only sleeps, step by step: whatever it misses, the machine has taken."""
+
+    def __init__(self, options: FleetOptions) -> None:
+        self._dt_s = options.config.control.dt
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._sleep, daemon=True)
+        self.missed = 0
+        self.late_s_max = 0.0
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _sleep(self) -> None:
+        due_s = time.monotonic()
+        while not self._over.is_set():
+            due_s += self._dt_s
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            late_s = time.monotonic() - due_s
+            self.late_s_max = max(self.late_s_max, late_s)
+            missed = int(late_s / self._dt_s)
+            self.missed += missed
+            due_s += missed * self._dt_s
+
+
+def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
+    scenario, client, servers, netem = options.config, flown.client, flown.servers, flown.netem
+    steps = sum(server["counts"].get("steps", 0) for server in servers)
+    spent_us = {
+        stage: sum(server["spent_ns"].get(stage, 0) for server in servers) / 1e3 / max(steps, 1)
+        for stage in STAGES
+    }
+    spent_us = {stage: us for stage, us in spent_us.items() if us}
+    if all("cpu_s" in server for server in servers):
+        spent_us["total"] = sum(server["cpu_s"] for server in servers) * 1e6 / max(steps, 1)
+    duration_s = (int(client["step"].max()) + 1) * scenario.control.dt
+    each = [client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])]
+    rmse = [summarise(scenario, options.scenario, rows, flown.server).rmse_xy for rows in each]
+    known = [value for value in rmse if value is not None]
+    links = (netem["uplink"], netem["downlink"])
+    packets = sum(link["packets"] for link in links)
+    cpu_s = {name: figures["cpu_s"] for name, figures in flown.processes.items()}
+    return FleetSummary(
+        scenario=options.scenario,
+        seed=scenario.seed,
+        vehicles=len(each),
+        workers=len(servers),
+        duration_s=duration_s,
+        steps=len(client),
+        secure=options.secure,
+        server_steps=steps,
+        event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
+        rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
+        uplink_packets_per_s=links[0]["packets"] / duration_s,
+        downlink_packets_per_s=links[1]["packets"] / duration_s,
+        lost=sum(link["lost"] for link in links),
+        dropped=sum(link["overflowed"] for link in links)
+        + sum(
+            process["kernel_drops"] + process["send_errors"]
+            for process in (*flown.processes.values(), *servers)
+            if "cpu_s" in process
+        ),
+        tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
+        tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
+        server_missed=sum(server["missed"] for server in servers),
+        client_missed=sum(int(rows["missed"][-1]) for rows in each),
+        machine_missed=flown.machine.missed if flown.machine else None,
+        machine_late_ms_max=flown.machine.late_s_max * 1e3 if flown.machine else None,
+        server_cpu_us=spent_us,
+        client_cpu_us=cpu_s["client"] * 1e6 / len(client) if cpu_s else None,
+        netem_cpu_us=cpu_s["netem"] * 1e6 / max(packets, 1) if cpu_s else None,
+        vehicle_steps_per_core_s=len(client) / flown.cpu_s if flown.cpu_s else None,
+    )
+
+
+def _show(summary: FleetSummary, title: str) -> None:
+    s = summary
+    rows = [
+        ("vehicles, server's workers", f"{s.vehicles}, {s.workers}"),
+        ("steps flown, planned for", f"{s.steps}, {s.server_steps} in {s.duration_s:g} s"),
+        ("RMSE xy min, median, max [m]", s.rmse_xy and ", ".join(f"{x:.4f}" for x in s.rmse_xy)),
+        ("link", "sealed" if s.secure else "plaintext"),
+        ("event ratio", f"{s.event_ratio:.3f}"),
+        (
+            "uplink, downlink packets/s",
+            f"{s.uplink_packets_per_s:.0f}, {s.downlink_packets_per_s:.0f}",
+        ),
+        ("lost packets, dropped by accident", f"{s.lost}, {s.dropped}"),
+        ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
+        ("deadlines missed by server, clients", f"{s.server_missed}, {s.client_missed}"),
+        (
+            "  by a process that only sleeps",
+            None
+            if s.machine_late_ms_max is None
+            else f"{s.machine_missed}; {s.machine_late_ms_max:.1f} ms late at worst",
+        ),
+        *((f"server's {stage} [µs]", f"{us:.2f}") for stage, us in s.server_cpu_us.items()),
+        ("client, a step [µs]", _value(s.client_cpu_us)),
+        ("netem, a packet [µs]", _value(s.netem_cpu_us)),
+        (
+            "vehicle-steps per core-second",
+            _value(s.vehicle_steps_per_core_s, ".0f"),
+        ),
+    ]
+    table = Table(title=title, title_justify="left", show_header=False)
+    for name, value in rows:
+        if value is not None:
+            table.add_row(Text(name), value)  # as text: "[m]" would be markup
+    Console().print(table)
+
+
+def _value(value: float | None, spec: str = ".1f") -> str | None:
+    return None if value is None else format(value, spec)

@@ -1,0 +1,272 @@
+"""`skytether fly`: one flight, over real UDP or in virtual time, and its summary."""
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from skytether.cli import page_process, processes
+from skytether.client import vehicles
+from skytether.figures import flights as figures
+from skytether.shared.base import kernel
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.events import (
+    Changed,
+    ChangeRefused,
+    Event,
+    Fault,
+    ModeChanged,
+    PlanningStopped,
+    RecordIncomplete,
+)
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import Summary, summarise
+from skytether.shared.wire.protocol import Mode
+from skytether.shell import command, temporary
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.sim import flight
+from skytether.view.browser.access import HOST_PORT
+
+TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, Fault
+"""Events that are shown while it flies."""
+POLL_S = 0.2
+"""Time after which Ctrl-C ends a page that lingers [s]."""
+ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
+"""Names of the modes before the first plan is flown, which are not worth a word."""
+
+
+@dataclass(frozen=True)
+class FlyOptions:
+    """Options of `skytether fly`."""
+
+    scenario: ScenarioName = "demo"
+    """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    secure: bool = False
+    """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
+    virtual: bool = False
+    """Fly in virtual time: the same code in one process, reproducible, many times faster."""
+    control: Path | None = None
+    """Folder for sockets called server, netem and client, through which keys change in flight, see
+    `skytether set`; it is made where there is none. Not in virtual time."""
+    page: str = os.environ.get(page_process.VARIABLE, HOST_PORT)
+    """HOST:PORT of the page on which the flight can be watched, and played with; on the next free
+    port where that is taken. Where other machines can reach it, they need the token that is printed
+    to do more than look. Not in virtual time."""
+    no_page: bool = False
+    """Fly without a page."""
+    linger: bool = False
+    """Keep the page when the flight is over, until Ctrl-C."""
+    json: Path | None = None
+    """File for the summary of the flight."""
+    figure: Path | None = None
+    """File for a picture of the flight (.png, .pdf or .svg)."""
+    record: Path | None = None
+    """File for a recording of the flight (.mcap): all that its processes record and say, written
+    while it flies. See `skytether report`, `replay`, `export` and `recover`; Foxglove and
+    Lichtblick show it, too."""
+    beside: str | None = None
+    """Another scenario to compare with, flown in virtual time with the same duration and seed."""
+    plugin: command.Plugins = ()
+    config: ScenarioFlags = Scenario()
+
+
+def fly(argv: Sequence[str]) -> None:
+    """Fly a scenario: server, netem and client as processes on loopback, or in virtual time.
+
+    Every key of the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight
+    and still shows what was flown.
+    """
+    options = command.parse(FlyOptions(), argv, "skytether fly", fly.__doc__)
+    scenario = options.config
+    if options.figure:
+        figures.check(options.figure)
+    if options.record:
+        from skytether.cli import recorder
+
+        recorder.check(options.record)
+    if options.control:
+        _make_folder(options.control, virtual=options.virtual)
+    beside = _beside(options)
+    where = "in virtual time" if options.virtual else "over UDP on loopback"
+    title = f"{options.scenario}, {where}, seed {scenario.seed}"
+    if not options.virtual:
+        for warning in command.flight_warnings(scenario):
+            page_process.say(warning)
+    vehicles.make(scenario, 0)  # it has kernels of its own, or cannot be made
+    with _paged(options) as sockets:
+        command.prepare(kernel.missing())
+        with (
+            command.interruptible() as interrupted,
+            command.progress(f"flying {title}", scenario.duration) as on_second,
+        ):
+            if options.virtual:
+                flown, unrecorded = _virtually(options, on_second, interrupted)
+            else:
+                flown, unrecorded = _really(options, sockets, on_second, interrupted)
+        _show(options, title, flown, unrecorded, beside)
+        if options.linger and sockets:
+            with command.interruptible() as interrupted:
+                while not interrupted():
+                    time.sleep(POLL_S)
+
+
+def _show(
+    options: FlyOptions,
+    title: str,
+    flown: Record,
+    unrecorded: str | None,
+    beside: Scenario | None,
+) -> None:
+    """Show what was flown, in words and as a picture.
+
+    Raises:
+        CommandError: it was nothing, or not all of what was to be.
+    """
+    scenario = options.config
+    if flown.failure and not len(flown.client):
+        raise CommandError(str(flown.failure))
+    if flown.incomplete:
+        title += ", as far as it is recorded"
+    if not len(flown.client):
+        missing = _missing(scenario, flown)
+        code = command.RUN if missing else command.INTERRUPTED
+        raise CommandError(missing or "interrupted before the first step", code)
+    flights = {title: (scenario, flown)}
+    if beside:
+        other = flight.fly(beside)
+        other_title = f"{options.beside}, in virtual time, seed {beside.seed}"
+        flights[other_title] = beside, other
+        command.finish(_summarise(beside, str(options.beside), other), other_title)
+    summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
+    command.finish(summary, title, options.json)
+    if options.figure:
+        figures.flights(options.figure, flights)
+    if missing := _missing(scenario, flown) or unrecorded:
+        raise CommandError(missing)
+    if flown.failure:
+        raise CommandError(str(flown.failure))
+
+
+@contextlib.contextmanager
+def _paged(options: FlyOptions) -> Iterator[Path | None]:
+    """Serve a page of the flight, unless there is to be none; yields the folder of its sockets."""
+    if options.virtual or options.no_page or options.page == page_process.NONE:
+        yield options.control
+        return
+    command.address("--page", options.page)
+    with ExitStack() as stack:
+        folder = options.control or stack.enter_context(temporary.folder())
+        stack.enter_context(page_process.beside([folder], options.page, page_process.say))
+        yield folder
+
+
+def _make_folder(folder: Path, *, virtual: bool) -> None:
+    """Make the folder of the sockets, for its owner alone.
+
+    Raises:
+        CommandError: it cannot be, or nobody could reach the sockets in time.
+    """
+    if virtual:
+        said = "--control: got a folder, expected none with --virtual, which nobody can follow"
+        raise CommandError(said, command.CONFIGURATION)
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        said = f"--control: {folder}: no folder can be made: {error.strerror}"
+        raise CommandError(said, command.CONFIGURATION) from None
+
+
+def _beside(options: FlyOptions) -> Scenario | None:
+    if options.beside is None:
+        return None
+    same = {key: getattr(options.config, key) for key in ("duration", "seed", "settle")}
+    try:
+        return msgspec.structs.replace(reading.load(options.beside), **same)
+    except ConfigError as error:
+        raise CommandError(str(error), command.CONFIGURATION) from None
+
+
+def _summarise(scenario: Scenario, name: str, flown: Record, *, secure: bool = False) -> Summary:
+    return summarise(scenario, name, flown.client, flown.server, flown.netem, secure=secure)
+
+
+def _virtually(
+    options: FlyOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+) -> tuple[Record, str | None]:
+    """Fly in virtual time; returns the flight, and what is wrong with its recording."""
+    scenario, secure = options.config, options.secure
+    flown = flight.fly(scenario, secure=secure, on_second=on_second, stopped=interrupted)
+    for each in flown.events:
+        if isinstance(each.event, Fault):
+            _tell(each.event)
+    if options.record is None:
+        return flown, None
+    from skytether.cli import recorder
+
+    name = options.scenario
+    summary = _summarise(scenario, name, flown, secure=secure)
+    return flown, recorder.write(options.record, scenario, name, flown, summary)
+
+
+def _really(
+    options: FlyOptions,
+    sockets: Path | None,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
+) -> tuple[Record, str | None]:
+    """Fly over UDP; returns the flight, and what is missing in its recording."""
+    with temporary.folder() as parts, ExitStack() as stack:
+        scenario = options.config
+        feeds = sockets or (parts if options.record else None)
+        live = None
+        if options.record and feeds:
+            from skytether.cli import recorder
+
+            live = recorder.Live(
+                options.record,
+                processes.feeds_in(feeds),
+                scenario,
+                options.scenario,
+                secure=options.secure,
+                tell=_tell,
+            )
+            stack.callback(live.finish)
+        shortfalls = processes.run(
+            scenario,
+            parts,
+            on_second=on_second,
+            interrupted=interrupted,
+            on_event=lambda line: _tell(line.event),
+            secure=options.secure,
+            control=sockets,
+            feeds=feeds,
+        )
+        flown = processes.record_of(parts, scenario, shortfalls)
+        if live is None:
+            return flown, None
+        summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
+        return flown, live.finish(summary if len(flown.client) else None, flown)
+
+
+def _missing(scenario: Scenario, flown: Record) -> str | None:
+    """What could not be recorded, and how much of the flight could; None where all was."""
+    if not flown.incomplete:
+        return None
+    reasons = "; ".join(f"{part.file}: {part.reason}" for part in flown.incomplete)
+    steps = flown.client["step"][-1] + 1 if len(flown.client) else 0
+    recorded_s = steps * scenario.control.dt
+    return f"{reasons}: recorded up to {recorded_s:g} of {scenario.duration:g} s"
+
+
+def _tell(event: Event) -> None:
+    """Show what may happen to the link and the record in flight, above the progress bar."""
+    begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
+    if isinstance(event, TOLD) and not begins:
+        page_process.say(event)

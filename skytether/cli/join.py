@@ -1,0 +1,54 @@
+"""`skytether join`: recordings of server, netem and client, as one."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from skytether.cli import recorder, recordings
+from skytether.shared.base import files
+from skytether.shared.base.errors import RecordingError
+from skytether.shell import command
+from skytether.shell.command import CONFIGURATION, CommandError
+from skytether.shell.options import read
+from skytether.view.joining import join as joined
+
+
+@dataclass(frozen=True)
+class JoinOptions:
+    """Options of `skytether join`."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
+    """The recordings (.mcap), one of each process."""
+    out: Path
+    """File for the recording of the flight (.mcap)."""
+    plugin: command.Plugins = ()
+
+
+def join(argv: Sequence[str]) -> None:
+    """Make one recording of those that server, netem and client have written by hand.
+
+    They are put in the order of the time of day: computers that are apart must agree on it. The
+    summary is that of the first vehicle.
+    """
+    options = read(JoinOptions((), tyro.MISSING), argv, "skytether join", join.__doc__)
+    if len(options.files) < 2:
+        said = f"got {len(options.files)} recordings, expected two or more"
+        raise CommandError(said, CONFIGURATION)
+    recorder.check(options.out, "--out")
+    command.check_output("--out", options.out)
+    if any(options.out.exists() and options.out.samefile(each) for each in options.files):
+        said = f"--out: {options.out} is one of the recordings, expected another file"
+        raise CommandError(said, CONFIGURATION)
+    with ExitStack() as stack:
+        opened = [stack.enter_context(recordings.opened(path)) for path in options.files]
+        try:
+            with files.create(options.out) as file:
+                joined(opened, file)
+        except RecordingError:
+            options.out.unlink(missing_ok=True)
+            raise
+    print(options.out)

@@ -1,0 +1,142 @@
+"""`skytether keygen`: make keys for vehicles, in a file that nobody else can read."""
+
+import os
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from skytether.shared.base import files
+from skytether.shared.wire import keys
+from skytether.shared.wire.keys import KEYS_MAX, NUMBERS, SECRET_BYTES, VEHICLES
+from skytether.shell import command
+from skytether.shell.command import CONFIGURATION, CommandError
+from skytether.shell.options import read
+
+HEAD = "# VEHICLE KEY SECRET. Who reads the secret of a vehicle can fly it.\n"
+"""First line of a new file."""
+
+
+@dataclass(frozen=True)
+class KeygenOptions:
+    """Options of `skytether keygen`."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """File for the keys."""
+    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Number of vehicles, one key each."""
+    first: Annotated[int, tyro.conf.arg(metavar="ID")] = 1
+    """Number of the first vehicle (0 to 65535); the others follow."""
+    key_id: Annotated[int | None, tyro.conf.arg(metavar="K")] = None
+    """Number of the new keys (0 to 255). Unless given, the one after the highest that the vehicle
+    has, and 1 for its first."""
+    add: bool = False
+    """Add to a file that is there: keys of more vehicles, or the next key of those that have
+    one."""
+    if_missing: bool = False
+    """Leave a file that is there as it is, and end well."""
+
+
+def keygen(argv: Sequence[str]) -> None:
+    """Make a key for each of some vehicles, in a new file that only its owner can read.
+
+    The server needs the keys of all vehicles, a vehicle only its own line. A vehicle uses the key
+    with the highest number. docs/security.md tells how keys are copied, exchanged and revoked.
+    """
+    options = read(KeygenOptions(tyro.MISSING), argv, "skytether keygen", keygen.__doc__)
+    command.check_count("--vehicles", options.vehicles, len(VEHICLES))
+    vehicles = range(options.first, options.first + options.vehicles)
+    if not (vehicles[0] in VEHICLES and vehicles[-1] in VEHICLES):
+        given = f"{vehicles[0]} to {vehicles[-1]}" if len(vehicles) > 1 else vehicles[0]
+        raise CommandError(f"--first: got {given}, expected 0 to {VEHICLES[-1]}", CONFIGURATION)
+    if options.key_id is not None and options.key_id not in NUMBERS:
+        raise CommandError(
+            f"--key-id: got {options.key_id}, expected 0 to {NUMBERS[-1]}", CONFIGURATION
+        )
+    if options.if_missing and options.file.exists():
+        print(f"{options.file}: is there, and stays as it is.")
+        return
+    make(options.file, vehicles, options.key_id, add=options.add)
+    many = len(vehicles) > 1
+    named = f"vehicles {vehicles[0]} to {vehicles[-1]}" if many else f"vehicle {vehicles[0]}"
+    print(f"{options.file}: wrote {len(vehicles)} key{'s' if many else ''}, of {named}.")
+    print(f"Next: start the server with `--keys {options.file}`; give each vehicle a file of mode")
+    print("0600 with its own line alone, by a way that nobody reads, and start it with `--keys`.")
+
+
+def make(
+    file: Path, vehicles: Sequence[int], number: int | None = None, *, add: bool = False
+) -> None:
+    """Make a key for each of some vehicles, in a new file or at the end of one that is there.
+
+    Args:
+        number: number of the new keys; unless given, the next of each vehicle.
+
+    Raises:
+        CommandError: a vehicle cannot have one more, or the file cannot be written.
+        ConfigError: the file that is there is none of keys.
+    """
+    present = keys.load(file) if add else keys.Keyring(str(file), {})
+    lines = []
+    for vehicle in vehicles:
+        own = _number(present, vehicle, number)
+        lines.append(keys.write(vehicle, own, secrets.token_bytes(SECRET_BYTES)))
+    _write(file, lines, add=add)
+
+
+def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
+    """Number of the new key of a vehicle.
+
+    Raises:
+        CommandError: it cannot have one more, or not with this number.
+    """
+    numbers = present.numbers(vehicle)
+    what = f"{present.name}: vehicle {vehicle}"
+    if len(numbers) == KEYS_MAX:
+        raise CommandError(
+            f"{what} has {KEYS_MAX} keys, expected 1: delete the line of the old one first",
+            CONFIGURATION,
+        )
+    number = asked
+    if number is None:
+        number = numbers[-1] + 1 if numbers else 1
+    if number in numbers:
+        raise CommandError(
+            f"--key-id: got {number}, expected another: {what} has it", CONFIGURATION
+        )
+    if number not in NUMBERS:
+        raise CommandError(
+            f"{what} has the last key, {NUMBERS[-1]}: choose another with --key-id", CONFIGURATION
+        )
+    return number
+
+
+def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
+    """Write lines to a new file of mode 0600, or to the end of one that is there.
+
+    Raises:
+        CommandError: it is there and should not be, or cannot be written.
+    """
+    flags = os.O_RDWR | os.O_APPEND if add else os.O_WRONLY | os.O_CREAT | os.O_EXCL
+    flags |= os.O_CLOEXEC | os.O_NOFOLLOW
+    try:
+        files.check_private(path)
+        with os.fdopen(os.open(path, flags, 0o600), "r+b" if add else "wb") as file:
+            head = HEAD
+            if add:
+                file.seek(-1, os.SEEK_END)
+                head = "" if file.read(1) == b"\n" else "\n"
+            file.write((head + "".join(lines)).encode())
+            file.flush()
+            os.fsync(file.fileno())
+    except FileExistsError:
+        raise CommandError(
+            f"{path}: is there already, expected a new file (or --add)", CONFIGURATION
+        ) from None
+    except OSError as error:
+        raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None
+    except ValueError as error:
+        raise CommandError(f"{str(path)!r}: cannot be written: {error}", CONFIGURATION) from None

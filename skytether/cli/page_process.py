@@ -1,0 +1,73 @@
+"""The page of a flight, as a process beside those that fly: whether it lives is nothing to them."""
+
+import contextlib
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from skytether.shell import plugins
+from skytether.shell.log import line_of
+from skytether.shell.workers import die_with_parent
+
+STOP_S = 5.0
+"""Longest time that the page may take to end once it is told to [s]."""
+VARIABLE = "SKYTETHER_PAGE"
+"""Environment variable with HOST:PORT of the page, or `none`."""
+NONE = "none"
+
+
+@contextlib.contextmanager
+def beside(folders: Sequence[Path], at: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Serve a page of flights for as long as the block takes.
+
+    Args:
+        folders: folders of the flights.
+        at: HOST:PORT.
+        say: told, in a thread, the address of the page, or why there is none.
+    """
+    arguments = [*map(str, folders), "--page", at, "--log", "json", *plugins.flags()]
+    child = subprocess.Popen(
+        [sys.executable, "-P", "-m", "skytether.view", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,
+        preexec_fn=die_with_parent,  # noqa: PLW1509 - no thread of ours runs yet
+    )
+    ended = threading.Event()
+
+    def hear() -> None:
+        last = ""
+        assert child.stdout is not None
+        for line in child.stdout:
+            said = line_of(line)
+            if said is not None:
+                say(str(said.event))
+            else:
+                last = line.decode(errors="replace").strip() or last
+        if not ended.is_set():
+            say(f"{last or 'page: it has ended'}; the flight goes on without a page")
+
+    reader = threading.Thread(target=hear, daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        child.terminate()
+        try:
+            child.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+        reader.join(STOP_S)
+        if child.stdout:
+            child.stdout.close()
+
+
+def say(line: object) -> None:
+    """Tell somebody who may be gone, on stderr."""
+    with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
+        print(line, file=sys.stderr)

@@ -1,0 +1,374 @@
+"""A flight over real UDP: server, netem and client as three processes on loopback.
+
+Each process writes its events as JSON on its standard output (`--log json`); they are all that is
+known here of what goes on in it. Anything else that it prints, a traceback or its one line for a
+mistake, is kept for its last words.
+
+The loop is asyncio's own: uvloop's would start them with signals that are no longer ignored.
+"""
+
+import asyncio
+import contextlib
+import sys
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from skytether.cli import keygen
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import (
+    Counted,
+    Failure,
+    Flying,
+    Listening,
+    NotFlown,
+    RecordIncomplete,
+    address_text,
+)
+from skytether.shared.scenario.reading import to_toml
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import (
+    PACKET_COLUMNS,
+    FlightEvent,
+    Record,
+    Rows,
+    client_columns,
+    plan_columns,
+    read,
+    server_columns,
+)
+from skytether.shell import plugins
+from skytether.shell.command import INTERRUPTED, CommandError
+from skytether.shell.log import LogLine, line_of
+from skytether.shell.workers import die_with_parent
+
+ANYWHERE = ("--bind", "127.0.0.1:0")
+"""Arguments with which a process listens on any free port of loopback."""
+NAMES = ("client", "server", "netem")
+"""Names of the processes, and of their parts of the record."""
+
+START_S = 120.0
+"""Longest time that a process may take until it listens [s]: it may have to compile first."""
+GRACE_S = 30.0
+"""Longest time that a flight may take beyond its duration and the time to connect [s]."""
+STOP_S = 5.0
+"""Longest time that a process may take to end once it is told to [s]."""
+POLL_S = 0.2
+"""Time after which Ctrl-C is noticed [s]."""
+LINES_MAX = 20
+"""Number of last lines kept of what a process said, for when it fails."""
+
+OnEvent = Callable[[LogLine], None]
+Shortfall = RecordIncomplete | NotFlown
+"""Events of a flight that goes on, and of which there is something to show."""
+
+
+@dataclass(slots=True)
+class Child:
+    """A process that was started, and what it has said."""
+
+    name: str
+    process: asyncio.subprocess.Process
+    reader: "asyncio.Task[None]" = field(init=False)
+    """Task that takes in what it says, until it has said all."""
+    said: deque[str] = field(default_factory=lambda: deque(maxlen=LINES_MAX))
+    """Last lines, those of events as sentences."""
+    address: Address = ("", 0)
+    """Address that it listens on."""
+    failed: bool = False
+    """Whether it has told of something after which it could not fly."""
+    fell_short: bool = False
+    """Whether it has told of a shortfall, for which it ends with 1."""
+
+    async def end(self) -> int:
+        """Exit code, once it has ended and all that it said is known."""
+        code = await self.process.wait()
+        await asyncio.wait((self.reader,), timeout=STOP_S)
+        return code
+
+    def last_words(self) -> str:
+        """Why it ended, in its own words."""
+        if self.said:
+            return self.said[-1]
+        code = self.process.returncode
+        said = f"does not listen after {START_S:.0f} s" if code is None else f"ended with {code}"
+        return f"{self.name}: {said}"
+
+
+@contextlib.asynccontextmanager
+async def started(
+    name: str, *arguments: str, on_event: OnEvent = lambda _: None
+) -> AsyncIterator[Child]:
+    """Start a process that listens; at the end of the block it is told to end, then killed.
+
+    Args:
+        name: process to run: server, netem, client, station or autopilot.
+        arguments: its command line, beside `--log json`.
+        on_event: called with each of its events, as a line of its log.
+
+    Raises:
+        CommandError: it ended, or did not come to listen.
+    """
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-P",  # a folder called like one of ours, where the user happens to be, is not ours
+        "-m",
+        f"skytether.{name}",
+        *arguments,
+        "--log",
+        "json",
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        # Ctrl-C is for the command alone: it ends its children in order.
+        start_new_session=True,
+        preexec_fn=die_with_parent,
+    )
+    child = Child(name, process)
+    assert process.stdout is not None
+    listening: asyncio.Future[Address] = asyncio.get_running_loop().create_future()
+
+    def hear(line: LogLine) -> None:
+        event = line.event
+        if isinstance(event, Listening) and not listening.done():
+            listening.set_result((event.host, event.port))
+        child.fell_short |= isinstance(event, Shortfall)
+        child.failed |= isinstance(event, Failure) and not isinstance(event, NotFlown)
+        on_event(line)
+
+    child.reader = asyncio.create_task(_read(child, process.stdout, hear))
+    try:
+        done, _ = await asyncio.wait(
+            (listening, child.reader), timeout=START_S, return_when=asyncio.FIRST_COMPLETED
+        )
+        if listening not in done:
+            if child.reader in done:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(process.wait(), STOP_S)
+            raise CommandError(child.last_words())
+        child.address = listening.result()
+        yield child
+    finally:
+        if process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                process.terminate()
+            try:
+                await asyncio.wait_for(process.wait(), STOP_S)
+            except TimeoutError:
+                process.kill()
+                await process.wait()
+        await child.reader
+
+
+async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -> None:
+    while True:
+        try:
+            line = await stream.readline()
+        except ValueError:  # longer than the stream has room for
+            continue
+        if not line:
+            return
+        said = line_of(line)
+        if said is None:
+            child.said.append(line.decode(errors="replace").rstrip())
+            continue
+        if not isinstance(said.event, Counted):  # numbers are no reason for an end
+            child.said.extend(f"{said.process}: {said.event}".splitlines())
+        on_event(said)
+
+
+def feeds_in(folder: Path) -> dict[str, Path]:
+    """Sockets of the feeds in a folder, by the names of the processes, see `run`."""
+    return {name: folder / f"{name}.feed" for name in NAMES}
+
+
+def run(
+    scenario: Scenario,
+    parts: Path,
+    *,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
+    on_event: OnEvent = lambda _: None,
+    vehicles: int = 1,
+    workers: int = 1,
+    watched: bool = True,
+    secure: bool = False,
+    control: Path | None = None,
+    feeds: Path | None = None,
+) -> list[Shortfall]:
+    """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
+
+    Whoever calls it has Ctrl-C and SIGTERM under control (`command.interruptible`). Returns what
+    the flight or its record fell short of, as the processes tell it; nothing in a good one.
+
+    Args:
+        scenario: what to fly.
+        parts: the folder, for a record of each process and, as `.json`, its figures.
+        on_second: called with the time flown [s], several times a second.
+        interrupted: asked several times a second; once it says so, the flight ends in order.
+        on_event: called with each event of the processes, as a line of their logs.
+        vehicles: number of vehicles, all in one process.
+        workers: number of processes of the server.
+        watched: whether server and netem record, too.
+        secure: whether the link is sealed, with keys that are made for this flight.
+        control: folder for a socket of each process, through which keys change in flight.
+        feeds: folder for the feed of each process, called as in `server.feed`; of several workers,
+            as in `server.feed.1`.
+
+    Raises:
+        CommandError: one of the processes failed, the folder cannot be written to, or it was
+            interrupted before the first step.
+    """
+    file = parts / "scenario.toml"
+    try:
+        file.write_bytes(to_toml(scenario))
+    except OSError as error:
+        raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
+    if secure:
+        keygen.make(parts / "keys", range(1, vehicles + 1))
+    keys = ["--keys", str(parts / "keys")] if secure else []
+    shortfalls: list[Shortfall] = []
+    timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
+
+    def common(name: str, *, recorded: bool) -> list[str]:
+        part = ["--record", str(parts / name)] if recorded else []
+        heeds = ["--control", str(control / name)] if control else []
+        tells = ["--feed", str(feeds_in(feeds)[name])] if feeds else []
+        told = ["--json", str(parts / f"{name}.json"), *part, *heeds, *tells]
+        return [name, str(file), *told, *plugins.flags()]
+
+    fleet = ["--vehicles", str(vehicles)]
+    server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]
+    netem = [*common("netem", recorded=watched), "--flows", str(vehicles)]
+    client = [*common("client", recorded=True), *fleet, *keys]
+
+    def hear(line: LogLine) -> None:
+        if isinstance(line.event, Shortfall):
+            shortfalls.append(line.event)
+        on_event(line)
+
+    fly_chain(
+        [[*server, *ANYWHERE], [*netem, *ANYWHERE, "--server"], [*client, "--server"]],
+        flies="client",
+        timeout_s=timeout_s,
+        on_second=on_second,
+        interrupted=interrupted,
+        on_event=hear,
+    )
+    if interrupted() and not (parts / "client.json").exists():
+        raise CommandError("interrupted before the first step", INTERRUPTED)
+    return shortfalls
+
+
+def fly_chain(
+    chain: Sequence[Sequence[str]],
+    *,
+    flies: str,
+    timeout_s: float,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
+    on_event: OnEvent,
+) -> None:
+    """Run processes until one of them ends, or Ctrl-C.
+
+    Args:
+        chain: name and arguments of each process; the last argument of each but the first is the
+            flag for the address of the one before.
+        flies: name of the process whose end is the flight's.
+        timeout_s: longest time that they run [s].
+        on_second, interrupted, on_event: see `run`.
+
+    Raises:
+        CommandError: a process failed, or the time is over.
+    """
+
+    async def main() -> None:
+        flight = asyncio.create_task(
+            _fly(chain, flies, timeout_s=timeout_s, on_second=on_second, on_event=on_event)
+        )
+        while not flight.done() and not interrupted():
+            await asyncio.wait((flight,), timeout=POLL_S)
+        flight.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await flight
+
+    asyncio.run(main())
+
+
+def record_of(
+    parts: Path, scenario: Scenario, shortfalls: Sequence[Shortfall], said: Sequence[LogLine] = ()
+) -> Record:
+    """Record of a flight, from what its processes have left; time counts from their first line on.
+
+    Args:
+        parts: see `run`.
+        shortfalls: what `run` has returned.
+        said: the processes' events, in their order.
+    """
+    axes = scenario.model.axes
+    netem = _rows(parts / "netem", PACKET_COLUMNS).copy()
+    zero_ns = said[0].time_ns if said else 0
+    netem["arrived_ns"] -= zero_ns
+    return Record(
+        client=_rows(parts / "client", client_columns(axes)),
+        server=_rows(parts / "server", server_columns(axes, scenario.control.scheme)),
+        netem=netem,
+        failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
+        events=tuple(
+            FlightEvent(each.time_ns - zero_ns, each.process, each.event) for each in said
+        ),
+        incomplete=tuple(each for each in shortfalls if not isinstance(each, NotFlown)),
+        plan=np.empty(0, plan_columns(axes, scenario.terms().planned)),
+    )
+
+
+def _rows(part: Path, columns: np.dtype[np.void]) -> Rows:
+    """Rows of a part of the record; none where the disk had no room for its first line."""
+    try:
+        return read(part)
+    except ValueError:
+        return np.empty(0, columns)
+
+
+async def _fly(
+    chain: Sequence[Sequence[str]],
+    flies: str,
+    *,
+    timeout_s: float,
+    on_second: Callable[[float], None],
+    on_event: OnEvent,
+) -> None:
+    loop = asyncio.get_running_loop()
+    flying_s: float | None = None
+
+    def hear(line: LogLine) -> None:
+        nonlocal flying_s
+        if isinstance(line.event, Flying) and flying_s is None:
+            flying_s = loop.time()
+        on_event(line)
+
+    async with contextlib.AsyncExitStack() as stack:
+        children: list[Child] = []
+        for argv in chain:
+            before = [address_text(*children[-1].address)] if children else []
+            child = await stack.enter_async_context(started(*argv, *before, on_event=hear))
+            children.append(child)
+        began_s = loop.time()
+        ended = [asyncio.create_task(child.end()) for child in children]
+        try:
+            while not any(task.done() for task in ended):
+                await asyncio.wait(ended, timeout=POLL_S, return_when=asyncio.FIRST_COMPLETED)
+                on_second(0.0 if flying_s is None else loop.time() - flying_s)
+                if loop.time() - began_s > timeout_s:
+                    raise CommandError(f"the flight has not ended in {timeout_s:.0f} s")
+        finally:
+            for task in ended:
+                task.cancel()
+        for child in children:
+            code = child.process.returncode
+            # What it fell short of is told at the end, beside what was flown.
+            flown = child.name == flies and (code == 0 or (child.fell_short and not child.failed))
+            if code is not None and not flown:
+                raise CommandError(child.last_words())

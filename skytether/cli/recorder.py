@@ -1,0 +1,248 @@
+"""Recordings of flights: of one over UDP from the feeds of its processes, while it flies."""
+
+import sys
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import BinaryIO
+
+import msgspec
+
+from skytether.shared.base import files
+from skytether.shared.core.events import RecordIncomplete
+from skytether.shared.scenario.reading import check as checked
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.feed import Frame, Opened, Rows
+from skytether.shared.telemetry.record import RECORDING, Record
+from skytether.shared.telemetry.summary import Summary
+from skytether.shell import command, plugins
+from skytether.shell.beside import Told
+from skytether.shell.command import CommandError
+from skytether.shell.feed import Subscriber
+from skytether.view.frames import of_flight
+from skytether.view.recording import About, Recording
+
+FLUSH_S = 0.25
+"""Time after which what has come is written [s]; as much is lost of a process that is killed."""
+PATIENCE_S = 3.0
+"""Longest time to wait at the end for the rest of the feeds [s]."""
+
+
+def check(path: Path, flag: str = "--record") -> None:
+    """Refuse a file that is not called as a recording is, before anything is flown.
+
+    Raises:
+        CommandError: with what would do.
+    """
+    if path.suffix != RECORDING:
+        said = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
+        raise CommandError(said, command.CONFIGURATION)
+
+
+def write(path: Path, scenario: Scenario, name: str, flown: Record, summary: Summary) -> str | None:
+    """Record a flight in virtual time once it is over; returns what is wrong with the recording."""
+    about = _about(scenario, name, began=None, offset_ns=0, secure=summary.secure)
+    try:
+        with files.create(path) as file:
+            recording = Recording(file, scenario, about)
+            for _, process, frame in of_flight(scenario, name, flown):
+                recording.add(process, frame)
+            recording.finish(summary)
+    except OSError as error:
+        return f"{path}: cannot be written: {error.strerror}"
+    return None
+
+
+def _about(
+    scenario: Scenario, name: str, *, began: datetime | None, offset_ns: int, secure: bool
+) -> About:
+    return About(
+        scenario=name,
+        seed=scenario.seed,
+        version=metadata.version("skytether"),
+        began=began.isoformat(timespec="seconds") if began else "",
+        offset_ns=offset_ns,
+        secure=secure,
+    )
+
+
+def beside() -> int:
+    """Record the feed of a process as it tells on stdin (`Told`), until stdin ends."""
+    told = msgspec.json.decode(sys.stdin.buffer.readline(), type=Told)
+    plugins.load(told.plugins)
+    scenario = checked(tomllib.loads(told.scenario))
+    path, feeds = Path(told.path), {told.process: Path(told.feed)}
+    live = Live(path, feeds, scenario, told.name, secure=told.secure, tell=lambda _: None)
+    print("it reads", flush=True)
+    sys.stdin.buffer.read()
+    fault = live.finish()
+    if fault:
+        print(fault, file=sys.stderr)
+    return 1 if fault else 0
+
+
+@dataclass(slots=True)
+class _Source:
+    """A feed, and how far it has been recorded."""
+
+    begun: bool = False
+    """Whether anything has come of it."""
+    ended: bool = False
+    """Whether it has ended, for now."""
+    resumed: bool = False
+    """Whether what comes next may have come before."""
+    last_ns: int = 0
+    """Time of the newest frame [ns]."""
+    newest: list[Frame] = field(default_factory=list)
+    """Frames of that time."""
+
+    def is_new(self, frame: Frame) -> bool:
+        """Whether a frame has not come before; a feed that begins anew repeats its last."""
+        if frame.time_ns < self.last_ns or frame in self.newest:
+            return False
+        if frame.time_ns > self.last_ns:
+            self.last_ns = frame.time_ns
+            self.newest.clear()
+        self.newest.append(frame)
+        return True
+
+
+class Live:
+    """Records a flight over UDP, in threads of its own; it is never in the flight's way.
+
+    A disk that is too slow blocks these threads alone: the feeds that they do not read in time are
+    dropped by their processes, and the recording is known to be incomplete.
+
+    Args:
+        path: its file.
+        feeds: socket of each process's feed, by its name.
+        scenario: what is flown.
+        name: of the scenario.
+        secure: whether the link is sealed.
+        tell: called once, in any thread, when something is missing.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        feeds: Mapping[str, Path],
+        scenario: Scenario,
+        name: str,
+        *,
+        secure: bool,
+        tell: Callable[[RecordIncomplete], None],
+    ) -> None:
+        self._path = path
+        self._tell = tell
+        self._fault: str | None = None
+        """What was missing first."""
+        self._file: BinaryIO | None = None
+        self._recording: Recording | None = None
+        """Recording, for as long as the file takes it."""
+        self._rows: dict[str, int] = {}
+        """Number of bytes of rows of each part that have come."""
+        self._sources = {process: _Source() for process in feeds}
+        self._changed = threading.Condition()
+        self._closed = threading.Event()
+        self._flusher = threading.Thread(target=self._flush, daemon=True)
+        began, offset_ns = datetime.now(UTC), time.time_ns() - time.monotonic_ns()
+        about = _about(scenario, name, began=began, offset_ns=offset_ns, secure=secure)
+        try:
+            self._file = files.create(path)
+            self._recording = Recording(self._file, scenario, about)
+        except OSError as error:
+            self._miss(error.strerror or str(error))
+        self._flusher.start()
+        self._subscriber = Subscriber(feeds, self._take, self._lost)
+
+    def finish(self, summary: Summary | None = None, flown: Record | None = None) -> str | None:
+        """End the file, once the processes have ended; returns what is missing in it, as a line.
+
+        Called again, it only says that again.
+
+        Args:
+            summary: of the flight, where it came to one.
+            flown: record of the flight, to compare the recording with.
+        """
+        if not self._closed.is_set():
+            with self._changed:
+                self._changed.wait_for(self._all_ended, PATIENCE_S)
+            self._subscriber.close()
+            self._closed.set()
+            self._flusher.join()
+            if flown is not None:
+                self._compare(flown)
+            self._write(lambda recording: recording.finish(summary))
+            if self._file:
+                with suppress(OSError):  # what its buffer still holds
+                    self._file.close()
+        return f"{self._path}: {self._fault}" if self._fault else None
+
+    def _all_ended(self) -> bool:
+        return all(source.ended or not source.begun for source in self._sources.values())
+
+    def _compare(self, flown: Record) -> None:
+        """Find out whether every row of the record has come."""
+        for part, rows in (
+            ("client", flown.client),
+            ("server", flown.server),
+            ("netem", flown.netem),
+        ):
+            count = self._rows.get(part, 0) // rows.dtype.itemsize
+            if count < len(rows):
+                self._miss(f"{count} of {len(rows)} rows of {part} are recorded")
+
+    def _take(self, process: str, frame: Frame) -> None:
+        source = self._sources[process]
+        if isinstance(frame, Opened):
+            source.ended, source.resumed = False, source.begun
+            if source.begun:
+                return
+            source.begun = True
+        else:
+            if source.resumed and frame.time_ns > source.last_ns:
+                self._miss(f"the recorder was too slow for what {process} tells")
+            source.resumed = False
+            if not source.is_new(frame):
+                return
+        if isinstance(frame, Rows):
+            self._rows[frame.part] = self._rows.get(frame.part, 0) + len(frame.rows)
+        self._write(lambda recording: recording.add(process, frame))
+
+    def _lost(self, process: str) -> None:
+        with self._changed:
+            self._sources[process].ended = True
+            self._changed.notify()
+
+    def _flush(self) -> None:
+        while not self._closed.wait(FLUSH_S):
+            self._write(Recording.flush)
+
+    def _write(self, action: Callable[[Recording], None]) -> None:
+        """Do something to the recording, as long as the file takes it."""
+        with self._changed:
+            if self._recording is None:
+                return
+            try:
+                action(self._recording)
+            except OSError as error:
+                self._recording = None
+                self._miss(error.strerror or str(error))
+            except ValueError as error:  # a process says one thing and does another
+                self._miss(str(error))
+
+    def _miss(self, reason: str) -> None:
+        """Remember that something is missing, and tell it the first time."""
+        if self._fault is None:
+            self._fault = reason
+            self._tell(RecordIncomplete(file=str(self._path), reason=reason))
+
+
+if __name__ == "__main__":
+    sys.exit(beside())

@@ -1,0 +1,45 @@
+"""`skytether recover`: give a recording an end that a killed flight has left without one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from skytether.cli.recordings import refused
+from skytether.shell import command
+from skytether.shell.command import CommandError
+from skytether.shell.options import read
+from skytether.view.recovery import recover as recovered
+
+
+@dataclass(frozen=True)
+class RecoverOptions:
+    """Options of `skytether recover`."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """The recording (.mcap)."""
+    out: Path | None = None
+    """File for what is recovered; left out: the recording itself, once all is done."""
+    plugin: command.Plugins = ()
+
+
+def recover(argv: Sequence[str]) -> None:
+    """Mend a recording that has no end, because its flight was killed or its disk was full.
+
+    All that is whole is kept, the last second may be missing, and summary and index are made anew.
+    It does no harm to a recording that is whole: the file is replaced once the new one was read and
+    holds no fewer rows.
+    """
+    options = read(RecoverOptions(tyro.MISSING), argv, "skytether recover", recover.__doc__)
+    command.check_output("--out", options.out)
+    out = options.out or options.file
+    try:
+        with refused(options.file):
+            kept = recovered(options.file, out)
+    except OSError as error:
+        raise CommandError(f"{out}: cannot be written: {error.strerror}") from None
+    what = f"{kept.messages} messages of {kept.seconds:.1f} s"
+    print(f"{out}: kept {what}, left out {kept.lost_bytes} bytes")
+    print(f"rows that can be read: {kept.rows_before} before, {kept.rows} now")

@@ -1,0 +1,47 @@
+"""`skytether replay`: a recording, on the page that showed the flight."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from skytether.shared.base.errors import RecordingError
+from skytether.shell import command
+from skytether.shell.command import CommandError
+from skytether.shell.options import read
+from skytether.view.browser.access import HOST_PORT
+from skytether.view.browser.flight import PageFlight
+from skytether.view.browser.replay import Player
+from skytether.view.browser.serve import until_told
+from skytether.view.recording import Recorded
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Options of `skytether replay`."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """The recording, as `fly --record FILE.mcap` makes it."""
+    page: str = HOST_PORT
+    """HOST:PORT to serve the page on; where that is taken, the next free port."""
+    plugin: command.Plugins = ()
+
+
+def replay(argv: Sequence[str]) -> None:
+    """Show a recorded flight in a browser, from any time and at any speed, until Ctrl-C."""
+    options = read(ReplayOptions(tyro.MISSING), argv, "skytether replay", replay.__doc__)
+    at = command.address("--page", options.page)
+    try:
+        with Recorded(options.file) as recorded:
+            frames = list(recorded.frames())
+    except OSError as error:
+        said = f"{options.file}: cannot be read: {error.strerror}"
+        raise CommandError(said, command.CONFIGURATION) from None
+    except RecordingError as error:
+        raise CommandError(str(error), command.CONFIGURATION) from None
+    flight = PageFlight()
+    with closing(Player([flight], [frames])) as player:
+        until_told(at, [flight], now_ns=player.now_ns, more=player.controls)

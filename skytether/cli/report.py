@@ -1,0 +1,43 @@
+"""`skytether report`: a recording as a page with figures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from skytether.cli import recordings
+from skytether.shared.base import files
+from skytether.shell import command
+from skytether.shell.command import CommandError
+from skytether.shell.options import read
+from skytether.view.report import page
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Options of `skytether report`."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """The recording (.mcap)."""
+    out: Path = Path("report.html")
+    """File for the page."""
+    plugin: command.Plugins = ()
+
+
+def report(argv: Sequence[str]) -> None:
+    """Write a page about a recorded flight that opens in any browser, offline.
+
+    It shows the path, what happened over time, the summary, the events and the scenario.
+    """
+    options = read(ReportOptions(tyro.MISSING), argv, "skytether report", report.__doc__)
+    command.check_output("--out", options.out)
+    with recordings.opened(options.file) as recorded:
+        summary = command.summary_rows(recorded.summary) if recorded.summary else []
+        written = page(recorded, summary)
+    try:
+        files.write(options.out, written.encode())
+    except OSError as error:
+        raise CommandError(f"{options.out}: cannot be written: {error.strerror}") from None
+    print(options.out)

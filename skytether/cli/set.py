@@ -1,0 +1,81 @@
+"""`skytether set`: change keys of a scenario while it is flown."""
+
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import tyro
+
+from skytether.shared.core.change import REQUEST_BYTES_MAX
+from skytether.shell.command import CONFIGURATION, CommandError
+from skytether.shell.control import Caller, ControlError
+from skytether.shell.options import read
+
+
+@dataclass(frozen=True)
+class SetOptions:
+    """Options of `skytether set`."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """The socket that server, netem or client were given as --control."""
+    changes: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="KEY=VALUE")]
+    """Keys and their values, as in network.uplink.loss=0.3; a value is TOML, or else a text."""
+
+
+def set_keys(argv: Sequence[str]) -> None:
+    """Give keys of a scenario other values while it is flown: all of them at once, or none.
+
+    Without any it lists the keys that may change there, and their present values. The exit code is
+    2 where nothing was changed because it cannot be, and 1 where nobody answers.
+    """
+    options = read(SetOptions(tyro.MISSING, ()), argv, "skytether set", set_keys.__doc__)
+    values = parsed(options.changes)
+    try:
+        caller = Caller(options.path)
+        try:
+            answer = caller.ask(values)
+        finally:
+            caller.close()
+    except ControlError as error:
+        raise CommandError(str(error)) from None
+    if answer.refused:
+        raise CommandError(f"{options.path}: {answer.refused}", CONFIGURATION)
+    for key, value in answer.values.items():
+        print(f"{key} = {msgspec.json.encode(value).decode()}")
+    for event in answer.changed:
+        print(event)
+
+
+def parsed(changes: Sequence[str]) -> dict[str, Any]:
+    """Values by key, of texts such as `control.epsilon=2`.
+
+    Raises:
+        CommandError: a text is none such, a key comes twice, or all are too long for a request.
+    """
+    values: dict[str, Any] = {}
+    for change in changes:
+        key, equals, text = change.partition("=")
+        key = key.strip()
+        if not (key and equals):
+            raise CommandError(f"got {change!r}, expected KEY=VALUE", CONFIGURATION)
+        if key in values:
+            raise CommandError(f"{key}: got two values, expected one", CONFIGURATION)
+        values[key] = value(text.strip())
+    size = len(msgspec.json.encode(values))
+    if size > REQUEST_BYTES_MAX:
+        expected = f"expected at most {REQUEST_BYTES_MAX} B at a time"
+        raise CommandError(f"got {size} B of keys and values, {expected}", CONFIGURATION)
+    return values
+
+
+def value(text: str) -> Any:
+    """What a text is in TOML, as far as JSON knows it, too; any other is itself."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+        return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text
+    except (ValueError, RecursionError, TypeError):
+        return text

@@ -1,0 +1,36 @@
+"""Colours of modes and of what is said of a flight: the same on the page and in a report."""
+
+from collections.abc import Mapping
+
+from skytether.shared.wire.protocol import Mode
+
+Rgb = tuple[int, int, int]
+"""Red, green and blue, each 0 … 255."""
+
+GREY, GREEN, AMBER, RED, BLUE, VIOLET = "grey", "green", "amber", "red", "blue", "violet"
+PALETTE: Mapping[str, Rgb] = {
+    GREY: (134, 142, 150),
+    GREEN: (55, 178, 77),
+    AMBER: (245, 159, 0),
+    RED: (240, 62, 62),
+    BLUE: (34, 139, 230),
+    VIOLET: (132, 94, 247),
+}
+"""Each colour, by its name."""
+MODE_COLOURS: Mapping[Mode, str] = {
+    Mode.INIT: GREY,
+    Mode.SYNC: GREY,
+    Mode.READY: GREY,
+    Mode.TRACK: GREEN,
+    Mode.COAST: AMBER,
+    Mode.BRAKE: RED,
+    Mode.HOVER: BLUE,
+    Mode.LAND: VIOLET,
+    Mode.FAULT: RED,
+}
+"""Name of the colour of each mode."""
+
+
+def css(rgb: Rgb) -> str:
+    """A colour as `#rrggbb`."""
+    return f"#{bytes(rgb).hex()}"

@@ -1,0 +1,137 @@
+"""Pictures of flights, and of a fleet."""
+
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from skytether.shared.base import files
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record, Rows
+from skytether.shared.telemetry.summary import desired, position_error
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMATS = (".png", ".pdf", ".svg")
+"""Suffixes of files that a picture can be written to."""
+
+
+def check(path: Path) -> None:
+    """Refuse a file that is none of a picture, before anything is flown.
+
+    Raises:
+        ConfigError: with what would do.
+        ModuleNotFoundError: there is nothing to draw with.
+    """
+    if path.suffix not in FORMATS:
+        raise ConfigError(f"{path}: expected a file in {', '.join(FORMATS)}")
+    import_module("matplotlib.figure")
+
+
+def flights(path: Path, flown: Mapping[str, tuple[Scenario, Record]]) -> None:
+    """Write a picture of flights side by side to a file in one of FORMATS; see `drawn`."""
+    save(drawn(flown), path, dpi=130)
+
+
+def save(figure: "Figure", path: Path, *, dpi: int) -> None:
+    """Write a figure to a file in one of FORMATS.
+
+    Raises:
+        OSError: the file cannot be written, or is no plain one.
+    """
+    with files.create(path) as file:
+        figure.savefig(file, format=path.suffix[1:], dpi=dpi)
+
+
+def drawn(flown: Mapping[str, tuple[Scenario, Record]]) -> "Figure":
+    """Flights side by side: the path over the reference, and below it when packets went up.
+
+    Args:
+        flown: scenario and record of each flight, by title.
+    """
+    from matplotlib.figure import Figure  # takes half a second to import
+
+    figure = Figure(figsize=(5.2 * len(flown), 5.6), layout="constrained")
+    grid = figure.subplots(
+        2, len(flown), squeeze=False, sharex="row", sharey="row", height_ratios=(6, 1)
+    )
+    for (title, (scenario, flight)), (plane, events) in zip(flown.items(), grid.T, strict=True):
+        dt = scenario.control.dt
+        position = flight.client["state"][..., 0]
+        draw_reference(plane, scenario, flight.client, flight.server)
+        plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
+        plane.plot(position[0, 0], position[0, 1], "ko", markersize=4, label="start")
+        plane.set_title(title, fontsize=10)
+        plane.set_xlabel("x [m]")
+        plane.set_aspect("equal", adjustable="box")
+        plane.grid(alpha=0.3)
+        sent = flight.server["event"]
+        ratio = float(np.mean(sent)) if len(sent) else 0.0
+        events.vlines(flight.server["step"][sent] * dt, 0.0, 1.0, color="k", linewidth=0.6)
+        events.set_xlabel(f"time [s]; sent at {ratio:.0%} of the steps")
+        events.set_yticks([])
+    grid[0, 0].set_ylabel("y [m]")
+    grid[0, 0].legend(loc="upper right", fontsize=8)
+    grid[1, 0].set_ylabel("sent")
+    return figure
+
+
+def draw_reference(
+    plane: Any, scenario: Scenario, client: Rows, server: Rows | None = None
+) -> None:
+    """Draw the reference, red and dashed, over the steps of a vehicle.
+
+    A closed curve is drawn for one round only, so that the dashes of the next do not fill its gaps.
+
+    Args:
+        client: rows of the vehicle.
+        server: rows of the server, which alone knows where a live point was.
+    """
+    if scenario.reference.shape in ("circle", "figure-eight", "square"):
+        time_s = client["step"] * scenario.control.dt
+        client = client[time_s - time_s[:1] <= scenario.reference.period_s]
+    x, y = desired(scenario, client, server)[:, :2].T
+    plane.plot(x, y, "r--", label="reference")
+
+
+def fleet(
+    path: Path, title: str, scenario: Scenario, client: Rows, server: Rows | None = None
+) -> None:
+    """Draw a fleet: all paths over the reference, and how the tracking error spreads.
+
+    Args:
+        path: file to write, in one of FORMATS.
+        client: rows of all vehicles' records.
+        server: rows of the server, which alone knows where a live point was.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.4, 4.8), layout="constrained")
+    plane, spread = figure.subplots(1, 2)
+    flights = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
+    for rows in flights:
+        x, y = rows["state"][:, :2, 0].T
+        plane.plot(x, y, "k-", linewidth=0.6, alpha=max(0.05, 1 / len(flights)))
+    draw_reference(plane, scenario, max(flights, key=len), server)
+    plane.set_aspect("equal", adjustable="datalim")
+    plane.set_xlabel("x [m]")
+    plane.set_ylabel("y [m]")
+    plane.legend(loc="upper right", fontsize=8)
+    settled = [rows[rows["step"] * scenario.control.dt >= scenario.settled_s] for rows in flights]
+    errors = [
+        np.sqrt((position_error(scenario, rows, server)[:, :2] ** 2).sum(axis=1).mean())
+        for rows in settled
+        if len(rows)
+    ]
+    known = np.array(errors)[np.isfinite(errors)]
+    spread.hist(known, bins=max(5, round(np.sqrt(len(known)))), color="0.4")
+    spread.set_xlabel("RMSE xy of a vehicle [m]")
+    spread.set_ylabel("vehicles")
+    for axes in (plane, spread):
+        axes.grid(alpha=0.3)
+    figure.suptitle(title, fontsize=10)
+    save(figure, path, dpi=130)

@@ -1,0 +1,184 @@
+"""Processes of a flight as children: started, heard, killed and stopped; none outlives a stack."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import Counted, Event, Listening, address_text
+from skytether.shared.scenario.reading import to_toml
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire import keys
+from skytether.shell.log import LogLine, line_of
+from skytether.shell.workers import die_with_parent
+
+HOST = "127.0.0.1"
+PATIENCE_S = 60.0
+"""Longest time to wait for what a process is to say [s]: it may have to compile first."""
+
+
+class ChildProcess:
+    """A process of a flight, from its start to its end.
+
+    Args:
+        stack: kills the process at its end, whatever it does then.
+        name: module to run: server, netem or client.
+        arguments: its command line, beside `--log json`.
+        python: what runs it.
+    """
+
+    def __init__(
+        self, stack: ExitStack, name: str, *arguments: str, python: str = sys.executable
+    ) -> None:
+        self.name = name
+        # -P: a folder called like one of ours, where the user happens to be, is not ours.
+        command = [python, "-P", "-m", f"skytether.{name}", *arguments, "--log", "json"]
+        self.process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            preexec_fn=die_with_parent,  # noqa: PLW1509 - one call of the kernel, which takes no lock
+        )
+        stack.callback(self.kill)
+        self.lines: list[LogLine] = []
+        """What it has said, as events."""
+        self.words: list[str] = []
+        """What else it has printed."""
+        self._heard = threading.Condition()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as said:
+            for text in said:
+                line = line_of(text)
+                if line is None:
+                    self.words.append(text.decode(errors="replace").rstrip())
+                    continue
+                with self._heard:
+                    self.lines.append(line)
+                    self._heard.notify_all()
+
+    def wait_for(self, kind: type[Event], count: int = 1) -> LogLine:
+        """The line of the event of a kind that comes as number `count`, waited for.
+
+        Raises:
+            TimeoutError: it has not come; the message has what the process printed last.
+        """
+        with self._heard:
+            if not self._heard.wait_for(lambda: len(self.all(kind)) >= count, PATIENCE_S):
+                said = [*self.words, *(str(line.event) for line in self.lines)][-3:]
+                raise TimeoutError(f"{self.name} says no {kind.__name__}, but {said}")
+            return self.all(kind)[count - 1]
+
+    def all(self, kind: type[Event]) -> list[LogLine]:
+        """All lines so far that are about events of a kind."""
+        return [line for line in self.lines if isinstance(line.event, kind)]
+
+    @property
+    def address(self) -> Address:
+        """Address that it listens on, waited for."""
+        event = self.wait_for(Listening).event
+        assert isinstance(event, Listening)
+        return event.host, event.port
+
+    def listening_ns(self) -> int:
+        """Time from which it has listened [ns; CLOCK_MONOTONIC], waited for."""
+        return self.wait_for(Listening).time_ns
+
+    def figures(self) -> dict[str, Any]:
+        """What it has counted so far, as it says when it is asked."""
+        count = len(self.all(Counted)) + 1
+        self.process.send_signal(signal.SIGUSR1)
+        event = self.wait_for(Counted, count).event
+        assert isinstance(event, Counted)
+        return event.figures
+
+    def kill(self) -> int:
+        """End it with SIGKILL, and wait until it is gone; returns the time of the kill [ns]."""
+        killed_ns = time.monotonic_ns()
+        self.process.kill()
+        self.process.wait()
+        self._reader.join()
+        return killed_ns
+
+    def stop(self) -> int:
+        """Let it end in order; returns its exit code."""
+        with contextlib.suppress(ProcessLookupError):
+            self.process.terminate()
+        code = self.process.wait(PATIENCE_S)
+        self._reader.join()
+        return code
+
+    def freeze(self, seconds: float) -> tuple[int, int]:
+        """Stop it with SIGSTOP for some time; returns when it began and ended [ns]."""
+        began_ns = time.monotonic_ns()
+        self.process.send_signal(signal.SIGSTOP)
+        try:
+            time.sleep(seconds)
+        finally:
+            ended_ns = time.monotonic_ns()
+            self.process.send_signal(signal.SIGCONT)
+        return began_ns, ended_ns
+
+    def cpu_s(self) -> float:
+        """CPU time that it has used [s]."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def resident_bytes(self) -> int:
+        """Memory that it occupies [B]."""
+        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+class Lab:
+    """Server, netem and clients of one scenario, with keys, on loopback.
+
+    Args:
+        stack: ends whatever is still alive.
+        folder: for the scenario, the keys and the records.
+        scenario: what they fly.
+        vehicles: numbers of the vehicles that have a key.
+    """
+
+    def __init__(
+        self, stack: ExitStack, folder: Path, scenario: Scenario, vehicles: Iterable[int] = (1,)
+    ) -> None:
+        self._stack = stack
+        self.folder = folder
+        self._file = folder / "scenario.toml"
+        self._file.write_bytes(to_toml(scenario))
+        self.key_file = folder / "keys"
+        self.key_file.touch(mode=0o600)
+        secrets = [(vehicle, os.urandom(keys.SECRET_BYTES)) for vehicle in vehicles]
+        self.key_file.write_text("".join(keys.write(vehicle, 1, it) for vehicle, it in secrets))
+
+    def server(self, bind: Address = (HOST, 0), *more: str) -> ChildProcess:
+        """A server."""
+        return self._start("server", "--bind", address_text(*bind), *self._keys(), *more)
+
+    def netem(self, server: Address, bind: Address = (HOST, 0), *, seed: int = 1) -> ChildProcess:
+        """A network of its own chance in front of a server."""
+        arguments = ("--bind", address_text(*bind), "--server", address_text(*server))
+        return self._start("netem", *arguments, "--seed", str(seed))
+
+    def client(self, server: Address, record: Path, vehicle: int = 1, *more: str) -> ChildProcess:
+        """A vehicle that records its flight."""
+        arguments = ("--server", address_text(*server), "--id", str(vehicle))
+        return self._start("client", *arguments, *self._keys(), "--record", str(record), *more)
+
+    def _keys(self) -> tuple[str, str]:
+        return "--keys", str(self.key_file)
+
+    def _start(self, name: str, *arguments: str) -> ChildProcess:
+        return ChildProcess(self._stack, name, str(self._file), *arguments)

@@ -1,0 +1,156 @@
+"""The problems of the benchmarks: recorded in flight, in the order of the flight."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from skytether.server.control import planner
+from skytether.server.control.exact import ExactSolver
+from skytether.server.control.mpc import FIRST, Problem, gradient, lead
+from skytether.server.control.planner import GENERATOR, TRACKER
+from skytether.server.control.solver import Solver
+from skytether.shared.law.model import Array, Flags
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.sim.flight import fly
+
+
+def derive(name: str, **sections: Any) -> Scenario:
+    """A scenario that comes with Skytether, with some keys changed: `control={"dt": 0.02}`."""
+    table = reading.to_table(reading.load(name))
+    for key, value in sections.items():
+        table[key] = {**table[key], **value} if isinstance(value, dict) else value
+    return reading.check(table, "a benchmark")
+
+
+def gradients(
+    problem: Problem, x: Array, target: Array, previous: Array, disturbance: Array
+) -> Array:
+    """Gradient g of the QPs of n vehicles; shape (n, axes, H).
+
+    Args:
+        problem: what poses them.
+        x: state at stage 0 [m, m/s]; shape (n, axes, 2).
+        target: desired states at the stages 0 … H [m, m/s]; shape (n, axes, H + 1, 2).
+        previous: horizon before, as seen now [m/s]; shape (n, axes, H).
+        disturbance: what is added to every input on its way [m/s]; shape (n, axes).
+    """
+    mpc, which, found = problem.mpc, problem.which, np.empty(previous.shape)
+    drift, fresh = np.empty((previous.shape[2], 2)), problem.which == FIRST
+    for at in np.ndindex(*previous.shape[:2]):
+        start, w, axis = (float(x[at][0]), float(x[at][1])), float(disturbance[at]), at[1]
+        lead(mpc, axis, start, w, target[at], drift)
+        gradient(mpc, axis, which, w, target[at], previous[at], 0, fresh, drift, found[at])
+    return found
+
+
+def saturated(inputs: Array, problem: Problem) -> float:
+    """Share of the axis problems that have an input at its bound, in inputs (..., axes, H)."""
+    return float((np.abs(inputs) >= problem.mpc.bounds[:, None]).any(axis=-1).mean())
+
+
+@dataclass(frozen=True)
+class RecordedProblems:
+    """The QPs of one vehicle's flight; two a tick, the generator's and the tracker's."""
+
+    problem: Problem
+    """What they have in common."""
+    gradient: Array
+    """Gradients of the QPs; shape (2, ticks, axes, H)."""
+    guess: Array
+    """The shifted horizon of the step before [m/s]; shape (2, ticks, axes, H)."""
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks."""
+        return self.gradient.shape[1]
+
+    def active(self) -> float:
+        """Share of the axis problems that have an input at its bound."""
+        flat = self.gradient.reshape(-1, *self.gradient.shape[2:])
+        inputs, _ = ExactSolver(self.problem).solve(flat, np.zeros_like(flat))
+        return saturated(inputs, self.problem)
+
+
+class Listener:
+    """An exact solver that notes what generator and tracker ask it by turns."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._solver = ExactSolver(problem)
+        self.problem = problem
+        self._asked: list[tuple[Array, Array]] = []
+
+    def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
+        """Note the problems and solve them (see `Solver`)."""
+        self._asked.append((gradient, guess))
+        return self._solver.solve(gradient, guess)
+
+    def heard(self, turns: int = 0) -> tuple[Array, Array]:
+        """Gradients and guesses of the last turns, or all; each of shape (2, problems, axes, H).
+
+        The generator's come first, then the tracker's.
+        """
+        asked = self._asked[-2 * turns :]
+        halves = [asked[half::2] for half in (GENERATOR, TRACKER)]
+        gradient, guess = (
+            np.array([np.concatenate([pair[i] for pair in half]) for half in halves])
+            for i in range(2)
+        )
+        return gradient, guess
+
+    def forget(self) -> None:
+        """Forget what was asked."""
+        self._asked.clear()
+
+
+class ByTurns:
+    """Two solvers, one for the generator and one for the tracker: each keeps its warm start."""
+
+    def __init__(self, make: Callable[[Problem], Solver], problem: Problem) -> None:
+        self._next, self._other = make(problem), make(problem)
+
+    def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
+        """Let the one whose turn it is solve (see `Solver`)."""
+        solver = self._next
+        self._next, self._other = self._other, solver
+        return solver.solve(gradient, guess)
+
+
+@contextmanager
+def solving(make: Callable[[Problem], Solver]) -> Iterator[None]:
+    """Planners made meanwhile solve by `make(problem)`, whatever their scenario says."""
+
+    def make_solver(control: ControlConfig, problem: Problem) -> Solver:  # noqa: ARG001
+        return make(problem)
+
+    with patch.object(planner, "make_solver", make_solver):
+        yield
+
+
+@contextmanager
+def listening() -> Iterator[list[Listener]]:
+    """Planners made meanwhile solve exactly, and are listened to.
+
+    Gives the listener to first steps and the one to later steps.
+    """
+    listeners: list[Listener] = []
+
+    def make(problem: Problem) -> Solver:
+        listeners.append(Listener(problem))
+        return listeners[-1]
+
+    with solving(make):
+        yield listeners
+
+
+def record(scenario: Scenario, ticks: int) -> RecordedProblems:
+    """Fly a scenario in virtual time and keep the QPs of its last ticks."""
+    with listening() as listeners:
+        flight = fly(scenario)
+    assert len(flight.client), flight.failure
+    _, later = listeners
+    return RecordedProblems(later.problem, *later.heard(ticks))

@@ -1,0 +1,79 @@
+"""The right answers: found by others' algorithms, then proved optimal.
+
+quadprog (or, where it is not installed, bounded least squares of scipy) says which inputs are at
+their bound. With these fixed, a dense Cholesky factor gives the others, and the conditions of
+optimality are checked: every free input within the box, and no multiplier of the wrong sign.
+"""
+
+from importlib.util import find_spec
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import lsq_linear
+
+from skytether.shared.law.model import Array
+
+AT_BOUND = 1e-7
+"""Distance from its bound within which an input counts as at it, before it is proved [m/s]."""
+ROUNDS_MAX = 10
+"""Number of times that this may turn out to be wrong."""
+ROUNDING = 1e-11
+"""Rounding error of a multiplier relative to the gradient, and of an input to its bound."""
+
+
+class NoReference(Exception):
+    """Error: no answer was found that is proved optimal."""
+
+
+class Reference:
+    """Exact inputs of box-constrained QPs of one Hessian.
+
+    Args:
+        hessian: shape (H, H).
+        bound: of every input [m/s].
+    """
+
+    def __init__(self, hessian: Array, bound: float) -> None:
+        self._hessian, self._bound = hessian, bound
+        self._root = np.linalg.cholesky(hessian).T
+        self._factor = np.linalg.inv(self._root)
+        H = len(hessian)
+        self._rows, self._limits = np.hstack([np.eye(H), -np.eye(H)]), np.full(2 * H, -bound)
+
+    def solve(self, gradient: Array) -> Array:
+        """The optimal inputs, right to rounding [m/s]; gradient of shape (H,).
+
+        Raises:
+            NoReference: none could be proved.
+        """
+        first = self._first(gradient)
+        near = self._bound - AT_BOUND
+        side = np.where(first >= near, 1.0, np.where(first <= -near, -1.0, 0.0))
+        for _ in range(ROUNDS_MAX):
+            inputs = self._polish(side, gradient)
+            slope = self._hessian @ inputs + gradient
+            small = ROUNDING * (1.0 + np.abs(gradient).max())
+            outside = np.abs(inputs) > self._bound * (1.0 + ROUNDING)
+            inward = side * slope > small
+            if not (outside | inward).any():
+                return np.clip(inputs, -self._bound, self._bound)
+            side = np.where(outside, np.sign(inputs), np.where(inward, 0.0, side))
+        raise NoReference
+
+    def _first(self, gradient: Array) -> Array:
+        if find_spec("quadprog"):
+            import quadprog
+
+            given = (self._factor, -gradient, self._rows, self._limits, 0, True)
+            return quadprog.solve_qp(*given)[0]
+        aim = -np.linalg.solve(self._root.T, gradient)
+        return lsq_linear(self._root, aim, (-self._bound, self._bound), "bvls", tol=1e-15).x
+
+    def _polish(self, side: Array, gradient: Array) -> Array:
+        """The best inputs with those at a side fixed to their bound; shape (H,)."""
+        inputs, free = side * self._bound, side == 0.0
+        if free.any():
+            toward = -gradient[free] - self._hessian[np.ix_(free, ~free)] @ inputs[~free]
+            factor = cho_factor(self._hessian[np.ix_(free, free)])
+            inputs[free] = cho_solve(factor, toward)
+        return inputs

@@ -1,0 +1,451 @@
+"""Restarts under way: server, netem and client are killed and stopped in a flight over real UDP.
+
+A vehicle flies the demonstration's figure eight, sealed, over a network of 30 to 50 ms each way
+that loses 5 % of the packets. Again and again one of the three processes is killed with SIGKILL
+and started anew, at once or after 3 s in which nothing listens at its port, or it is stopped with
+SIGSTOP for 3 s. What the vehicle made of it is read from its own record.
+
+Speed is held against the braking curve from the step at which the vehicle brakes, and from 1.2 s
+after the process was gone at the latest: 1 s of silence makes it brake, and 0.2 s are for packets
+still under way and for the step that has begun. With v the speed commanded at that step and
+a = `vehicle.brake_mps2`,
+
+    commanded   b(t) = max(0, v - a t)
+    true        τ ds/dt = b(t) - s,   s(0) = the true speed at that step
+
+The vehicle follows its command with the lag τ, and each axis alike, so that its speed is at most
+the lag of the commanded one; in still air, as it is here, nothing else moves it. A curve without
+the lag would ask for what no braking could do. It holds until the first horizon that was made after
+the process was back: from there on it flies again. A vehicle whose own process was stopped brakes
+when that wakes, which its time counts from; one that was killed begins a new life, at rest, and has
+to stay there until it flies.
+"""
+
+import math
+import tempfile
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.figures.flights import save
+from skytether.lab.benchmarks.children import HOST, ChildProcess, Lab
+from skytether.lab.benchmarks.harness import Lateness, TextTable, progress
+from skytether.lab.benchmarks.problems import derive
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import Flying, ModeChanged
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import record
+from skytether.shared.telemetry.record import Rows
+from skytether.shared.wire.protocol import Mode
+
+FIGURE = Path(__file__).parents[3] / "docs" / "restarts.png"
+DOWN_S = 3.0
+"""Time for which nothing listens, or a process is stopped [s]."""
+BRAKES_S = 1.2
+"""Target for the time from an outage to braking [s]."""
+RETURNS_S = 3.0
+"""Target for the time from the return of a process to flying again [s]."""
+ROUNDING_MPS = 1e-6
+"""Speed by which arithmetic alone may leave a curve [m/s]."""
+
+Subject = Literal["server", "netem", "client"]
+Way = Literal["killed", "killed, nothing listens for 3 s", "stopped for 3 s"]
+SUBJECTS: tuple[Subject, ...] = ("server", "netem", "client")
+WAYS: tuple[Way, Way, Way] = ("killed", "killed, nothing listens for 3 s", "stopped for 3 s")
+KILLED, CLOSED, STOPPED = WAYS
+
+
+@dataclass(frozen=True)
+class RestartsCounts:
+    """How often to do what, to each of the processes."""
+
+    kills: int
+    """Number of kills; every other one leaves the port closed for 3 s."""
+    stops: int
+    """Number of times that it is stopped."""
+    flight_s: float
+    """Least time of flight between two of them [s]."""
+    subjects: tuple[Subject, ...] = SUBJECTS
+    """What is killed and stopped."""
+
+
+FULL, QUICK = (
+    RestartsCounts(kills=50, stops=10, flight_s=5.0),
+    RestartsCounts(kills=1, stops=0, flight_s=4.0),
+)
+
+
+class Outage(NamedTuple):
+    """What was done to a process."""
+
+    subject: Subject
+    way: Way
+    began_ns: int
+    """Time at which it was killed or stopped."""
+    back_ns: int
+    """Time from which it listened again."""
+
+
+@dataclass(frozen=True)
+class ProcessLife:
+    """Record of one life of the vehicle."""
+
+    time_ns: NDArray[np.int64]
+    """Time at which each row's step begins; shape (n,)."""
+    commanded: Array
+    """Commanded speed from there on [m/s]; shape (n,)."""
+    speed: Array
+    """True speed [m/s]; shape (n,)."""
+    off_m: Array
+    """Distance from the reference [m]; shape (n,)."""
+    in_force: NDArray[np.int64]
+    """Step that the horizon was made for, -1 for none; shape (n,)."""
+    mode: NDArray[np.uint8]
+    """What the vehicle does, a `Mode`; shape (n,)."""
+
+    @classmethod
+    def of(cls, rows: Rows, epoch_ns: int, scenario: Scenario) -> "ProcessLife":
+        """Life of a record whose step 0 began at the epoch."""
+        state = rows["state"]
+        reference = scenario.make_reference()(rows["step"] * scenario.control.dt)
+        return cls(
+            epoch_ns + rows["step"] * scenario.dt_ns,
+            np.linalg.norm(rows["input"], axis=1),
+            np.linalg.norm(state[:, :, 1], axis=1),
+            np.linalg.norm((state - reference)[:, :2, 0], axis=1),
+            rows["in_force"],
+            rows["mode"],
+        )
+
+
+@dataclass(frozen=True)
+class RestartVerdict:
+    """What the vehicle made of an outage; what does not apply is None."""
+
+    subject: Subject
+    way: Way
+    down_s: float
+    """Time for which the process was gone [s]."""
+    brakes_s: float | None
+    """Time to braking [s]; None where the process was back before."""
+    over_commanded_mps: float | None
+    """Most by which the commanded speed was over its curve, less than 0 below it [m/s]."""
+    over_true_mps: float | None
+    """Most by which the true speed was over its curve [m/s]."""
+    flies_s: float
+    """Time from the return to flying again [s]; infinite where it never did."""
+    on_path_s: float
+    """Time from the return until it was within half a metre of the reference [s]."""
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether it meets its targets."""
+        over = (self.over_commanded_mps, self.over_true_mps)
+        braked = self.brakes_s is None or self.brakes_s <= BRAKES_S
+        return (
+            braked
+            and all(each is None or each <= ROUNDING_MPS for each in over)
+            and self.flies_s <= RETURNS_S
+        )
+
+
+def scenario() -> Scenario:
+    """The demonstration in still air, on a network of our own, for as long as it takes."""
+    way = {"delay": "poisson", "minimum_s": 0.03, "slot_s": 0.005, "slots_mean": 1.0, "loss": 0.05}
+    return derive(
+        "demo",
+        duration=7200.0,
+        vehicle={"wind": 0.0},
+        network={"uplink": way, "downlink": way},
+    )
+
+
+def schedule(counts: RestartsCounts) -> list[tuple[Subject, Way]]:
+    """What is done, in order: the processes take turns."""
+    kills: list[tuple[Subject, Way]] = [
+        (subject, CLOSED if number % 2 else KILLED)
+        for number in range(counts.kills)
+        for subject in counts.subjects
+    ]
+    stops: list[tuple[Subject, Way]] = [
+        (subject, STOPPED) for _ in range(counts.stops) for subject in counts.subjects
+    ]
+    return [*kills, *stops]
+
+
+class Processes:
+    """Server, netem and a vehicle, each of which can be taken away.
+
+    Args:
+        stack: ends them.
+        folder: for their files.
+    """
+
+    def __init__(self, stack: ExitStack, folder: Path) -> None:
+        self._lab = Lab(stack, folder, scenario())
+        self._folder = folder
+        self._lives = 0
+        self._parts: list[tuple[Path, ChildProcess]] = []
+        """Record and process of each life of the vehicle."""
+        self._children = {"server": self._lab.server()}
+        self._addresses = {"server": self._children["server"].address}
+        self._children["netem"] = self._start("netem")
+        self._addresses["netem"] = self._children["netem"].address
+        self._children["client"] = self._start("client")
+        self.wait_for_flight()
+
+    def _start(self, subject: str) -> ChildProcess:
+        """The process anew, at the address that it had."""
+        self._lives += 1
+        addresses = self._addresses
+        match subject:
+            case "server":
+                return self._lab.server(addresses["server"])
+            case "netem":
+                bind = addresses.get("netem", (HOST, 0))
+                return self._lab.netem(addresses["server"], bind, seed=self._lives)
+        part = self._folder / f"client.{self._lives}"
+        child = self._lab.client(addresses["netem"], part)
+        self._parts.append((part, child))
+        return child
+
+    def suffer(self, subject: Subject, way: Way) -> Outage:
+        """Take a process away, and give it back."""
+        child = self._children[subject]
+        if way == STOPPED:
+            return Outage(subject, way, *child.freeze(DOWN_S))
+        began_ns = child.kill()
+        if way == CLOSED:
+            time.sleep(DOWN_S)
+        child = self._children[subject] = self._start(subject)
+        return Outage(subject, way, began_ns, child.listening_ns())
+
+    def wait_for_flight(self) -> None:
+        """Wait until the vehicle says that it flies a plan, unless it does so already."""
+        client = self._children["client"]
+        while True:
+            told = [line.event for line in client.all(ModeChanged)]
+            if told and getattr(told[-1], "after", None) == str(Mode.TRACK):
+                return
+            client.wait_for(ModeChanged, len(told) + 1)
+
+    def end(self) -> list[ProcessLife]:
+        """All lives of the vehicle that flew, in order."""
+        self._children["client"].stop()
+        flown = scenario()
+        lives = []
+        for part, child in self._parts:
+            if flying := child.all(Flying):
+                lives.append(ProcessLife.of(record.read(part), flying[0].time_ns, flown))
+        return lives
+
+
+def judge(outage: Outage, lives: Sequence[ProcessLife], scenario: Scenario) -> RestartVerdict:
+    """What the record says of an outage."""
+    life = _life(outage, lives)
+    died = outage.subject == "client" and outage.way != STOPPED
+    # A vehicle that was asleep can brake when it wakes, and no sooner.
+    zero_ns = outage.back_ns if outage.subject == "client" else outage.began_ns
+    time_s = (life.time_ns - zero_ns) / SECOND_NS
+    known = life.in_force[life.time_ns < outage.back_ns].max(initial=-1)
+    after = life.time_ns >= outage.back_ns
+    resumed = _first(after & (life.mode == Mode.TRACK) & (life.in_force > known))
+    on_path = _first(np.arange(len(after)) >= resumed) if resumed < len(after) else resumed
+    on_path += _first(life.off_m[on_path:] < 0.5)
+    braking = _first((time_s >= 0.0) & (life.mode == Mode.BRAKE)) if not died else len(after)
+    begins = 0 if died else min(braking, _first(time_s >= BRAKES_S))
+    over: tuple[float | None, float | None] = None, None
+    if begins < resumed:
+        over = _over(life, slice(begins, resumed), scenario)
+    back_s = (life.time_ns - outage.back_ns) / SECOND_NS
+    return RestartVerdict(
+        outage.subject,
+        outage.way,
+        (outage.back_ns - outage.began_ns) / SECOND_NS,
+        float(time_s[braking]) if braking < resumed else None,
+        *over,
+        _at(back_s, resumed),
+        _at(back_s, on_path),
+    )
+
+
+def _life(outage: Outage, lives: Sequence[ProcessLife]) -> ProcessLife:
+    """The life that goes on, or begins, after an outage."""
+    for life in lives:
+        if life.time_ns[-1] > outage.back_ns:
+            return life
+    return lives[-1]
+
+
+def _first(which: NDArray[np.bool_]) -> int:
+    """Index of the first that is true; their number without any."""
+    return int(which.argmax()) if which.any() else len(which)
+
+
+def _at(values: Array, index: int) -> float:
+    return float(values[index]) if index < len(values) else math.inf
+
+
+def _over(life: ProcessLife, rows: slice, scenario: Scenario) -> tuple[float, float]:
+    """Most by which commanded and true speed are over their curves [m/s]."""
+    time_ns, commanded, speed = life.time_ns[rows], life.commanded[rows], life.speed[rows]
+    since_s = (time_ns - time_ns[0]) / SECOND_NS
+    curve, lagged = curves(float(commanded[0]), float(speed[0]), since_s, scenario)
+    return float((commanded - curve).max()), float((speed - lagged).max())
+
+
+def curves(
+    commanded: float, speed: float, since_s: Array, scenario: Scenario
+) -> tuple[Array, Array]:
+    """The curves of commanded and true speed [m/s].
+
+    Args:
+        commanded: v, the commanded speed at the first time [m/s].
+        speed: the true one [m/s].
+        since_s: times at which steps begin, the first of them 0 [s]; shape (n,).
+    """
+    curve = np.maximum(0.0, commanded - scenario.vehicle.brake_mps2 * since_s)
+    tau_s, lagged = float(scenario.true_tau_s.max()), np.empty_like(curve)
+    lagged[0] = speed
+    for i, passed_s in enumerate(np.diff(since_s)):
+        # Between two steps the command stays.
+        lagged[i + 1] = curve[i] + (lagged[i] - curve[i]) * math.exp(-passed_s / tau_s)
+    return curve, lagged
+
+
+def measure(counts: RestartsCounts) -> dict[str, Any]:
+    """What the vehicle made of every outage, and its speed around each."""
+    lateness, rng, outages = Lateness(), np.random.default_rng(1), []
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-"))
+        flight = Processes(stack, Path(folder))
+        for subject, way in progress(schedule(counts), "restarts"):
+            lateness.sleep(counts.flight_s + float(rng.random()))
+            outages.append(flight.suffer(subject, way))
+            flight.wait_for_flight()
+        lateness.sleep(counts.flight_s)
+        lives = flight.end()
+    flown = scenario()
+    return {
+        "verdicts": [asdict(judge(outage, lives, flown)) for outage in outages],
+        "traces": [trace(outage, lives) for outage in outages if outage.way in (KILLED, CLOSED)],
+        "wake": lateness.figures(),
+    }
+
+
+AROUND_S = (-1.0, 8.0)
+"""Time around an outage that is drawn [s]."""
+
+
+def trace(outage: Outage, lives: Sequence[ProcessLife]) -> dict[str, Any]:
+    """Speeds around an outage, rounded, for the figure."""
+    begin_ns, end_ns = (outage.began_ns + round(at_s * SECOND_NS) for at_s in AROUND_S)
+    runs = []
+    for life in lives:
+        here = (life.time_ns >= begin_ns) & (life.time_ns < end_ns)
+        if here.any():
+            time_s = (life.time_ns[here] - outage.began_ns) / SECOND_NS
+            shown = (time_s, life.commanded[here], life.speed[here])
+            runs.append([np.round(each, 3).tolist() for each in shown])
+    down_s = (outage.back_ns - outage.began_ns) / SECOND_NS
+    return {"subject": outage.subject, "way": outage.way, "down_s": down_s, "runs": runs}
+
+
+def verdicts_of(result: Mapping[str, Any]) -> list[RestartVerdict]:
+    """Verdicts in the figures of `measure`."""
+    return [RestartVerdict(**each) for each in result["verdicts"]]
+
+
+def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
+    """Table with a row for each process and each way of taking it away."""
+    headings = ["process", "times", "gone\n[s]", f"brakes [s]\n(≤ {BRAKES_S:g})", "\nworst"]
+    headings += ["over curve\n[m/s]", "\ntrue", f"flies [s]\n(≤ {RETURNS_S:g})", "\nworst"]
+    headings += ["within\n0.5 m [s]", "\nworst", "out-\nside"]
+    rows, verdicts = [], verdicts_of(result)
+    for subject in SUBJECTS:
+        for way in WAYS:
+            those = [each for each in verdicts if (each.subject, each.way) == (subject, way)]
+            if those:
+                rows.append([f"{subject} {way}", *_row(those)])
+    return {"restarts": TextTable(headings, rows)}
+
+
+def _row(those: Sequence[RestartVerdict]) -> list[str]:
+    over = [
+        _worst((getattr(each, name) for each in those), ".3f")
+        for name in ("over_commanded_mps", "over_true_mps")
+    ]
+    return [
+        str(len(those)),
+        f"{np.median([each.down_s for each in those]):.2f}",
+        *_both(each.brakes_s for each in those),
+        *over,
+        *_both(each.flies_s for each in those),
+        *_both(each.on_path_s for each in those),
+        str(sum(not each.is_inside for each in those)),
+    ]
+
+
+def _both(values: Iterable[float | None]) -> list[str]:
+    """Median and largest of those that there are."""
+    known = [each for each in values if each is not None]
+    return [f"{np.median(known):.2f}", f"{max(known):.2f}"] if known else ["–", "–"]
+
+
+def _worst(values: Iterable[float | None], spec: str) -> str:
+    known = [each for each in values if each is not None]
+    return format(max(known), spec) if known else "–"
+
+
+def draw(result: Mapping[str, Any], path: Path = FIGURE) -> None:
+    """Draw the speeds around all kills over each other, a panel for each process."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 9.0), layout="constrained")
+    panels, flown = figure.subplots(len(SUBJECTS), 1, sharex=True, sharey=True), scenario()
+    colours: dict[str, str] = {KILLED: "#0072b2", CLOSED: "#c1272d"}
+    for subject, panel in zip(SUBJECTS, panels, strict=True):
+        those = [each for each in result["traces"] if each["subject"] == subject]
+        fastest = np.zeros(2)
+        for each in those:
+            style: Any = {"color": colours[each["way"]], "alpha": 0.35}
+            for time_s, commanded, speed in each["runs"]:
+                panel.step(time_s, commanded, where="post", linewidth=0.4, linestyle=":", **style)
+                panel.plot(time_s, speed, linewidth=0.7, **style)
+                flies = slice(*np.searchsorted(time_s, (0.0, BRAKES_S)).tolist())
+                for i, speeds in enumerate((commanded, speed)):
+                    fastest[i] = max(fastest[i], *speeds[flies], 0.0)
+            panel.plot(each["down_s"], 0.0, "|", color=colours[each["way"]], markersize=12)
+        if subject != "client":  # which is at rest when it begins anew
+            since_s = np.arange(0.0, AROUND_S[1] - BRAKES_S, flown.control.dt)
+            for curve, line in zip(
+                curves(fastest[0], fastest[1], since_s, flown), ("k--", "k-"), strict=True
+            ):
+                panel.plot(BRAKES_S + since_s, curve, line, linewidth=1.4)
+        panel.axvline(0.0, color="0.4", linewidth=0.8)
+        panel.set_title(f"{subject}, killed {len(those)} times", fontsize=10)
+        panel.set_ylabel("speed [m/s]")
+        panel.grid(alpha=0.3)
+    panels[-1].set_xlabel("time since the kill [s]; a tick at the bottom: it listens again")
+    panels[-1].set_xlim(*AROUND_S)
+    panels[0].legend(handles=_legend(colours), loc="upper right", fontsize=8, ncols=2)
+    save(figure, path, dpi=90)
+
+
+def _legend(colours: Mapping[str, str]) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    names = {KILLED: "true speed, restarted at once", CLOSED: "true speed, restarted after 3 s"}
+    return [
+        *(Line2D([], [], color=colours[way], label=name) for way, name in names.items()),
+        Line2D([], [], color="0.4", linestyle=":", label="commanded speed"),
+        Line2D([], [], color="k", linestyle="--", label="braking curve of the fastest, commanded"),
+        Line2D([], [], color="k", label="and true"),
+    ]

@@ -1,0 +1,86 @@
+"""What stands beside the contenders of a case: floors, and flights that need no network."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from skytether.lab import floor
+from skytether.lab.contenders import BESIDE, Plan
+from skytether.lab.journal import digests
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import UPLINK
+from skytether.shared.telemetry.summary import Summary
+from skytether.sim.flight import fly_batch
+
+PERIODS = (1, 3, 10, 30)
+"""Steps between two packets at which the floor is drawn."""
+RUNS = 4
+"""Number of flights for a point of the floor."""
+
+
+class Floor(msgspec.Struct, frozen=True):
+    """A point of a floor, for packets that are sent by a clock."""
+
+    packets_per_s: float
+    """Packets up per second."""
+    rmse_m: float
+    """Floor of RMSE xy [m]."""
+
+
+class Baselines(msgspec.Struct, frozen=True):
+    """What stands beside the contenders of a case."""
+
+    floor: list[Floor] = []
+    """Points of the floor: of all where only the server sees the target, and in wind of those
+    without feedback aboard."""
+    aboard: list[Summary] = []
+    """Flights with the reference aboard, and no packets; none where only the server knows it."""
+
+
+class Work:
+    """What is flown beside the contenders of a case.
+
+    Args:
+        plan: what they fly.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        scenario = plan.tuned(BESIDE)
+        self.regular = [
+            replace(scenario, control=replace(scenario.control, trigger="periodic", period=period))
+            for period in PERIODS
+        ]
+        """What is flown for each point of the floor."""
+        first, runs = scenario.seed, 0 if _is_unknown(scenario) else plan.runs
+        self.aboard = [replace(scenario, seed=seed) for seed in range(first, first + runs)]
+        """What is flown with the reference aboard."""
+
+    def settings(self) -> dict[str, Any]:
+        """All that the results follow from, as plain values."""
+        return {
+            "files": digests(self.regular),
+            "periods": list(PERIODS),
+            "runs": [RUNS, len(self.aboard)],
+            "scenario": reading.to_table(self.regular[0]),
+        }
+
+
+def _is_unknown(scenario: Scenario) -> bool:
+    return scenario.reference.shape in floor.UNKNOWN
+
+
+def floor_of(scenario: Scenario) -> Floor:
+    """Floor of a scenario, from the ages of a few flights; called in a worker."""
+    flights = fly_batch(scenario, range(scenario.seed, scenario.seed + RUNS))
+    floor_m = floor.target_floor_m if _is_unknown(scenario) else floor.wind_floor_m
+    packets = sum(int((flight.netem["direction"] == UPLINK).sum()) for flight in flights)
+    floors = [floor_m(scenario, flight.client) for flight in flights]
+    return Floor(packets / RUNS / scenario.duration, float(np.mean(floors)))
+
+
+def fly_aboard(scenario: Scenario) -> Summary:
+    """Summary of a flight with the reference aboard; called in a worker."""
+    return floor.summarise_aboard(scenario, "aboard")

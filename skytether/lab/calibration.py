@@ -1,0 +1,211 @@
+"""What a search is after: the paper's Table 1, or the smallest error within some limits.
+
+An objective (see `lab.search.Objective`) flies a point of a search, a scenario, with the same seeds
+as every other point, and scores what came out: the smaller the score, the better.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from skytether.lab import sweep
+from skytether.lab.search import Free, Values, plain
+from skytether.shared.scenario import policies, reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.summary import Summary
+
+COLUMNS: Mapping[str, Mapping[str, str]] = {
+    "no compensation": {"scheme": "none", "trigger": "always"},
+    "compensation": {"trigger": "always"},
+    "compensation and trigger": {},
+}
+"""Keys of `control` that each column of Table 1 changes; all else is the same."""
+
+TABLE_1: Mapping[str, Mapping[str, float]] = {
+    "no compensation": {"rmse_x": 0.3724, "rmse_y": 0.3719, "rmse_xy": 0.5263},
+    "compensation": {"rmse_x": 0.1068, "rmse_y": 0.1057, "rmse_xy": 0.1502},
+    "compensation and trigger": {
+        "rmse_x": 0.1762,
+        "rmse_y": 0.1761,
+        "rmse_xy": 0.2492,
+        "event_ratio": 0.1,
+    },
+}
+"""The paper's Table 1 [m], and the event ratio that its "10 times smaller" means."""
+
+TOLERANCE = 0.1
+"""Largest relative deviation of an entry that counts as reproduced; twice that for event ratios."""
+UNFLYABLE = 1e9
+"""Score of a point of which a flight fails."""
+
+
+FREE = (
+    Free("control.state_weight.0", 0.5, 100.0),
+    Free("control.state_weight.1", 0.5, 100.0),
+    Free("control.terminal_weight.0", 5.0, 2000.0),
+    Free("control.terminal_weight.1", 5.0, 5000.0),
+    Free("control.input_weight", 0.1, 20.0),
+    Free("control.change_weight", 0.001, 2.0),
+    Free("model.tau_s.0", 0.2, 2.0),
+    Free("model.u_max.0", 0.8, 5.0),
+    Free("reference.radius_m", 0.5, 5.0),
+)
+"""Keys that a search for Table 1 changes unless others are asked for (E4)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table1:
+    """The objective that every entry of Table 1 comes out as in the paper."""
+
+    def settings(self) -> Mapping[str, Any]:
+        """Name of the objective, as plain values."""
+        return {"objective": "table1"}
+
+    def free(self) -> Sequence[Free]:
+        """Keys to change unless others are asked for."""
+        return FREE
+
+    def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
+        """Means over seeds, for each column of the table."""
+        values: dict[str, dict[str, float | None]] = {}
+        for column, changes in COLUMNS.items():
+            table = plain(scenario)
+            table["control"] |= changes
+            runs = sweep.summaries(column, reading.check(table, column), seeds)
+            values[column] = {name: _mean(runs, name) for name in TABLE_1[column]}
+        return values
+
+    def score(self, values: Values) -> float:
+        """Sum of squared deviations, each ten times as heavy where it is out of tolerance."""
+        off = deviations(values)
+        if not np.isfinite(list(off.values())).all():
+            return UNFLYABLE
+        weights = [1.0 if within(name, value) else 10.0 for (_, name), value in off.items()]
+        return float(np.dot(weights, np.square(list(off.values()))))
+
+
+def deviations(values: Values) -> dict[tuple[str, str], float]:
+    """Relative deviation of each entry from Table 1, by column and name; NaN for no figure."""
+    found = {
+        (column, name): (values[column][name], target)
+        for column, targets in TABLE_1.items()
+        for name, target in targets.items()
+    }
+    return {
+        key: math.nan if value is None else value / target - 1.0
+        for key, (value, target) in found.items()
+    }
+
+
+def within(name: str, deviation: float) -> bool:
+    """Whether an entry of this name with this deviation is within tolerance."""
+    return abs(deviation) <= TOLERANCE * (2.0 if name == "event_ratio" else 1.0)
+
+
+def is_admissible(values: Values) -> bool:
+    """Whether every entry of Table 1 is within tolerance."""
+    return all(within(name, value) for (_, name), value in deviations(values).items())
+
+
+WEIGHTS = (
+    Free("control.state_weight.1", 1e-4, 1e4),
+    Free("control.terminal_weight.0", 1e-2, 1e6),
+    Free("control.terminal_weight.1", 1e-2, 1e6),
+    Free("control.input_weight", 1e-4, 1e4),
+    Free("control.change_weight", 1e-4, 1e4),
+)
+"""Weights that are searched for; only ratios matter, so the position's keeps its value."""
+REGULATOR = (WEIGHTS[0], WEIGHTS[3])
+"""Those of them that make the gain aboard, where nothing is planned."""
+TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
+    "state_gap": (Free("control.epsilon", 1e-4, 1e8), Free("control.decay_rate", 1e-2, 1e2)),
+    "cost_gap": (Free("control.cost_gap", 1e-6, 1e6),),
+    "expected_gap": (Free("control.cost_gap", 1e-6, 1e6),),
+    "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
+    "tolerance": (Free("control.tolerance_m", 1e-4, 1e1),),
+    "delta": (Free("control.tolerance_m", 1e-4, 1e1),),
+}
+"""Keys of each policy that looks at the flight, so that weights decide what it sends, too."""
+OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
+"""Keys of the schemes that have a disturbance observer."""
+OBSERVE = ("committed", "predictive")
+"""Those schemes."""
+MEANS = ("rmse_xy", "event_ratio", "effort_mps", "saturated")
+"""Figures of a point whose means over the seeds are kept."""
+HERE = "here"
+"""Name of the one column of a point that is flown as it is."""
+
+
+def trigger_keys(trigger: str) -> Sequence[Free]:
+    """Keys of the policies in a trigger; a policy with numbers of its own has none."""
+    bare = (each.name for each in policies.policies(policies.parse(trigger)) if not each.values)
+    keys = (key for name in bare for key in TRIGGER_KEYS.get(name, ()))
+    return list(dict.fromkeys(keys))
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What may be spent on a small error."""
+
+    packets: float = 1.0
+    """Largest share of steps that may send; it binds only a trigger that looks at the flight."""
+    effort_mps: float = math.inf
+    """Largest effort, the RMS change of the command from step to step [m/s]."""
+    saturated: float = 1.0
+    """Largest share of steps with an input at its bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rmse:
+    """The objective of the smallest RMSE xy within some limits."""
+
+    scenario: Scenario
+    """What is flown, but for the keys that are searched for."""
+    limits: Limits
+
+    def settings(self) -> Mapping[str, Any]:
+        """Name of the objective and its limits, as plain values."""
+        return {"objective": "rmse", **asdict(self.limits)}
+
+    def free(self) -> Sequence[Free]:
+        """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
+        control, table = self.scenario.control, plain(self.scenario)
+        weights = REGULATOR if control.scheme == "dead_reckoning" else WEIGHTS
+        observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
+        keys = [*weights, *trigger_keys(control.trigger), *observer]
+        return [key for key in keys if key.of(table) > 0.0]
+
+    def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
+        """Means over seeds, and the upper end of the event ratio's 95 % interval."""
+        runs = sweep.summaries(HERE, scenario, seeds)
+        found = {name: _mean(runs, name) for name in MEANS}
+        _, half = sweep.estimate(runs, "event_ratio")
+        ratio = found["event_ratio"]
+        most = None if ratio is None else ratio + (half or 0.0)
+        return {HERE: {**found, "event_ratio_most": most}}
+
+    def score(self, values: Values) -> float:
+        """RMSE xy [m], times the cube of how many times too much of anything limited is spent."""
+        here = values[HERE]
+        rmse, most = here["rmse_xy"], here["event_ratio_most"]
+        effort, saturated = here["effort_mps"], here["saturated"]
+        if rmse is None or most is None or effort is None or saturated is None:
+            return UNFLYABLE
+        over = [effort / self.limits.effort_mps, saturated / self.limits.saturated]
+        if self._binds():
+            over.append(most / self.limits.packets)
+        return rmse * math.prod(max(1.0, each) ** 3 for each in over)
+
+    def _binds(self) -> bool:
+        """Whether the share of packets follows from what is flown."""
+        named = policies.policies(policies.parse(self.scenario.control.trigger))
+        return any(each.name in TRIGGER_KEYS for each in named)
+
+
+def _mean(runs: Sequence[Summary], name: str) -> float | None:
+    """Mean of a figure, or None where it is missing in a run, which did not fly."""
+    values = [getattr(run, name) for run in runs]
+    return None if None in values else float(np.mean(values))

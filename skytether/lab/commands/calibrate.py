@@ -1,0 +1,158 @@
+"""`skytether calibrate`: search for the numbers that the paper does not print, or the best ones."""
+
+import math
+from collections.abc import Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from skytether.figures.page import as_text
+from skytether.lab import calibration
+from skytether.lab.calibration import HERE, Limits, Rmse, Table1
+from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
+from skytether.lab.journal import Journal, write
+from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
+from skytether.shared.scenario.reading import to_toml
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+
+BEST = "best.toml"
+"""File of the best point, a scenario."""
+POPULATION_MIN, POPULATION_MAX = 4, 1000
+"""Fewest and most points in a generation."""
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """Options of `skytether calibrate`."""
+
+    scenario: ScenarioName = "paper"
+    """Name of a scenario (see `skytether scenarios`) or path of a .toml file, where the search
+    starts."""
+    objective: Literal["table1", "rmse"] = "table1"
+    """What to search for: table1, the paper's Table 1, or rmse, the smallest mean RMSE xy."""
+    packets: float = 0.1
+    """Largest share of steps that may send, with the objective rmse and a trigger that looks at
+    the flight."""
+    effort: Annotated[float, tyro.conf.arg(metavar="MPS")] = math.inf
+    """Largest effort with the objective rmse, the RMS change of the command from step to step
+    [m/s]; no limit unless given."""
+    free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=LOW:HIGH")] = ()
+    """Keys that may change, each within its bounds, on a logarithmic scale. Unless given, table1
+    changes weights and plant, and rmse the weights (but the position's, for only ratios matter) and
+    the keys of scheme and trigger."""
+    runs: int = 10
+    """Number of flights of each point (for table1 in each column), with seeds from --seed on."""
+    generations: int = 40
+    """Number of generations; a search in OUT goes on until it has so many."""
+    population: int = 10
+    """Number of points in a generation."""
+    sigma: float = SIGMA
+    """First step, as a share of the range of each key."""
+    pool: PoolFlags = Flags()
+    out: Path = Path("calibration")
+    """Folder for every point flown (journal.jsonl) and for the best one (best.toml)."""
+    config: ScenarioFlags = Scenario()
+
+
+def calibrate(argv: Sequence[str]) -> None:
+    """Search for the values of some keys that give the paper's Table 1, or the smallest error.
+
+    Every point is flown in virtual time with the same seeds. OUT/best.toml is the best scenario,
+    which flies like any other. Everything flown is kept: after Ctrl-C, or a crash, the same command
+    goes on.
+    """
+    options = command.parse(CalibrateOptions(), argv, "skytether calibrate", calibrate.__doc__)
+    command.check_count("--runs", options.runs, 1000)
+    command.check_count("--generations", options.generations, 10**6)
+    if not POPULATION_MIN <= options.population <= POPULATION_MAX:
+        expected = f"expected {POPULATION_MIN} to {POPULATION_MAX}"
+        raise CommandError(f"--population: got {options.population}, {expected}", 2)
+    for flag, share in (("--sigma", options.sigma), ("--packets", options.packets)):
+        if not 0.0 < share <= 1.0:
+            raise CommandError(f"{flag}: got {share:g}, expected more than 0, at most 1", 2)
+    if not options.effort > 0.0:
+        raise CommandError(f"--effort: got {options.effort:g}, expected more than 0", 2)
+    options.pool.check()
+    scenario = options.config
+    is_rmse = options.objective == "rmse"
+    limits = Limits(packets=options.packets, effort_mps=options.effort)
+    objective = Rmse(scenario, limits) if is_rmse else Table1()
+    free = list(map(Free.parse, options.free)) or objective.free()
+    check_free(free, scenario)
+    search = Search(
+        start=scenario,
+        objective=objective,
+        free=free,
+        runs=options.runs,
+        population=options.population,
+        sigma=options.sigma,
+    )
+    title = f"searching from {options.scenario}"
+    with (
+        writing(options.out),
+        closing(Journal(options.out, search.settings(), list[SearchPoint])) as journal,
+    ):
+        with (
+            crew(options.pool, title, options.generations, "generations") as flyers,
+            suppress(Interrupted),
+        ):
+            flyers.search(search, journal, options.generations)
+        points = list(chain.from_iterable(journal.entries[: options.generations]))
+        if not points:
+            raise CommandError("ended before the first generation was flown")
+        write(options.out / BEST, to_toml(search.scenario(best(points))))
+    if is_rmse:
+        _print_rmse(points)
+    else:
+        _print_table_1(points)
+    print(f"The best one is in {options.out / BEST}.")
+
+
+def _print_rmse(points: Sequence[SearchPoint]) -> None:
+    """Print the best point of a search for the smallest error."""
+    found = best(points)
+    here = found.values[HERE]
+    table = Table(title=f"the best of {len(points)} points", show_header=False)
+    table.add_row("score", f"{found.score:.4f}")
+    table.add_row(Text("RMSE xy [m]"), as_text(here["rmse_xy"], ".4f"))
+    table.add_row("event ratio", as_text(here["event_ratio"], ".4f"))
+    table.add_row(Text("effort [m/s]"), as_text(here["effort_mps"], ".4f"))
+    for key, value in found.keys.items():
+        table.add_row(key, f"{value:g}")
+    Console().print(table)
+
+
+def _print_table_1(points: Sequence[SearchPoint]) -> None:
+    """Print the best point beside Table 1, and what all points within tolerance span."""
+    found, console = best(points), Console()
+    console.print(_entries(found.values))
+    near = [point for point in points if calibration.is_admissible(point.values)]
+    table = Table(title=f"{len(near)} of {len(points)} points have every entry within tolerance")
+    for heading in ("key", "best", "least", "most", "of these"):
+        table.add_column(heading)
+    for key, value in found.keys.items():
+        span = [point.keys[key] for point in near]
+        ends = [f"{min(span):g}", f"{max(span):g}"] if span else []
+        table.add_row(key, f"{value:g}", *ends)
+    console.print(table)
+
+
+def _entries(values: Values) -> Table:
+    """Table 1, the paper's figures beside those of a point."""
+    table = Table(title="Table 1")
+    for heading in ("", "entry", "paper", "here", "off"):
+        table.add_column(heading)
+    for (column, name), off in calibration.deviations(values).items():
+        paper, here = calibration.TABLE_1[column][name], values[column][name]
+        mark = "" if calibration.within(name, off) else " !"
+        table.add_row(column, name, f"{paper:.4f}", as_text(here, ".4f"), f"{off:+.1%}{mark}")
+    return table

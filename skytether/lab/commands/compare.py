@@ -1,0 +1,135 @@
+"""`skytether compare`: schemes and triggers on the same seeds, each at its own best weights."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from skytether.figures.page import as_text
+from skytether.lab import comparison, contenders
+from skytether.lab.beside import Baselines, Work, floor_of, fly_aboard
+from skytether.lab.calibration import HERE, Limits, Rmse
+from skytether.lab.commands import report_folder
+from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
+from skytether.lab.commands.report_folder import CommandCall
+from skytether.lab.contenders import CASES, PACKETS, SATURATED, ComparisonSize, Found, Plan
+from skytether.lab.journal import Journal, write
+from skytether.lab.search import Search, SearchPoint, best
+from skytether.shared.scenario import reading
+from skytether.shell import command
+from skytether.shell.options import read
+
+WEIGHTS = "weights.toml"
+"""File of the weights that a search has found."""
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Options of `skytether compare`."""
+
+    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 100
+    """Number of flights of each contender in each case at each threshold, with seeds from 1 on."""
+    out: Path = Path("compare")
+    """Folder for the report, and for weights and their searches; the same command goes on with
+    what it holds."""
+    quick: bool = False
+    """Take a first look: few flights, cases and thresholds."""
+    cases: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CASE")] = ()
+    """Cases that are flown; all unless given."""
+    tune: bool = False
+    """Only search for the weights of every contender in every case, with the same effort for each,
+    and write them to OUT/weights.toml."""
+    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 16
+    """Number of generations of each of these searches."""
+    weights: Annotated[str, tyro.conf.arg(metavar="FILE")] = reading.COMPARED
+    """File of the weights, as --tune writes it; those that come with Skytether unless given."""
+    pool: PoolFlags = Flags()
+
+
+def compare(argv: Sequence[str]) -> None:
+    """Fly every scheme with every trigger after a target that only the server sees.
+
+    OUT/report.html has the tables and figures, and opens anywhere; each is in OUT as CSV, PNG and
+    PDF as well. Everything flown is kept: after Ctrl-C, or a crash, the same command goes on; once
+    all is flown, it only draws anew.
+    """
+    options = read(CompareOptions(), argv, "skytether compare", compare.__doc__)
+    command.check_count("--runs", options.runs, 100_000)
+    command.check_count("--generations", options.generations, 10**6)
+    options.pool.check()
+    cases = contenders.cases(options.cases)
+    scale = ComparisonSize(options.runs, options.generations, cases=cases)
+    if options.quick:
+        scale = contenders.quick(scale)
+    with writing(options.out):
+        if options.tune:
+            _tune(options, scale)
+        else:
+            _compare(options, scale, CommandCall.now("compare", argv))
+
+
+def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) -> None:
+    """Fly all contenders in all cases, and write the report."""
+    plans = [Plan(case, options.weights, scale) for case in scale.cases]
+    total = sum(len(plan.sweep.cells) * plan.runs for plan in plans)
+    with crew(options.pool, "comparing", total) as flyers:
+        results = []
+        for plan in plans:
+            folder = options.out / "sweeps" / plan.case.name
+            done = flyers.flown(plan.sweep, folder, plan.case.title)
+            beside = _beside(flyers, plan, options.out / "beside" / plan.case.name)
+            results.append(comparison.compared(plan, done, beside))
+    drawn = comparison.draw(results)
+    runs = flyers.spent.runs
+    report_folder.write(options.out, drawn, reading.load(CASES[0].plant), call, runs)
+    for table in drawn.tables:
+        report_folder.show(table)
+    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
+    print(drawn.verdict)
+
+
+def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
+    """What stands beside the contenders of a case that has its own weights."""
+    if plan.case.weights:
+        return Baselines()
+    work = Work(plan)
+    with closing(Journal(folder, work.settings(), Baselines)) as journal:
+        if not journal.entries:
+            floor = flyers.map(floor_of, work.regular)
+            journal.append(Baselines(floor, flyers.map(fly_aboard, work.aboard)))
+        return journal.entries[0]
+
+
+def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
+    """Search for the weights of every contender in every case, and write them to a file."""
+    found = []
+    total = len(scale.searched) * scale.generations
+    with crew(options.pool, "searching", total, "generations") as flyers:
+        for contender, case in scale.searched:
+            start = contenders.search_start(contender, case, scale)
+            objective = Rmse(start, Limits(PACKETS, case.effort_mps, SATURATED))
+            search = Search(
+                start=start,
+                objective=objective,
+                free=objective.free(),
+                runs=scale.search_runs,
+                population=scale.population,
+            )
+            name = contenders.entry(contender, case)
+            folder = options.out / "searches" / name
+            with closing(Journal(folder, search.settings(), list[SearchPoint])) as journal:
+                points = flyers.search(search, journal, scale.generations, f"{name}: ")
+            point = best(points)
+            here = point.values[HERE]
+            says = (
+                f"RMSE xy {as_text(here['rmse_xy'], '.4f')} m at "
+                f"{as_text(here['event_ratio'], '.1%')} of the steps, effort "
+                f"{as_text(here['effort_mps'], '.3f')} m/s"
+            )
+            found.append(Found(contender, case, search.scenario(point), says))
+            print(f"{name}: {says}")
+    write(options.out / WEIGHTS, contenders.to_file(found, scale).encode())
+    print(f"{options.out / WEIGHTS}: weights of {len(found)} contenders in their cases")

@@ -1,0 +1,98 @@
+"""`skytether envelope`: which networks and settings a scenario bears, by flights at many points."""
+
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, get_args
+
+import tyro
+from rich.table import Table
+
+from skytether.lab import figures
+from skytether.lab.commands.pool import Flags, PoolFlags, crew, writing
+from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
+from skytether.lab.journal import Journal, write
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+
+TOLD_MAX = 10
+"""Most points that are printed with their command lines."""
+
+
+@dataclass(frozen=True)
+class EnvelopeOptions:
+    """Options of `skytether envelope`."""
+
+    out: Path
+    """Folder for the results; the same command, with more points if you like, goes on there."""
+    scenario: ScenarioName = "demo"
+    """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
+    points: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
+    """Number of points, which follow from --seed: the first N of always the same ones."""
+    pool: PoolFlags = Flags()
+    config: ScenarioFlags = Scenario()
+
+
+def envelope(argv: Sequence[str]) -> None:
+    """Find out what networks and settings a scenario bears: fly it in virtual time with others.
+
+    A point has a delay of up to 3 s and a loss of up to 0.99 in each direction, steps of 5 ms to
+    0.5 s, horizons of 1 to 120 steps, and the scheme committed or feedback; all else is the
+    scenario's. It is "flown" within 1 m of the reference, "refused" in one line, or ends without a
+    plan and brakes, "hovering". What moves when it should brake, or leaves the reference's
+    surroundings, is a "flyaway": the exit code is then 1, and a command line flies the point again.
+    docs/envelope.md explains each outcome.
+
+    OUT/points.csv has a row for each point, OUT/envelope.png shows what came of them. Everything
+    flown is kept: after Ctrl-C, or a crash, the same command goes on.
+    """
+    options = command.parse(
+        EnvelopeOptions(tyro.MISSING), argv, "skytether envelope", envelope.__doc__
+    )
+    command.check_count("--points", options.points, 10**6)
+    options.pool.check()
+    plan = Envelope(options.scenario, options.config)
+    title = f"flying points of {options.scenario}"
+    with (
+        writing(options.out),
+        closing(Journal(options.out, plan.settings(), EnvelopePoint)) as journal,
+    ):
+        done = {point.number for point in journal.entries if point.number < options.points}
+        todo = [number for number in range(options.points) if number not in done]
+        with crew(options.pool, title, options.points, "points") as flyers:
+            flyers.advance(len(done))
+
+            def keep(_: int, point: EnvelopePoint) -> None:
+                journal.append(point)
+                flyers.advance(1)
+
+            flyers.share(plan.fly, todo, keep)
+        points = sorted(journal.entries, key=lambda point: point.number)[: options.points]
+        _finish(options, plan, points)
+
+
+def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
+    """Write and print what came of all points.
+
+    Raises:
+        CommandError: some of them are bad.
+    """
+    title = f"{options.scenario}, {len(points)} points, in virtual time, seed {plan.scenario.seed}"
+    write(options.out / "points.csv", plan.csv(points).encode())
+    figures.envelope(options.out / "envelope.png", title, plan, points)
+    counts = Counter(point.outcome for point in points)
+    table = Table(title=title, title_justify="left", min_width=len(title))
+    for heading in ("outcome", "points", "share"):
+        table.add_column(heading, justify="left" if heading == "outcome" else "right")
+    for outcome in get_args(Outcome):
+        table.add_row(outcome, str(counts[outcome]), f"{counts[outcome] / len(points):.1%}")
+    command.show(table)
+    for point in worst_first(points)[:TOLD_MAX]:
+        said = f": {point.line}" if point.line else f": {point.error_max:.2f} m from the reference"
+        print(f"{point.outcome}{said}\n    {plan.command(point.number)}")
+    print(f"{options.out}: points.csv, envelope.png")
+    if bad := sum(counts[outcome] for outcome in BAD):
+        raise CommandError(f"{bad} of {len(points)} points flew away or crashed")

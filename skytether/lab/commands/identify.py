@@ -1,0 +1,366 @@
+"""`skytether identify`: the model of a vehicle, from small steps that it flies."""
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from rich.table import Table
+from rich.text import Text
+
+from skytether.client import vehicles
+from skytether.figures import flights as figures
+from skytether.figures.tables import to_csv
+from skytether.lab.commands.pool import writing
+from skytether.lab.identify import outcome, picture
+from skytether.lab.identify.fit import Fit, fit, misfit, verdict
+from skytether.lab.identify.flight import Identifying
+from skytether.lab.identify.outcome import AXES, Axis, AxisTold
+from skytether.lab.identify.responses import responses
+from skytether.lab.identify.steps import (
+    STEP_MIN_MPS,
+    Experiment,
+    Plan,
+    default_hold_s,
+    default_speeds,
+    fenced,
+)
+from skytether.lab.journal import write
+from skytether.shared.base import kernel
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import Event
+from skytether.shared.core.line import parse_line
+from skytether.shared.core.steady import Steady
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command, driver
+from skytether.shell.command import CommandError, ScenarioFlags
+from skytether.shell.options import Argument
+from skytether.shell.udp import AddressError
+from skytether.sim.world import World
+
+SCENARIO, PICTURE, MEASURED = "scenario.toml", "steps.png", "measured.csv"
+"""Files in the folder of an identification, beside the one for programs."""
+OUTCOME = "identified.json"
+NUMBER = 1
+"""Number of the vehicle, in what it says."""
+REPEATS_MAX, HOLD_MAX_S = 100, 60.0
+"""Most repetitions, and the longest time after a step [s]."""
+VIRTUAL_MAX_NS = 7200 * SECOND_NS
+"""Longest flight in virtual time [ns]."""
+
+
+@dataclass(frozen=True)
+class IdentifyOptions:
+    """Options of `skytether identify`."""
+
+    kind: Annotated[str, Argument(metavar="KIND", positional=True)] = ""
+    """Vehicle to fly (see `skytether vehicles`), in place of `vehicle.kind`. One that talks to
+    hardware, as mavlink does, flies in real time; others fly in virtual time."""
+    scenario: str = "demo"
+    """A scenario's name (see `skytether scenarios`) or a .toml file: what will be flown, which the
+    scenario that is written extends."""
+    speed: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
+    """Size of step [m/s], one for all axes or one each. Unless given, the largest speed of the
+    desired trajectory on the axis, and at least half of that on any axis."""
+    also: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
+    """Other sizes of step to fly as well [m/s], to see what a wrong size costs."""
+    hold: float | None = None
+    """Time after each step [s]: four time constants of the scenario's model, and 3 to 6 s, unless
+    given."""
+    repeats: int = 3
+    """Number of times that each axis flies its four steps, out and back and out and back."""
+    set_parameters: bool = False
+    """Set the autopilot's parameters that decide what it does in silence, where they are not safe;
+    without it, they are told, and nothing is armed."""
+    out: Path = Path("identified")
+    """Folder for the scenario (scenario.toml), the picture (steps.png), what was measured
+    (measured.csv) and the outcome for a program (identified.json)."""
+    plugin: command.Plugins = ()
+    config: ScenarioFlags = Scenario()
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """What was flown with steps of one size."""
+
+    flight: Identifying
+    axes: list[Axis]
+
+
+class Told(msgspec.Struct, frozen=True):
+    """What came of an identification, for a program."""
+
+    scenario: str
+    kind: str
+    ended: str
+    hold_s: float
+    flown_s: float
+    axes: list[AxisTold]
+    sizes: list[list[AxisTold]]
+    costs: list[dict[str, float]]
+
+
+def identify(argv: Sequence[str]) -> None:
+    """Identify the model of a vehicle: gain, time constant and dead time of each axis.
+
+    The vehicle takes off, flies small steps of velocity out and back inside its fence, one axis
+    after another, and lands. What is fitted to them is told with 95 % intervals, in words, as a
+    picture, and as a scenario that flies by it at once. Without a fence in its scenario the vehicle
+    stays near where it began. Ctrl-C makes it land, and what was measured is kept.
+    """
+    options = command.parse(
+        IdentifyOptions(), argv, "skytether identify", identify.__doc__, leads=False
+    )
+    scenario, plans = _asked(options)
+    flies = vehicles.make(scenario, NUMBER)
+    if len(plans) > 1 and flies.port:
+        raise CommandError("--also: got a vehicle of real hardware, expected one computed", 2)
+    if options.set_parameters and not flies.set_parameters():
+        said = f"--set-parameters: a vehicle of the kind {scenario.vehicle.kind} has none"
+        raise CommandError(said, command.CONFIGURATION)
+    figures.check(options.out / PICTURE)
+    with writing(options.out):
+        options.out.mkdir(parents=True, exist_ok=True)
+    flown = [_fly(scenario, plan, sets=options.set_parameters) for plan in plans]
+    if failure := flown[0].flight.failure:
+        raise CommandError(str(failure))
+    _tell(options, scenario, flown)
+    if why := flown[0].flight.why:
+        code = command.INTERRUPTED if why == "interrupted" else command.RUN
+        raise CommandError(f"ended early: {why}; what was measured is in {options.out}", code)
+    _write_scenario(options, scenario, flown[0])
+
+
+def _asked(options: IdentifyOptions) -> tuple[Scenario, list[Plan]]:
+    """The scenario with the kind of vehicle that is asked for, and what is to be flown with it.
+
+    Raises:
+        CommandError, ConfigError: it cannot be.
+    """
+    table = reading.to_table(options.config)
+    if options.kind:
+        table["vehicle"] |= {"kind": options.kind}
+    scenario = reading.check(table, f"{options.scenario} and the command line")
+    command.check_count("--repeats", options.repeats, REPEATS_MAX)
+    hold_s = default_hold_s(scenario) if options.hold is None else options.hold
+    if not 0.5 <= hold_s <= HOLD_MAX_S:
+        raise CommandError(f"--hold: got {hold_s:g}, expected 0.5 to {HOLD_MAX_S:g} s", 2)
+    speeds = options.speed or default_speeds(scenario)
+    sizes = [_size(scenario, "--speed", speeds)]
+    sizes += [_size(scenario, "--also", (each,)) for each in options.also]
+    return scenario, [Plan(size, hold_s, options.repeats) for size in sizes]
+
+
+def _size(scenario: Scenario, flag: str, given: Sequence[float]) -> tuple[float, ...]:
+    """Size of step on each axis [m/s].
+
+    Raises:
+        CommandError: it is none that can be flown.
+    """
+    axes = scenario.model.axes
+    if len(given) not in (1, axes):
+        raise CommandError(f"{flag}: got {len(given)} numbers, expected 1 or {axes}", 2)
+    speeds = tuple(given) * (axes if len(given) == 1 else 1)
+    limit = scenario.fence.speed_mps or math.inf
+    for speed, bound in zip(speeds, scenario.u_max.tolist(), strict=True):
+        most = min(bound, limit)
+        if not STEP_MIN_MPS <= speed <= most:
+            bounds = f"{STEP_MIN_MPS:g} to {most:g} m/s (model.u_max, fence.speed_mps)"
+            raise CommandError(f"{flag}: got {speed:g}, expected {bounds}", 2)
+    return speeds
+
+
+def _fly(scenario: Scenario, plan: Plan, *, sets: bool) -> Flown:
+    """Fly an experiment, in real time where the vehicle has hardware; what came of it.
+
+    Args:
+        sets: whether parameters of its hardware may be set.
+
+    Raises:
+        CommandError: its line cannot be opened.
+    """
+    flies = vehicles.make(scenario, NUMBER)
+    if sets and not flies.set_parameters():
+        raise CommandError(
+            f"--set-parameters: a vehicle of the kind {scenario.vehicle.kind} has none", 2
+        )
+    within = fenced(scenario, plan)
+    if within is not scenario:
+        _say(f"no fence is given: it stays within {within.fence.radius_m:g} m of where it began")
+    flight = Identifying(within, flies, Experiment(within, plan))
+    command.prepare(kernel.missing() if "skytether.shared.base.kernel" in sys.modules else [])
+    title = f"identifying {scenario.vehicle.kind}"
+    with command.progress(title, plan.duration_s) as bar:
+
+        def show(*_: object) -> None:
+            bar(flight.flown_s, _doing(flight))
+
+        if flies.port is None:
+            _virtually(flight, show)
+        else:
+            _really(flight, scenario, show)
+    steps, cut = flight.experiment.steps, flight.experiment.cut
+    axes = []
+    for number, speed in enumerate(plan.speeds):
+        found = responses(flight.inputs, flight.measured, steps, number)
+        axes.append(Axis(speed, cut[number], found, fit(found)))
+    return Flown(flight, axes)
+
+
+def _doing(flight: Identifying) -> str:
+    """What a flight is at."""
+    if not flight.flown_s:
+        return "on its way into the air"
+    return f"{len(flight.experiment.steps)} steps" if not flight.is_over else "landing"
+
+
+def _virtually(flight: Identifying, show: Callable[[], None]) -> None:
+    """Fly in virtual time."""
+    world = World()
+    world.add("vehicle", flight)
+    with command.interruptible() as interrupted:
+
+        def over() -> bool:
+            show()
+            return flight.finished or interrupted()
+
+        world.run(over, limit_ns=VIRTUAL_MAX_NS)
+        if not flight.finished:
+            flight.close(now_ns=world.now_ns)
+
+
+def _really(flight: Identifying, scenario: Scenario, show: Callable[[], None]) -> None:
+    """Fly in real time, over the line to the vehicle's hardware.
+
+    Raises:
+        CommandError: the line cannot be opened.
+    """
+    line = parse_line("vehicle.address", scenario.vehicle.address)
+    try:
+        shell = driver.Shell(Steady(flight), None, line=line)
+    except AddressError as error:
+        raise CommandError(str(error)) from None
+    driver.run([shell], on_event=_say, on_second=show)
+
+
+def _say(line: Event | str) -> None:
+    print(line, file=sys.stderr)
+
+
+# -- what came of it -------------------------------------------------------------------------
+
+
+def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[Flown]) -> None:
+    """Write what was measured and what it came to, and print it."""
+    first, out = flown[0], options.out
+    costs = _costs(flown) if len(flown) > 1 else []
+    told = Told(
+        scenario=options.scenario,
+        kind=scenario.vehicle.kind,
+        ended=first.flight.why,
+        hold_s=first.flight.experiment.plan.hold_s,
+        flown_s=first.flight.flown_s,
+        axes=_all_told(first),
+        sizes=[_all_told(each) for each in flown[1:]],
+        costs=costs,
+    )
+    with writing(out):
+        write(out / OUTCOME, msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n")
+        write(out / MEASURED, _measured(first.flight, scenario.model.axes).encode())
+        figures.save(picture.drawn(first.axes), out / PICTURE, dpi=130)
+    command.show(_table(first))
+    for name, axis in zip(AXES, first.axes, strict=False):
+        print(f"{name}: {verdict(axis.fit) if axis.fit else outcome.describe(axis)}")
+    if costs:
+        print("What a wrong size costs, as the largest difference from steps of the first row's:")
+        command.show(_cost_table(flown, costs))
+
+
+def _all_told(flown: Flown) -> list[AxisTold]:
+    return [outcome.told(name, axis) for name, axis in zip(AXES, flown.axes, strict=False)]
+
+
+def _measured(flight: Identifying, axes: int) -> str:
+    """All that was measured, and the input that was flown then, as CSV text."""
+    names = AXES[:axes]
+    header = ["time_s", *(f"{what}_{name}" for what in ("p", "v", "u") for name in names)]
+    inputs, nothing, rows, at = flight.inputs, [None] * axes, [], 0
+    zero_ns = inputs[0][0] if inputs else 0
+    for stamp_ns, position, velocity in sorted(flight.measured, key=lambda each: each.stamp_ns):
+        while at + 1 < len(inputs) and inputs[at + 1][0] <= stamp_ns:
+            at += 1
+        flown = inputs[at][1] if inputs and inputs[at][0] <= stamp_ns else [0.0] * axes
+        time_s = (stamp_ns - zero_ns) / SECOND_NS
+        rows.append([time_s, *(position or nothing), *(velocity or nothing), *flown])
+    return to_csv(header, rows)
+
+
+def _table(flown: Flown) -> Table:
+    """Numbers of each axis, as a table."""
+    table = Table(title="first order with dead time, 95 % intervals", title_justify="left")
+    heading = ("axis", "step [m/s]", "steps", "gain", "time constant [s]", "dead time [s]")
+    for each in (*heading, "left over, rms", "largest"):
+        table.add_column(Text(each))
+    for name, axis in zip(AXES, flown.axes, strict=False):
+        row = [name, f"{axis.speed:g}", axis.steps]
+        if found := axis.fit:
+            keys = ("gain", "tau_s", "dead_time_s")
+            row += [outcome.with_interval(key, found.numbers, found.within) for key in keys]
+            row += [f"{found.misfit.rms:.1%}", f"{found.misfit.largest:.1%}"]
+        table.add_row(*map(Text, row))
+    return table
+
+
+def _costs(flown: Sequence[Flown]) -> list[dict[str, float]]:
+    """Largest difference from the steps of the size asked for, by models of each size."""
+    measured = [axis.responses for axis in flown[0].axes]
+
+    def off(model: Fit | None, axis: int) -> float:
+        if model is None or not measured[axis]:
+            return math.nan
+        return misfit(measured[axis], model.numbers).largest
+
+    return [
+        {
+            name: off(axis.fit, n)
+            for n, (name, axis) in enumerate(zip(AXES, each.axes, strict=False))
+        }
+        for each in flown
+    ]
+
+
+def _cost_table(flown: Sequence[Flown], costs: Sequence[dict[str, float]]) -> Table:
+    """What a wrong size of step costs, as a table."""
+    table = Table()
+    for each in ("model of [m/s]", *costs[0]):
+        table.add_column(Text(each))
+    for one, cost in zip(flown, costs, strict=True):
+        of = ", ".join(f"{axis.speed:g}" for axis in one.axes)
+        table.add_row(of, *(f"{each:.1%}" for each in cost.values()))
+    return table
+
+
+def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: Flown) -> None:
+    """Write the scenario that flies by what was identified, and see that it can be flown.
+
+    Raises:
+        CommandError: there is none, or it cannot.
+    """
+    base = reading.load(options.scenario)
+    text = outcome.scenario_text(scenario, options.scenario, base, flown.axes)
+    if text is None:
+        missing = [n for n, axis in zip(AXES, flown.axes, strict=False) if axis.fit is None]
+        raise CommandError(f"no scenario is written: too few steps of {', '.join(missing)}")
+    file = options.out / SCENARIO
+    with writing(options.out):
+        write(file, text)
+    try:
+        reading.load(str(file))
+    except ConfigError as error:
+        raise CommandError(f"what was identified cannot be flown as it is: {error}") from None
+    print(f"The scenario is {file}, the picture {options.out / PICTURE}.")

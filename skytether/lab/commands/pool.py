@@ -1,0 +1,358 @@
+"""Who flies the flights of sweeps and searches: processes of this machine, or a Dask cluster."""
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import metadata
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import tyro
+from msgspec.structs import replace
+
+import skytether.lab.sweep
+from skytether.lab.journal import Journal, digest
+from skytether.lab.search import Generation, Search, SearchPoint, Values, best
+from skytether.lab.sweep import Done, FlightTask, Results, Sweep
+from skytether.shared.base import kernel
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command, plugins, temporary
+from skytether.shell.command import Bar, CommandError
+from skytether.shell.plugins import Plugin
+from skytether.shell.workers import die_with_parent
+
+UNDER_WAY_MAX = 256
+"""Largest number of tasks handed out at once: more than any machine has cores."""
+POLL_S = 0.2
+"""Time after which Ctrl-C is noticed [s]."""
+CONNECT_S = 10.0
+"""Time that a scheduler may take to answer [s]."""
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Options of every command that has a pool."""
+
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Number of processes that fly; one for each core unless given."""
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
+    """Address of a Dask scheduler whose workers fly instead of processes of this machine."""
+    plugin: command.Plugins = ()
+
+    def check(self) -> None:
+        """Refuse options that cannot be.
+
+        Raises:
+            CommandError: with what would do.
+        """
+        if self.workers is not None:
+            command.check_count("--workers", self.workers, 1024)
+            if self.scheduler:
+                raise CommandError("--workers: got --scheduler as well, which has its own", 2)
+
+
+PoolFlags = Annotated[Flags, tyro.conf.arg(name="")]
+
+
+class Interrupted(CommandError):
+    """Ctrl-C, after which the same command goes on."""
+
+    def __init__(self, done: float, total: float, unit: str) -> None:
+        said = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
+        super().__init__(f"{said}; the same command goes on from here", command.INTERRUPTED)
+
+
+@dataclass(slots=True)
+class Spent:
+    """What was flown by this command."""
+
+    cpu_s: float = 0.0
+    """CPU time of the workers [s]."""
+    steps: int = 0
+    """Number of steps flown, of all vehicles."""
+    runs: int = 0
+    """Number of flights."""
+
+
+@dataclass(slots=True)
+class Crew:
+    """Workers, and a bar that shows how far they are."""
+
+    executor: Executor
+    bar: Bar
+    total: float
+    """Amount of work that there is, what is done with it."""
+    unit: str
+    """What the work is counted in."""
+    interrupted: Callable[[], bool]
+    done: float = 0.0
+    """Amount of work that is done."""
+    spent: Spent = field(default_factory=Spent)
+
+    def advance(self, amount: float, text: str = "") -> None:
+        """Count work that is done, and show it."""
+        self.done += amount
+        self.bar(self.done, text)
+
+    def fly(self, plan: Sweep, journal: Journal[Done], text: str = "") -> None:
+        """Fly what is not done of a sweep.
+
+        Args:
+            text: what the bar says meanwhile.
+
+        Raises:
+            CommandError: interrupted, or a worker has died.
+            ConfigError: the trajectory's file has changed since the sweep began.
+        """
+        todo = plan.todo(skytether.lab.sweep.results(journal.entries))
+        before = len(plan.cells) * plan.runs - sum(len(task.seeds) for task in todo)
+        self.advance(before, text)
+
+        def keep(_: int, result: tuple[Done, float]) -> None:
+            done, cpu_s = result
+            journal.append(done)
+            self.spent.cpu_s += cpu_s
+            self.spent.steps += sum(run.steps for run in done.runs)
+            self.spent.runs += len(done.runs)
+            self.advance(len(done.runs), text)
+
+        self.share(partial(work, files=journal.files), todo, keep)
+
+    def flown(self, plan: Sweep, folder: Path, text: str) -> Results:
+        """All results of a sweep, after what was missing has been flown; see `fly`.
+
+        Args:
+            folder: folder of the sweep's journal.
+        """
+        with closing(Journal(folder, plan.settings(), Done)) as journal:
+            self.fly(plan, journal, text)
+            return skytether.lab.sweep.results(journal.entries)
+
+    def search(
+        self, search: Search, journal: Journal[Generation], generations: int, text: str = ""
+    ) -> list[SearchPoint]:
+        """All points of a search, after what was missing has been flown.
+
+        Args:
+            text: what the bar says before the best score.
+
+        Raises:
+            CommandError: interrupted, or a worker has died.
+            ConfigError: the journal is another search's, or the trajectory's file has changed since
+                the search began.
+        """
+
+        def fly_all(
+            fly: Callable[[Scenario], Values], proposed: Sequence[Scenario]
+        ) -> Sequence[Values]:
+            return self.map(partial(_fly_point, fly, journal.files), proposed)
+
+        points: list[SearchPoint] = []
+        for points in search.points(journal, generations, fly_all):
+            self.advance(1, f"{text}best {best(points).score:.4f}")
+        return points
+
+    def map(self, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+        """Results of a function for all items, in their order; see `share`."""
+        results: dict[int, R] = {}
+        self.share(function, items, results.__setitem__)
+        return [results[number] for number in range(len(items))]
+
+    def share(
+        self, function: Callable[[T], R], items: Sequence[T], on_done: Callable[[int, R], None]
+    ) -> None:
+        """Have a function done for all items, in any order.
+
+        Args:
+            on_done: called with the number of an item and its result.
+
+        Raises:
+            CommandError: interrupted, a worker has died, or the cluster has gone.
+        """
+        waiting = iter(enumerate(items))
+        equipped = partial(_equipped, function, plugins.loaded())
+        under_way: dict[Future[R], int] = {}
+        while True:
+            try:
+                with _deaf():
+                    for number, item in islice(waiting, UNDER_WAY_MAX - len(under_way)):
+                        under_way[self.executor.submit(equipped, item)] = number
+                if not under_way:
+                    return
+                ready, _ = wait(under_way, POLL_S, FIRST_COMPLETED)
+                for future in ready:
+                    on_done(under_way.pop(future), future.result())
+            except BrokenExecutor:
+                died = "a worker has died; the same command goes on from here"
+                raise CommandError(died) from None
+            except CancelledError:
+                gone = "the scheduler has gone; the same command goes on from here"
+                raise CommandError(gone) from None
+            if self.interrupted():
+                raise Interrupted(self.done, self.total, self.unit)
+
+
+@contextmanager
+def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator[Crew]:
+    """A crew, with a bar on stderr; Ctrl-C ends its work in order.
+
+    Args:
+        total: amount of work that there is, what is done with it, in the unit.
+    """
+    if not flags.scheduler:  # or each worker would compile all of them
+        command.prepare(kernel.missing())
+    with (
+        command.interruptible() as interrupted,
+        _executor(flags) as executor,
+        command.progress(title, total, unit) as bar,
+    ):
+        yield Crew(executor, bar, total, unit, interrupted)
+
+
+@contextmanager
+def writing(out: Path) -> Iterator[None]:
+    """Name the file or folder that cannot be written, in one line.
+
+    Raises:
+        CommandError: something within it raised an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise CommandError(f"{error.filename or out}: {error.strerror or error}") from None
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Keep Ctrl-C, which is for the command alone, from workers that are started within it."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _equipped(function: Callable[[T], R], plugged: tuple[Plugin, ...], item: T) -> R:
+    """Result of a function for an item; called in a worker, which is given the plug-ins first.
+
+    They come with their content: a worker may be on another machine, or be started later, and
+    nothing that is written into a file meanwhile is flown.
+    """
+    plugins.use(plugged)
+    return function(item)
+
+
+def work(task: FlightTask, files: Mapping[str, str]) -> tuple[Done, float]:
+    """What came of a task, and the CPU time that it took [s]; called in a worker.
+
+    Args:
+        files: see `pinned`.
+    """
+    kernel.load()
+    began_s = time.thread_time()
+    with pinned(task.scenario, files) as scenario:
+        done = skytether.lab.sweep.fly(replace(task, scenario=scenario))
+    return done, time.thread_time() - began_s
+
+
+def _fly_point(
+    fly: Callable[[Scenario], Values], files: Mapping[str, str], scenario: Scenario
+) -> Values:
+    """Figures of a point of a search; called in a worker."""
+    with pinned(scenario, files) as flown:
+        return fly(flown)
+
+
+@contextmanager
+def pinned(scenario: Scenario, files: Mapping[str, str]) -> Iterator[Scenario]:
+    """A scenario that refers to a copy of its file, which nobody edits while it is flown.
+
+    Args:
+        files: digest that each file must have, by its path; others are left as they are.
+
+    Raises:
+        ConfigError: the file has changed since the work began, or is another one on this machine.
+    """
+    reference = scenario.reference
+    if reference.shape != "csv" or reference.file not in files:
+        yield scenario
+        return
+    content, expected = Path(reference.file).read_bytes(), files[reference.file]
+    if digest(content) != expected:
+        raise ConfigError(
+            f"{reference.file}: got the content {digest(content)}, expected {expected}, "
+            "with which the work began; or another --out"
+        )
+    with temporary.folder() as folder:
+        copy = folder / "trajectory.csv"
+        copy.write_bytes(content)
+        yield replace(scenario, reference=replace(reference, file=str(copy)))
+
+
+def _executor(flags: Flags) -> AbstractContextManager[Executor]:
+    if flags.scheduler:
+        return _cluster(flags.scheduler)
+    return _processes(flags.workers or len(os.sched_getaffinity(0)))
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[Executor]:
+    """Processes of this machine, a core each; at the end none of them goes on."""
+    for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
+        os.environ[f"{library}_NUM_THREADS"] = "1"
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _start, (os.getpid(),))
+    before = set(multiprocessing.active_children())
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(multiprocessing.active_children()) - before:
+            child.terminate()
+
+
+def _start(parent: int) -> None:
+    """Begin a worker, which ends with the command."""
+    die_with_parent()
+    if os.getppid() != parent:  # it was gone before
+        os._exit(1)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    """The workers of a Dask scheduler."""
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise CommandError(f"--scheduler: {address} cannot be reached: {error}") from None
+    with client:
+        ours = metadata.version("skytether")
+        try:
+            theirs = client.run(metadata.version, "skytether")
+        except ModuleNotFoundError as error:
+            raise CommandError(f"--scheduler: {address}: its workers have no skytether") from error
+        for worker, version in theirs.items():
+            if version != ours:
+                other = f"{worker} has skytether {version}, expected {ours}"
+                raise CommandError(f"--scheduler: {address}: {other}")
+        yield client.get_executor(pure=False)

@@ -1,0 +1,124 @@
+"""The folder of a report: its page, each table and figure beside it, and the calls that made it."""
+
+import contextlib
+import json
+import os
+import platform
+import shlex
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import rich.table
+from rich.text import Text
+
+from skytether.figures.page import Table
+from skytether.lab import report
+from skytether.lab.report import Drawn
+from skytether.shared.base import files
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command
+
+PAGE = "report.html"
+"""File of the page."""
+CALLS = "calls.jsonl"
+"""File with a line for each call that has added to the folder, or drawn it anew."""
+PACKAGES = ("skytether", "numpy", "scipy", "numba", "daqp", "msgpack", "matplotlib")
+"""Packages whose versions the page names."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommandCall:
+    """A command under way."""
+
+    command: str
+    """Command line."""
+    began: datetime
+    """Time of day at which the command began."""
+    began_s: float
+    """Time at which the command began, on a clock that nobody sets [s]."""
+
+    @classmethod
+    def now(cls, name: str, argv: Sequence[str]) -> "CommandCall":
+        """A call of the command of this name, which begins now."""
+        return cls(shlex.join(["skytether", name, *argv]), datetime.now(UTC), time.monotonic())
+
+    def facts(self, runs: int) -> dict[str, Any]:
+        """Facts about the call for a reader of the report, as plain values.
+
+        Args:
+            runs: number of flights that were flown.
+        """
+        return {
+            "command": self.command,
+            "date": self.began.isoformat(timespec="seconds"),
+            "runs": runs,
+            "machine": f"{_processor()}, {len(os.sched_getaffinity(0))} cores, "
+            f"{platform.platform()}",
+            "python": platform.python_version(),
+            "versions": {name: metadata.version(name) for name in PACKAGES},
+            "commit": _commit(),
+            "seconds": round(time.monotonic() - self.began_s, 1),
+        }
+
+
+def write(out: Path, drawn: Drawn, scenario: Scenario, call: CommandCall, runs: int) -> None:
+    """Write all files of a report.
+
+    Args:
+        scenario: what the report is about.
+        runs: number of flights flown by this call.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    for picture in drawn.pictures:
+        for suffix, content in picture.files().items():
+            files.write(out / f"{picture.name}{suffix}", content)
+    for table in drawn.tables:
+        files.write(out / f"{table.name}.csv", table.csv.encode())
+    files.check(out / CALLS)
+    with (out / CALLS).open("a") as file:
+        file.write(json.dumps(call.facts(runs)) + "\n")
+    calls = [json.loads(line) for line in (out / CALLS).read_text().splitlines()]
+    files.write(out / PAGE, report.html(drawn, scenario, calls).encode())
+
+
+def show(table: Table) -> None:
+    """Print a table of a report."""
+    shown = rich.table.Table(title=table.title, title_justify="left")
+    for heading in table.heading:
+        shown.add_column(Text(heading), no_wrap=True)
+    for row in table.rows:
+        shown.add_row(*map(Text, row))
+    command.show(shown)
+
+
+def _processor() -> str:
+    """Name of this machine's processor."""
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """Commit of the checkout that this runs from; None where it is no checkout."""
+    with contextlib.suppress(OSError):
+        run = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--dirty"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if run.returncode == 0:
+            return run.stdout.strip()
+    return None

@@ -1,0 +1,190 @@
+"""`skytether reproduce`: the paper's table and figures, and more, flown and put in a report."""
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import tyro
+
+from skytether.cli import processes
+from skytether.lab import report, studies
+from skytether.lab.commands import delays, report_folder
+from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
+from skytether.lab.commands.report_folder import CommandCall
+from skytether.lab.journal import Journal, write
+from skytether.lab.report import Reproduction
+from skytether.lab.studies import EVENT, EVERY, PERIODIC, Cells, ReproductionSize, Study
+from skytether.lab.sweep import Done
+from skytether.shared.base import kernel
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import record
+from skytether.shared.telemetry.record import Record
+from skytether.shell import command
+from skytether.shell.command import CommandError
+from skytether.shell.options import read
+from skytether.sim.flight import fly_batch
+
+
+@dataclass(frozen=True)
+class ReproduceOptions:
+    """Options of `skytether reproduce`."""
+
+    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 100
+    """Number of flights of each column of Table 1; each point of a curve has half as many, each
+    cell of Fig. 5 a quarter."""
+    out: Path = Path("results")
+    """Folder for the report; the same command goes on with what it holds."""
+    quick: bool = False
+    """Take a first look, in under a minute: few flights, coarse grids."""
+    pool: PoolFlags = Flags()
+
+
+def reproduce(argv: Sequence[str]) -> None:
+    """Fly the paper's Table 1 and Figures 2 to 5, and what the literature asks for besides.
+
+    OUT/report.html has all of it, and opens anywhere; every figure is in OUT as PNG, PDF and CSV.
+    Flights over real UDP stand beside those in virtual time. Everything flown is kept: after
+    Ctrl-C, or a crash, the same command goes on; once all is flown, it only draws anew.
+    """
+    options = read(ReproduceOptions(), argv, "skytether reproduce", reproduce.__doc__)
+    command.check_count("--runs", options.runs, 100_000)
+    options.pool.check()
+    scale = studies.full(options.runs)
+    if options.quick:
+        scale = replace(studies.QUICK, runs=min(options.runs, studies.QUICK.runs))
+    scenario = msgspec.structs.replace(reading.load(studies.SCENARIO), duration=scale.duration)
+    call = CommandCall.now("reproduce", argv)
+    with writing(options.out):
+        measured, runs = _measure(options, scenario, scale)
+        drawn = report.draw(measured)
+        report_folder.write(options.out, drawn, scenario, call, runs)
+    report_folder.show(drawn.tables[0])
+    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
+    print(drawn.verdict)
+
+
+def _measure(
+    options: ReproduceOptions, scenario: Scenario, scale: ReproductionSize
+) -> tuple[Reproduction, int]:
+    """All flights, those done before with them, and the number of those flown now."""
+    table = studies.table_study(scenario, scale)
+    curves = studies.curve_studies(scenario, scale)
+    maps, periods = studies.map_sweep(scenario, scale), studies.period_sweep(scenario, scale)
+    points = sum(study.runs * len(study.axis.values) for study in (table, *curves))
+    total = points * (len(studies.METHODS.values) + 1)
+    total += sum(len(plan.cells) * plan.runs for plan in (maps, periods))
+    sweeps = options.out / "sweeps"
+    # Another reproduction's folder is refused before anything is flown.
+    Journal(sweeps / table.name, table.first().settings(), Done).close()
+    command.prepare(kernel.missing())
+    # First what is measured on the clock, while nobody else needs the cores.
+    delay_ms = _delays(options.out, scenario, scale)
+    real = {method: _really(options.out, table, method, scale) for method in (EVERY, EVENT)}
+    with crew(options.pool, "reproducing", total) as flyers:
+        table_cells = _fly_study(flyers, sweeps, table, "Table 1")
+        curve_cells = [_fly_study(flyers, sweeps, study, f"RMSE, {study.name}") for study in curves]
+        map_cells = flyers.flown(maps, sweeps / "fig5", "Fig. 5")
+        period_cells = flyers.flown(periods, sweeps / "fig5-periodic", "Fig. 5, periodic")
+    measured = Reproduction(
+        table=(table, table_cells),
+        curves=list(zip(curves, curve_cells, strict=True)),
+        maps=studies.flown(maps, map_cells),
+        periods=studies.flown(periods, period_cells),
+        delay_ms=delay_ms,
+        real=real,
+        samples=_samples(options.out, table, table_cells, scale),
+    )
+    return measured, flyers.spent.runs
+
+
+def _fly_study(flyers: Crew, out: Path, study: Study, title: str) -> Cells:
+    """Fly both sweeps of a study."""
+    first = study.first()
+    firstly = flyers.flown(first, out / study.name, title)
+    second = study.second(studies.flown(first, firstly))
+    secondly = flyers.flown(second, out / f"{study.name}-periodic", f"{title}, periodic")
+    return studies.cells(study, first, firstly, second, secondly)
+
+
+def _delays(out: Path, scenario: Scenario, scale: ReproductionSize) -> Array:
+    """Time that packets take through netem, as `delays.measure` returns it [ms]."""
+    file = out / "delays.npy"
+    if not file.exists():
+        folder = out / "netem"
+        folder.mkdir(exist_ok=True)
+        seconds = scale.delay_packets * delays.EVERY_S
+        content = io.BytesIO()
+        with command.progress("packets through netem, over UDP", seconds) as on_second:
+            np.save(content, delays.measure(scenario, folder, scale.delay_packets, on_second))
+        write(file, content.getvalue())
+    kept: Array = np.load(file)
+    return kept
+
+
+def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> report.Real:
+    """A flight over UDP, with the scenario's seed; flown unless it was before."""
+    plan = table.first()
+    scenario = plan.scenario_of(scale.real_s, method)
+    folder = out / "real" / method.replace(" ", "-")
+    if not folder.exists():
+        part = folder.with_name(folder.name + ".part")
+        part.mkdir(parents=True, exist_ok=True)
+        title = f"flying over UDP: {method}"
+        with (
+            command.interruptible() as interrupted,
+            command.progress(title, scale.real_s) as on_second,
+        ):
+            shortfalls = processes.run(scenario, part, on_second=on_second, interrupted=interrupted)
+        if shortfalls:
+            raise CommandError("; ".join(map(str, shortfalls)))
+        steps = record.read(part / "client")["step"]
+        if not len(steps) or steps[-1] < scenario.steps - 2:
+            said = "interrupted; the same command goes on from here"
+            raise CommandError(said, command.INTERRUPTED)
+        part.rename(folder)
+    client, server, netem = (record.read(folder / part) for part in processes.NAMES)
+    figures = json.loads((folder / "netem.json").read_bytes())
+    return report.Real(scenario, Record(client, server, netem), figures)
+
+
+def _samples(
+    out: Path, table: Study, table_cells: Cells, scale: ReproductionSize
+) -> Mapping[str, tuple[Scenario, Sequence[Record]]]:
+    """Scenario and a few flights in virtual time with their whole records, by method."""
+    steps = table_cells[table.here, PERIODIC].period
+    samples = {}
+    for method in (*studies.METHODS.values, PERIODIC):
+        plan = table.first()
+        scenario = plan.scenario_of(table.here, EVENT if method == PERIODIC else method)
+        if method == PERIODIC:
+            keys = {"trigger": "periodic", "period": steps}
+            control = msgspec.structs.replace(scenario.control, **keys)
+            scenario = msgspec.structs.replace(scenario, control=control)
+        file = out / "samples" / f"{method.replace(' ', '-')}.npz"
+        if not file.exists():
+            file.parent.mkdir(exist_ok=True)
+            seeds = range(scenario.seed, scenario.seed + scale.sample_runs)
+            rows = {
+                f"{part}{number}": getattr(flight, part)
+                for number, flight in enumerate(fly_batch(scenario, seeds))
+                for part in processes.NAMES
+            }
+            content = io.BytesIO()
+            np.savez_compressed(content, **rows)
+            write(file, content.getvalue())
+        with np.load(file) as kept:
+            samples[method] = (
+                scenario,
+                [
+                    Record(**{part: kept[f"{part}{number}"] for part in processes.NAMES})
+                    for number in range(scale.sample_runs)
+                ],
+            )
+    return samples

@@ -1,0 +1,119 @@
+"""`skytether sweep`: many flights over a grid, on all cores or on a Dask cluster."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.table import Table
+from rich.text import Text
+
+from skytether.lab import figures
+from skytether.lab.commands.pool import Flags, PoolFlags, Spent, crew, writing
+from skytether.lab.journal import Journal, write
+from skytether.lab.sweep import Done, Sweep, estimate, parse_axis, results
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command
+from skytether.shell.command import ScenarioFlags, ScenarioName
+
+DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
+"""Figures of which a picture is drawn, and their labels."""
+SHOWN = {
+    "rmse_xy": ("RMSE xy [m]", ".4f"),
+    "event_ratio": ("event ratio", ".4f"),
+    "uplink_packets": ("packets up", ".1f"),
+}
+"""Figures in the printed table, with their headings and formats."""
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Options of `skytether sweep`."""
+
+    out: Path
+    """Folder for the results; the same command goes on with what it holds."""
+    scenario: ScenarioName = "paper"
+    """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
+    grid: Annotated[
+        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUES")
+    ] = ()
+    """A key of the scenario and its values: KEY=START:STOP:COUNT, evenly spaced, or KEY=A,B,C.
+    Several grids make all combinations of their values."""
+    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 50
+    """Number of flights of each combination, with seeds that count up from the scenario's."""
+    pool: PoolFlags = Flags()
+    config: ScenarioFlags = Scenario()
+
+
+def sweep(argv: Sequence[str]) -> None:
+    """Fly a scenario many times in virtual time, for every combination of some keys' values.
+
+    OUT/runs.csv has a row for each flight, OUT/cells.csv one for each combination, with means and
+    95 % intervals; for one key or two there are pictures as well. Everything flown is kept: after
+    Ctrl-C, or a crash, the same command goes on, and the tables have the same bytes in the end,
+    for any number of workers.
+    """
+    options = command.parse(SweepOptions(tyro.MISSING), argv, "skytether sweep", sweep.__doc__)
+    command.check_count("--runs", options.runs, 100_000)
+    options.pool.check()
+    axes = [parse_axis(text) for text in options.grid]
+    plan = Sweep(options.scenario, options.config, axes, options.runs)
+    title = f"sweeping {options.scenario}, {len(plan.cells)} cells"
+    with (
+        writing(options.out),
+        closing(Journal(options.out, plan.settings(), Done)) as journal,
+    ):
+        with crew(options.pool, title, len(plan.cells) * plan.runs) as flyers:
+            flyers.fly(plan, journal)
+        _finish(options, plan, journal, flyers.spent)
+
+
+def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: Spent) -> None:
+    """Write and print the tables and pictures of a sweep that is whole."""
+    files = ["runs.csv", "cells.csv"]
+    done = results(journal.entries)
+    write(options.out / "runs.csv", plan.runs_csv(done).encode())
+    write(options.out / "cells.csv", plan.cells_csv(done).encode())
+    cells = [plan.of_cell(done, cell) for cell in range(len(plan.cells))]
+    title = f"{options.scenario}, {plan.runs} runs each, in virtual time"
+    for figure, name in DRAWN.items():
+        pairs = [estimate(runs, figure) for runs in cells]
+        means, halves = np.array(pairs, dtype=np.float64).T  # None becomes NaN
+        path = options.out / f"{figure}.png"
+        match [axis for axis in plan.axes if len(axis.values) > 1]:
+            case (axis,):
+                halves = np.nan_to_num(halves)
+                figures.curve(path, title, axis, name, means=means, halves=halves)
+            case (one, other):
+                shape = (len(one.values), len(other.values))
+                means = means.reshape(shape)
+                figures.heat_map(path, title, (one, other), name, means=means)
+            case _:
+                continue
+        files.append(path.name)
+    table = Table(title=title, title_justify="left")
+    for heading in [axis.key for axis in plan.axes] + [name for name, _ in SHOWN.values()]:
+        table.add_column(Text(heading), justify="right", no_wrap=True)
+    for values, runs in zip(plan.cells, cells, strict=True):
+        row = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
+        for figure, (_, spec) in SHOWN.items():
+            mean, half = estimate(runs, figure)
+            row.append(_interval(mean, half, spec))
+        table.add_row(*map(Text, row))
+    command.show(table)
+    failed = sum(not run.steps for runs in cells for run in runs)
+    if failed:
+        print(f"{failed} runs found no server and count in no mean of the error")
+    if spent.cpu_s:
+        rate = spent.steps / spent.cpu_s
+        print(f"{spent.steps} vehicle-steps, {rate:.0f} per core-second")
+    print(f"{options.out}: {', '.join(files)}")
+
+
+def _interval(mean: float | None, half: float | None, spec: str) -> str:
+    if mean is None:
+        return "-"
+    return format(mean, spec) + ("" if half is None else f" ± {half:{spec}}")

@@ -1,0 +1,167 @@
+"""`skytether torture`: sealed flights through faults and attacks, and what must hold meanwhile."""
+
+import math
+import secrets
+import shlex
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import tyro
+from rich.table import Table
+
+from skytether.lab.commands.pool import Flags, Interrupted, crew
+from skytether.lab.faults import Trial, dumps, loads
+from skytether.lab.torture import Outcome, fly, long_trial, short_trial, shrunk
+from skytether.shared.base.errors import ConfigError
+from skytether.shell import command
+from skytether.shell.command import CommandError
+from skytether.shell.options import read
+
+SEEDS = 2**32
+"""Number of seeds."""
+HOURS_MAX = 10_000
+"""Largest number of hours."""
+TOLD_MAX = 10
+"""Most failures that are shrunk and printed."""
+
+
+@dataclass(frozen=True)
+class TortureOptions:
+    """Options of `skytether torture`."""
+
+    seed: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """First seed; another each time unless given."""
+    count: Annotated[int, tyro.conf.arg(metavar="N")] = 100
+    """Number of flights, with seeds that count up."""
+    hours: Annotated[float | None, tyro.conf.arg(metavar="H")] = None
+    """Number of hours to be flown instead, in flights of an hour with faults all along."""
+    jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Number of processes that fly; one for each core unless given."""
+    replay: Path | None = None
+    """File with a schedule in each line, to be flown instead of what is drawn from seeds."""
+    schedule: str | None = None
+    """Schedule to be flown instead, as a failure prints it."""
+    json: Path | None = None
+    """File for what was flown and counted, and for the failures."""
+
+
+def torture(argv: Sequence[str]) -> None:
+    """Fly server, netem and clients in virtual time, sealed, and do all that is bad to them.
+
+    Packets are lost, doubled, held back, changed, recorded and sent again; hosts freeze, restart,
+    and set their clocks; the solver fails, the server is overloaded, strangers flood. At each step
+    of each vehicle it is checked that nothing unsafe is flown, and at the end that all fly again;
+    docs/torture.md has the list. The exit code is 1 where a flight failed: its schedule is then
+    shrunk to the shortest that fails in the same way, and printed; --schedule flies it again.
+    """
+    options = read(TortureOptions(), argv, "skytether torture", torture.__doc__)
+    command.check_count("--count", options.count, 10**6)
+    command.check_output("--json", options.json)
+    pool = Flags(workers=options.jobs)
+    pool.check()
+    trials, title = _trials(options)
+    done: list[Outcome] = []
+    interrupted = ""
+    try:
+        with crew(pool, title, len(trials), "flights") as flyers:
+
+            def keep(_: int, outcome: Outcome) -> None:
+                done.append(outcome)
+                failed = sum(bool(each.failure) for each in done)
+                flyers.advance(1, f"{failed} failed" if failed else "")
+
+            flyers.share(fly, trials, keep)
+            failed = [each for each in done if each.failure]
+            failed.sort(key=lambda outcome: outcome.trial.seed)
+            failed[:TOLD_MAX] = flyers.map(shrunk, failed[:TOLD_MAX])
+    except Interrupted:
+        interrupted = f"interrupted with {len(done)} of {len(trials)} flights done"
+        failed = [each for each in done if each.failure]
+    _finish(options, title, done, failed)
+    if failed:
+        said = f"{len(failed)} of {len(done)} flights failed"
+        raise CommandError(f"{interrupted}, and {said}" if interrupted else said)
+    if interrupted:
+        raise CommandError(interrupted, command.INTERRUPTED)
+
+
+def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
+    """Trials that are asked for, and what they are called.
+
+    Raises:
+        CommandError: they cannot be, or not together.
+        ConfigError: a schedule is none.
+    """
+    asked = ("seed", "hours", "replay", "schedule")
+    given = [name for name in asked if getattr(options, name) is not None]
+    if len(given) > 1 and given != ["seed", "hours"]:
+        together = " and ".join(f"--{name}" for name in given)
+        raise CommandError(f"got {together}, expected one of them", command.CONFIGURATION)
+    if options.schedule is not None:
+        return [loads(options.schedule)], "torture by a schedule"
+    if options.replay is not None:
+        return _read(options.replay), f"torture by {options.replay}"
+    seed = secrets.randbelow(SEEDS) if options.seed is None else options.seed
+    if not 0 <= seed < SEEDS:
+        expected = f"expected 0 to {SEEDS - 1}"
+        raise CommandError(f"--seed: got {seed}, {expected}", command.CONFIGURATION)
+    if options.hours is None:
+        seeds = [(seed + number) % SEEDS for number in range(options.count)]
+        return list(map(short_trial, seeds)), f"torture from seed {seed}"
+    if not 0.0 < options.hours <= HOURS_MAX:
+        expected = f"expected more than 0, at most {HOURS_MAX}"
+        raise CommandError(f"--hours: got {options.hours:g}, {expected}", command.CONFIGURATION)
+    each = [min(1.0, options.hours - begun) for begun in range(math.ceil(options.hours))]
+    trials = [long_trial((seed + number) % SEEDS, hours) for number, hours in enumerate(each)]
+    return trials, f"torture for {options.hours:g} h from seed {seed}"
+
+
+def _read(path: Path) -> list[Trial]:
+    """Trials in a file, one a line; a line that begins with # is none.
+
+    Raises:
+        CommandError: the file cannot be read.
+        ConfigError: a line is no schedule, or there is none.
+    """
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise CommandError(f"--replay: {path}: {error}", command.CONFIGURATION) from None
+    trials = [loads(line) for line in lines if line.strip() and not line.startswith("#")]
+    if not trials:
+        raise ConfigError(f"{path}: no schedules, expected one a line")
+    return trials
+
+
+def _finish(
+    options: TortureOptions, title: str, done: Sequence[Outcome], failed: list[Outcome]
+) -> None:
+    """Write and print what was flown, and what failed."""
+    counts: Counter[str] = Counter()
+    for outcome in done:
+        counts.update(outcome.counts)
+    flown_s = sum(outcome.flown_s for outcome in done)
+    if options.json is not None:
+        figures = {
+            "title": title,
+            "flights": len(done),
+            "flown_s": flown_s,
+            "failed": len(failed),
+            "counts": dict(sorted(counts.items())),
+            "failures": failed,
+        }
+        command.write(options.json, msgspec.json.encode(figures))
+    table = Table(title=title, title_justify="left", show_header=False)
+    table.add_row("flights", f"{len(done)}, {flown_s / 3600:.2f} h in virtual time")
+    for name, amount in sorted(counts.items()):
+        table.add_row(name, str(amount))
+    command.show(table)
+    for outcome in failed[:TOLD_MAX]:
+        print(f"seed {outcome.trial.seed}: {outcome.failure}")
+        print(f"    skytether torture --schedule {shlex.quote(dumps(outcome.trial))}")
+    if len(failed) > TOLD_MAX:
+        print(f"and {len(failed) - TOLD_MAX} more, in the file of --json")

@@ -1,0 +1,481 @@
+"""The contenders and cases of `skytether compare`, and the file of the weights that each flies at.
+
+The best weights of a contender in a case are a table of that file, found by a search
+(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. Around them
+the contender's threshold is moved, which gives a curve of what a packet buys. Other cases are flown
+at the weights of one that was searched: they show what weights are worth where they were not meant
+to be.
+"""
+
+import json
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from skytether.lab.sweep import GridAxis, Sweep
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.hint import hint
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.schema import Scenario
+
+SEARCH_SEED = 1001
+"""First seed of a search; the seeds that are compared begin at the plant's own."""
+PACKETS = 0.1
+"""Largest share of steps that may send, for a contender whose trigger looks at the flight."""
+SATURATED = 0.1
+"""Largest share of steps with an input at its bound, in a search."""
+
+NEAR = (0.4, 0.8, 1, 1.25, 2.5)
+"""Factors of a threshold with which what is seen of a flight is compared."""
+PERIODS = (0.2, 0.5, 1, 1.5, 3)
+"""Factors of a period of ten steps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """A scheme with a trigger."""
+
+    name: str
+    """Short name, in tables, files and scenarios."""
+    scheme: str
+    """Name of the scheme as a reader of the report sees it."""
+    trigger: str
+    """Name of the trigger as a reader of the report sees it."""
+    control: Mapping[str, Any]
+    """Keys of `control` that make up the contender, with the weights its search starts from."""
+    threshold: str = ""
+    """Key of `control` that decides how many packets are sent; empty where there is none."""
+
+    @property
+    def title(self) -> str:
+        """Name as a reader of the report sees it."""
+        return f"{self.scheme}, {self.trigger}"
+
+    @property
+    def factors(self) -> Sequence[float]:
+        """Multiples of the threshold found, each a point of the curve."""
+        if not self.threshold:
+            return ()
+        return PERIODS if self.threshold == "period" else NEAR
+
+
+LOOSE = {
+    "state_weight": [7.1, 3.0],
+    "terminal_weight": [1e5, 1e5],
+    "input_weight": 5.0,
+    "change_weight": 200.0,
+}
+"""Start of a search with the paper's scheme, whose plans should hardly change from step to step."""
+TIGHT = {
+    "state_weight": [7.1, 1.0],
+    "terminal_weight": [50.0, 20.0],
+    "input_weight": 0.3,
+    "change_weight": 0.01,
+}
+"""Start of a search with committed inputs, which need no S-term."""
+
+PAPER = {"scheme": "predictive", "feedback": False, "observer_s": 0.0, "horizon": 40} | LOOSE
+"""The paper's scheme, with the horizon that reproduces its table."""
+OBSERVED = PAPER | {"observer_s": 4.0}
+LED = OBSERVED | {"feedback": True}
+BLIND = {"scheme": "committed", "feedback": False, "observer_s": 0.0, "horizon": 60} | TIGHT
+COMMITTED = BLIND | {"observer_s": 4.0}
+"""Committed inputs; the observer's time constant is searched for and may come out very long."""
+FEEDBACK = COMMITTED | {"feedback": True}
+RECKONING = {
+    "scheme": "dead_reckoning",
+    "feedback": True,
+    "state_weight": [7.1, 1.0],
+    "input_weight": 0.3,
+}
+"""No plan is sent, but the target's state, towards which the vehicle regulates itself."""
+
+ALWAYS = {"trigger": "always"}
+PERIODIC = {"trigger": "periodic", "period": 10}
+STATE_GAP = {"trigger": "state_gap", "epsilon": 5e4}
+COST_GAP = {"trigger": "cost_gap", "cost_gap": 300.0}
+EXPECTED_GAP = {"trigger": "expected_gap", "cost_gap": 300.0}
+DEVIATION = {"trigger": "deviation", "deviation_m": 1.0}
+TOLERANCE = {"trigger": "tolerance", "tolerance_m": 0.05}
+DELTA = {"trigger": "delta", "tolerance_m": 0.4}
+
+
+def _contenders() -> tuple[Contender, ...]:
+    """All contenders, family by family."""
+    every, periodic, event = "every step", "periodic", "eq. (16)"
+    paper, observed, led = "paper", "paper with observer", "paper with feedback"
+    committed, aboard, state = "committed", "committed with feedback", "target's state"
+    return (
+        Contender("paper-every-step", paper, every, PAPER | ALWAYS),
+        Contender("paper-event", paper, event, PAPER | STATE_GAP, "epsilon"),
+        Contender("paper-periodic", paper, periodic, PAPER | PERIODIC, "period"),
+        Contender("paper-observer-every-step", observed, every, OBSERVED | ALWAYS),
+        Contender("paper-observer-event", observed, event, OBSERVED | STATE_GAP, "epsilon"),
+        Contender("paper-feedback-every-step", led, every, LED | ALWAYS),
+        Contender("paper-feedback-event", led, event, LED | STATE_GAP, "epsilon"),
+        Contender("committed-every-step", committed, every, COMMITTED | ALWAYS),
+        Contender("committed-periodic", committed, periodic, COMMITTED | PERIODIC, "period"),
+        Contender("committed-gap", committed, "cost gap", COMMITTED | COST_GAP, "cost_gap"),
+        Contender(
+            "committed-deviation", committed, "deviation", COMMITTED | DEVIATION, "deviation_m"
+        ),
+        Contender(
+            "committed-blind-gap",
+            "committed without observer",
+            "cost gap",
+            BLIND | COST_GAP,
+            "cost_gap",
+        ),
+        Contender("feedback-every-step", aboard, every, FEEDBACK | ALWAYS),
+        Contender("feedback-periodic", aboard, periodic, FEEDBACK | PERIODIC, "period"),
+        Contender("feedback-gap", aboard, "cost gap", FEEDBACK | COST_GAP, "cost_gap"),
+        Contender("feedback-expected", aboard, "expected gap", FEEDBACK | EXPECTED_GAP, "cost_gap"),
+        Contender("reckoning-every-step", state, every, RECKONING | ALWAYS),
+        Contender("reckoning-periodic", state, periodic, RECKONING | PERIODIC, "period"),
+        Contender("reckoning-tolerance", state, "tolerance", RECKONING | TOLERANCE, "tolerance_m"),
+        Contender("reckoning-delta", state, "send on delta", RECKONING | DELTA, "tolerance_m"),
+    )
+
+
+CONTENDERS = _contenders()
+BESIDE = "feedback-gap"
+"""Contender at whose weights it is flown with the reference aboard, and a floor is measured."""
+ABOARD = Contender("aboard", "reference aboard", "no packets", {})
+"""Stands beside the contenders where the reference is known before the flight."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is flown: a scenario, and what the server of it is not told."""
+
+    name: str
+    """Short name, in tables, files and scenarios."""
+    title: str
+    """Name as a reader of the report sees it."""
+    plant: str
+    """Name of the scenario whose vehicle, trajectory and network all contenders fly."""
+    keys: Mapping[str, Any]
+    """Keys of the scenario, with dots, that differ from the plant's."""
+    effort_mps: float = math.inf
+    """Largest effort in a search, the RMS change of the command from step to step [m/s]."""
+    weights: str = ""
+    """Name of the case whose weights are flown; empty where the case has its own."""
+    contenders: Sequence[str] = ()
+    """Names of those who fly it; empty for all."""
+    start: Mapping[str, float] = field(default_factory=dict)
+    """Keys of `control` from whose values searches start here, where a contender has them."""
+
+
+TARGET = {"link.heartbeat_s": 1.0, "link.timeout_s": 5.0, "duration": 35.0}
+"""Keys of every case with a target: as few heartbeats as in the paper's scenario, so that hardly a
+packet is sent but by a trigger."""
+CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap")
+"""Contenders on a trajectory that is known for ever, for which no network is needed."""
+AHEAD = ("paper-every-step", "feedback-gap", "reckoning-tolerance")
+"""Contenders where a plan may say more than a target's state."""
+TURNING = (
+    "paper-every-step",
+    "paper-event",
+    "feedback-every-step",
+    "feedback-periodic",
+    "feedback-gap",
+    "feedback-expected",
+    "reckoning-periodic",
+    "reckoning-tolerance",
+)
+"""Contenders where a trigger may earn its packets."""
+
+
+def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
+    """A case that is flown at the weights of the case `target`."""
+    return Case(name, title, "target", {**TARGET, **keys}, weights="target")
+
+
+def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -> Case:
+    """A case that flies the paper's circle, where costs are hundreds of times smaller."""
+    small = {"cost_gap": 1.0, "epsilon": 300.0}
+    round_ = {**keys, "duration": 32.5}  # a whole one, after what RMSE leaves out
+    return Case(name, title, "paper", round_, effort_mps, contenders=CIRCLE, start=small)
+
+
+def _network(**keys: Any) -> Mapping[str, Any]:
+    """Keys of both directions of the network."""
+    ways = ("uplink", "downlink")
+    return {f"network.{way}.{key}": value for way in ways for key, value in keys.items()}
+
+
+def _noise(position_m: float) -> Mapping[str, Any]:
+    """Keys of the sensor's noise; that of a velocity, in m/s, is 2.5 times that of a position."""
+    return {
+        "sensor.position_noise_m": position_m,
+        "sensor.velocity_noise_mps": 2.5 * position_m,
+    }
+
+
+GUSTS = {"vehicle.gust_mps2": 1.0, "vehicle.gust_every_s": 10.0, "vehicle.gust_s": 1.0}
+CASES = (
+    Case("target", "a target that only the server sees", "target", TARGET, 0.3),
+    Case(
+        "turns",
+        "a target that turns every 4 s on average",
+        "target",
+        {**TARGET, "reference.turn_every_s": 4.0},
+        0.3,
+        contenders=TURNING,
+    ),
+    _unsearched("loss-0.3", "loss of 0.3 each way", _network(loss=0.3)),
+    _unsearched("loss-0.5", "loss of 0.5 each way", _network(loss=0.5)),
+    _unsearched("jitter", "jitter doubled", _network(minimum_s=0.36, slot_s=0.04, slots_mean=2.0)),
+    _unsearched("burst-0.5", "bursts of 0.5 s", _network(burst_s=0.5)),
+    _unsearched("burst-2", "bursts of 2 s", _network(burst_s=2.0)),
+    _unsearched("noise-1", "noise of 1 cm", _noise(0.01)),
+    _unsearched("noise-5", "noise of 5 cm", _noise(0.05)),
+    _unsearched("noise-10", "noise of 10 cm", _noise(0.1)),
+    Case(
+        "route",
+        "a route that only the server knows, for 4 s",
+        "target",
+        {**TARGET, "reference.preview": 4.0},
+        0.3,
+        contenders=AHEAD,
+    ),
+    Case(
+        "bounds",
+        "a target nearly as fast as the vehicle",
+        "target",
+        {**TARGET, "reference.speed_mps": 1.5, "reference.agility": 0.6},
+        0.6,
+        contenders=AHEAD,
+    ),
+    _circle("wind-0.1", "circle, wind of 0.1 m/s per √s", {"vehicle.wind": 0.1}, 0.1),
+    _circle("wind-0.3", "circle, wind of 0.3 m/s per √s", {"vehicle.wind": 0.3}, 0.35),
+    _circle("gusts", "circle, gusts of 1 m/s²", GUSTS, 0.1),
+)
+"""Every case; the first is the benchmark."""
+
+
+def cases(names: Sequence[str]) -> Sequence[Case]:
+    """Cases by name; all where none is named.
+
+    Raises:
+        ConfigError: there is no such case.
+    """
+    known = {case.name: case for case in CASES}
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"--cases: got {name!r}, expected others; {hint(name, known)}")
+    return [known[name] for name in names] or CASES
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonSize:
+    """How much a comparison flies; what is not given is as in those that are reported."""
+
+    runs: int
+    """Number of flights of each contender in each case at each threshold; half as many where the
+    case has no weights of its own."""
+    generations: int
+    """Number of generations of a search."""
+    population: int = 8
+    """Number of points in a generation."""
+    search_runs: int = 6
+    """Number of flights of each point of a search."""
+    search_duration: float = 30.0
+    """Length of a flight of a search [s]."""
+    cases: Sequence[Case] = CASES
+    """Cases that are flown."""
+    contenders: Sequence[Contender] = CONTENDERS
+    """Contenders that fly, in those cases that they are in."""
+    every: int = 1
+    """Stride over a contender's factors; it meets the middle one, a factor of 1."""
+    duration: float = math.inf
+    """Largest length of a flight [s]."""
+
+    def who(self, case: Case) -> list[Contender]:
+        """Contenders that fly in a case."""
+        return [
+            each for each in self.contenders if not case.contenders or each.name in case.contenders
+        ]
+
+    @property
+    def searched(self) -> list[tuple[Contender, Case]]:
+        """Every contender in every case for which weights are searched."""
+        return [
+            (contender, case)
+            for case in self.cases
+            if not case.weights
+            for contender in self.who(case)
+        ]
+
+
+LOOKED_AT = ("paper-every-step", "paper-event", "feedback-gap", "reckoning-tolerance")
+"""Contenders of a first look."""
+
+
+def quick(scale: ComparisonSize) -> ComparisonSize:
+    """Scale of a first look, with no more than is asked for."""
+    few = [case for case in scale.cases if case.name in ("target", "loss-0.5")]
+    return ComparisonSize(
+        runs=min(scale.runs, 3),
+        generations=min(scale.generations, 2),
+        population=4,
+        search_runs=2,
+        search_duration=12.0,
+        cases=few or scale.cases[:1],
+        contenders=[each for each in CONTENDERS if each.name in LOOKED_AT],
+        every=2,
+        duration=12.0,
+    )
+
+
+# -- weights -------------------------------------------------------------------------------------
+
+
+def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Scenario:
+    """Scenario from which the search for a contender's weights in a case begins."""
+    table = reading.to_table(reading.load(case.plant))
+    control = {key: case.start.get(key, value) for key, value in contender.control.items()}
+    lay({f"control.{key}": value for key, value in control.items()}, table)
+    lay(case.keys, table)
+    lay({"duration": scale.search_duration, "seed": SEARCH_SEED}, table)
+    return reading.check(table, f"{contender.title}, {case.title}")
+
+
+def entry(contender: Contender, case: Case) -> str:
+    """Name of a contender in a case: of its table in the file of weights."""
+    return f"{contender.name}-{case.weights or case.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What the search for a contender's weights in a case has found."""
+
+    contender: Contender
+    case: Case
+    scenario: Scenario
+    """Scenario with the weights."""
+    says: str
+    """What it came to on the seeds of the search, in a line."""
+
+
+def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
+    """The file of weights: a table for each contender in each case, with what the plant has not.
+
+    Args:
+        scale: what the searches took, which the file says.
+    """
+    says = (
+        "Scenarios of each contender of `skytether compare` in each case, with the weights and "
+        f"thresholds that `skytether compare --tune` has found for it in {scale.generations} "
+        f"generations of {scale.population} points, each flown with {scale.search_runs} seeds from "
+        f"{SEARCH_SEED} on for {scale.search_duration:g} s. At most {SATURATED:.0%} of the steps "
+        f"may have an input at its bound, and at most {PACKETS:.0%} may send, where the trigger "
+        "has a say in that. The largest effort, the RMS change of the command from step to step, is"
+    )
+    efforts = {each.case.name: each.case.effort_mps for each in found}
+    lines = [f"# {line}" for line in textwrap.wrap(says, 98)]
+    lines += [f"# - {effort:g} m/s in the case {name}" for name, effort in efforts.items()]
+    for each in found:
+        sections: dict[str, Any] = {}
+        lay(differences(each.scenario, each.case.plant), sections)
+        lines += [
+            "",
+            f"# {each.says}",
+            f"[{_inline(entry(each.contender, each.case))}]",
+            f"title = {_inline(f'{each.contender.title}, at its best: {each.case.title}')}",
+            f"extends = {_inline(each.case.plant)}",
+            *(f"{section} = {_inline(keys)}" for section, keys in sections.items()),
+        ]
+    return "\n".join([*lines, ""])
+
+
+def _inline(value: Any) -> str:
+    """A value as TOML has it in a line; numbers, texts and lists are the same in JSON."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {_inline(each)}' for key, each in value.items())} }}"
+    return json.dumps(value, ensure_ascii=False)
+
+
+def differences(scenario: Scenario, plant: str) -> dict[str, Any]:
+    """Keys in the sections of a scenario that differ from its plant's, with dots, and values."""
+    here, there = (dict(flat(reading.to_table(each))) for each in (scenario, reading.load(plant)))
+    return {key: value for key, value in here.items() if "." in key and value != there[key]}
+
+
+# -- what is flown -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class FlownContender:
+    """A contender in a case, at one threshold."""
+
+    contender: Contender
+    threshold: float | None
+    """Value of the contender's threshold; None where it has none."""
+    tuned: bool
+    """Whether the threshold is the one that the search has found."""
+    control: Mapping[str, Any]
+    """Keys that differ from the plant's, with dots, and their values."""
+
+
+def flying(
+    contender: Contender, case: Case, tuned: Scenario, scale: ComparisonSize
+) -> list[FlownContender]:
+    """A contender at all thresholds of its curve, in rising order; one of them is tuned.
+
+    At the weights of another case it flies at its tuned threshold alone.
+    """
+    keys, key = differences(tuned, case.plant), contender.threshold
+    keys = {path: value for path, value in keys.items() if path not in case.keys}
+    if not key:
+        return [FlownContender(contender, None, True, keys)]
+    here = getattr(tuned.control, key)
+    factors = (1,) if case.weights else contender.factors[:: scale.every]
+    values = {here * factor for factor in factors}
+    if isinstance(here, int):  # steps
+        values = {max(1, round(value)) for value in values}
+    return [
+        FlownContender(contender, value, value == here, {**keys, f"control.{key}": value})
+        for value in sorted(values)
+    ]
+
+
+class Plan:
+    """What all contenders fly in one case.
+
+    Args:
+        weights: COMPARED, or the path of a file that `to_file` has made.
+
+    Raises:
+        ConfigError: the file cannot be read, or a contender is missing there, or wrong.
+    """
+
+    def __init__(self, case: Case, weights: str, scale: ComparisonSize) -> None:
+        self.case = case
+        self.flying: list[FlownContender] = []
+        known = reading.names(weights)
+        for contender in scale.who(case):
+            name = entry(contender, case)
+            if f"{weights}/{name}" not in known:
+                there_is = "expected every contender in every case, as --tune writes them"
+                raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
+            self.flying += flying(contender, case, reading.load(f"{weights}/{name}"), scale)
+        values = tuple((each.contender.name, each.threshold) for each in self.flying)
+        changes = tuple(each.control for each in self.flying)
+        self.runs = -(-scale.runs // 2) if case.weights else scale.runs
+        """Number of flights of each contender at each threshold."""
+        plant = reading.to_table(reading.load(case.plant))
+        lay(case.keys, plant)
+        plant["duration"] = min(plant["duration"], scale.duration)
+        scenario = reading.check(plant, case.title)
+        self.sweep = Sweep(case.name, scenario, [GridAxis("contender", values, changes)], self.runs)
+
+    def tuned(self, name: str) -> Scenario:
+        """What a contender flies at the threshold that was found."""
+        (threshold,) = (
+            each.threshold for each in self.flying if each.contender.name == name and each.tuned
+        )
+        return self.sweep.scenario_of((name, threshold))

@@ -1,0 +1,345 @@
+"""The envelope of a scenario: which networks and settings it bears, by flights at random points.
+
+A point is the scenario with other delays, losses, step, horizon and scheme, which follow from the
+seed and the point's number alone. What came of it is judged from the scenario and the client's
+record, whatever the controller meant to do. A vehicle without a planned input since time s, when
+its command was u and its velocity v, must keep to the braking curve (a: brake_mps2, g: gain):
+
+    |u(t)| ≤ |u| - a (t - s)                                                   what is commanded
+    |p(t) - p(s)| ≤ τ |v| + g (|u|²/2a + |u| Δt)                               how far that takes it
+    |v(t)| ≤ |v| e^(-(t - s)/τ) + g |u| e^(-(t - s - |u|/a - Δt)/τ)            how fast it still is
+
+With feedback aboard a horizon that has ended is still held, and leads the vehicle to where it
+brakes to: then the second line alone binds, 1 m wider, until the horizon is dropped.
+
+In all, it must stay within a disc: that around the reference, 1 m and the way to stop wider. And it
+must have come near the reference once it flies a plan that was made of what it did under plans.
+"""
+
+import math
+import shlex
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+
+from skytether.figures.tables import to_csv
+from skytether.lab.journal import digests
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.law.model import Array, Flags
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.summary import position_error
+from skytether.sim import flight
+
+DELAY_MAX_S = 3.0
+"""Largest of the smallest delays of a direction that are drawn [s]."""
+LOSSES_MAX = (0.5, 0.99)
+"""Largest loss of a direction, in one half of the points and in the other."""
+DT_MIN_S, DT_MAX_S = 0.005, 0.5
+"""Shortest and longest step that is drawn [s]."""
+HORIZON_MAX = 120
+"""Longest horizon that is drawn; the shortest is 1."""
+NEAR_M = 1.0
+"""Distance from the reference within which a vehicle flies it [m]."""
+SIGMAS = 6.0
+"""Number of standard deviations of white wind that are no fault of the vehicle."""
+ROUNDING = 1e-6
+"""Rounding of a distance [m] or of a speed [m/s]."""
+
+Outcome = Literal[
+    "flown", "interrupted", "hovering", "unanswered", "refused", "astray", "flyaway", "crashed"
+]
+"""What came of a point, as docs/envelope.md explains it."""
+BAD: tuple[Outcome, ...] = ("crashed", "flyaway")
+"""Outcomes that must not be, the worst first."""
+WRONG: tuple[Outcome, ...] = (*BAD, "astray")
+"""Outcomes that tell of a fault, the worst first."""
+
+
+def draw(seed: int, number: int) -> dict[str, Any]:
+    """Keys of a point and their values, which follow from the seed and the point's number."""
+    rng = stream(seed, "envelope", number)
+    loss_max = float(rng.choice(LOSSES_MAX))
+    keys: dict[str, Any] = {}
+    for direction in ("uplink", "downlink"):
+        keys[f"network.{direction}.delay"] = str(rng.choice(("constant", "poisson")))
+        keys[f"network.{direction}.minimum_s"] = _short(rng.uniform(0.0, DELAY_MAX_S))
+        keys[f"network.{direction}.loss"] = _short(rng.uniform(0.0, loss_max))
+    keys["control.dt"] = _short(DT_MIN_S * (DT_MAX_S / DT_MIN_S) ** rng.random())
+    keys["control.horizon"] = int((HORIZON_MAX + 1) ** rng.random())
+    keys["control.feedback"] = bool(rng.integers(2))
+    keys["vehicle.exhausted"] = "brake"
+    keys["seed"] = int(rng.integers(2**32))
+    return keys
+
+
+def _short(value: float) -> float:
+    """A number of four digits, which a command line can show."""
+    return float(f"{value:.4g}")
+
+
+class EnvelopePoint(msgspec.Struct, frozen=True):
+    """What came of a point; an entry of an envelope's journal."""
+
+    number: int
+    """Number of the point, from 0 on."""
+    outcome: Outcome
+    error_max: float | None = None
+    """Largest distance from the reference after settling [m]; None where none was settled."""
+    covered: float | None = None
+    """Share of the steps with a planned input; None where none was flown."""
+    outside_m: float | None = None
+    """Largest distance from the disc around the reference [m]; 0 within it."""
+    line: str = ""
+    """Why it was refused, found unsafe, or ended early."""
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """A scenario, of which points are flown."""
+
+    name: str
+    """Name of the scenario, for command lines and messages."""
+    scenario: Scenario
+
+    def settings(self) -> dict[str, Any]:
+        """All that the points follow from, as plain values."""
+        files, table = digests([self.scenario]), reading.to_table(self.scenario)
+        return {"name": self.name, "files": files, "scenario": table}
+
+    def keys(self, number: int) -> dict[str, Any]:
+        """Keys of a point and their values; see `draw`."""
+        return draw(self.scenario.seed, number)
+
+    def _table(self, number: int) -> dict[str, Any]:
+        table = reading.to_table(self.scenario)
+        lay(self.keys(number), table)
+        return table
+
+    def scenario_of(self, number: int) -> Scenario:
+        """Scenario of a point.
+
+        Raises:
+            ConfigError: it cannot be flown.
+        """
+        return reading.check(self._table(number), self.name)
+
+    def fly(self, number: int) -> EnvelopePoint:
+        """Fly a point in virtual time, and judge it; called in a worker."""
+        try:
+            scenario = self.scenario_of(number)
+        except ConfigError as error:
+            return EnvelopePoint(number, "refused", line=str(error))
+        try:
+            flown = flight.fly(scenario)
+            verdict = judge(scenario, flown.client)
+        except Exception as error:  # whatever it is, it is what the point has shown
+            return EnvelopePoint(number, "crashed", line=f"{type(error).__name__}: {error}")
+        line = verdict.line or (str(flown.failure) if flown.failure else "")
+        return EnvelopePoint(number, *verdict._replace(line=line))
+
+    def command(self, number: int) -> str:
+        """Command line that flies just one point again."""
+        before = dict(flat(reading.to_table(reading.load(self.name))))
+        now = flat(self._table(number))
+        changed = ((key, value) for key, value in now if value != before.get(key))
+        flags = [word for key, value in changed for word in _flag(key, value)]
+        return shlex.join(["skytether", "fly", self.name, "--virtual", *flags])
+
+    def csv(self, points: Iterable[EnvelopePoint]) -> str:
+        """CSV table with a row for each point: the keys drawn, and what came of it."""
+        names = EnvelopePoint.__struct_fields__
+        rows = [
+            [point.number, *self.keys(point.number).values(), *msgspec.structs.astuple(point)[1:]]
+            for point in points
+        ]
+        return to_csv([names[0], *self.keys(0), *names[1:]], rows)
+
+
+def _flag(key: str, value: Any) -> Iterator[str]:
+    """Words of a command line that set a key."""
+    section, _, name = key.replace("_", "-").rpartition(".")
+    path = f"{section}." if section else ""
+    if isinstance(value, bool):
+        yield f"--{path}{name}" if value else f"--{path}no-{name}"
+    else:
+        yield f"--{path}{name}"
+        yield from map(str, value if isinstance(value, list | tuple) else [value])
+
+
+def worst_first(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
+    """Points that went wrong: crashes, flyaways by how far they went, and what went astray."""
+    wrong = [point for point in points if point.outcome in WRONG]
+    return sorted(
+        wrong,
+        key=lambda point: (
+            WRONG.index(point.outcome),
+            -(point.outside_m or 0.0),
+            -(point.error_max or 0.0),
+        ),
+    )
+
+
+class PointVerdict(NamedTuple):
+    """What came of a flight; the fields are those of `EnvelopePoint`."""
+
+    outcome: Outcome
+    error_max: float | None = None
+    covered: float | None = None
+    outside_m: float | None = None
+    line: str = ""
+
+
+def settling_s(scenario: Scenario) -> float:
+    """Time that a vehicle may take to the reference from anywhere in its disc [s].
+
+    Twice the time across at full speed, since the reference moves on meanwhile, and five time
+    constants.
+    """
+    _, radius_m = disc(scenario)
+    across_s = 2.0 * radius_m / float(scenario.u_max.min())
+    return 2.0 * across_s + 5.0 * float(scenario.true_tau_s.max())
+
+
+def disc(scenario: Scenario) -> tuple[Array, float]:
+    """Centre [m; shape (axes,)] and radius [m] of a disc, or ball, around reference and start."""
+    times_s = np.arange(scenario.steps) * scenario.control.dt
+    points = scenario.make_reference()(times_s)[..., 0]
+    if scenario.vehicle.start_m:
+        points = np.vstack([points, scenario.vehicle.start_m])
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
+def judge(scenario: Scenario, client: Rows) -> PointVerdict:
+    """What came of a flight.
+
+    Args:
+        scenario: what was flown.
+        client: rows of its one vehicle, a row for every step.
+    """
+    if not len(client):
+        return PointVerdict("unanswered")
+    covered = client["covered"]
+    error_m = np.linalg.norm(position_error(scenario, client), axis=1)
+    centre, radius_m = disc(scenario)
+    outside_m = np.linalg.norm(client["state"][..., 0] - centre, axis=1) - radius_m
+    time_s = client["step"] * scenario.control.dt
+    first_s = time_s[covered].min(initial=math.inf)
+    settled_m = error_m[time_s >= first_s + settling_s(scenario)]
+    error_max = float(settled_m.max()) if len(settled_m) else None
+    figures = (error_max, float(covered.mean()), max(0.0, float(outside_m.max())))
+    faults = list(_faults(scenario, client, error_m, outside_m, radius_m))
+    if faults:
+        return PointVerdict("flyaway", *figures, min(faults)[1])
+    if error_max is not None and error_max < NEAR_M:
+        return PointVerdict("flown", *figures)
+    if not covered[-1]:
+        return PointVerdict("hovering", *figures)
+    if error_max is None or not covered[time_s >= first_s].all():
+        return PointVerdict("interrupted", *figures)
+    return PointVerdict("astray", *figures)
+
+
+def _faults(
+    scenario: Scenario, client: Rows, error_m: Array, outside_m: Array, radius_m: float
+) -> Iterator[tuple[int, str]]:
+    """First step that breaks each rule of safety, and a sentence on it."""
+    vehicle, dt, covered = scenario.vehicle, scenario.control.dt, client["covered"]
+    tau_s, brake = float(scenario.true_tau_s.max()), vehicle.brake_mps2
+    gain, late_s = float(scenario.true_gain.max()), float(scenario.true_dead_time_s.max())
+    top_mps = float(np.linalg.norm(scenario.u_max))
+    time_s = client["step"] * dt
+    position, velocity = client["state"][..., 0], client["state"][..., 1]
+    speed, command = np.linalg.norm(velocity, axis=1), np.linalg.norm(client["input"], axis=1)
+    # It holds a horizon that has ended, and comes to rest where that leads.
+    led = ~covered & (client["age_ns"] >= 0) & scenario.control.feedback
+    blind = ~covered & ~led
+    begun = _begun(covered, led)
+    since_s = time_s - time_s[begun]
+    age_s = client["age_ns"] / SECOND_NS
+    # Nobody answers the wind before it has been seen.
+    pushed_m, pushed_mps = _wind(scenario, np.where(covered, np.maximum(0.0, age_s), since_s))
+    # A command flown before is still on its way for as long as the dead time.
+    on_its_way = np.where(late_s > 0.0, top_mps, command[begun])
+    stopping_s = on_its_way / brake + dt + late_s
+
+    def stop_m(v: Array | float, u: Array | float) -> Array | float:
+        ramp_m = u**2 / (2.0 * brake) + u * (dt + late_s)
+        return tau_s * v + gain * ramp_m
+
+    def left(passed_s: Array) -> Array:
+        return np.exp(-np.maximum(0.0, passed_s) / tau_s)
+
+    travelled_m = np.linalg.norm(position - position[begun], axis=1)
+    curve_mps = speed[begun] * left(since_s)
+    curve_mps += gain * on_its_way * left(since_s - stopping_s)
+    # Time under plans that the vehicle was last seen at by whoever made the plan it flies.
+    seen_s = np.where(age_s >= 0.0, since_s - age_s, -1.0)
+    rules: tuple[tuple[str, Flags, Array, Any], ...] = (
+        (
+            "it is commanded {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",
+            blind,
+            command,
+            np.maximum(0.0, command[begun] - brake * since_s),
+        ),
+        (
+            "it went {:.3g} m without a plan, where braking takes {:.3g} m",
+            ~covered,
+            travelled_m,
+            stop_m(speed[begun], on_its_way) + pushed_m + NEAR_M * led,
+        ),
+        (
+            "it has {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",
+            blind,
+            speed,
+            curve_mps + pushed_mps,
+        ),
+        (
+            "it is {:.3g} m outside the reference's disc, where stopping may take {:.3g} m",
+            np.ones_like(covered),
+            outside_m,
+            NEAR_M + stop_m(top_mps * max(1.0, gain), top_mps) + pushed_m,
+        ),
+        (
+            "it is {:.3g} m from the reference, which {:.3g} m would hold if it stood still",
+            covered & (seen_s >= settling_s(scenario)),
+            error_m,
+            NEAR_M + radius_m + pushed_m,
+        ),
+    )
+    lost = ~np.isfinite(client["state"]).all(axis=(1, 2))
+    if lost.any():
+        step = int(lost.argmax())
+        yield step, f"at {time_s[step]:.2f} s its state is no number"
+    for says, rows, given, most in rules:
+        broken = rows & (given > most + ROUNDING)
+        if broken.any():
+            step = int(broken.argmax())
+            yield step, f"at {time_s[step]:.2f} s {says.format(given[step], most[step])}"
+
+
+def _begun(covered: Flags, led: Flags) -> Any:
+    """Row at which the stretch with planned inputs, led on, or without, began; shape (steps,)."""
+    rows, kind = np.arange(len(covered)), covered + 2 * led
+    changed = np.concatenate([[True], kind[1:] != kind[:-1]])
+    return np.maximum.accumulate(np.where(changed, rows, 0))
+
+
+def _wind(scenario: Scenario, blind_s: Array) -> tuple[Array, float]:
+    """How far [m], and at what speed [m/s], wind may carry a vehicle that nobody leads back.
+
+    Args:
+        blind_s: for how long nobody does [s]; shape (steps,).
+    """
+    vehicle, tau_s = scenario.vehicle, float(scenario.true_tau_s.max())
+    blown_mps = float(np.linalg.norm(vehicle.steady_wind_mps)) + tau_s * vehicle.gust_mps2
+    white = SIGMAS * vehicle.wind * tau_s
+    return blown_mps * blind_s + white * np.sqrt(blind_s), blown_mps + white / math.sqrt(tau_s)

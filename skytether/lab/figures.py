@@ -1,0 +1,212 @@
+"""Pictures of sweeps and of envelopes."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from msgspec.structs import replace
+
+from skytether.figures.flights import save
+from skytether.lab.envelope import WRONG, Envelope, EnvelopePoint, Outcome
+from skytether.lab.sweep import GridAxis
+from skytether.shared.law.model import Array, Flags
+from skytether.shared.scenario.schema import DirectionConfig, Scenario
+
+OUTCOMES: Mapping[Outcome, Mapping[str, Any]] = {
+    "refused": {"color": "0.82", "marker": "."},
+    "unanswered": {"color": "0.55", "marker": "."},
+    "flown": {"color": "#0072b2", "marker": "o"},
+    "interrupted": {"color": "#56b4e9", "marker": "s"},
+    "hovering": {"color": "#e69f00", "marker": "D"},
+    "astray": {"color": "#cc79a7", "marker": "^"},
+    "flyaway": {"color": "#c1272d", "marker": "X"},
+    "crashed": {"color": "black", "marker": "P"},
+}
+"""Colour and marker of each outcome of a point, in the order in which they are drawn."""
+RATIOS = np.geomspace(1 / 16, 16, 17)
+"""Bounds of the bars of `envelope`: what a horizon covers, in round trips."""
+
+
+def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
+    """Draw what came of the points of an envelope, over delays, losses and the length of a plan.
+
+    Args:
+        path: file to write, in one of FORMATS.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    keys = [plan.keys(point.number) for point in points]
+
+    def column(key: str) -> Array:
+        return np.array([each[key] for each in keys])
+
+    outcomes = np.array([point.outcome for point in points])
+    up_s, down_s = (_mean_delays_s(plan.scenario, way, keys) for way in ("uplink", "downlink"))
+    loss = np.maximum(column("network.uplink.loss"), column("network.downlink.loss"))
+    trip_s, covers_s = up_s + down_s, column("control.horizon") * column("control.dt")
+    figure = Figure(figsize=(10.0, 9.0), layout="constrained")
+    (cover, bars), (ways, losses) = figure.subplots(2, 2)
+    shown = {outcome: outcomes == outcome for outcome in OUTCOMES if outcome in outcomes}
+    for outcome, here in shown.items():
+        style: Any = {**OUTCOMES[outcome], "s": _size(outcome, len(points)), "linewidths": 0.0}
+        cover.scatter(trip_s[here], covers_s[here], **style)
+        long = here & (covers_s >= trip_s)
+        ways.scatter(up_s[long], down_s[long], **style)
+        losses.scatter(trip_s[long], loss[long], **style)
+    line_s = np.geomspace(0.01, float(trip_s.max()), 100)
+    cover.plot(line_s, line_s, "k-", linewidth=1.0)
+    cover.set_yscale("log")
+    cover.set_ylabel("what a horizon covers, H · Δt [s]")
+    cover.set_title("all points; above the line a horizon covers a round trip", fontsize=10)
+    losses.set_ylabel("loss, the larger of both ways")
+    for plane in (ways, losses):
+        plane.set_title("where a horizon covers a round trip", fontsize=10)
+    for plane in (cover, losses):
+        plane.set_xlabel("mean round trip [s]")
+    ways.set_xlabel("mean delay to the vehicle [s]")
+    ways.set_ylabel("mean delay to the server [s]")
+    ways.set_aspect("equal", adjustable="box")
+    _stack(bars, covers_s / trip_s, shown)
+    for plane in (cover, ways, losses):
+        plane.grid(alpha=0.3)
+    patches = [
+        Patch(color=OUTCOMES[outcome]["color"], label=f"{outcome} {here.sum()}")
+        for outcome, here in shown.items()
+    ]
+    figure.suptitle(title, fontsize=11)
+    figure.legend(
+        handles=patches,
+        loc="outside lower center",
+        ncols=len(patches),
+        fontsize=9,
+        handlelength=1.0,
+    )
+    save(figure, path, dpi=100)
+
+
+def _mean_delays_s(scenario: Scenario, way: str, keys: Sequence[Mapping[str, Any]]) -> Array:
+    """Mean delay of a direction at each point [s]; shape (points,)."""
+    base: DirectionConfig = getattr(scenario.network, way)
+    names = ("delay", "minimum_s")
+    changed = ({name: each[f"network.{way}.{name}"] for name in names} for each in keys)
+    return np.array([replace(base, **changes).mean_s for changes in changed])
+
+
+def _size(outcome: Outcome, points: int) -> float:
+    """Area of an outcome's marker among so many [points²]; what went wrong can be seen."""
+    area = float(np.clip(20_000.0 / points, 5.0, 30.0))
+    return max(25.0, area) if outcome in WRONG else area
+
+
+def _stack(plane: Any, ratios: Array, shown: Mapping[Outcome, Flags]) -> None:
+    """Draw the share of each outcome over how many round trips a horizon covers."""
+    bins = np.digitize(np.clip(ratios, RATIOS[0], RATIOS[-1] * (1.0 - 1e-9)), RATIOS) - 1
+    total = np.maximum(1, np.bincount(bins, minlength=len(RATIOS) - 1))
+    below = np.zeros(len(total))
+    for outcome, here in shown.items():
+        share = np.bincount(bins[here], minlength=len(total)) / total
+        style = {"color": OUTCOMES[outcome]["color"], "edgecolor": "white", "linewidth": 0.5}
+        plane.bar(RATIOS[:-1], share, np.diff(RATIOS), bottom=below, align="edge", **style)
+        below += share
+    plane.set_xscale("log", base=2)
+    plane.set_xticks(RATIOS[::4], ["1/16", "1/4", "1", "4", "16"])
+    plane.set_xlim(RATIOS[0], RATIOS[-1])
+    plane.set_ylim(0.0, 1.0)
+    plane.axvline(1.0, color="k", linewidth=1.0)
+    plane.set_xlabel("what a horizon covers, in round trips; the ends hold all beyond")
+    plane.set_ylabel("share of points")
+    plane.set_title("all points; right of the line a horizon covers a round trip", fontsize=10)
+
+
+UNITS = {"s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "ppm": "ppm"}
+"""Unit of a key, by the last part of its name."""
+OTHER_UNITS = {
+    "duration": "s",
+    "settle": "s",
+    "control.dt": "s",
+    "control.horizon": "steps",
+    "control.delay_bound": "s",
+    "control.period": "steps",
+    "control.decay_rate": "1/s",
+    "model.u_max": "m/s",
+    "vehicle.wind": "m/s per √s",
+}
+"""Units of the keys whose names do not end in one."""
+
+
+def label(key: str) -> str:
+    """Label of a key of the scenario, with the unit where there is one."""
+    unit = OTHER_UNITS.get(key) or ("_" in key and UNITS.get(key.rsplit("_", 1)[1]))
+    return f"{key} [{unit}]" if unit else key
+
+
+def curve(
+    path: Path, title: str, axis: GridAxis, name: str, *, means: Array, halves: Array
+) -> None:
+    """Draw the means of a sweep over one key, with their intervals.
+
+    Args:
+        path: file to write, in one of FORMATS.
+        name: label of the figure that was measured, with its unit.
+        means: mean at each value, NaN for none; shape (values,).
+        halves: half the width of each mean's interval; shape (values,).
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    plane = figure.subplots()
+    places = _places(axis)
+    if _is_scale(axis):
+        plane.plot(places, means, "k.-")
+        plane.fill_between(places, means - halves, means + halves, color="0.8", label="95 %")
+    else:
+        plane.errorbar(places, means, halves, fmt="ko", capsize=4, label="95 %")
+        plane.set_xticks(places, list(map(str, axis.values)))
+        plane.margins(x=0.2)
+    plane.set_xlabel(label(axis.key))
+    plane.set_ylabel(name)
+    plane.legend(fontsize=8)
+    plane.grid(alpha=0.3)
+    plane.set_title(title, fontsize=10)
+    save(figure, path, dpi=130)
+
+
+def heat_map(
+    path: Path, title: str, axes: tuple[GridAxis, GridAxis], name: str, *, means: Array
+) -> None:
+    """Draw the means of a sweep over two keys.
+
+    Args:
+        path: file to write, in one of FORMATS.
+        axes: the axis that runs across, and the axis that runs up.
+        name: label of the figure that was measured, with its unit.
+        means: mean in each cell, NaN for none; shape (values across, values up).
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 5.0), layout="constrained")
+    plane = figure.subplots()
+    across, up = axes
+    mesh = plane.pcolormesh(_places(across), _places(up), means.T, shading="nearest")
+    for axis, set_ticks in ((across, plane.set_xticks), (up, plane.set_yticks)):
+        if not _is_scale(axis):
+            set_ticks(_places(axis), list(map(str, axis.values)))
+    plane.set_xlabel(label(across.key))
+    plane.set_ylabel(label(up.key))
+    figure.colorbar(mesh, label=name)
+    plane.set_title(title, fontsize=10)
+    save(figure, path, dpi=130)
+
+
+def _is_scale(axis: GridAxis) -> bool:
+    """Whether an axis has numbers that rise, and not names."""
+    numbers = all(type(value) in (int, float) for value in axis.values)
+    return numbers and all(low < high for low, high in pairwise(axis.values))
+
+
+def _places(axis: GridAxis) -> Array:
+    """Coordinates of an axis' values in a picture; shape (values,)."""
+    return np.array(axis.values if _is_scale(axis) else range(len(axis.values)), dtype=np.float64)

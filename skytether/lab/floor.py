@@ -1,0 +1,141 @@
+"""Floors: how near vehicles can come to their trajectory at all, and a flight without any packets.
+
+What a vehicle flies follows from an observation of its own and from a plan, and both are of some
+age by the time that an input has done its work. What has happened since, nobody has answered. For
+white accelerations its variance is known in closed form, and the record has the ages: so a flight
+has a floor, which no other planner, solver or weight would have flown below with packets that came
+as these did.
+
+Ages tell less of a sender that looks, as an event trigger does: it sends where the error is large,
+age and error are then correlated, and some flights come below their floor. It holds for what is
+sent at every step, periodically, or by a clock.
+
+The other end of the scale is a flight that needs no network: the reference and a regulator aboard.
+It is possible where the trajectory is known before the flight.
+"""
+
+import math
+
+import msgspec
+import numpy as np
+
+from skytether.client.clamp import clamped
+from skytether.client.navigation import Navigation
+from skytether.client.simulated.vehicle import simulated
+from skytether.server.control.gain import stationary_gain
+from skytether.shared.law.model import Array, white_acceleration
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Reason, Rows, client_columns
+from skytether.shared.telemetry.summary import Summary, summarise
+from skytether.shared.wire.protocol import NO_HORIZON, Mode
+
+UNKNOWN = ("target", "live")
+"""Shapes of a reference that only the server knows, while it is flown."""
+
+
+def wind_floor_m(scenario: Scenario, client: Rows) -> float:
+    """Floor of RMSE xy [m], from `settle` on, of plans that are flown as they are, in white wind.
+
+    An input cannot answer what the wind did after the observation that it was planned from. Steps
+    that were flown without a plan count as if there had been no wind. Gusts are not reckoned with;
+    feedback aboard answers the wind by itself, and has no such floor.
+
+    Args:
+        client: rows of one vehicle, whose ages count.
+    """
+    before = _inputs(scenario, client)
+    ages_s = (before["age_ns"] * 1e-9 + scenario.control.dt)[before["age_ns"] >= 0]
+    ages_s, counts = np.unique(ages_s, return_counts=True)
+    roots = [white_acceleration(scenario.true_tau_s[:2], float(age_s)) for age_s in ages_s]
+    variances = [scenario.vehicle.wind**2 * float((root[:, 0, 0] ** 2).sum()) for root in roots]
+    return _root(np.dot(counts, variances), len(before))
+
+
+def target_floor_m(scenario: Scenario, client: Rows) -> float:
+    """Floor of RMSE xy [m], from `settle` on, for a target that only the server sees.
+
+    A vehicle cannot know what the target did after its plan was made: a walk of white acceleration,
+    of the strength `reference.agility`, but for what the server sees ahead. Its bounds, which hold
+    it back, are left out. Steps that were flown without a plan count as if it had stood still.
+
+    Args:
+        client: rows of one vehicle, of whose plans the ages count.
+    """
+    before, preview = _inputs(scenario, client), scenario.reference.preview
+    if preview == "all":
+        return 0.0
+    seen_s = 0.0 if preview == "none" else preview
+    planned = before[before["in_force"] != NO_HORIZON]
+    ages_s = (planned["step"] + 1 - planned["in_force"]) * scenario.control.dt - seen_s
+    variances = 2.0 * scenario.reference.agility**2 * np.maximum(ages_s, 0.0) ** 3 / 3.0
+    return _root(variances.sum(), len(before))
+
+
+def _inputs(scenario: Scenario, client: Rows) -> Rows:
+    """Rows of the steps whose inputs have led to the states from `settle` on."""
+    return client[:-1][client["step"][1:] * scenario.control.dt >= scenario.settled_s]
+
+
+def _root(total: float, count: int) -> float:
+    return math.sqrt(total / count) if count else 0.0
+
+
+def fly_aboard(scenario: Scenario) -> Rows:
+    """Fly with the reference aboard, and without a network; the client's part of the record.
+
+        u(k) = u_ff(k) + K (x_ref(k) - x(k))
+
+    u_ff takes the model's velocity along the reference. K is the gain that the server sends for
+    feedback aboard, and inputs pass the same clamp. The vehicle meets the same winds, and the same
+    noise, as one of this seed that is planned for.
+
+    Raises:
+        ValueError: only the server knows the reference.
+    """
+    if scenario.reference.shape in UNKNOWN:
+        raise ValueError(f"reference.shape: {scenario.reference.shape!r} is no shape known aboard")
+    terms, vehicle = scenario.terms(), scenario.vehicle
+    model, u_max = terms.model, terms.u_max
+    flies, known = simulated(scenario, 1), Navigation(scenario)
+    desired = _due(scenario)
+    forward = (desired[1:, :, 1] - model.a11 * desired[:-1, :, 1]) / model.b1
+    gain = stationary_gain(model, scenario.control)
+    change_max = math.inf if terms.exhausted == "hold" else vehicle.slew_mps2 * terms.dt_s
+    rows = np.zeros(scenario.steps, client_columns(terms.axes))
+    rows["step"] = np.arange(scenario.steps)
+    rows["covered"], rows["mode"], rows["reason"] = True, Mode.TRACK, Reason.BEGUN
+    rows["in_force"] = rows["age_ns"] = NO_HORIZON
+    u: Array = np.zeros(terms.axes)
+    for k, row in enumerate(rows):
+        now_ns = k * terms.dt_ns
+        known.advance(flies.measurements(now_ns=now_ns), u, now_ns=now_ns)
+        back = (gain * (desired[k] - known.predicted)).sum(axis=1)
+        told = forward[k].tolist()
+        wanted = (forward[k] + back).tolist()
+        flown = clamped(wanted, u.tolist(), u_max, change_max, told=told)
+        assert flown is not None
+        u = np.array(flown)
+        row["state"], row["measured"] = flies.truth(), known.measured
+        row["estimate"], row["input"] = known.predicted, u
+        flies.fly(u)
+    return rows
+
+
+def _due(scenario: Scenario) -> Array:
+    """Desired states at which the input of each step meets the vehicle [m, m/s]; one more than
+    there are steps; shape (steps + 1, axes, 2).
+    """
+    sample, times_s = scenario.make_reference(), np.arange(scenario.steps + 1) * scenario.control.dt
+    late_s = scenario.terms().dead_time_s
+    return np.stack([sample(times_s + late)[:, axis] for axis, late in enumerate(late_s)], axis=1)
+
+
+def summarise_aboard(scenario: Scenario, name: str) -> Summary:
+    """Summary of `fly_aboard`: no packet, and none at any step.
+
+    Args:
+        name: of the scenario.
+    """
+    packets = np.empty(0, PACKET_COLUMNS)
+    summary = summarise(scenario, name, fly_aboard(scenario), netem=packets)
+    return msgspec.structs.replace(summary, event_ratio=0.0)

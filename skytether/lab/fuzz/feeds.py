@@ -1,0 +1,121 @@
+"""Feeds as targets: what a process tells whoever looks on, and what a page makes of it."""
+
+import io
+from collections.abc import Sequence
+from contextlib import suppress
+from random import Random
+from types import ModuleType
+
+from skytether.lab.fuzz.flown import SCENARIO, flown
+from skytether.lab.fuzz.mutators import bytes_changed
+from skytether.lab.fuzz.texts import Text
+from skytether.shared.telemetry import feed
+from skytether.shared.telemetry.feed import FeedError, Frame, Opened, Reader
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.view import recording, rows, state
+from skytether.view.frames import of_flight
+from skytether.view.recording import About, Recording
+from skytether.view.state import State
+
+PIECES = 3
+"""Number of pieces in which a feed comes."""
+EACH = 12
+"""Number of frames of a process and kind among the seeds."""
+LIFE = 300
+"""Number of feeds after which a page begins anew."""
+ABOUT = About(scenario="demo", seed=1, version="1", began="", offset_ns=0, secure=False)
+"""What the recording says of itself."""
+POINTS = 50
+"""Number of points of a drawn curve."""
+
+
+class Feed(Text):
+    """Feed of a process, in pieces: it is none, as `FeedError` says, or frames that come back."""
+
+    code: Sequence[ModuleType] = (feed,)
+
+    def __init__(self) -> None:
+        kinds: dict[tuple[str, str, str], list[Frame]] = {}
+        for _, process, frame in of_flight(SCENARIO, "demo", flown()):
+            kind = process, type(frame).__name__, getattr(frame, "part", "")
+            kinds.setdefault(kind, []).append(frame)
+        self.frames = {kind: frames[-EACH:] for kind, frames in kinds.items()}
+        """Frames of a flight by process, type and part."""
+        each = [feed.encode(frame) for frames in self.frames.values() for frame in frames]
+        super().__init__([*each, b"".join(each[:5])])
+
+    def mutated(self, rng: Random, payload: bytes) -> bytes:
+        """A feed with other bytes or words, the length of its first frame often made right."""
+        if rng.random() < 0.5:
+            changed = bytes_changed(rng, payload, self.largest)
+        else:
+            changed = super().mutated(rng, payload)
+        if rng.random() < 0.7:
+            body = changed[feed.LENGTH_BYTES :]
+            changed = len(body).to_bytes(feed.LENGTH_BYTES, "big") + body
+        return changed
+
+    def __call__(self, payload: bytes) -> None:
+        """Read it, whole and in pieces."""
+        whole, size = read(payload), len(payload) // PIECES + 1
+        pieces = [payload[size * i : size * (i + 1)] for i in range(PIECES)]
+        assert read(*pieces) == whole, payload.hex()
+        for frame in whole or ():
+            assert read(feed.encode(frame)) is not None, payload.hex()
+            for described in frame.parts.values() if isinstance(frame, Opened) else ():
+                with suppress(FeedError):
+                    feed.table(payload, feed.columns_of(described))
+
+
+class Page(Feed):
+    """Page and recording of a flight: what its processes tell is refused, or shown and written."""
+
+    code = (recording, rows, state)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._heard = LIFE
+
+    def __call__(self, payload: bytes) -> None:
+        """Take the frames of a feed, as of any process; show what is known, and record it."""
+        if self._heard == LIFE:
+            self._begin()
+        self._heard += 1
+        for frame in read(payload) or ():
+            for process in ("client", "server", "netem"):
+                with suppress(ValueError):
+                    self._state.take(process, frame)
+                with suppress(ValueError):
+                    self._recording.add(process, frame)
+        self._show()
+
+    def _begin(self) -> None:
+        self._heard, self._state = 0, State()
+        self._recording = Recording(io.BytesIO(), SCENARIO, ABOUT)
+        for (process, *_), frames in self.frames.items():
+            for frame in frames:
+                self._state.take(process, frame)
+                self._recording.add(process, frame)
+
+    def _show(self) -> None:
+        shown, now_ns = self._state, self._state.newest_ns
+        assert shown.title is not None
+        assert len(shown.vehicles) <= state.VEHICLES_MAX
+        for number, track in shown.vehicles.items():
+            assert len(track.curves(POINTS).time_s) == POINTS
+            assert track.ahead().shape[1] == track.trail().shape[1]
+            assert track.does.text
+            assert shown.link(number, now_ns).text
+        for direction in (UPLINK, DOWNLINK):
+            shown.network.traffic(direction, 1.0, now_ns)
+            shown.network.histogram(direction, now_ns)
+            shown.network.delays_s(direction, now_ns)
+
+
+def read(*pieces: bytes) -> list[Frame] | None:
+    """Frames of a feed; None where it is none."""
+    reader = Reader()
+    try:
+        return [frame for piece in pieces for frame in reader.read(piece)]
+    except FeedError:
+        return None

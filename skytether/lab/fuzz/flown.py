@@ -1,0 +1,18 @@
+"""A short flight, for targets that take what a flight leaves behind."""
+
+from functools import cache
+
+import msgspec
+
+from skytether.shared.scenario import reading
+from skytether.shared.telemetry.record import Record
+from skytether.sim.flight import fly
+
+SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=1.0, settle=0.0)
+"""What is flown."""
+
+
+@cache
+def flown() -> Record:
+    """Record of the flight."""
+    return fly(SCENARIO)

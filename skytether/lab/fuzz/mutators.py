@@ -1,0 +1,170 @@
+"""Bytes that are nearly messages: real ones, odd ones, and both with something changed."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from random import Random
+
+import msgpack
+import numpy as np
+
+from skytether.shared.law.terms import Terms
+from skytether.shared.wire.protocol import (
+    FEEDBACK,
+    Close,
+    Heartbeat,
+    Hello,
+    Horizon,
+    Observation,
+    Welcome,
+    encode,
+)
+
+CORPUS = Path(__file__).with_name("corpus.txt")
+"""Odd payloads: a line each, its name and its bytes in hexadecimal."""
+
+TOKENS = re.compile(rb'"[^"\n]*"|[\w.+-]+|\s+|.', re.DOTALL)
+"""Tokens of a text: a string, a word or number, space, or any other letter."""
+SMALL_TOKENS = re.compile(rb"\w+|\s+|.", re.DOTALL)
+"""Tokens of a text and of its strings and numbers."""
+DEEP = 20_000
+"""Depth to which lists are nested: deeper than any decoder goes."""
+WORDS = (
+    *(b"-1 0 1 2 9 1.5 -0.0 1e-320 1e99 1e308 1e400 4096 2147483648 9223372036854775807".split()),
+    *(b"18446744073709551616 nan inf -inf true false null [] {} [[]] [0.1,0.2] = , :".split()),
+    *(b'"" "x" "auto" "never" "\\u0000" "\\ud800" "1" [ ] { } ( ) [0] and or not'.split()),
+    *(b"\n", b"\xff", b"\0", b"` - at `$.model"),
+    *(b"[" * DEEP, b'{"a":' * DEEP, b"9" * 5000, b'"' + b"x" * 5000 + b'"', b"a." * 2000 + b"a"),
+)
+"""Words that are rarely right where they stand."""
+
+NUMBERS = (
+    -1,
+    0,
+    1,
+    2,
+    9,
+    127,
+    128,
+    255,
+    2**15,
+    2**16,
+    2**31,
+    2**32,
+    2**36,
+    2**40,
+    2**63,
+    2**64 - 1,
+)
+"""Numbers at which something changes."""
+
+
+def corpus() -> dict[str, bytes]:
+    """Odd payloads that are kept, by name."""
+    lines = CORPUS.read_text().splitlines()
+    return {name: bytes.fromhex(code) for name, _, code in (line.partition(" ") for line in lines)}
+
+
+def seeds(terms: Terms) -> list[bytes]:
+    """A message of each type, as an end with these terms would send it."""
+    axes, n = terms.axes, terms.horizon
+    inputs = np.zeros((axes, n), np.float32)
+    feedback = np.ones((axes, FEEDBACK), np.float32)
+    state, flown = np.zeros((axes, 2)), np.zeros(axes)
+    return [
+        encode(message)
+        for message in (
+            Hello(1, 2**50, terms),
+            Welcome(1, 7, 5, 3, 10, 0, terms),
+            Observation(1, 7, 5, 10, 4, 4, 8, 9, 3, 1, state, flown),
+            Horizon(1, 7, 5, 10, 9, inputs),
+            Horizon(1, 7, 5, 10, 9, inputs, feedback),
+            Heartbeat(1, 7, 10, 0, 0),
+            Close(1, 7),
+        )
+    ]
+
+
+def fields_changed(rng: Random, payload: bytes) -> bytes:
+    """A message with another value in one or two of its fields; what is none has bytes changed."""
+    try:
+        fields = msgpack.unpackb(payload)
+    except (ValueError, msgpack.UnpackException):
+        fields = None
+    if not isinstance(fields, list) or len(fields) < 3:
+        return bytes_changed(rng, payload)
+    for _ in range(rng.randrange(1, 3)):
+        n = rng.randrange(2, len(fields))
+        old = fields[n]
+        if type(old) is int and rng.random() < 0.5:
+            fields[n] = max(
+                -(2**63), min(2**64 - 1, old + rng.choice((-1, 1)) * rng.choice(NUMBERS))
+            )
+        elif isinstance(old, bytes) and rng.random() < 0.8:
+            fields[n] = _floats(rng, old)
+        else:
+            fields[n] = rng.choice((*NUMBERS, None, True, 0.5, float("nan"), "", b"", [], [[]]))
+    packed: bytes = msgpack.packb(fields)
+    return packed
+
+
+def _floats(rng: Random, packed: bytes) -> bytes:
+    """Other numbers in an array of a message."""
+    changed = bytearray(packed)
+    odd = (np.nan, np.inf, -np.inf, 1e308, -1e9, 1e-310, -0.0, 0.1)
+    value = rng.choice(odd)
+    with np.errstate(over="ignore"):
+        code = rng.choice((np.float64(value).tobytes(), np.float32(value).tobytes()))
+    at = rng.randrange(max(1, len(packed) // len(code))) * len(code)
+    changed[at : at + len(code)] = code
+    return bytes(changed)
+
+
+def bytes_changed(rng: Random, payload: bytes, most: int = 2000) -> bytes:
+    """A payload with bytes changed, cut off, put in or doubled; `most` of them at most."""
+    changed = bytearray(payload)
+    for _ in range(rng.randrange(1, 4)):
+        at = rng.randrange(len(changed) + 1)
+        match rng.randrange(4):
+            case 0 if at < len(changed):
+                changed[at] = rng.randrange(256)
+            case 1:
+                del changed[at:]
+            case 2:
+                changed[at:at] = rng.randbytes(rng.randrange(1, 9))
+            case _:
+                changed += changed[at : at + 1200]
+    return bytes(changed[:most])
+
+
+def text_changed(rng: Random, text: bytes, words: Sequence[bytes]) -> bytes:
+    """A text with a few tokens replaced, left out, doubled or exchanged, or with bytes changed.
+
+    Args:
+        rng: source of chance.
+        text: the text.
+        words: what may stand in place of a token, beside WORDS.
+    """
+    if rng.random() < 0.15:
+        return bytes_changed(rng, text, len(text) + 1000)
+    tokens = (TOKENS if rng.random() < 0.5 else SMALL_TOKENS).findall(text)
+    for _ in range(rng.randrange(1, 4) if tokens else 0):
+        at, other = rng.randrange(len(tokens)), rng.randrange(len(tokens))
+        match rng.randrange(6):
+            case 0:
+                tokens[at] = b""
+            case 1:
+                tokens[at] *= 2
+            case 2:
+                tokens[at], tokens[other] = tokens[other], tokens[at]
+            case 3:
+                tokens[at] = tokens[other]
+            case _:
+                tokens[at] = rng.choice(words if words and rng.random() < 0.5 else WORDS)
+    return b"".join(tokens)
+
+
+def words_of(texts: Sequence[bytes]) -> list[bytes]:
+    """Words and strings that occur in texts."""
+    found = {token for text in texts for token in TOKENS.findall(text) if len(token) > 1}
+    return sorted(token for token in found if not token.isspace())

@@ -1,0 +1,52 @@
+"""Targets by name, each made with a folder for its files."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from random import Random
+from types import MappingProxyType
+
+from skytether.lab.fuzz.datagrams import SCENARIOS, Decoder, EndpointInFlight
+from skytether.lab.fuzz.feeds import Feed, Page
+from skytether.lab.fuzz.handshake import Holder, Strangers
+from skytether.lab.fuzz.recordings import RecordingFile
+from skytether.lab.fuzz.target import Target
+from skytether.lab.fuzz.texts import Control, LogLines, ScenarioFile
+
+
+class Both(Target):
+    """A target in the plane and one in space, which take the same inputs."""
+
+    def __init__(self, *targets: Target) -> None:
+        self._targets = targets
+        self.code = targets[0].code
+
+    def __call__(self, payload: bytes) -> None:
+        """Give an input to each."""
+        for target in self._targets:
+            target(payload)
+
+    def seeds(self) -> Sequence[bytes]:
+        """Seeds of the first."""
+        return self._targets[0].seeds()
+
+    def mutated(self, rng: Random, payload: bytes) -> bytes:
+        """An input as the first changes it."""
+        return self._targets[0].mutated(rng, payload)
+
+
+TARGETS: Mapping[str, Callable[[Path], Target]] = MappingProxyType(
+    {
+        "decoder": lambda _: Both(*map(Decoder, SCENARIOS)),
+        "flight": lambda _: Both(*map(EndpointInFlight, SCENARIOS)),
+        "sealed": lambda _: Both(*(EndpointInFlight(each, sealed=True) for each in SCENARIOS)),
+        "handshake": lambda _: Strangers(),
+        "holder": lambda _: Holder(),
+        "control": lambda _: Control(),
+        "recording": RecordingFile,
+        "scenario": ScenarioFile,
+        "feed": lambda _: Feed(),
+        "page": lambda _: Page(),
+        "log": lambda _: LogLines(),
+    }
+)
+"""What is fuzzed."""

@@ -1,0 +1,157 @@
+"""Texts as targets: scenarios, requests for changes in flight, and what a process says."""
+
+import importlib
+import tomllib
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+
+import msgspec
+import numpy as np
+
+from skytether.lab.fuzz.datagrams import SCENARIOS, EndpointInFlight
+from skytether.lab.fuzz.flown import flown
+from skytether.lab.fuzz.mutators import text_changed, words_of
+from skytether.lab.fuzz.target import Target
+from skytether.netem.proxy import Proxy
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core import change
+from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
+from skytether.shared.core.events import Counted
+from skytether.shared.scenario import contradictions, policies, reading, reference
+from skytether.shared.scenario.registry import REFERENCES, TRIGGERS
+from skytether.shared.wire import handshake
+from skytether.shared.wire.protocol import Hello, Welcome, decode, encode
+from skytether.shell import log
+from skytether.shell.control import ANSWER_BYTES_MAX, ControlError, answer_of
+from skytether.shell.log import LogLine, line_of
+
+SAMPLES_S = np.array([-1.0, 0.0, 0.05, 7.3, 1e3, 1e5])
+"""Times at which a scenario's trajectory must be finite [s]."""
+LIVE = reading.check(
+    {
+        "reference": {"shape": "live", "points_m": [[0.0, 0.0]]},
+        "control": {"scheme": "committed", "trigger": "state_gap & budget(5, 2) | silence(1)"},
+    },
+    "fuzz",
+)
+"""A flight in which as much as possible can be changed."""
+POLICIES = [name.encode() for name in (*TRIGGERS, *REFERENCES)] + b"( ) & | ! ,".split()
+"""Pieces of policies."""
+
+
+class Text(Target):
+    """Something that takes text.
+
+    Args:
+        known: texts to begin with.
+        words: what may stand in place of a token, beside the words of these texts.
+    """
+
+    largest = 8192
+
+    def __init__(self, known: Sequence[bytes], words: Sequence[bytes] = ()) -> None:
+        self._known = known
+        self._words = [*words_of(known), *words]
+
+    def seeds(self) -> Sequence[bytes]:
+        """Texts that are right."""
+        return self._known
+
+    def mutated(self, rng: Random, payload: bytes) -> bytes:
+        """A text with other words."""
+        return text_changed(rng, payload, self._words)
+
+
+class ScenarioFile(Text):
+    """Scenario in a file: it is refused as `ConfigError`, or it can be agreed upon and flown."""
+
+    code = (
+        reading,
+        contradictions,
+        policies,
+        reference,
+        importlib.import_module("tomllib._parser"),
+    )
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "it.toml"
+        files = [(reading.SCENARIOS / f"{name}.toml").read_bytes() for name in reading.names()]
+        whole = [reading.to_toml(reading.load(name)) for name in reading.names()]
+        made = [reading.to_toml(each) for each in (*SCENARIOS, LIVE)]
+        words = [f'"{name}"'.encode() for name in (*reading.names(), "compare/none", "it.toml")]
+        super().__init__([*files, *whole, *made], [*words, *POLICIES])
+
+    def __call__(self, payload: bytes) -> None:
+        """Read it."""
+        self._path.write_bytes(payload)
+        try:
+            scenario = reading.load(str(self._path))
+        except ConfigError:
+            return
+        again = tomllib.loads(reading.to_toml(scenario).decode())
+        assert reading.check(again) == scenario
+        terms, largest = scenario.terms(), 2**64 - 1
+        hello = encode(Hello(2**16 - 1, largest, terms))
+        welcome = encode(Welcome(2**16 - 1, 2**32 - 1, largest, largest, 2**63 - 1, 0, terms))
+        for message in (hello, welcome):
+            assert encode(decode(message, terms)) == message
+        assert len(hello) <= handshake.HELLO_BYTES_MAX
+        assert len(welcome) <= handshake.WELCOME_BYTES_MAX
+        assert np.isfinite(scenario.make_reference()(SAMPLES_S)).all()
+
+
+class Control(Text, EndpointInFlight):
+    """Requests to the processes of a flight: each is answered, and what it changes can be flown."""
+
+    code = (change, reading, contradictions, policies)
+    largest = REQUEST_BYTES_MAX + 1
+
+    def __init__(self) -> None:
+        EndpointInFlight.__init__(self, LIVE)
+        tables = [reading.to_table(each) for each in (LIVE, *SCENARIOS)]
+        values = [
+            {key: change._at(table, key)}
+            for table in tables
+            for running in self._running
+            for key in sorted(running.changeable)
+        ]
+        known = [msgspec.json.encode(each) for each in ({}, *values)]
+        Text.__init__(self, known, POLICIES)
+
+    def _begin(self) -> None:
+        super()._begin()
+        ends = (self.server, self.client, Proxy(self._scenario, server=("server", 0)))
+        self._running = [Running(end, self._scenario) for end in ends]
+
+    def _attack(self, payload: bytes) -> None:
+        for running in self._running:
+            before = running.scenario
+            answer = running.answer(payload[: REQUEST_BYTES_MAX + 1], now_ns=self._now_ns)
+            assert len(answer) <= ANSWER_BYTES_MAX, payload.hex()
+            said = answer_of(answer)
+            assert bool(said.changed) == (running.scenario != before), payload.hex()
+            assert not (said.refused and said.changed), payload.hex()
+            reading.check(reading.to_table(running.scenario), known=running.scenario)
+        running._endpoint.events()  # nobody else asks netem
+
+
+class LogLines(Text):
+    """Lines of a process, and answers at its control socket, which may be none."""
+
+    code = (log,)
+
+    def __init__(self) -> None:
+        own = {type(each.event): each.event for each in flown().events}
+        events = *own.values(), Counted(figures={"missed": 3, "dropped": {"late": 2}})
+        lines = [LogLine(process="client", time_ns=5, event=event) for event in events]
+        answers = Answer(refused="no such key"), Answer(values={"network.uplink.loss": 0.1})
+        super().__init__([msgspec.json.encode(each) for each in (*lines, *answers)])
+
+    def __call__(self, payload: bytes) -> None:
+        """Read it as either."""
+        line = line_of(payload)
+        assert line is None or str(line.event).splitlines(), payload.hex()
+        with suppress(ControlError):
+            answer_of(payload)

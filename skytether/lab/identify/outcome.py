@@ -1,0 +1,184 @@
+"""What an identification came to: numbers of each axis in words, and a scenario that flies by them.
+
+Whatever the command line changed in the scenario stands in the one that is written as well.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import tomli_w
+
+from skytether.lab.identify.fit import Fit, Numbers, Response, verdict
+from skytether.lab.identify.steps import STEPS, reference_speeds
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+
+AXES = "xyz"
+"""Names of the axes."""
+BEYOND = 1.5
+"""How much larger than the steps an input may be: nobody has seen how a larger one is answered."""
+FASTER = 1.25
+"""How much faster than the desired trajectory the vehicle has to be, to catch up."""
+DIGITS = 4
+"""Significant digits of what is written."""
+
+
+class Axis(NamedTuple):
+    """What came of the steps of an axis."""
+
+    speed: float
+    """Size of step [m/s]."""
+    cut: int
+    """Number of steps that the fence cut, or left no room for."""
+    responses: Sequence[Response]
+    """Responses to the steps that are used."""
+    fit: Fit | None
+    """The model; None where there are too few steps."""
+
+    @property
+    def steps(self) -> str:
+        """How many of the steps are used."""
+        return f"{len(self.responses)}{f', {self.cut} cut' if self.cut else ''}"
+
+
+def with_interval(name: str, numbers: Numbers, within: Numbers) -> str:
+    """A number and its interval."""
+    half = getattr(within, name)
+    return f"{getattr(numbers, name):.3f} ± {f'{half:.3f}' if math.isfinite(half) else '?'}"
+
+
+def describe(axis: Axis) -> str:
+    """What came of an axis, in words."""
+    fit = axis.fit
+    if fit is None:
+        return f"too few steps ({axis.steps}), {_remedy(axis)}"
+    gain, tau, late = (with_interval(name, fit.numbers, fit.within) for name in Numbers._fields)
+    numbers = f"gain {gain}, time constant {tau} s, dead time {late} s"
+    return f"{numbers}, from {axis.steps} steps of {axis.speed:g} m/s: {verdict(fit)}"
+
+
+def _remedy(axis: Axis) -> str:
+    """What would give more steps."""
+    if axis.cut < STEPS:
+        return "fly it to its end, and measure velocities"
+    return "the fence leaves no room: expected a wider one, a smaller --speed, or a shorter --hold"
+
+
+def scenario_text(
+    flown: Scenario, extends: str, base: Scenario, axes: Sequence[Axis]
+) -> bytes | None:
+    """The scenario that flies by what was identified; None where an axis has no model.
+
+    Args:
+        flown: what was flown.
+        extends: name or file of the scenario that it extends.
+        base: that scenario.
+        axes: what came of each axis.
+    """
+    fits = [each.fit for each in axes if each.fit is not None]
+    if len(fits) < len(axes):
+        return None
+    told: dict[str, Any] = {
+        "extends": str(Path(extends).absolute()) if ".toml" in extends else extends,
+        "title": f"{extends}, with the model of a {flown.vehicle.kind} as identified",
+    }
+    told |= differing(reading.to_table(base), reading.to_table(flown))
+    if file := told.get("reference", {}).get("file"):
+        told["reference"]["file"] = str(Path(file).absolute())
+    if flown.vehicle.kind == "simulated":  # it flies by its model where nothing else is said
+        truth = {
+            "tau_s": flown.true_tau_s,
+            "gain": flown.true_gain,
+            "dead_time_s": flown.true_dead_time_s,
+        }
+        told["vehicle"] = told.get("vehicle", {}) | {
+            key: values.tolist() for key, values in truth.items()
+        }
+    numbers = [fit.numbers for fit in fits]
+    told["model"] = told.get("model", {}) | {
+        "tau_s": [_rounded(each.tau_s) for each in numbers],
+        "u_max": _u_max(flown, axes, numbers),
+        "gain": [_rounded(each.gain) for each in numbers],
+        "dead_time_s": [round(each.dead_time_s, 3) for each in numbers],
+    }
+    made = f"Made by `skytether identify {flown.vehicle.kind}`: steps of velocity, and the model of"
+    lines = [
+        f"{made} first order with dead time",
+        "that answers them alike; with 95 % intervals.",
+        *(f"{name}: {describe(axis)}" for name, axis in zip(AXES, axes, strict=False)),
+        f"u_max: up to {BEYOND:g} times the size of the steps, for nobody has seen larger ones.",
+    ]
+    return "".join(f"# {line}\n" for line in lines).encode() + tomli_w.dumps(told).encode()
+
+
+def differing(base: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
+    """Values of a table that are others in the base, as a table."""
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        before = base.get(key)
+        if isinstance(value, dict) and isinstance(before, dict):
+            if below := differing(before, value):
+                found[key] = below
+        elif value != before:
+            found[key] = value
+    return found
+
+
+def _rounded(number: float) -> float:
+    return float(f"{number:.{DIGITS}g}")
+
+
+def _u_max(flown: Scenario, axes: Sequence[Axis], numbers: Sequence[Numbers]) -> list[float]:
+    """Bounds of the input [m/s]: as much as was tried, and enough for the desired trajectory."""
+    wanted = reference_speeds(flown)
+    most = flown.u_max.tolist()
+    each = zip(axes, numbers, wanted, most, strict=True)
+    return [
+        _rounded(min(bound, max(BEYOND * axis.speed, FASTER * speed / found.gain)))
+        for axis, found, speed, bound in each
+    ]
+
+
+class AxisTold(msgspec.Struct, frozen=True):
+    """What came of an axis, for a program; None where nothing is known."""
+
+    axis: str
+    step_mps: float
+    steps: int
+    cut: int
+    verdict: str
+    gain: float | None = None
+    tau_s: float | None = None
+    dead_time_s: float | None = None
+    gain_within: float | None = None
+    tau_s_within: float | None = None
+    dead_time_s_within: float | None = None
+    rms: float | None = None
+    largest: float | None = None
+    largest_at_s: float | None = None
+
+
+def told(name: str, axis: Axis) -> AxisTold:
+    """What came of an axis, for a program."""
+    steps, fit = len(axis.responses), axis.fit
+    if fit is None:
+        return AxisTold(name, axis.speed, steps, axis.cut, describe(axis))
+    gain, tau, late = (each if math.isfinite(each) else None for each in fit.within)
+    off = fit.misfit
+    return AxisTold(
+        name,
+        axis.speed,
+        steps,
+        axis.cut,
+        verdict(fit),
+        *fit.numbers,
+        gain_within=gain,
+        tau_s_within=tau,
+        dead_time_s_within=late,
+        rms=off.rms,
+        largest=off.largest,
+        largest_at_s=off.at_s,
+    )

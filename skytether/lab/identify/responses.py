@@ -1,0 +1,55 @@
+"""What came of each step: velocities by their own stamps, beside all inputs that they answer to."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from skytether.client.vehicle import Measurement
+from skytether.lab.identify.fit import Response
+from skytether.lab.identify.steps import Step
+from skytether.shared.base.units import SECOND_NS
+
+LOOKBACK = 2.0
+"""How far back inputs are told of, in times of a step."""
+LEAD = 0.25
+"""Time before a step whose measurements count with it, in times of a step: without a dead time
+nothing else tells gain from wind."""
+SAMPLES_MIN = 10
+"""Fewest measurements of a step that can be used."""
+
+
+def responses(
+    inputs: Sequence[tuple[int, list[float]]],
+    measured: Sequence[Measurement],
+    steps: Sequence[Step],
+    axis: int,
+) -> list[Response]:
+    """Responses of an axis to its steps; one that was hardly measured is left out.
+
+    Args:
+        inputs: times from which inputs were flown [ns], and each input of every axis [m/s].
+        measured: what was measured, in any order.
+        steps: steps that were flown, of any axis.
+        axis: number of the axis.
+    """
+    flown_ns = np.array([time_ns for time_ns, _ in inputs], dtype=np.int64)
+    flown = np.array([each[axis] for _, each in inputs])
+    change = np.diff(flown, prepend=0.0)
+    known = [each for each in measured if each.velocity is not None]
+    stamps_ns = np.array([each.stamp_ns for each in known], dtype=np.int64)
+    velocity = np.array([each.velocity[axis] for each in known if each.velocity is not None])
+    found = []
+    for step in steps:
+        if step.axis != axis:
+            continue
+        since_ns = step.began_ns - round(LOOKBACK * (step.ended_ns - step.began_ns))
+        told = (change != 0.0) & (flown_ns >= since_ns) & (flown_ns < step.ended_ns)
+        after = (stamps_ns >= step.began_ns) & (stamps_ns < step.ended_ns)
+        lead_ns = round(LEAD * (step.ended_ns - step.began_ns))
+        during = (stamps_ns >= step.began_ns - lead_ns) & (stamps_ns < step.ended_ns)
+        if after.sum() < SAMPLES_MIN:
+            continue
+        changes = np.stack([(flown_ns[told] - step.began_ns) / SECOND_NS, change[told]], axis=1)
+        times = (stamps_ns[during] - step.began_ns) / SECOND_NS
+        found.append(Response(step.before, step.after, changes, times, velocity[during]))
+    return found

@@ -1,0 +1,577 @@
+"""What must hold at every step of every vehicle under torture, and who looks.
+
+A `WatchedLife` stands between one life of a client and its link, and takes its record: it sees
+every message that the vehicle believes, and every input that it flies. A `Gatekeeper` stands
+likewise between one life of the server and its gate. Both keep a `Ledger` of what was really
+sealed, so that nothing is believed that nobody has said. Time is counted in steps of the vehicle
+where the vehicle must act (nobody acts while asleep), and in the world's time where the world must
+agree.
+"""
+
+import io
+import math
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
+from skytether.client.link import ClientLink
+from skytether.client.pilot import ALTITUDE, LAND_MPS
+from skytether.server.gate import Call, Gate, Line
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.endpoint import EVENTS_MAX, Datagram
+from skytether.shared.law.model import Array
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, client_columns
+from skytether.shared.wire.protocol import (
+    DISTURBANCE,
+    FEEDBACK,
+    GAIN_P,
+    GAIN_V,
+    LED,
+    NO_HORIZON,
+    Horizon,
+    Mode,
+    Observation,
+    decode,
+)
+
+WELCOME, OBSERVATION, HORIZON = 2, 3, 4
+"""Numbers of types of messages on the wire, see `shared.wire.protocol`."""
+ONCE = frozenset({OBSERVATION, HORIZON, 5})
+"""Types of which each message is unlike all others, and so is believed once at most."""
+REMEMBERED = 8192
+"""Number of newest messages of a direction that are remembered; none is under way for longer."""
+STEPS_REMEMBERED = 4096
+"""Number of newest steps of a life whose time is remembered."""
+HELD_MAX = 1024
+"""Number of newest horizons of a life that are remembered."""
+ROUNDING = 1e-6
+"""What arithmetic may add to a speed [m/s]: horizons travel as float32."""
+MARGIN_M = 2.0
+"""What the bound of the position leaves to wind and to the dynamics of the vehicle [m]."""
+FLYING = (Mode.TRACK, Mode.COAST)
+"""Modes in which a horizon is flown."""
+
+
+class Violation(Exception):
+    """An invariant that does not hold."""
+
+    def __init__(self, invariant: str, what: str) -> None:
+        super().__init__(f"{invariant}: {what}")
+        self.invariant = invariant
+        """Name of the invariant."""
+
+
+class Ledger:
+    """Messages of one direction: by whom each was sealed, and how often."""
+
+    def __init__(self) -> None:
+        self._sealed: OrderedDict[tuple[int, bytes], list[int]] = OrderedDict()
+        """Life of the sender, times sealed and times believed, by vehicle and message."""
+
+    def seal(self, vehicle: int, payload: bytes, life: int) -> None:
+        """Note a message that is sent."""
+        entry = self._sealed.setdefault((vehicle, payload), [life, 0, 0])
+        entry[1] += 1
+        if len(self._sealed) > REMEMBERED:
+            self._sealed.popitem(last=False)
+
+    def believe(self, vehicle: int, payload: bytes, kind: int) -> None:
+        """Note a message that is believed.
+
+        Raises:
+            Violation: nobody has sent it, or not as often.
+        """
+        entry = self._sealed.get((vehicle, payload))
+        if entry is None:
+            raise Violation("authentic", f"a message of type {kind} that nobody has sent")
+        entry[2] += 1
+        if kind in ONCE and entry[2] > entry[1]:
+            raise Violation("once", f"a message of type {kind} is believed again")
+
+    def life(self, vehicle: int, payload: bytes) -> int:
+        """Life of the sender of a message, or -1 of none."""
+        return self._sealed.get((vehicle, payload), (-1,))[0]
+
+
+class Gatekeeper:
+    """Gate of one life of the server, around the real one.
+
+    Args:
+        gate: the real one.
+        life: number of the server's life.
+        up, down: what the server sends, and what vehicles send.
+    """
+
+    def __init__(self, gate: Gate, life: int, up: Ledger, down: Ledger) -> None:
+        self.gate = gate
+        self.secure = gate.secure
+        self._life = life
+        self._up, self._down = up, down
+
+    def open(self, datagram: Datagram, *, now_ns: int) -> Call | None:
+        """See `Gate`; the message must be one that a vehicle has sent."""
+        call = self.gate.open(datagram, now_ns=now_ns)
+        if call is None:
+            return None
+        assert call.vehicle is not None
+        self._down.believe(call.vehicle, call.payload, call.payload[2])
+        return call._replace(line=_Noted(call.line, call.vehicle, self._life, self._up))
+
+    def admit(self, call: Call, *, now_ns: int) -> None:
+        """See `Gate`."""
+        assert isinstance(call.line, _Noted)
+        self.gate.admit(call._replace(line=call.line.inner), now_ns=now_ns)
+
+    def outbox(self) -> list[Datagram]:
+        """See `Gate`."""
+        return self.gate.outbox()
+
+
+class _Noted:
+    """Line that notes what is sealed."""
+
+    __slots__ = ("_life", "_up", "_vehicle", "inner")
+
+    def __init__(self, line: Line, vehicle: int, life: int, up: Ledger) -> None:
+        self.inner = line
+        self._vehicle, self._life, self._up = vehicle, life, up
+
+    def seal(self, payload: bytes) -> bytes:
+        """See `Line`."""
+        self._up.seal(self._vehicle, payload, self._life)
+        return self.inner.seal(payload)
+
+
+class HorizonWatch:
+    """What a horizon tells and where that leads, worked out anew.
+
+    Args:
+        horizon: the horizon.
+        length: number of its inputs that may be flown.
+        terms: the rule of flight.
+    """
+
+    def __init__(self, horizon: Horizon, length: int, terms: Terms) -> None:
+        bound = np.array(terms.u_max)[:, None]
+        self._inputs = np.clip(horizon.inputs[:, :length].astype(float), -bound, bound)
+        self._speed = float(np.linalg.norm(self._inputs[:, -1]))
+        self._model, self._brake = terms.model, terms.brake
+        feedback = horizon.feedback.astype(float)
+        self.feeds_back = feedback.size > 0
+        """Whether it brings feedback."""
+        if not self.feeds_back:
+            feedback = np.zeros((terms.axes, FEEDBACK))
+        self._gain, self._disturbance = feedback[:, [GAIN_P, GAIN_V]], feedback[:, DISTURBANCE]
+        self._led, self._stage = feedback[:, LED], 0
+
+    def told(self, stage: int) -> Array:
+        """What it tells at a stage: its input, and after the last the braking curve [m/s]."""
+        length = self._inputs.shape[1]
+        u: Array = self._inputs[:, min(max(stage, 0), length - 1)]
+        left = self._speed - max(stage - length + 1, 0) * self._brake
+        return u * (max(0.0, left) / self._speed) if self._speed else 0.0 * u
+
+    def back(self, stage: int, state: Array) -> Array:
+        """Feedback at a stage, no earlier than those before, in a state of (axes, 2) [m/s]."""
+        if stage < 0 or not self.feeds_back:
+            return np.zeros(len(self._inputs))
+        for reached in range(self._stage, stage):
+            told = self.told(reached)
+            stands = reached >= self._inputs.shape[1] and not told.any()
+            self._led = self._model.step(self._led, told if stands else told + self._disturbance)
+        self._stage = max(self._stage, stage)
+        back: Array = (self._gain * (self._led - state)).sum(axis=1)
+        return back
+
+
+class WatchedLife(Recorder):
+    """One life of a vehicle: its link, around the real one, and what takes its record.
+
+    Args:
+        link: the real link.
+        scenario: what is flown.
+        vehicle: number of the vehicle.
+        number: number of this life of it.
+        up, down: what the server sends, and what vehicles send.
+        clock: tells the world's time [ns].
+        overdue: tells whether nothing has happened for so long that the vehicle must fly.
+        rekey_ns: time after which it wants new keys, if that is sooner than the link does [ns].
+        drifted_m: how far it may have flown while asleep, in the lives before [m].
+    """
+
+    def __init__(
+        self,
+        link: ClientLink,
+        scenario: Scenario,
+        *,
+        vehicle: int,
+        number: int,
+        up: Ledger,
+        down: Ledger,
+        clock: Callable[[], int],
+        overdue: Callable[[], bool],
+        rekey_ns: int,
+        drifted_m: float,
+    ) -> None:
+        super().__init__(client_columns(scenario.model.axes), io.BytesIO())
+        self.secure, self.hello_ns = link.secure, link.hello_ns
+        self.vehicle, self._number = vehicle, number
+        self._link, self._up, self._down = link, up, down
+        self._clock, self._overdue, self._rekey_ns = clock, overdue, rekey_ns
+        self._terms, self._dt_ns = scenario.terms(), scenario.dt_ns
+        self._timeout = seconds_to_ns(scenario.link.timeout_s) // self._dt_ns
+        """Time-out [steps]."""
+        self._change_max = scenario.vehicle.slew_mps2 * self._terms.dt_s + ROUNDING
+        self._extent = _extent(scenario)
+        self._reach_m = _reach_m(scenario.link.age_max_s, self._terms)
+
+        self._adopted_ns = 0
+        """Time at which the newest keys were adopted [vehicle's clock]."""
+        self._welcome: tuple[int, int] | None = None
+        """Session and life of the server of the WELCOME that was opened last."""
+        self._session: tuple[int, int] | None = None
+        """Those that were adopted."""
+        self._heard = False
+        """Whether a packet of the session has come since the last step."""
+        self._silent = 0
+        """Steps since the newest packet of the session."""
+        self._good_ns: int | None = None
+        """Time since which the link has been good; None while it is lost."""
+        self._speed_lost = 0.0
+        """Speed at the last step before the link was lost [m/s]."""
+        self._epoch_ns: int | None = None
+        """Begin of step 0 [vehicle's clock]."""
+        self._times_ns: OrderedDict[int, int] = OrderedDict()
+        """Time of the world of each step that was flown."""
+        self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HELD_MAX)
+        """Session, life of the server and message of each horizon that was opened."""
+        self._held: tuple[int, int, Horizon] | None = None
+        """The one in force, decoded."""
+        self._course: HorizonWatch | None = None
+        """What it tells."""
+        self._covered = False
+        """Whether it had an input for the last step."""
+        self._speed = 0.0
+        """Magnitude of what was flown last but for the feedback [m/s]."""
+        self.drifted_m = drifted_m
+        """How far it may have flown while asleep, in this life and those before [m]."""
+        self.input = [0.0] * self._terms.axes
+        """Input flown now, of each axis [m/s]."""
+        self.mode = Mode.INIT
+        """What the vehicle does."""
+        self.step, self.steps, self.missed = -1, 0, 0
+        """Its newest step, number of steps flown, and slept through."""
+        self.row_ns = -1
+        """Time of the world of its newest step, or -1."""
+
+    # -- the link ----------------------------------------------------------------------------
+
+    def hello(self, payload: bytes, *, now_ns: int) -> bytes:
+        """See `ClientLink`."""
+        self._down.seal(self.vehicle, payload, self._number)
+        return self._link.hello(payload, now_ns=now_ns)
+
+    def seal(self, payload: bytes) -> bytes:
+        """See `ClientLink`."""
+        if self._epoch_ns is None:
+            observation = decode(payload, self._terms)
+            assert isinstance(observation, Observation)
+            self._epoch_ns = observation.stamp_ns - observation.step * self._dt_ns
+        self._down.seal(self.vehicle, payload, self._number)
+        return self._link.seal(payload)
+
+    def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
+        """See `ClientLink`; the message must be one that the server has sent to this vehicle."""
+        payload = self._link.open(datagram, now_ns=now_ns)
+        if payload is None:
+            return None
+        kind = payload[2]
+        self._up.believe(self.vehicle, payload, kind)
+        life, session = self._up.life(self.vehicle, payload), _session(payload)
+        if kind == WELCOME:
+            self._welcome = (session, life)
+        elif self._session is not None and session == self._session[0]:
+            self._hear()
+            if kind == HORIZON:
+                self._horizons.append((session, life, payload))
+        return payload
+
+    def outbox(self) -> list[bytes]:
+        """See `ClientLink`."""
+        return self._link.outbox()
+
+    def adopt(self, *, now_ns: int) -> None:
+        """See `ClientLink`."""
+        self._link.adopt(now_ns=now_ns)
+        self._adopted_ns = now_ns
+        assert self._welcome is not None
+        if self._session is None or self._welcome[1] != self._session[1]:
+            self._good_ns = None
+        self._session = self._welcome
+        self._hear()
+
+    def wants_hello(self, now_ns: int) -> bool:
+        """See `ClientLink`."""
+        is_old = self._session is not None and now_ns - self._adopted_ns >= self._rekey_ns
+        return is_old or self._link.wants_hello(now_ns)
+
+    def _hear(self) -> None:
+        self._heard = True
+        if self._good_ns is None:
+            self._good_ns = self._clock()
+
+    # -- the record --------------------------------------------------------------------------
+
+    def append_row(self, *values: float) -> None:
+        """Take one row of the record, and check it.
+
+        Raises:
+            Violation: something in it must not be.
+        """
+        axes = self._terms.axes
+        step, now_ns = int(values[1]), self._clock()
+        state, estimate = values[2 : 2 + 2 * axes], values[2 + 4 * axes : 2 + 6 * axes]
+        rest = values[2 + 6 * axes :]
+        flown = list(rest[:axes])
+        covered, in_force, age_ns, _, missed, number, _ = rest[axes:]
+        mode, asleep = Mode(int(number)), int(missed) - self.missed
+        self._times_ns[step] = now_ns
+        if len(self._times_ns) > STEPS_REMEMBERED:
+            self._times_ns.popitem(last=False)
+        self._listen()
+        self._check_input(flown)
+        self._check_mode(mode, covered=bool(covered), now_ns=now_ns)
+        self._check_horizon(step, int(in_force), int(age_ns), now_ns)
+        known = np.reshape(estimate, (axes, 2))
+        self._check_follows(step, known, flown, covered=bool(covered))
+        self._check_silence(mode, flown)
+        self._check_place(state[::2], asleep)
+        if mode not in FLYING and mode is not Mode.LAND and self._overdue():
+            raise Violation("recovers", f"{mode}, though nothing has happened for long")
+        self.step, self.missed, self.mode, self.input = step, int(missed), mode, flown
+        self.steps += 1
+        self.row_ns = now_ns
+
+    def _listen(self) -> None:
+        """Count the silence."""
+        self._silent = 0 if self._heard else self._silent + 1
+        self._heard = False
+        if self._silent == self._timeout + 1:
+            self._good_ns = None
+            self._speed_lost = math.hypot(*self.input)
+
+    def _check_input(self, flown: list[float]) -> None:
+        """It is finite, within its bound, and changes no faster than it may."""
+        for u, before, most in zip(flown, self.input, self._terms.u_max, strict=True):
+            if not math.isfinite(u):
+                raise Violation("finite", f"an input of {u}")
+            if abs(u) > most:
+                raise Violation("bounded", f"an input of {u} m/s, at most {most}")
+            if abs(u - before) > self._change_max:
+                raise Violation("slew", f"from {before:.4f} to {u:.4f} m/s in a step")
+
+    def _check_mode(self, mode: Mode, *, covered: bool, now_ns: int) -> None:
+        """It is one that the table leads to, and does not fly on after sleep."""
+        if mode not in REACHED[self.mode]:
+            raise Violation("table", f"from {self.mode} to {mode}")
+        if mode is Mode.FAULT:
+            raise Violation("table", "in fault, with a state and an input that are finite")
+        if covered != (mode in FLYING):
+            raise Violation("table", f"{mode}, and a horizon is {'' if covered else 'not '}flown")
+        late_ns = now_ns - self.row_ns - self._dt_ns
+        if self.row_ns >= 0 and late_ns > STALL_NS + MILLISECOND_NS and mode in FLYING:
+            raise Violation("asleep", f"{mode} on waking {late_ns / SECOND_NS:.2f} s late")
+
+    def check_change(self, before: str, after: str) -> None:
+        """Check a change of mode that the vehicle has told.
+
+        Raises:
+            Violation: the table has no such move.
+        """
+        if (before, after) not in MOVES:
+            raise Violation("table", f"from {before} to {after} at once")
+
+    def _check_horizon(self, step: int, in_force: int, age_ns: int, now_ns: int) -> None:
+        """It was sent by the present life of the server for this session, and is not too old."""
+        if in_force == NO_HORIZON:
+            self._held = self._course = None
+            return
+        if self._held is None or self._held[2].step != in_force:
+            self._held = self._find(in_force, step * self._dt_ns - age_ns)
+            self._course = None
+            good_ns = self._good_ns
+            if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * self._dt_ns:
+                since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
+                raise Violation("good link", f"a horizon is flown, the link good for {since}")
+        session, life, horizon = self._held
+        if (session, life) != self._session:
+            said = f"of life {life} and session {session}, not {self._session}"
+            raise Violation("foreign", f"a horizon {said}")
+        assert self._epoch_ns is not None
+        observed, rest_ns = divmod(horizon.observed_ns - self._epoch_ns, self._dt_ns)
+        observed_ns = self._times_ns.get(observed)
+        if rest_ns or observed_ns is None or observed > step:
+            raise Violation("observed", f"a horizon from an observation of step {observed}")
+        if self._course is None:
+            last = min(horizon.inputs.shape[1], observed + self._terms.age_max - in_force + 1)
+            self._course = HorizonWatch(horizon, last, self._terms)
+
+    def _find(self, made_for: int, observed_ns: int) -> tuple[int, int, Horizon]:
+        """The horizon in force, by the step that it was made for and its observation."""
+        for session, life, payload in reversed(self._horizons):
+            horizon = decode(payload, self._terms)
+            assert isinstance(horizon, Horizon)
+            assert self._epoch_ns is not None
+            if horizon.step == made_for and horizon.observed_ns == self._epoch_ns + observed_ns:
+                return session, life, horizon
+        raise Violation("foreign", f"a horizon for step {made_for} that has not come")
+
+    def _check_follows(self, step: int, state: Array, flown: list[float], *, covered: bool) -> None:
+        """It flies what its horizon tells, as fast as it may change, and none that is too old.
+
+        After the last input that is the braking curve, and no faster than what was told before,
+        whatever feedback adds.
+        """
+        course, before = self._course, np.array(self.input)
+        if course is None:
+            self._speed, self._covered = math.hypot(*flown), covered
+            return
+        assert self._held is not None
+        assert self._epoch_ns is not None
+        horizon = self._held[2]
+        if covered:
+            self._check_age(step, (horizon.observed_ns - self._epoch_ns) // self._dt_ns)
+        stage, most = step - horizon.step, math.inf
+        told = course.told(stage)
+        if not covered:
+            most = max(0.0, self._speed - (0.0 if self._covered else self._terms.brake))
+        told = told * min(1.0, most / max(float(np.linalg.norm(told)), ROUNDING))
+        bound = np.array(self._terms.u_max)
+        want = np.clip(told + course.back(stage, state), -bound, bound)
+        near = np.clip(want, before - self._change_max, before + self._change_max)
+        for u, should, meant in zip(flown, near.tolist(), want.tolist(), strict=True):
+            if abs(u - should) > 2.0 * ROUNDING:
+                raise Violation("follows", f"{u:.4f} m/s flown, {meant:.4f} planned")
+        feeds_back = course.feeds_back
+        self._speed = float(np.linalg.norm(told)) if feeds_back else math.hypot(*flown)
+        self._covered = covered
+
+    def _check_age(self, step: int, observed: int) -> None:
+        """An input is flown no later after the observation behind it than it may be."""
+        limit_ns = self._terms.age_max * self._dt_ns
+        old_ns = max(self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns)
+        if old_ns > limit_ns + 2 * self._dt_ns or step - observed > self._terms.age_max:
+            raise Violation(
+                "expired", f"an input from an observation {old_ns / SECOND_NS:.2f} s old"
+            )
+
+    def _check_silence(self, mode: Mode, flown: list[float]) -> None:
+        """It has braked as long as it has lost the link, and descends at most."""
+        lost = self._silent - self._timeout - 1
+        if lost < 0:
+            return
+        speed = math.hypot(*flown)
+        if mode is Mode.LAND:
+            sinks = len(flown) > ALTITUDE and -LAND_MPS <= flown[ALTITUDE] <= 0.0
+            speed = math.hypot(*flown[:ALTITUDE]) if sinks else speed
+        most = max(0.0, self._speed_lost - lost * self._terms.brake)
+        if speed > most + ROUNDING:
+            silent_s = self._silent * self._terms.dt_s
+            raise Violation("brakes", f"{speed:.3f} m/s after {silent_s:.2f} s of silence")
+
+    def _check_place(self, position: tuple[float, ...], asleep: int) -> None:
+        """It is where the reference is, or where it may have come from there without a plan."""
+        away = max(
+            max(low - p, p - high) for p, (low, high) in zip(position, self._extent, strict=True)
+        )
+        if away <= MARGIN_M:  # it is back
+            self.drifted_m = 0.0
+        self.drifted_m += _speed_max(self._terms) * asleep * self._terms.dt_s
+        if away > self._reach_m + self.drifted_m:
+            raise Violation("place", f"{away:.1f} m outside of the reference")
+
+
+MOVES = frozenset(
+    {(str(mode), str(after)) for (mode, _), after in TABLE.items()}
+    | {(str(mode), str(mode)) for mode in Mode}
+)
+"""Names of modes, and of those that the table leads to from there at once."""
+
+
+def _reached(mode: Mode) -> frozenset[Mode]:
+    """Modes to which the table leads from one, in any number of moves."""
+    reached = {mode}
+    while True:
+        more = {after for (before, _), after in TABLE.items() if before in reached} - reached
+        if not more:
+            return frozenset(reached)
+        reached |= more
+
+
+REACHED = {mode: _reached(mode) for mode in Mode}
+
+
+def _session(payload: bytes) -> int:
+    """Number of the session that a message of the server names."""
+    session: int = msgpack.unpackb(payload)[3]
+    return session
+
+
+def _speed_max(terms: Terms) -> float:
+    """Largest steady speed on an axis [m/s]."""
+    return max(gain * u_max for gain, u_max in zip(terms.gain, terms.u_max, strict=True))
+
+
+def _reach_m(age_max_s: float, terms: Terms) -> float:
+    """How far outside of the reference a vehicle may come [m]."""
+    return _speed_max(terms) * (age_max_s + 1.0 + max(terms.dead_time_s)) + MARGIN_M
+
+
+def _extent(scenario: Scenario) -> list[tuple[float, float]]:
+    """Smallest and largest coordinate of the reference on each axis [m]."""
+    times = np.linspace(0.0, scenario.reference.period_s, 200)
+    positions = scenario.make_reference()(times)[:, :, 0]
+    return list(zip(positions.min(axis=0).tolist(), positions.max(axis=0).tolist(), strict=True))
+
+
+# -- bounds of containers --------------------------------------------------------------------
+
+LARGE = {"_heap": 65536, "_by_bin": 4096, "_agenda": 10**9}
+"""Bounds of containers by the name of their attribute, where it is another than BOUND."""
+BOUND = max(EVENTS_MAX, 2048)
+"""Largest number of things in a container of an endpoint."""
+OURS = tuple(f"skytether.{room}." for room in ("server", "client", "netem", "shared"))
+"""Packages whose objects are looked into."""
+
+
+def check_bounds(name: str, endpoint: object) -> None:
+    """Check that no container within an endpoint is larger than its bound.
+
+    Raises:
+        Violation: one is.
+    """
+    for attribute, size in _sizes(endpoint, name, set()):
+        bound = LARGE.get(attribute.rpartition(".")[2], BOUND)
+        if size > bound:
+            raise Violation("bounded memory", f"{attribute} holds {size}, at most {bound}")
+
+
+def _sizes(thing: Any, name: str, seen: set[int]) -> Iterator[tuple[str, int]]:
+    """Names and sizes of all containers within something."""
+    if id(thing) in seen:
+        return
+    seen.add(id(thing))
+    if isinstance(thing, dict | list | deque | set):
+        yield name, len(thing)
+        for each in list(thing.values() if isinstance(thing, dict) else thing)[:BOUND]:
+            yield from _sizes(each, name, seen)
+    elif type(thing).__module__.startswith(OURS):
+        slots = (slot for kind in type(thing).__mro__ for slot in getattr(kind, "__slots__", ()))
+        for attribute in (*getattr(thing, "__dict__", ()), *slots):
+            yield from _sizes(getattr(thing, attribute, None), f"{name}.{attribute}", seen)

@@ -1,0 +1,143 @@
+"""The journal of a long piece of work: its settings, and what is done of it, safe from any end.
+
+A journal is a folder. `settings.toml` holds all that the results follow from, `journal.jsonl` a
+line for each entry: its checksum (CRC-32) and the entry itself. A line is on the disk before the
+next is begun. Half a line at the end, left by a writer that was killed, is overwritten; a line that
+was changed is refused. Files that the results follow from stand in the settings by their digests.
+"""
+
+import fcntl
+import hashlib
+import os
+import tomllib
+import zlib
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from skytether.shared.base import files
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario.dotted import flat
+from skytether.shared.scenario.schema import Scenario
+
+SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
+
+E = TypeVar("E")
+
+
+class Journal(Generic[E]):
+    """The entries of one piece of work, in a folder that is made where it is missing.
+
+    Args:
+        folder: where the journal is kept.
+        settings: all that the entries follow from, as plain values; the version is added.
+        kind: type of an entry.
+
+    Raises:
+        ConfigError: the folder holds other work or a line that is no entry, or somebody writes.
+        OSError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any], kind: type[E]) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        self.files: Mapping[str, str] = settings.get("files", {})
+        """Digest of every file that the entries follow from, by its path."""
+        self.entries: list[E] = []
+        """Everything done so far, in the order in which it was done."""
+        self._file = os.fdopen(os.open(folder / ENTRIES, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
+        try:
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConfigError(f"{folder}: another command is writing there") from None
+            self._agree({"version": metadata.version("skytether"), **settings})
+            self._read(msgspec.json.Decoder(kind))
+        except BaseException:
+            self.close()
+            raise
+
+    def _agree(self, settings: Mapping[str, Any]) -> None:
+        """Write the settings down, or compare them with those that are there."""
+        path = self.folder / SETTINGS
+        text = msgspec.toml.encode(settings)
+        if not path.exists():
+            if os.fstat(self._file.fileno()).st_size:
+                raise ConfigError(f"{self.folder}: got {ENTRIES} without {SETTINGS}, expected both")
+            write(path, text)
+        try:
+            before = dict(flat(tomllib.loads(path.read_text())))
+        except ValueError as error:
+            raise ConfigError(f"{path}: no valid TOML: {error}") from None
+        now = dict(flat(tomllib.loads(text.decode())))
+        for key in [*now, *before]:
+            if now.get(key) != before.get(key):
+                raise ConfigError(
+                    f"{self.folder}: {key.removeprefix('scenario.')}: got {now.get(key)!r}, "
+                    f"expected {before.get(key)!r}, to go on there; or another --out"
+                )
+
+    def _read(self, decoder: msgspec.json.Decoder[E]) -> None:
+        """Take the entries that are there, so that the next line comes behind them."""
+        whole = 0
+        for number, line in enumerate(self._file, start=1):
+            if not line.endswith(b"\n"):
+                break
+            content = line[len(sealed(b"")) - 2 : -2]
+            try:
+                if line != sealed(content):
+                    raise ValueError("its checksum is wrong")
+                self.entries.append(decoder.decode(content))
+            except (ValueError, msgspec.MsgspecError) as error:
+                where = f"{self.folder / ENTRIES}: line {number}"
+                raise ConfigError(f"{where} is not what was written: {error}") from None
+            whole += len(line)
+        self._file.seek(whole)
+        self._file.truncate()
+
+    def append(self, entry: E) -> None:
+        """Keep an entry, whatever happens next."""
+        self._file.write(sealed(msgspec.json.encode(entry)))
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self.entries.append(entry)
+
+    def close(self) -> None:
+        """Let another command write to the folder."""
+        self._file.close()
+
+
+def sealed(content: bytes) -> bytes:
+    """A line of a journal: a JSON list of the checksum and of what it is the checksum of."""
+    return b'["%08x",%b]\n' % (zlib.crc32(content), content)
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file as a whole, or not at all.
+
+    Raises:
+        OSError: it cannot be written, or something else than a plain file is there.
+    """
+    files.check(path)
+    part = path.with_name(f"{path.name}.part")
+    with files.create(part) as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
+    """Digest of every file and plug-in that some scenarios name: a part of their settings."""
+    files = {each.reference.file for each in scenarios if each.reference.shape == "csv"}
+    entries = (entry for each in scenarios for entry in each.entries())
+    plugged = {entry.source: entry.version for entry in entries if not entry.is_ours}
+    return plugged | {file: digest(Path(file).read_bytes()) for file in sorted(files)}
+
+
+def digest(content: bytes) -> str:
+    """Short text that differs where the content of a file does."""
+    return hashlib.blake2b(content, digest_size=8).hexdigest()

@@ -1,0 +1,120 @@
+"""Text of docs/keys.md, made from `shared/scenario/schema.py`; `make keys` writes it.
+
+Each key's sentence is its docstring in the source, as in `--help`; the unit is what stands there
+in brackets.
+"""
+
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import msgspec
+
+from skytether.shared.scenario.catalogue import KEYS
+from skytether.shared.scenario.schema import Scenario, Section
+
+HEAD = """# Keys of a scenario
+
+Every key that a scenario's file may have, and a flag of every command that flies. This page is
+made from `shared/scenario/schema.py` by `make keys`.
+
+The **owner** of a key uses its value. A key of *both ends* is a [term](protocol.md#terms): where
+the ends differ in one, there is no flight. Any other key may differ: *each end* has a value of its
+own, or one end alone uses it; flights over UDP do not use those of *virtual time*. Keys with "yes"
+under **in flight** may be [changed in flight](control.md), position and velocity of a point where
+it is a live one. Values are written as in TOML; *list of numbers, 0 to 1* bounds each number.
+"""
+
+
+def document() -> str:
+    """The whole text."""
+    return "\n".join([HEAD, *_tables(Scenario, "", inspect.getdoc(Scenario) or "")])
+
+
+def _tables(section: type[Section], prefix: str, about: str) -> Iterator[str]:
+    """Table of a section's keys, and then of each section within it."""
+    told = sentences(section)
+    rows: list[str] = []
+    within: list[str] = []
+    for field in msgspec.structs.fields(section):
+        name = f"{prefix}{field.name}"
+        if name in KEYS:
+            rows.append(_row(name, field, told[field.name]))
+        else:
+            inner = told.get(field.name) or inspect.getdoc(field.type) or ""
+            within += _tables(field.type, f"{name}.", inner)
+    yield f"## {prefix.rstrip('.') or 'scenario'}\n\n{about}\n"
+    yield "| key | unit | values | default | owner | in flight | meaning |"
+    yield "|---|---|---|---|---|---|---|"
+    yield "\n".join(rows) + "\n"
+    yield from within
+
+
+def _row(name: str, field: msgspec.structs.FieldInfo, sentence: str) -> str:
+    """Row of a key; its unit has a column of its own."""
+    key = KEYS[name]
+    cells = (
+        f"`{name}`",
+        ", ".join(dict.fromkeys(re.findall(r"\[(.*?)\]", sentence))),
+        values(field.type),
+        f"`{_toml(field.default)}`",
+        key.owner.value,
+        "yes" if key.in_flight else "",
+        re.sub(r" \[.*?\]", "", sentence),
+    )
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def values(kind: Any) -> str:
+    """Values of a key's type, in words."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        metas = [each for each in parts if isinstance(each, msgspec.Meta)]
+        return _bounded(parts[0], metas[0]) if metas else values(parts[0])
+    if origin is Literal:
+        return ", ".join(f"`{_toml(part)}`" for part in parts)
+    if origin is tuple:
+        each = values(parts[0])
+        if get_origin(parts[0]) is tuple:
+            return each.replace("list of", "list of lists of")
+        return f"{'list of' if parts[-1] is Ellipsis else len(parts)} numbers, {each}"
+    if parts:
+        return " or ".join(map(values, parts))
+    return {bool: "`true`, `false`", str: "text"}[kind]
+
+
+def _bounded(kind: type, meta: msgspec.Meta) -> str:
+    """Range of a number, or length of a text."""
+    if kind is str:
+        return f"text of at most {meta.max_length} characters"
+    low = _number(meta.ge) if meta.gt is None else f"more than {_number(meta.gt)}"
+    return f"{'whole number, ' * (kind is int)}{low} to {_number(meta.le)}"
+
+
+def _number(value: float | None) -> str:
+    """Bound of a number, as short as it can be written."""
+    assert value is not None  # every number of a scenario has bounds
+    return str(value) if isinstance(value, int) else f"{value:g}".replace("e+0", "e")
+
+
+def _toml(value: object) -> str:
+    """A value as TOML and JSON have it."""
+    return msgspec.json.encode(value).decode()
+
+
+def sentences(section: type[Section]) -> dict[str, str]:
+    """Docstring of each key of a section that has one, in one line."""
+    (definition,) = ast.parse(inspect.getsource(section)).body
+    assert isinstance(definition, ast.ClassDef)
+    return {
+        ast.unparse(key.target): " ".join(ast.literal_eval(text.value).split())
+        for key, text in pairwise(definition.body)
+        if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
+    }
+
+
+if __name__ == "__main__":
+    print(document(), end="")

@@ -1,0 +1,235 @@
+"""Margin maps: flights of vehicles that differ from the model, over a box of differences.
+
+Each point of the box is flown without wind, twice: at rest, from START_M beside the point where it
+is to hover; and along the scenario's reference. At rest nothing disturbs it, so a vehicle whose
+loop is stable comes to rest. One that still moves in the last quarter, by more than REST_M about
+the point and hardly less than in the quarter before, is in a limit cycle: it swings between the
+bounds of its input for ever. Beside that stands what is computed (`lab.margins`).
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from skytether.figures.flights import save
+from skytether.figures.tables import to_csv
+from skytether.lab.journal import digests
+from skytether.lab.margins import Differing, growth_of, hovering
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.summary import Summary, position_error, summarise
+from skytether.sim.flight import fly_batch
+
+START_M = 1.0
+"""Distance along the first axis at which a vehicle begins to come to rest [m]."""
+REST_S = 60.0
+"""Length of the flights at rest [s]."""
+REST_M = 0.05
+"""Root mean square of the distance from the point, beyond which a vehicle has not come to rest
+[m]."""
+SUSTAINED = 0.7
+"""Share of that in the quarter before, beyond which it does not die away."""
+RUNS = 2
+"""Number of flights of each kind at a point, with seeds that count up from the scenario's."""
+TIMINGS, PUSHES = 12, 16
+"""Number of timings that the growth is computed along, and of pushes followed at a time."""
+
+
+class Place(NamedTuple):
+    """Where a point lies in the box."""
+
+    burst_s: float
+    """Mean length of the bursts of loss, both ways [s]; 0: each packet is lost by itself."""
+    dead_time_s: float
+    """Dead time of the vehicle, less that of the model [s]."""
+    gain: float
+    """Gain of its velocity loop over that of the model."""
+    tau: float
+    """Its time constants over those of the model."""
+
+
+class MapPoint(msgspec.Struct, frozen=True):
+    """What came of a point; an entry of a map's journal."""
+
+    number: int
+    """Number of the point, from 0 on."""
+    cycles: bool
+    """Whether a flight at rest ended in a limit cycle."""
+    rest_m: float
+    """Largest root mean square of the distance in the last quarter of the flights at rest [m]."""
+    rmse_m: float | None
+    """RMSE along the reference, over all axes of the plane [m]."""
+    saturated: float | None
+    """Share of the steps along it with an input at its bound."""
+    event_ratio: float | None
+    """Share of the server's steps along it that sent a horizon."""
+    growth: float
+    """Growth of the second moment at each step, computed without bounds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A scenario, and what differs from it."""
+
+    name: str
+    """Name of the scenario."""
+    scenario: Scenario
+    trigger: str
+    """Trigger of which the growth is computed: the scenario's, or one that sends as often."""
+    tau: tuple[float, ...]
+    gain: tuple[float, ...]
+    dead_time_s: tuple[float, ...]
+    burst_s: tuple[float, ...]
+
+    @property
+    def places(self) -> list[Place]:
+        """All points, by their number."""
+        return [Place(*at) for at in product(self.burst_s, self.dead_time_s, self.gain, self.tau)]
+
+    def settings(self) -> dict[str, Any]:
+        """All that the points follow from, as plain values."""
+        files, table = digests([self.scenario]), reading.to_table(self.scenario)
+        box = {
+            "tau": self.tau,
+            "gain": self.gain,
+            "dead_time_s": self.dead_time_s,
+            "burst_s": self.burst_s,
+            "trigger": self.trigger,
+        }
+        return {"name": self.name, "box": box, "files": files, "scenario": table}
+
+    def scenario_of(self, number: int) -> Scenario:
+        """Scenario of a point, without wind."""
+        burst_s, dead_time_s, gain, tau = self.places[number]
+        scenario, network = self.scenario, self.scenario.network
+        vehicle = replace(scenario.vehicle, wind=0.0, steady_wind_mps=(), gust_mps2=0.0)
+        uplink, downlink = (
+            replace(direction, burst_s=burst_s) for direction in (network.uplink, network.downlink)
+        )
+        still = replace(
+            scenario,
+            vehicle=vehicle,
+            network=replace(network, uplink=uplink, downlink=downlink),
+        )
+        return Differing(tau, gain, dead_time_s).of(still)
+
+    def fly(self, number: int) -> MapPoint:
+        """Fly a point in virtual time, and judge it; called in a worker."""
+        scenario = self.scenario_of(number)
+        seeds = range(scenario.seed, scenario.seed + RUNS)
+        rest = at_rest(scenario)
+        rests = [resting(rest, flight.client) for flight in fly_batch(rest, seeds)]
+        flown: list[Summary] = []
+        for seed, flight in zip(seeds, fly_batch(scenario, seeds), strict=True):
+            seeded = replace(scenario, seed=seed)
+            flown.append(summarise(seeded, self.name, flight.client, flight.server))
+        control = replace(scenario.control, trigger=self.trigger)
+        growth, _ = growth_of(replace(scenario, control=control), TIMINGS, PUSHES)
+        return MapPoint(
+            number,
+            cycles=any(before * SUSTAINED < last > REST_M for before, last in rests),
+            rest_m=max(last for _, last in rests),
+            rmse_m=_mean(each.rmse_xy for each in flown),
+            saturated=_mean(each.saturated for each in flown),
+            event_ratio=_mean(each.event_ratio for each in flown),
+            growth=growth,
+        )
+
+    def csv(self, points: Iterable[MapPoint]) -> str:
+        """CSV table with a row for each point: where it lies, and what came of it."""
+        places = self.places
+        rows = [
+            [point.number, *places[point.number], *msgspec.structs.astuple(point)[1:]]
+            for point in points
+        ]
+        return to_csv(["number", *Place._fields, *MapPoint.__struct_fields__[1:]], rows)
+
+
+def at_rest(scenario: Scenario) -> Scenario:
+    """The scenario as a flight at rest."""
+    beside = (START_M,) + (0.0,) * (scenario.model.axes - 1)
+    still = replace(hovering(scenario), duration=REST_S, settle=0.0)
+    return replace(still, vehicle=replace(still.vehicle, start_m=beside))
+
+
+def resting(scenario: Scenario, client: Rows) -> tuple[float, float]:
+    """Root mean square of the distance from the point, in the last two quarters [m]."""
+    squares: Array = (position_error(scenario, client) ** 2).sum(axis=1)
+    if not len(squares):
+        return 0.0, 0.0
+    quarter = max(1, len(squares) // 4)
+    before, last = squares[-2 * quarter : -quarter], squares[-quarter:]
+    return float(np.sqrt(before.mean())), float(np.sqrt(last.mean()))
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def draw(path: Path, title: str, box: Box, points: Sequence[MapPoint]) -> None:
+    """Draw the RMSE over time constant and gain, a map for each dead time and length of bursts.
+
+    Args:
+        path: file to write.
+        points: all of the box, by their number.
+    """
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    shape = (len(box.burst_s), len(box.dead_time_s), len(box.gain), len(box.tau))
+    rmse = np.array([point.rmse_m or np.nan for point in points]).reshape(shape)
+    cycles = np.array([point.cycles for point in points]).reshape(shape)
+    grows = np.array([point.growth >= 1.0 for point in points]).reshape(shape)
+    figure = Figure(figsize=(1.2 + 2.5 * shape[1], 1.4 + 2.3 * shape[0]), layout="constrained")
+    planes = figure.subplots(shape[0], shape[1], squeeze=False, sharex=True, sharey=True)
+    known = rmse[np.isfinite(rmse)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.01, 0.1)
+    norm = LogNorm(low, max(high, 1.01 * low))
+    across, up = (np.arange(len(values)) for values in (box.tau, box.gain))
+    for row, burst_s in enumerate(box.burst_s):
+        for column, dead_time_s in enumerate(box.dead_time_s):
+            plane, here = planes[row, column], (row, column)
+            mesh = plane.pcolormesh(across, up, rmse[here], norm=norm, shading="nearest")
+            for marks, style in ((grows[here], GROWS), (cycles[here], CYCLES)):
+                y, x = np.nonzero(marks)
+                plane.plot(x, y, **style)
+            bursts = f"bursts of {burst_s:g} s" if burst_s else "no bursts"
+            plane.set_title(f"dead time {dead_time_s:g} s, {bursts}", fontsize=8)
+            plane.set_xticks(across, [f"{value:.2g}" for value in box.tau])
+            plane.set_yticks(up, [f"{value:.2g}" for value in box.gain])
+    for plane in planes[-1]:
+        plane.set_xlabel("τ over the model's")
+    for plane in planes[:, 0]:
+        plane.set_ylabel("gain")
+    figure.colorbar(mesh, ax=planes, label="RMSE xy without wind [m]")
+    handles = [Line2D([], [], **style) for style in (CYCLES, GROWS)]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    save(figure, path, dpi=110)
+
+
+CYCLES: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "x",
+    "color": "#c1272d",
+    "markeredgewidth": 2.0,
+    "label": "flown: limit cycle",
+}
+GROWS: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "markersize": 10,
+    "markerfacecolor": "none",
+    "color": "black",
+    "label": "computed: not stable",
+}

@@ -1,0 +1,537 @@
+"""The figures of a report, drawn for print, each with its numbers and a sentence on what they say.
+
+Sizes are those of a journal's columns, letters 8 points. Red and dashed is the reference, black the
+vehicle, as in the paper.
+"""
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import stats
+
+from skytether.figures.flights import draw_reference
+from skytether.figures.page import Picture
+from skytether.figures.tables import rows_csv, to_csv
+from skytether.lab.studies import EVENT, EVERY, NONE, PERIODIC, Cells, Flown, Study, periodic_wins
+from skytether.lab.sweep import by_name, estimate
+from skytether.shared.law.model import Array, Indices
+from skytether.shared.scenario.schema import ControlConfig, DirectionConfig, Scenario
+from skytether.shared.telemetry.record import Record, Rows
+from skytether.shared.telemetry.summary import Summary, desired, summarise
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COLUMN, PAGE = 3.5, 7.16
+"""Width of a figure over one column and over the page [inch]."""
+LETTERS: Any = {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 8}
+LETTERS |= {"axes.grid": True, "grid.alpha": 0.3}
+"""Settings of matplotlib for every figure."""
+STYLES: Mapping[str, Mapping[str, Any]] = {
+    NONE: {"color": "0.5", "linestyle": ":", "marker": "s"},
+    EVERY: {"color": "black", "linestyle": "-", "marker": "o"},
+    EVENT: {"color": "#c1272d", "linestyle": "-", "marker": "^"},
+    PERIODIC: {"color": "#0072b2", "linestyle": "--", "marker": "v"},
+}
+"""Line style of each method; they can be told apart without colour as well."""
+RATIO_LOG = 20.0
+"""Ratio of largest to smallest value above which a scale is logarithmic."""
+
+Samples = Mapping[str, tuple[Scenario, Sequence[Record]]]
+"""Scenario and a few flights with their records, by method."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plate(Picture):
+    """A figure of a report, for print as well, with its numbers."""
+
+    pdf: bytes
+    """Drawing for print."""
+    csv: str
+    """Numbers that are drawn."""
+
+    def files(self) -> dict[str, bytes]:
+        """Content of each of the figure's files, by suffix."""
+        return {".png": self.png, ".pdf": self.pdf, ".csv": self.csv.encode()}
+
+
+@contextmanager
+def _figure(width: float, height: float) -> "Iterator[Figure]":
+    """An empty figure of some size [inch]."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(LETTERS):
+        yield Figure(figsize=(width, height), layout="constrained")
+
+
+def _picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Plate:
+    """A figure, as it is written."""
+    png, pdf = io.BytesIO(), io.BytesIO()
+    figure.savefig(png, format="png", dpi=220)
+    figure.set_layout_engine("none")  # it lies as it should
+    figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
+    return Plate(name, title, says, png.getvalue(), pdf.getvalue(), csv)
+
+
+def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
+    """Fig. 2: the delay (17), and the delay that netem really added.
+
+    Args:
+        delay_ms: time that each packet took over UDP, and time it was drawn to take [ms]; shape
+            (packets, 2).
+    """
+    took_ms, late_ms = delay_ms[:, 0], delay_ms[:, 0] - delay_ms[:, 1]
+    first_ms, slot_ms = direction.minimum_s * 1e3, direction.slot_s * 1e3
+    count = int(stats.poisson.ppf(0.9999, direction.slots_mean)) + 2
+    slots = np.arange(count)
+    lattice_ms, pdf = first_ms + slot_ms * slots, stats.poisson.pmf(slots, direction.slots_mean)
+    # A packet can be late, not early: what took up to a slot more than the lattice says is its.
+    nearest = np.floor((took_ms - first_ms) / slot_ms + 0.1)
+    share = np.array([np.mean(nearest == slot) for slot in slots])
+    fine_ms = np.arange(first_ms - slot_ms, lattice_ms[-1] + 1.0)
+    cdf = stats.poisson.cdf(np.floor((fine_ms - first_ms) / slot_ms + 1e-9), direction.slots_mean)
+    took_cdf = np.searchsorted(np.sort(took_ms), fine_ms, side="right") / len(took_ms)
+    with _figure(PAGE, 2.4) as figure:
+        left, right = figure.subplots(1, 2)
+        left.bar(lattice_ms, share, 0.7 * slot_ms, color="0.75", label="over UDP")
+        left.plot(lattice_ms, pdf, "r_", markersize=10, markeredgewidth=1.5, label="(17)")
+        left.set_ylabel("probability")
+        right.plot(fine_ms, took_cdf, "k-", linewidth=1.2, label="over UDP")
+        right.plot(fine_ms, cdf, "r--", linewidth=1.0, label="(17)")
+        right.set_ylabel("cumulative probability")
+        for axes in (left, right):
+            axes.set_xlabel("delay [ms]")
+            axes.legend()
+    p50, p99 = np.quantile(late_ms, (0.5, 0.99))
+    worst = np.max(np.abs(share - pdf))
+    says = (
+        f"The delay (17), as corrected (E1, E2), and what {len(took_ms)} packets met in netem over "
+        f"UDP on loopback: they came {p50:.2f} ms (median) and {p99:.2f} ms (p99) later than "
+        f"drawn, and no probability is off by more than {worst:.3f}."
+    )
+    at = dict(zip(lattice_ms.round(6).tolist(), zip(pdf, share, strict=True), strict=True))
+    rows = [
+        (ms, *at.get(round(ms, 6), (None, None)), theory, real)
+        for ms, theory, real in zip(fine_ms.tolist(), cdf, took_cdf, strict=True)
+    ]
+    header = ("delay_ms", "probability", "probability_udp", "cumulative", "cumulative_udp")
+    return _picture(figure, "fig2", "Fig. 2: network delay", says, to_csv(header, rows))
+
+
+def paths(samples: Samples) -> Plate:
+    """Fig. 3: the path without and with compensation, a packet at every step."""
+    rmse, positions = [], []
+    with _figure(PAGE, 3.9) as figure:
+        planes = figure.subplots(1, 2, sharex=True, sharey=True)
+        for plane, letter, method in zip(planes, "ab", (NONE, EVERY), strict=True):
+            scenario, flights = samples[method]
+            rmse.append(summarise(scenario, method, flights[0].client).rmse_xy)
+            step, wanted, position = _path(scenario, flights[0])
+            _draw_path(plane, scenario, flights[0])
+            plane.set_title(f"({letter}) {method}, a packet at every step")
+            positions.append(position)
+        planes[0].legend(loc="center")
+    says = (
+        f"One flight each, of the same seed. Without compensation the vehicle is {rmse[0]:.3f} m "
+        f"off (RMSE xy), with both compensators {rmse[1]:.3f} m."
+    )
+    header = ("step", "reference_x_m", "reference_y_m", "a_x_m", "a_y_m", "b_x_m", "b_y_m")
+    rows = np.column_stack([step, wanted, *positions]).tolist()
+    title = "Fig. 3: position without and with delay compensation"
+    return _picture(figure, "fig3", title, says, to_csv(header, rows))
+
+
+def events(samples: Samples) -> Plate:
+    """Fig. 4: the path with the event trigger, and its events below."""
+    scenario, flights = samples[EVENT]
+    flight, dt = flights[0], scenario.control.dt
+    step, wanted, position = _path(scenario, flight)
+    sent = np.isin(step, flight.server["step"][flight.server["event"]])
+    with _figure(COLUMN, 4.4) as figure:
+        plane, below = figure.subplots(2, 1, height_ratios=(5, 1))
+        _draw_path(plane, scenario, flight)
+        plane.legend(loc="center")
+        below.vlines(step[sent] * dt, 0.0, 1.0, color="k", linewidth=0.5)
+        below.set_xlim(0.0, scenario.duration)
+        below.set_yticks([])
+        below.set_xlabel("time [s]")
+        below.set_ylabel("event")
+    rmse = summarise(scenario, EVENT, flight.client).rmse_xy
+    says = (
+        f"The event trigger (16), same seed: {rmse:.3f} m (RMSE xy) with a packet at "
+        f"{np.mean(flight.server['event']):.1%} of the steps."
+    )
+    header = ("step", "reference_x_m", "reference_y_m", "x_m", "y_m", "event")
+    rows = np.column_stack([step, wanted, position, sent]).tolist()
+    title = "Fig. 4: position with the event trigger, and when it sent"
+    return _picture(figure, "fig4", title, says, to_csv(header, rows))
+
+
+def _path(scenario: Scenario, flight: Record) -> tuple[Indices, Array, Array]:
+    """Steps, reference and position [m] of a flight; shapes (steps,), (steps, 2), (steps, 2)."""
+    client = flight.client
+    wanted = desired(scenario, client, flight.server)[:, :2]
+    return client["step"], wanted, client["state"][:, :2, 0]
+
+
+def _draw_path(plane: Any, scenario: Scenario, flight: Record) -> None:
+    """Draw the path of a flight over its reference."""
+    draw_reference(plane, scenario, flight.client, flight.server)
+    position = flight.client["state"][:, :2, 0]
+    plane.plot(position[:, 0], position[:, 1], "k-", linewidth=0.8, label="UAV")
+    plane.plot(position[0, 0], position[0, 1], "ko", markersize=3, label="start")
+    plane.set_aspect("equal", adjustable="box")
+    plane.set_xlabel("x [m]")
+    plane.set_ylabel("y [m]")
+
+
+DECAY, EPSILON = "decay rate λ [1/s]", "tolerance ε"
+
+
+def maps(flown: Flown, here: ControlConfig) -> Plate:
+    """Fig. 5: RMSE and event ratio over the decay rate λ and the tolerance ε.
+
+    Args:
+        here: the paper's own λ and ε, which a cross marks.
+    """
+    decay, epsilon, rmse, ratio = _grid(flown)
+    with _figure(PAGE, 2.8) as figure:
+        panes = figure.subplots(1, 2)
+        names = ("RMSE xy [m]", "event ratio")
+        for plane, values, name in zip(panes, (rmse, ratio), names, strict=True):
+            mesh = plane.pcolormesh(decay, epsilon, values.T, shading="nearest")
+            plane.grid(visible=False)
+            plane.plot(here.decay_rate, here.epsilon, "wx", markeredgewidth=1.5)
+            plane.set_xlabel(DECAY)
+            plane.set_ylabel(EPSILON)
+            figure.colorbar(mesh, label=name)
+    ranks = stats.spearmanr(rmse.ravel(), ratio.ravel()).statistic
+    says = (
+        f"{len(flown)} cells; the cross is the paper's. More λ, more events: from "
+        f"{ratio[0].mean():.3f} at {decay[0]:g} to {ratio[-1].mean():.3f} at {decay[-1]:g} on "
+        f"average; more ε, fewer: from {ratio[:, 0].mean():.3f} to {ratio[:, -1].mean():.3f}. RMSE "
+        f"and event ratio have a rank correlation of {ranks:.2f}; the paper calls them inversely "
+        f"related."
+    )
+    rows = [
+        {"decay_rate": decay, "epsilon": epsilon} | by_name(DRAWN, partial(estimate, runs))
+        for (decay, epsilon), runs in flown.items()
+    ]
+    title = "Fig. 5: control performance and event ratio over λ and ε"
+    return _picture(figure, "fig5", title, says, rows_csv(rows))
+
+
+DRAWN = ("rmse_xy", "event_ratio")
+"""Figures of the maps, and of the curves beside them."""
+
+
+def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
+    """Values of λ and ε; over both, mean RMSE xy [m] and event ratio; shapes (λ,), (ε,), (λ, ε)."""
+    decay, epsilon = (np.unique([values[axis] for values in flown]) for axis in (0, 1))
+    shape = (len(decay), len(epsilon))
+    rmse, ratio = (
+        np.array([estimate(runs, name)[0] for runs in flown.values()], dtype=np.float64)
+        for name in DRAWN
+    )
+    return decay, epsilon, rmse.reshape(shape), ratio.reshape(shape)
+
+
+def pareto(flown: Flown, periodic: Flown) -> Plate:
+    """Fig. 5 as curves: RMSE against event ratio, and periodic sending beside it."""
+    decay, _, rmse, ratio = _grid(flown)
+    rates, errors = (
+        np.array([estimate(runs, name)[0] for runs in periodic.values()], dtype=np.float64)
+        for name in ("event_ratio", "rmse_xy")
+    )
+    with _figure(COLUMN, 3.0) as figure:
+        from matplotlib import colormaps
+
+        plane = figure.subplots()
+        colours = colormaps["autumn"](np.linspace(0.0, 0.7, len(decay)))
+        for value, x, y, colour in zip(decay, ratio, rmse, colours, strict=True):
+            ends = value in (decay[0], decay[-1])
+            label = f"(16), λ = {value:g} /s" if ends else None
+            plane.plot(x, y, "^-", color=colour, linewidth=0.8, markersize=3, label=label)
+        plane.plot(rates, errors, "v--", color="#0072b2", markersize=4, label="periodic")
+        plane.set_xscale("log")
+        plane.set_yscale("log")
+        plane.set_xlabel("event ratio")
+        plane.set_ylabel("RMSE xy [m]")
+        plane.legend()
+    order = np.argsort(rates)
+    within = (ratio >= rates.min()) & (ratio <= rates.max())
+    at_rate = np.interp(np.log(ratio), np.log(rates[order]), errors[order])
+    worse, compared = int(np.sum(within & (at_rate < rmse))), int(within.sum())
+    says = (
+        f"Below and to the left is better. At the same rate (interpolated), periodic sending has "
+        f"the smaller RMSE in {worse} of {compared} cells; the trigger's is "
+        f"{np.mean(rmse[within] / at_rate[within]):.2f} times it on average."
+    )
+
+    def row(method: str, values: Sequence[Any], runs: Sequence[Summary]) -> dict[str, Any]:
+        names = ("decay_rate", "epsilon", "period")
+        means = by_name(DRAWN, partial(estimate, runs))
+        return {"method": method} | dict(zip(names, values, strict=True)) | means
+
+    rows = [row(EVENT, (*values, None), runs) for values, runs in flown.items()]
+    rows += [row("periodic", (None, None, *values), runs) for values, runs in periodic.items()]
+    title = "Fig. 5 as curves: what a packet buys"
+    return _picture(figure, "fig5-pareto", title, says, rows_csv(rows))
+
+
+def curve(study: Study, cells: Cells) -> Plate:
+    """RMSE of all methods against the one thing that changes in a study, with 95 % bands."""
+    methods = list(STYLES)
+    table = {
+        method: np.array(
+            [cells[value, method].estimate("rmse_xy") for value in study.axis.values], np.float64
+        )
+        for method in methods
+    }
+    places = np.array(study.axis.values)
+    with _figure(COLUMN, 3.2) as figure:
+        plane = figure.subplots()
+        for method in methods:
+            means, halves = table[method].T
+            halves = np.nan_to_num(halves)
+            plane.plot(places, means, **STYLES[method], linewidth=1.0, markersize=3.5, label=method)
+            colour = STYLES[method]["color"]
+            low = np.maximum(means - halves, 0.5 * means)  # a logarithmic scale has no 0
+            plane.fill_between(places, low, means + halves, color=colour, alpha=0.2, linewidth=0)
+        plane.axvline(study.here, color="0.6", linewidth=0.8)
+        means = np.concatenate([table[method][:, 0] for method in methods])
+        if np.nanmax(means) > RATIO_LOG * np.nanmin(means):
+            plane.set_yscale("log")
+        plane.set_xlabel(study.label)
+        plane.set_ylabel("RMSE xy [m]")
+        figure.legend(loc="outside upper center", ncols=2)
+    better, worse = against_periodic(study, cells)
+    n = len(study.axis.values)
+    failed = sum(not run.steps for cell in cells.values() for run in cell.runs)
+    says = (
+        f"The vertical line is the paper's network and vehicle; {study.runs} runs a point. "
+        f"Periodic sending at the event trigger's own rate flies better than it at {better} of {n} "
+        f"values and worse at {worse} (95 % intervals apart)."
+    )
+    if failed:
+        says += f" {failed} runs never got a session and count in no mean."
+    rows = [
+        {
+            study.name: value,
+            "method": method,
+            "period": cell.period,
+            "runs": len(cell.runs),
+            "flown": sum(run.steps > 0 for run in cell.runs),
+        }
+        | by_name(DRAWN, cell.estimate)
+        for (value, method), cell in cells.items()
+    ]
+    title = f"RMSE against {study.label.partition(' [')[0]}"
+    return _picture(figure, f"rmse-{study.name}", title, says, rows_csv(rows))
+
+
+def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
+    """Numbers of values at which periodic sending is better than the trigger, and worse."""
+    signs = [
+        periodic_wins(cells[value, EVENT], cells[value, PERIODIC]) for value in study.axis.values
+    ]
+    return signs.count(1), signs.count(-1)
+
+
+def estimates(samples: Samples) -> Plate:
+    """Distribution of the error of the server's estimate (13)."""
+    shares = np.linspace(0.0, 1.0, 201)
+    errors = {
+        method: np.concatenate([_estimate_error(flight) for flight in flights])
+        for method, (_, flights) in samples.items()
+    }
+    quantiles = {method: np.quantile(error, shares, axis=0) for method, error in errors.items()}
+    with _figure(PAGE, 2.6) as figure:
+        panes = figure.subplots(1, 2, sharey=True)
+        for part, (plane, unit) in enumerate(zip(panes, ("m", "m/s"), strict=True)):
+            for method, values in quantiles.items():
+                style = {key: STYLES[method][key] for key in ("color", "linestyle")}
+                plane.plot(values[:, part], shares, **style, linewidth=1.2, label=method)
+            plane.set_xscale("log")
+            plane.set_xlabel(f"error of the estimated {('position', 'velocity')[part]} [{unit}]")
+        panes[0].set_ylabel("share of steps")
+        panes[1].legend()
+    medians = ", ".join(f"{np.median(error[:, 0]):.3f} m {name}" for name, error in errors.items())
+    says = (
+        f"‖x̂ − x‖ over {len(samples[EVENT][1])} flights each; median error of position: {medians}."
+    )
+    parts = ("position_m", "velocity_mps")
+    header = ("share", *(f"{method}: {part}" for method in quantiles for part in parts))
+    rows = np.column_stack([shares, *quantiles.values()]).tolist()
+    return _picture(figure, "estimate-error", "Error of the estimate", says, to_csv(header, rows))
+
+
+def _estimate_error(flight: Record) -> Array:
+    """‖x̂ − x‖ of position [m] and velocity [m/s], where both are known; shape (steps, 2)."""
+    _, ours, theirs = np.intersect1d(
+        flight.server["step"], flight.client["step"], return_indices=True
+    )
+    error = flight.server["estimate"][ours] - flight.client["state"][theirs]
+    norms: Array = np.linalg.norm(error, axis=1)
+    return norms
+
+
+@dataclass(frozen=True, slots=True)
+class Bought:
+    """A point of `trade`: what is spent, and the error that it leaves."""
+
+    packets_per_s: float
+    """Packets up per second; of none a line is drawn."""
+    bytes_per_s: float
+    """Bytes up per second."""
+    effort_mps: float
+    """RMS change of the command from step to step [m/s]."""
+    rmse_m: float | None
+    """Mean RMSE xy [m]; None where none flew."""
+    rmse_half_m: float | None
+    """Half the width of the 95 % interval of `rmse_m` [m]."""
+    median_m: float | None
+    """Median RMSE xy [m]; None where none flew."""
+    tuned: bool
+    """Whether the threshold is the one that was searched for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A curve of `trade`."""
+
+    label: str
+    """Name in the legend."""
+    colour: str
+    marker: str
+    points: Sequence[Bought]
+    """Points in the order in which they are joined."""
+
+
+def trade(
+    name: str,
+    title: str,
+    says: str,
+    curves: Sequence[Curve],
+    floor: Sequence[tuple[float, float]],
+    csv: str,
+) -> Plate:
+    """RMSE over what is spent, in packets, in bytes and in effort, with 95 % bands.
+
+    Args:
+        floor: points of a floor: packets up per second, and RMSE xy [m].
+        csv: the numbers, as `Picture` has them.
+    """
+    with _figure(PAGE, 5.0) as figure:
+        panes = figure.subplots(1, 3, sharey=True)
+        for curve in curves:
+            flown = [point for point in curve.points if point.rmse_m]
+            rmse = np.array([point.rmse_m for point in flown], np.float64)
+            half = np.array([point.rmse_half_m or 0.0 for point in flown], np.float64)
+            median = np.array([point.median_m for point in flown], np.float64)
+            large = np.array([point.tuned for point in flown], np.bool_)
+            low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic scale has no 0
+            if flown and not flown[0].packets_per_s:
+                for plane in panes:
+                    plane.axhline(rmse[0], color=curve.colour, linestyle="--", label=curve.label)
+                continue
+            style: Any = {"color": curve.colour, "linestyle": "none"}
+            shape, label = curve.marker, curve.label
+            for plane, spent in zip(panes, SPENT, strict=True):
+                cost = np.array([getattr(point, spent) for point in flown], np.float64)
+                plane.plot(cost, rmse, **style, marker=shape, markersize=2.5)
+                plane.plot(
+                    cost[large], rmse[large], **style, marker=shape, markersize=6, label=label
+                )
+                plane.plot(cost[large], median[large], **style, marker="_", markersize=9)
+                if spent == "effort_mps":
+                    continue  # with the threshold it may rise or fall
+                plane.plot(cost, rmse, color=style["color"], linewidth=0.8)
+                plane.fill_between(
+                    cost, low, rmse + half, color=style["color"], alpha=0.2, linewidth=0
+                )
+        if floor:
+            panes[0].plot(*zip(*floor, strict=True), color="0.3", linestyle=":", label="floor")
+        for plane, (spent, label) in zip(panes, SPENT.items(), strict=True):
+            plane.set_yscale("log")
+            if spent != "effort_mps":
+                plane.set_xscale("log")
+                plane.xaxis.set_minor_formatter("")  # they would lie over each other
+            plane.set_xlabel(label)
+        panes[0].set_ylabel("RMSE xy [m]")
+        handles, labels = panes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=7)
+    return _picture(figure, name, title, says, csv)
+
+
+SPENT = {
+    "packets_per_s": "packets up /s",
+    "bytes_per_s": "bytes up /s",
+    "effort_mps": "effort [m/s]",
+}
+"""What is spent, and how an axis calls it."""
+
+
+def intervals(samples: Samples) -> Plate:
+    """Distribution of the time between two packets of the event trigger."""
+    scenario, flights = samples[EVENT]
+    gaps = np.concatenate(
+        [np.diff(flight.server["step"][flight.server["event"]]) for flight in flights]
+    )
+    steps = np.arange(1, int(gaps.max()) + 1)
+    counts = np.array([np.sum(gaps == step) for step in steps])
+    regular = samples[PERIODIC][0].control.period
+    with _figure(COLUMN, 2.4) as figure:
+        plane = figure.subplots()
+        dt = scenario.control.dt
+        plane.bar(steps * dt, counts / len(gaps), 0.8 * dt, color="0.4", label="event trigger (16)")
+        plane.axvline(
+            regular * dt, color="#0072b2", linestyle="--", label=f"periodic, every {regular} steps"
+        )
+        plane.set_xlabel("time between two packets [s]")
+        plane.set_ylabel("share")
+        plane.legend()
+    says = (
+        f"{len(gaps)} intervals of {len(flights)} flights: {np.mean(gaps == 1):.0%} are a single "
+        f"step, the median is {np.median(gaps):g} steps, the longest {gaps.max()}."
+    )
+    rows = list(zip(steps.tolist(), (steps * dt).tolist(), counts.tolist(), strict=True))
+    title = "Time between two packets"
+    csv = to_csv(("steps", "seconds", "count"), rows)
+    return _picture(figure, "intervals", title, says, csv)
+
+
+def solve_times(servers: Mapping[str, Rows], dt: float) -> Plate:
+    """Distribution of the time that both MPCs of a step took in the flights over UDP.
+
+    Args:
+        servers: rows of the server's records, by method.
+        dt: length of a step [s].
+    """
+    solve_ms = {
+        name: rows["solve_ns"][rows["solve_ns"] >= 0] / 1e6 for name, rows in servers.items()
+    }
+    everything = np.concatenate(list(solve_ms.values()))
+    edges = np.geomspace(max(1e-3, everything.min()), everything.max() * 1.01, 40)
+    counts = {name: np.histogram(values, edges)[0] for name, values in solve_ms.items()}
+    with _figure(COLUMN, 2.4) as figure:
+        plane = figure.subplots()
+        for name, values in counts.items():
+            plane.stairs(values, edges, color=STYLES[name]["color"], label=name)
+        plane.set_xscale("log")
+        plane.set_xlabel("both MPCs of a step [ms]")
+        plane.set_ylabel("steps")
+        plane.legend()
+    says = (
+        f"p50 {np.median(everything):.2f} ms, p99 {np.quantile(everything, 0.99):.2f} ms, longest "
+        f"{everything.max():.2f} ms, where a step has {dt * 1e3:g} ms."
+    )
+    rows = np.column_stack([edges[:-1], edges[1:], *counts.values()]).tolist()
+    header = ("from_ms", "to_ms", *counts)
+    return _picture(figure, "solve-times", "Solve times over UDP", says, to_csv(header, rows))

@@ -1,0 +1,258 @@
+"""A report, a page of tables and figures that opens offline; and the report of `reproduce`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from msgspec.structs import asdict
+
+from skytether.figures.page import Table, as_text, rendered
+from skytether.figures.tables import rows_csv
+from skytether.lab import plates
+from skytether.lab.calibration import within
+from skytether.lab.plates import Plate, Samples
+from skytether.lab.studies import (
+    EVENT,
+    EVERY,
+    PERIODIC,
+    TRAFFIC,
+    Cell,
+    Cells,
+    Flown,
+    Study,
+    TableEntry,
+    periodic_wins,
+    table_1,
+)
+from skytether.lab.sweep import Estimate, by_name
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import summarise
+
+TITLE = "Efficient networked UAV control using event-triggered predictive control, reproduced"
+ABOUT = (
+    "Jang, Son, Yoo, Kim, Johansson (2019), flown with Skytether: the same endpoints in virtual "
+    "time and over UDP."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Real:
+    """A flight over UDP."""
+
+    scenario: Scenario
+    """What was flown."""
+    flight: Record
+    """Records of the flight."""
+    netem: Mapping[str, Any]
+    """Figures of netem: what it counted, and how late it was."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction:
+    """All that a reproduction has flown."""
+
+    table: tuple[Study, Cells]
+    """Study of Table 1, and its cells."""
+    curves: Sequence[tuple[Study, Cells]]
+    """Study of each curve, and its cells."""
+    maps: Flown
+    """Summaries of Fig. 5, by λ and ε."""
+    periods: Flown
+    """Summaries of periodic sending beside Fig. 5, by period."""
+    delay_ms: Array
+    """Time of each packet over UDP, and time that was drawn for it [ms]; shape (packets, 2)."""
+    real: Mapping[str, Real]
+    """Flights over UDP, by method."""
+    samples: Samples
+    """Flights in virtual time with their whole records, by method."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A report, drawn."""
+
+    title: str
+    """Heading of the page."""
+    about: str
+    """One or two sentences on what was flown."""
+    tables: Sequence[Table]
+    """Tables, the most important first."""
+    pictures: Sequence[Plate]
+    """Figures."""
+    verdict: str
+    """One or two sentences on what came out."""
+
+
+def draw(measured: Reproduction) -> Drawn:
+    """The report of a reproduction."""
+    study, cells = measured.table
+    columns = {method: cell for (value, method), cell in cells.items() if value == study.here}
+    entries = table_1(columns)
+    samples = measured.samples
+    servers = {method: real.flight.server for method, real in measured.real.items()}
+    scenario = study.scenario
+    pictures = [
+        plates.delay(scenario.network.downlink, measured.delay_ms),
+        plates.paths(samples),
+        plates.events(samples),
+        plates.maps(measured.maps, scenario.control),
+        plates.pareto(measured.maps, measured.periods),
+        *(plates.curve(*curve) for curve in measured.curves),
+        plates.estimates(samples),
+        plates.intervals(samples),
+        plates.solve_times(servers, scenario.control.dt),
+    ]
+    tables = [paper_table(entries, columns), traffic_table(columns), real_table(measured)]
+    return Drawn(TITLE, ABOUT, tables, pictures, verdict(entries, columns))
+
+
+def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, Cell]) -> Table:
+    """Table 1, the paper's figures beside ours."""
+    runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
+    rows = [
+        (
+            each.column,
+            each.entry,
+            as_text(each.paper, ".4f"),
+            as_text(each.here, ".4f"),
+            as_text(each.ci95, ".4f"),
+            as_text(each.deviation, "+.1%"),
+        )
+        for each in entries
+    ]
+    ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
+    meet = not periodic_wins(columns[EVENT], columns[PERIODIC])
+    loss = f"{abs(ours / theirs - 1.0):.0%} {'more' if ours > theirs else 'less'}"
+    says = (
+        f"Means of {runs} flights a column with 95 % intervals, in metres; the paper's event ratio "
+        f"is its “10 times smaller”. The last column is no scheme of the paper's but a packet "
+        f"every {steps} steps, the rate nearest to the trigger's: against it the event trigger has "
+        f"{loss} RMSE xy{', though the intervals meet' if meet else ''}."
+    )
+    text = rows_csv([asdict(entry) for entry in entries])
+    heading = ("column", "entry", "paper", "here", "± 95 %", "deviation")
+    return Table("table1", "Table 1: RMSE to the desired trajectory", says, text, heading, rows)
+
+
+def traffic_table(columns: Mapping[str, Cell]) -> Table:
+    """Table of the packets and bytes that entered the network, by method."""
+    text = rows_csv(
+        [{"column": method} | by_name(TRAFFIC, cell.estimate) for method, cell in columns.items()]
+    )
+    rows = [
+        [method, *(as_interval(cell.estimate(name), ",.0f") for name in TRAFFIC)]
+        for method, cell in columns.items()
+    ]
+    share = [
+        (columns[EVENT].estimate(name)[0] or 0.0) / (columns[EVERY].estimate(name)[0] or 1.0)
+        for name in TRAFFIC
+    ]
+    says = (
+        f"All that entered the network in a flight. The paper's “10 times” counts packets on the "
+        f"uplink alone: there the trigger sends {share[0]:.1%} of what every step takes; of all "
+        f"packets, both ways, {share[4]:.1%}, and {share[5]:.1%} of all bytes."
+    )
+    heading = ("column", *(name.replace("_", " ") for name in TRAFFIC))
+    return Table("traffic", "Packets and bytes (UDP payload)", says, text, heading, rows)
+
+
+REAL = {
+    "column": ("column", ""),
+    "rmse_xy_udp": ("UDP", ".4f"),
+    "rmse_xy_same_seed": ("same seed", ".4f"),
+    "rmse_xy_virtual": ("virtual", ".4f"),
+    "rmse_xy_virtual_ci95": ("± 95 %", ".4f"),
+    "rmse_xy_least": ("least", ".4f"),
+    "rmse_xy_most": ("most", ".4f"),
+    "event_ratio_udp": ("events, UDP", ".3f"),
+    "event_ratio_virtual": ("virtual", ".3f"),
+    "solve_ms_p50": ("solve p50 [ms]", ".2f"),
+    "solve_ms_p99": ("p99 [ms]", ".2f"),
+    "deadline_misses": ("misses", "d"),
+    "netem_late_ms_p99": ("netem late p99 [ms]", ".2f"),
+}
+"""Columns of `real_table`: heading and format of each."""
+
+
+def real_table(measured: Reproduction) -> Table:
+    """Table of the flights over real UDP beside those in virtual time, by method."""
+    study, cells = measured.table
+    length_s = study.axis.values[1]
+    rows: list[dict[str, Any]] = []
+    within_range = 0
+    for method, real in measured.real.items():
+        flight, runs = real.flight, cells[length_s, method].runs
+        udp = summarise(real.scenario, method, flight.client, flight.server, flight.netem)
+        errors = [run.rmse_xy for run in runs if run.rmse_xy is not None]
+        cell = cells[length_s, method]
+        late_ms = max(real.netem[way]["error_ms_p99"] for way in ("uplink", "downlink"))
+        least, most = min(errors, default=None), max(errors, default=None)
+        if None not in (least, most, udp.rmse_xy):
+            within_range += (least or 0.0) <= (udp.rmse_xy or 0.0) <= (most or 0.0)
+        mean, half = cell.estimate("rmse_xy")
+        rows.append(
+            {
+                "column": method,
+                "rmse_xy_udp": udp.rmse_xy,
+                "rmse_xy_same_seed": runs[0].rmse_xy,
+                "rmse_xy_virtual": mean,
+                "rmse_xy_virtual_ci95": half,
+                "rmse_xy_least": least,
+                "rmse_xy_most": most,
+                "event_ratio_udp": udp.event_ratio,
+                "event_ratio_virtual": cell.estimate("event_ratio")[0],
+                "solve_ms_p50": udp.solve_ms_p50,
+                "solve_ms_p99": udp.solve_ms_p99,
+                "deadline_misses": udp.deadline_misses,
+                "netem_late_ms_p99": late_ms,
+            }
+        )
+    shown = [[as_text(row[name], spec) for name, (_, spec) in REAL.items()] for row in rows]
+    says = (
+        f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
+        f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
+        f"{within_range} of {len(rows)} flights over UDP lie within what virtual time says. Where "
+        f"a server's tick falls within a vehicle's step is chance in both, so equal seeds do not "
+        f"give equal flights."
+    )
+    heading = [heading for heading, _ in REAL.values()]
+    title = "RMSE xy [m] over real UDP and in virtual time"
+    return Table("real", title, says, rows_csv(rows), heading, shown)
+
+
+def verdict(entries: Sequence[TableEntry], columns: Mapping[str, Cell]) -> str:
+    """What a reproduction came to, in two sentences."""
+    off = {(e.column, e.entry): e.deviation for e in entries if e.deviation is not None}
+    near = sum(within(entry, deviation) for (_, entry), deviation in off.items())
+    (column, entry), worst = max(off.items(), key=lambda item: abs(item[1]))
+    ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
+    wins = periodic_wins(columns[EVENT], columns[PERIODIC])
+    what = {1: "loses to", -1: "beats", 0: "cannot be told from"}[wins]
+    return (
+        f"{near} of {len(off)} entries of Table 1 are within tolerance; the farthest is {entry} of "
+        f"“{column}”, {worst:+.1%}. At its own rate the event trigger {what} a packet every "
+        f"{columns[PERIODIC].period} steps: {ours:.3f} m against {theirs:.3f} m."
+    )
+
+
+def _rmse(cell: Cell) -> float:
+    """Mean RMSE xy [m]; NaN where nothing was flown."""
+    mean = cell.estimate("rmse_xy")[0]
+    return float("nan") if mean is None else mean
+
+
+def as_interval(estimate: Estimate, spec: str) -> str:
+    """A mean with its interval, as a table shows it."""
+    return " ± ".join(as_text(part, spec) for part in estimate)
+
+
+def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -> str:
+    """The page of a report.
+
+    Args:
+        scenario: what the report is about.
+        calls: facts of each call of the command that made it, the last one last.
+    """
+    return rendered("figures/report.html.jinja", drawn=drawn, scenario=scenario, calls=calls)

@@ -1,0 +1,254 @@
+"""Who sits on the way between vehicles and netem while they are tortured, and reads nothing.
+
+Packets pass, unless a fault is on (`lab.faults`): then they are lost, doubled, held back, changed
+or sent again, or a stranger sends others beside them.
+"""
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from heapq import heappop, heappush
+
+import numpy as np
+
+from skytether.lab.faults import Kind, ScheduledFault
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+
+SERVER: Address = ("server", 0)
+NETEM: Address = ("netem", 0)
+
+RECORDED = 2048
+"""Number of newest packets of a direction that an attacker has recorded."""
+HELD_MAX = 65536
+"""Largest number of packets that an attacker holds back."""
+FLOOD_NS = 10 * MILLISECOND_NS
+"""Time between two volleys of forged packets [ns]."""
+OTHER_SOCKET, STRANGERS_SOCKET, STRANGERS = 100, 200, 8
+"""First number of the sockets from which packets of vehicles are replayed, of those from which
+forged ones are sent, and number of the latter."""
+COPIER_SOCKET, COPIERS = 300, 16
+"""First number and number of the sockets from which copies are sent, and which are answered."""
+COPY_S = 0.3
+"""Longest time for which a copy or an answer to it is held back [s]."""
+SWIFT = 0.5
+"""Share of attackers who are faster than the network."""
+ASTRAY = 0.2
+"""Share of copies and answers that are sent to another than they were meant for."""
+
+
+class Saboteur(Endpoint):
+    """Who sits on the way between vehicles and netem, and reads nothing.
+
+    Vehicle number n is a client of netem's by its socket n. Packets pass unless a fault is on.
+
+    Args:
+        rng: source of chance.
+        clients: addresses of vehicles 1, 2, ….
+    """
+
+    def __init__(self, rng: np.random.Generator, clients: Sequence[Address]) -> None:
+        super().__init__()
+        self._rng = rng
+        self._clients = dict(enumerate(clients, start=1))
+        self._numbers = {client: number for number, client in self._clients.items()}
+        self._on: list[ScheduledFault] = []
+        """Faults that last."""
+        self._left: dict[ScheduledFault, int] = {}
+        """Number of packets that are still lost of a burst."""
+        self._recorded: dict[str, deque[tuple[int, Datagram]]] = {
+            direction: deque(maxlen=RECORDED) for direction in ("uplink", "downlink")
+        }
+        """Newest packets of each direction, and the times at which they passed."""
+        self._held: list[tuple[int, int, Datagram]] = []
+        """Heap of time at which a packet goes on, order, and packet."""
+        self._order = 0
+        self._swift: set[ScheduledFault] = set()
+        """Attackers who copy all packets; those of vehicles come to the server before the originals
+        do."""
+        self._copied: dict[int, Address] = {}
+        """Vehicle whose packet was copied last from each socket, by the socket's number."""
+        self._volley_ns: int | None = None
+        """Time of the next volley of forged packets."""
+        self.counts: Counter[str] = Counter()
+        """Number of packets that each kind of fault has befallen."""
+
+    def begin(self, fault: ScheduledFault, now_ns: int) -> None:
+        """Let a fault befall what passes from now on."""
+        self._on.append(fault)
+        if fault.kind is Kind.FLOOD:
+            self._volley_ns = now_ns
+        if fault.kind is Kind.COPY and self._rng.random() < SWIFT:
+            self._swift.add(fault)
+        if fault.kind is Kind.REPLAY:
+            for direction in self._directions(fault):
+                for passed_ns, datagram in self._recorded[direction]:
+                    self._replay(fault, datagram, passed_ns, now_ns)
+
+    def end(self, fault: ScheduledFault) -> None:
+        """Let it befall nothing more."""
+        self._on.remove(fault)
+        self._left.pop(fault, None)
+        self._swift.discard(fault)
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Let a packet pass, or not."""
+        payload, peer, socket = datagram
+        if socket == 0:
+            number = self._numbers.get(peer)
+            if number is not None:
+                self._pass("downlink", Datagram(payload, NETEM, number), now_ns)
+        elif socket in self._clients:
+            self._pass("uplink", Datagram(payload, self._clients[socket]), now_ns)
+        elif socket in self._copied:
+            self._hand_on(payload, socket, now_ns)
+        self._release(now_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        """Let go on what was held back, and flood."""
+        if self._volley_ns is not None and now_ns >= self._volley_ns:
+            floods = [fault for fault in self._on if fault.kind is Kind.FLOOD]
+            for fault in floods:
+                for _ in range(self._rng.poisson(fault.amount * FLOOD_NS / SECOND_NS)):
+                    self._forge(fault.where)
+            self._volley_ns = now_ns + FLOOD_NS if floods else None
+        self._release(now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """Time at which the next packet goes on."""
+        due_ns = self._held[0][0] if self._held else None
+        if due_ns is None or (self._volley_ns is not None and self._volley_ns < due_ns):
+            return self._volley_ns
+        return due_ns
+
+    @staticmethod
+    def _directions(fault: ScheduledFault) -> tuple[str, ...]:
+        return ("uplink", "downlink") if fault.where == "both" else (fault.where,)
+
+    def _pass(  # noqa: PLR0912 - a branch for each kind of fault
+        self, direction: str, datagram: Datagram, now_ns: int
+    ) -> None:
+        self._recorded[direction].append((now_ns, datagram))
+        delay_ns, copies = 0, 1
+        for fault in self._on:
+            if fault.where not in (direction, "both"):
+                continue
+            rng, amount = self._rng, fault.amount
+            match fault.kind:
+                case Kind.PARTITION:
+                    copies = 0
+                case Kind.LOSS if rng.random() < amount:
+                    copies = 0
+                case Kind.BURST:
+                    left = self._left.get(fault, 0)
+                    if not left and rng.random() < 1.0 / amount:
+                        left = round(amount)
+                    self._left[fault] = max(0, left - 1)
+                    copies = 0 if left else copies
+                case Kind.DUPLICATES if rng.random() < amount:
+                    copies *= 2
+                case Kind.REORDERING:
+                    delay_ns += seconds_to_ns(amount * rng.random())
+                case Kind.DELAY:
+                    delay_ns += seconds_to_ns(amount)
+                case Kind.CORRUPTION if rng.random() < amount:
+                    datagram = datagram._replace(payload=self._flipped(datagram.payload))
+                case Kind.REPLAY:
+                    self._replay(fault, datagram, now_ns, now_ns)
+                    continue
+                case Kind.COPY:
+                    self._copy(fault, direction, datagram, now_ns)
+                    continue
+                case _:
+                    continue
+            self.counts[f"packets: {fault.kind}"] += 1
+        for _ in range(copies):
+            self._hold(now_ns + delay_ns, datagram)
+
+    def _replay(
+        self, fault: ScheduledFault, datagram: Datagram, passed_ns: int, now_ns: int
+    ) -> None:
+        """Send a packet again where its time lies in the fault, maybe from another address."""
+        again_ns = passed_ns + seconds_to_ns(fault.amount)
+        if not now_ns <= again_ns < fault.end_ns:
+            return
+        if self._rng.random() < 0.5:
+            other = datagram.socket + OTHER_SOCKET
+            datagram = datagram._replace(socket=other)
+        self.counts[f"packets: {fault.kind}"] += 1
+        self._hold(again_ns, datagram)
+
+    def _copy(self, fault: ScheduledFault, direction: str, datagram: Datagram, now_ns: int) -> None:
+        """Send a copy of a packet from an address of his own."""
+        swift = fault in self._swift
+        if not swift and self._rng.random() >= fault.amount:
+            return
+        self.counts[f"packets: {Kind.COPY}"] += 1
+        socket = COPIER_SOCKET + int(self._rng.integers(COPIERS))
+        if direction == "uplink":
+            self._send_copy(datagram.payload, datagram.peer, socket, now_ns)
+            return
+        self._copied[socket] = self._clients[datagram.socket]
+        to, later_ns = (SERVER, NETEM)[self._rng.integers(2)], self._later_ns()
+        if swift:
+            to, later_ns = SERVER, 0
+        self._hold(now_ns + later_ns, Datagram(datagram.payload, to, socket))
+
+    def _hand_on(self, payload: bytes, socket: int, now_ns: int) -> None:
+        """Send a vehicle what came in answer to a copy of its packet, maybe twice."""
+        for _ in range(1 + self._rng.integers(2)):
+            self._send_copy(payload, self._copied[socket], socket, now_ns)
+
+    def _send_copy(self, payload: bytes, client: Address, socket: int, now_ns: int) -> None:
+        """Send something to a vehicle, maybe to another, and under the server's address or not."""
+        rng = self._rng
+        if rng.random() < ASTRAY:
+            client = list(self._clients.values())[rng.integers(len(self._clients))]
+        socket = socket if rng.random() < 0.5 else 0
+        self._hold(now_ns + self._later_ns(), Datagram(payload, client, socket))
+
+    def _later_ns(self) -> int:
+        """Time for which a copy is held back [ns]; half of them are not."""
+        return seconds_to_ns(COPY_S * max(0.0, self._rng.uniform(-1.0, 1.0)))
+
+    def _flipped(self, payload: bytes) -> bytes:
+        """Payload with one bit flipped."""
+        bit = int(self._rng.integers(8 * len(payload)))
+        flipped = bytearray(payload)
+        flipped[bit // 8] ^= 1 << bit % 8
+        return bytes(flipped)
+
+    def _forge(self, where: str) -> None:
+        """Send what a stranger can make: noise, or what was recorded with something changed."""
+        rng = self._rng
+        recorded = self._recorded["downlink" if where == "server" else "uplink"]
+        payload = rng.bytes(int(rng.integers(1, 600)))
+        if recorded and rng.random() < 0.8:
+            payload = recorded[int(rng.integers(len(recorded)))][1].payload
+            size, at = len(payload), int(rng.integers(len(payload)))
+            match rng.integers(4):
+                case 0:
+                    payload = self._flipped(payload)
+                case 1:
+                    payload = payload[:at]
+                case 2:
+                    payload = payload[:at] + rng.bytes(size - at)
+                case _:  # another counter, as if it were newer
+                    payload = payload[:8] + rng.bytes(8) + payload[16:]
+        socket = STRANGERS_SOCKET + int(rng.integers(STRANGERS))
+        clients = list(self._clients.values())
+        to = (
+            (SERVER, NETEM)[rng.integers(2)]
+            if where == "server"
+            else clients[int(rng.integers(len(clients)))]
+        )
+        self._out.append(Datagram(payload, to, socket))
+        self.counts[f"packets: {Kind.FLOOD}"] += 1
+
+    def _hold(self, due_ns: int, datagram: Datagram) -> None:
+        if len(self._held) < HELD_MAX:
+            self._order += 1
+            heappush(self._held, (due_ns, self._order, datagram))
+
+    def _release(self, now_ns: int) -> None:
+        while self._held and self._held[0][0] <= now_ns:
+            self._out.append(heappop(self._held)[2])

@@ -1,0 +1,267 @@
+"""A search for the values of some keys of a scenario: CMA-ES, resumable from its journal.
+
+The free keys live on logarithmic scales between bounds. A generation of points is proposed, flown
+by whoever is passed in, and scored by an objective. All that a search proposes follows from its
+settings and from the scores it was told: told them again, from its journal, it goes on where it was
+broken off.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+
+from skytether.lab.journal import Journal, digests
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+
+SIGMA = 0.1
+"""First step of a search unless another is asked for, as a share of the range of each key."""
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """A key of a scenario, as in `control.state_weight.0`, and the bounds of its value."""
+
+    key: str
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        """KEY=LOW:HIGH, as `parse` reads it."""
+        return f"{self.key}={self.low:g}:{self.high:g}"
+
+    @classmethod
+    def parse(cls, text: str) -> "Free":
+        """The free key that a user writes as KEY=LOW:HIGH.
+
+        Raises:
+            ConfigError: the text has another form, or the bounds are impossible.
+        """
+        key, _, bounds = text.partition("=")
+        try:
+            low, high = map(float, bounds.split(":"))
+        except ValueError:
+            raise ConfigError(f"--free: got {text!r}, expected KEY=LOW:HIGH") from None
+        if not 0.0 < low < high < np.inf:
+            raise ConfigError(f"--free: {key}: got the bounds {bounds}, expected 0 < LOW < HIGH")
+        return cls(key, low, high)
+
+    def of(self, table: Any) -> float:
+        """Value of the key in the table of a scenario."""
+        for name in self._path():
+            table = table[name]
+        return float(table)
+
+    def put(self, table: Any, value: float) -> None:
+        """Change the value of the key in the table of a scenario."""
+        *path, last = self._path()
+        for name in path:
+            table = table[name]
+        table[last] = value
+
+    def _path(self) -> list[str | int]:
+        return [int(name) if name.isdigit() else name for name in self.key.split(".")]
+
+
+def check_free(free: Sequence[Free], start: Scenario) -> None:
+    """Refuse keys that cannot be searched for.
+
+    Raises:
+        ConfigError: a key is no number of the scenario, or its value is out of its bounds.
+    """
+    for key in free:
+        try:
+            value = key.of(plain(start))
+        except (KeyError, IndexError, TypeError, ValueError):
+            raise ConfigError(
+                f"--free: got {key.key}, expected the key of a number, as in model.tau_s.0"
+            ) from None
+        if not key.low <= value <= key.high:
+            raise ConfigError(
+                f"--free: {key.key}: got the bounds {key.low:g} to {key.high:g}, "
+                f"expected them to hold {value:g}, where the search starts"
+            )
+
+
+def put(scenario: Scenario, values: Mapping[Free, float]) -> Scenario:
+    """A scenario with other values of some keys."""
+    table = plain(scenario)
+    for key, value in values.items():
+        key.put(table, value)
+    return reading.check(table, "search")
+
+
+def plain(table: Any) -> Any:
+    """A scenario, or a table of one, as dictionaries and lists that may be changed."""
+    if isinstance(table, Scenario):
+        table = reading.to_table(table)
+    if isinstance(table, Mapping):
+        return {name: plain(value) for name, value in table.items()}
+    return [plain(value) for value in table] if isinstance(table, list | tuple) else table
+
+
+class Optimiser:
+    """CMA-ES over free keys, from the values of a scenario.
+
+    Args:
+        sigma: first step, as a share of the (logarithmic) range of each key.
+    """
+
+    def __init__(
+        self, start: Scenario, free: Sequence[Free], *, population: int, sigma: float, seed: int
+    ) -> None:
+        import cma  # takes half a second to import
+
+        self._start = start
+        self._free = free
+        low, high = np.log([key.low for key in free]), np.log([key.high for key in free])
+        self._low, self._range = low, high - low
+        here = (np.log([key.of(plain(start)) for key in free]) - low) / self._range
+        rng = np.random.default_rng(seed)  # its own dice: numpy's global ones are anybody's
+        options = {
+            "bounds": [0, 1],
+            "popsize": population,
+            "verbose": -9,
+            "seed": np.nan,
+            "randn": lambda *shape: rng.standard_normal(shape),
+        }
+        self._search = cma.CMAEvolutionStrategy(np.clip(here, 0.01, 0.99), sigma, options)
+        self._points: list[Any] = []
+
+    def ask(self) -> list[Scenario]:
+        """The next generation; the first one begins with the start itself."""
+        first = self._search.countiter == 0
+        self._points = self._search.ask()
+        if first:
+            self._points[0] = self._search.x0.copy()
+        return [self._scenario(point) for point in self._points]
+
+    def tell(self, scores: Sequence[float]) -> None:
+        """Take the score of each point of the generation that was asked for."""
+        self._search.tell(self._points, scores)
+
+    def _scenario(self, point: Any) -> Scenario:
+        values = np.exp(self._low + self._range * point)
+        # Rounded, so that people can read the file, before it is flown.
+        return put(
+            self._start,
+            {key: float(f"{value:.4g}") for key, value in zip(self._free, values, strict=True)},
+        )
+
+    def values(self, scenario: Scenario) -> dict[str, float]:
+        """Values of the free keys in a scenario."""
+        table = plain(scenario)
+        return {key.key: key.of(table) for key in self._free}
+
+
+Values = Mapping[str, Mapping[str, float | None]]
+"""Figures of a point, by column and name; None where a flight failed."""
+
+
+class Objective(Protocol):
+    """What a search is after."""
+
+    def settings(self) -> Mapping[str, Any]:
+        """Name and settings of the objective, as plain values."""
+
+    def free(self) -> Sequence[Free]:
+        """Keys to change unless others are asked for."""
+
+    def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
+        """Figures of a point; called in a worker."""
+
+    def score(self, values: Values) -> float:
+        """Score of a point with these figures; the smaller, the better."""
+
+
+class SearchPoint(msgspec.Struct, frozen=True):
+    """A point that was flown."""
+
+    keys: dict[str, float]
+    """Values of the free keys."""
+    values: dict[str, dict[str, float | None]]
+    """Figures, by column and name; None where a flight failed."""
+    score: float
+    """Score, which is the smaller the better the point is."""
+
+
+Generation = list[SearchPoint]
+"""Entry of a search's journal."""
+FlyAll = Callable[[Callable[[Scenario], Values], Sequence[Scenario]], Sequence[Values]]
+"""Calls a function with each of some scenarios, and returns the results in their order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """Where a search starts, what it is after, and its effort."""
+
+    start: Scenario
+    objective: Objective
+    free: Sequence[Free]
+    """Keys that change."""
+    runs: int
+    """Number of flights of each point, with seeds that count up from the start's."""
+    population: int
+    """Number of points in a generation."""
+    sigma: float = SIGMA
+    """First step, as a share of the (logarithmic) range of each key."""
+
+    def settings(self) -> dict[str, Any]:
+        """All that the points of the search follow from, as plain values."""
+        return {
+            **self.objective.settings(),
+            "free": list(map(str, self.free)),
+            "runs": self.runs,
+            "population": self.population,
+            "sigma": self.sigma,
+            "files": digests([self.start]),
+            "scenario": reading.to_table(self.start),
+        }
+
+    def points(
+        self, journal: Journal[Generation], generations: int, fly_all: FlyAll
+    ) -> Iterator[list[SearchPoint]]:
+        """After each generation, all points so far, those that the journal has with them.
+
+        Raises:
+            ConfigError: the journal has points that this search does not propose.
+        """
+        seed = self.start.seed
+        optimiser = Optimiser(
+            self.start, self.free, population=self.population, sigma=self.sigma, seed=seed
+        )
+        fly = partial(self.objective.fly, seeds=range(seed, seed + self.runs))
+        points: list[SearchPoint] = []
+        for number in range(generations):
+            proposed = optimiser.ask()
+            keys = [optimiser.values(each) for each in proposed]
+            if number == len(journal.entries):
+                flown = zip(keys, fly_all(fly, proposed), strict=True)
+                journal.append([self._point(here, values) for here, values in flown])
+            generation = journal.entries[number]
+            if [point.keys for point in generation] != keys:
+                raise ConfigError(
+                    f"{journal.folder}: got other points in generation {number + 1}, "
+                    "expected those of this search; or another --out"
+                )
+            points += generation
+            optimiser.tell([point.score for point in generation])
+            yield points
+
+    def _point(self, keys: dict[str, float], values: Values) -> SearchPoint:
+        figures = {column: dict(found) for column, found in values.items()}
+        return SearchPoint(keys, figures, self.objective.score(values))
+
+    def scenario(self, point: SearchPoint) -> Scenario:
+        """The scenario of a point."""
+        return put(self.start, {key: point.keys[key.key] for key in self.free})
+
+
+def best(points: Sequence[SearchPoint]) -> SearchPoint:
+    """The point with the smallest score."""
+    return min(points, key=lambda point: point.score)

@@ -1,0 +1,330 @@
+"""What `skytether reproduce` flies: the paper's Table 1 and Fig. 5, and the literature's usual set.
+
+A study flies all methods over the values of one thing that changes. Its second sweep is the honest
+baseline: at each value, periodic sending with the period nearest to the event trigger's own rate
+at that value, which follows from the first sweep.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from skytether.lab.calibration import COLUMNS, TABLE_1, deviations
+from skytether.lab.sweep import Estimate, GridAxis, Results, Sweep, estimate, interval
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.summary import Summary
+
+SCENARIO = "paper"
+"""Name of the scenario that all studies start from."""
+NONE, EVERY, EVENT = COLUMNS
+PERIODIC = "periodic at equal rate"
+METHODS = GridAxis(
+    "method",
+    tuple(COLUMNS),
+    tuple({f"control.{key}": value for key, value in keys.items()} for keys in COLUMNS.values()),
+)
+"""Methods of Table 1, each a column of it; PERIODIC is flown beside them."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReproductionSize:
+    """How much a reproduction flies."""
+
+    runs: int
+    """Number of flights of each column of Table 1."""
+    curve_runs: int
+    """Number of flights of each point of a curve."""
+    map_runs: int
+    """Number of flights of each cell of Fig. 5."""
+    points: int
+    """Number of points of each curve."""
+    cells: int
+    """Number of cells along each side of Fig. 5."""
+    periods: tuple[int, ...]
+    """Periods of the periodic curve beside Fig. 5 [steps]."""
+    duration: float
+    """Length of a flight in virtual time [s]."""
+    real_s: float
+    """Length of a flight over UDP [s]."""
+    real_settle_s: float
+    """Start of a flight over UDP that RMSE leaves out [s]."""
+    sample_runs: int
+    """Number of flights of each method whose whole records are drawn."""
+    delay_packets: int
+    """Number of packets sent through netem, each way, to measure their delay."""
+
+
+def full(runs: int) -> ReproductionSize:
+    """Scale of a reproduction that is reported."""
+    return ReproductionSize(
+        runs=runs,
+        curve_runs=-(-runs // 2),
+        map_runs=-(-runs // 4),
+        points=9,
+        cells=10,
+        periods=(1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40),
+        duration=60.0,
+        real_s=30.0,
+        real_settle_s=5.0,
+        sample_runs=10,
+        delay_packets=10_000,
+    )
+
+
+QUICK = ReproductionSize(
+    runs=4,
+    curve_runs=2,
+    map_runs=2,
+    points=3,
+    cells=3,
+    periods=(1, 5, 10, 20),
+    duration=32.5,
+    real_s=4.0,
+    real_settle_s=1.0,
+    sample_runs=2,
+    delay_packets=500,
+)
+"""Scale of a first look."""
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """All methods over the values of one thing that changes."""
+
+    name: str
+    """Short name, in files."""
+    label: str
+    """Label of the axis, with its unit."""
+    scenario: Scenario
+    """What is flown, but for what changes."""
+    axis: GridAxis
+    """Values, and the keys that each changes."""
+    runs: int
+    """Number of flights of each method at each value."""
+    here: float
+    """Value that the scenario itself has."""
+
+    def first(self) -> Sweep:
+        """The sweep of the methods of Table 1."""
+        return Sweep(SCENARIO, self.scenario, [self.axis, METHODS], self.runs)
+
+    def second(self, flown: "Flown") -> Sweep:
+        """The sweep of periodic sending, as often as the event trigger sent in the first."""
+        changes = tuple(
+            {**keys, **periodic(period(flown[value, EVENT]))} for value, keys in self.axis.points()
+        )
+        return Sweep(
+            SCENARIO, self.scenario, [GridAxis(self.axis.key, self.axis.values, changes)], self.runs
+        )
+
+
+def periodic(steps: int) -> Mapping[str, Any]:
+    """Keys of a scenario that sends every so many steps, and their values."""
+    return {"control.trigger": "periodic", "control.period": steps}
+
+
+def period(runs: Sequence[Summary]) -> int:
+    """Period whose rate is nearest to the mean event ratio of some runs [steps]."""
+    ratio = estimate(runs, "event_ratio")[0]
+    if not ratio:  # none of them flew
+        return 1
+    below = max(1, math.floor(1.0 / ratio))
+    return min(below, below + 1, key=lambda steps: abs(1.0 / steps - ratio))
+
+
+def table_study(scenario: Scenario, scale: ReproductionSize) -> Study:
+    """Study of Table 1, and of flights as short as those over UDP, to stand beside them."""
+    short = {"duration": scale.real_s, "settle": scale.real_settle_s}
+    values = (scenario.duration, scale.real_s)
+    axis = GridAxis("duration", values, ({}, short))
+    return Study("table1", "duration [s]", scenario, axis, scale.runs, scenario.duration)
+
+
+def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
+    """Studies of the literature's usual set: loss, delay, jitter, a wrong model, other clocks."""
+    up, n = scenario.network.uplink, scale.points
+    slots_s = up.slot_s * up.slots_mean
+
+    def study(
+        name: str,
+        label: str,
+        values: Any,
+        here: float,
+        changes: Callable[[float], Mapping[str, Any]],
+    ) -> Study:
+        rounded = tuple(float(f"{value:.6g}") for value in values)
+        axis = GridAxis(name, rounded, tuple(map(changes, rounded)))
+        return Study(name, label, scenario, axis, scale.curve_runs, here)
+
+    def both_ways(**keys: float) -> dict[str, Any]:
+        directions = ("uplink", "downlink")
+        return {f"network.{way}.{key}": keys[key] for way in directions for key in keys}
+
+    def jitter(std_ms: float) -> Mapping[str, Any]:
+        # A Poisson number of slots has its mean as variance; the mean delay stays what it is.
+        slots = (std_ms / 1e3 / up.slot_s) ** 2
+        return both_ways(slots_mean=slots, minimum_s=round(up.mean_s - up.slot_s * slots, 9))
+
+    return [
+        study(
+            "loss",
+            "share of packets lost, each way",
+            np.linspace(0.0, 0.9, n if n < 9 else 10),
+            up.loss,
+            lambda loss: both_ways(loss=loss),
+        ),
+        study(
+            "delay",
+            "mean delay, each way [s]",
+            np.linspace(slots_s, 2 * up.mean_s - slots_s, n),
+            up.mean_s,
+            lambda mean_s: both_ways(minimum_s=round(mean_s - slots_s, 9)),
+        ),
+        study(
+            "jitter",
+            "standard deviation of the delay, each way [ms]",
+            np.linspace(0.0, 90.0, n if n < 9 else 10),
+            up.slot_s * math.sqrt(up.slots_mean) * 1e3,
+            jitter,
+        ),
+        study(
+            "mismatch",
+            "true time constant / the model's",
+            np.geomspace(0.5, 2.0, n),
+            1.0,
+            lambda factor: {"vehicle.tau_s": (scenario.tau_s * factor).tolist()},
+        ),
+        study(
+            "clock",
+            "vehicle's clock minus server's [s]",
+            np.linspace(-2.0, 2.0, n),
+            0.0,
+            lambda offset_s: {"simulation.clock_offset_s": offset_s},
+        ),
+    ]
+
+
+def map_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
+    """Sweep of Fig. 5, over the decay rate λ and the tolerance ε."""
+    decay = np.linspace(0.5, 5.0, scale.cells).tolist()
+    epsilon = np.linspace(0.9, 9.0, scale.cells).tolist()
+    axes = [
+        GridAxis("control.decay_rate", tuple(round(value, 9) for value in decay)),
+        GridAxis("control.epsilon", tuple(round(value, 9) for value in epsilon)),
+    ]
+    return Sweep(SCENARIO, scenario, axes, scale.map_runs)
+
+
+def period_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
+    """Sweep of periodic sending beside Fig. 5, from every step to hardly ever."""
+    axis = GridAxis("control.period", scale.periods, tuple(map(periodic, scale.periods)))
+    return Sweep(SCENARIO, scenario, [axis], scale.map_runs)
+
+
+Flown = Mapping[tuple[Any, ...], Sequence[Summary]]
+"""Summaries of each cell of a sweep, by its values."""
+
+
+def flown(plan: Sweep, done: Results) -> Flown:
+    """Summaries of each cell of a sweep, by its values."""
+    return {values: plan.of_cell(done, cell) for cell, values in enumerate(plan.cells)}
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Flights of one method at one value."""
+
+    runs: Sequence[Summary]
+    """Summary of each flight."""
+    period: int | None = None
+    """Steps between packets, for periodic sending; None for other methods."""
+
+    def estimate(self, figure: str) -> Estimate:
+        """Estimate of a figure; `total_packets` and `total_bytes` count both directions."""
+        if not figure.startswith("total_"):
+            return estimate(self.runs, figure)
+        what = figure.removeprefix("total_")
+        return interval(
+            [getattr(run, f"uplink_{what}") + getattr(run, f"downlink_{what}") for run in self.runs]
+        )
+
+
+def periodic_wins(event: Cell, periodic: Cell) -> int:
+    """1 where periodic sending has the smaller RMSE xy, -1 where it has the larger one.
+
+    The result is 0 where the 95 % intervals meet, or nothing was flown.
+    """
+    (ours, ours_half), (theirs, theirs_half) = (
+        cell.estimate("rmse_xy") for cell in (event, periodic)
+    )
+    if ours is None or theirs is None:
+        return 0
+    margin = (ours_half or 0.0) + (theirs_half or 0.0)
+    return (ours - theirs > margin) - (theirs - ours > margin)
+
+
+Cells = Mapping[tuple[float, str], Cell]
+"""Cells of a study, by value and method; PERIODIC is one of the methods."""
+
+
+def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly: Results) -> Cells:
+    """Cells of a study, from both of its sweeps.
+
+    Args:
+        firstly: what is done of the first sweep.
+        secondly: what is done of the second sweep.
+    """
+    found = {key: Cell(runs) for key, runs in flown(first, firstly).items()}
+    periods = [keys["control.period"] for _, keys in second.axes[0].points()]
+    for steps, ((value,), runs) in zip(periods, flown(second, secondly).items(), strict=True):
+        found[value, PERIODIC] = Cell(runs, steps)
+    return {
+        (value, method): found[value, method]
+        for value in study.axis.values
+        for method in (*COLUMNS, PERIODIC)
+    }
+
+
+class TableEntry(msgspec.Struct, frozen=True):
+    """An entry of Table 1, the paper's figure beside ours."""
+
+    column: str
+    """Method."""
+    entry: str
+    """Name of the figure."""
+    paper: float | None
+    """The paper's figure; None where it has none."""
+    here: float | None
+    """Mean of our flights; None where none flew."""
+    ci95: float | None
+    """Half the width of the 95 % interval of `here`."""
+    deviation: float | None
+    """Relative deviation of `here` from `paper`; None without the latter."""
+
+
+ENTRIES = ("rmse_x", "rmse_y", "rmse_xy", "event_ratio")
+WAYS = ("uplink", "downlink", "total")
+TRAFFIC = tuple(f"{way}_{what}" for way in WAYS for what in ("packets", "bytes"))
+
+
+def table_1(columns: Mapping[str, Cell]) -> list[TableEntry]:
+    """Entries of Table 1 for all columns; PERIODIC, which the paper does not have, with them."""
+    found = {
+        (column, name): cell.estimate(name) for column, cell in columns.items() for name in ENTRIES
+    }
+    off = deviations(
+        {
+            column: {name: found[column, name][0] for name in targets}
+            for column, targets in TABLE_1.items()
+        }
+    )
+    return [
+        TableEntry(
+            column, name, TABLE_1.get(column, {}).get(name), mean, half, off.get((column, name))
+        )
+        for (column, name), (mean, half) in found.items()
+    ]

@@ -1,0 +1,306 @@
+"""Sweeps: many flights over a grid of scenarios, their summaries, and the tables of their means.
+
+A sweep is cells × runs. A cell is the scenario with one value from each grid; its runs differ in
+the seed alone, counting up from the scenario's. They are flown in chunks of a fixed size, so that
+no result depends on how many workers there were, or on what was interrupted.
+"""
+
+import itertools
+import math
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec.structs import astuple, replace
+from scipy import stats
+
+from skytether.figures.tables import rows_csv, to_csv
+from skytether.lab.journal import digests
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.summary import Summary, summarise
+from skytether.sim.flight import fly_batch
+
+CHUNK = 25
+"""Number of runs in a task; the last of a cell may have fewer."""
+FORM = "KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
+"""Form of a grid on the command line."""
+SEED_MAX = 2**32 - 1
+"""Largest seed of a scenario."""
+
+
+@dataclass(frozen=True, slots=True)
+class GridAxis:
+    """One key of the scenario, and the values it takes; or a label, and what its values change."""
+
+    key: str
+    """Key with dots, or a label where there are `changes`."""
+    values: tuple[Any, ...]
+    """Values of the key, or names of the changes."""
+    changes: tuple[Mapping[str, Any], ...] = ()
+    """Keys that each value changes, and their values; empty where it changes `key` alone."""
+
+    def __str__(self) -> str:
+        """KEY=VALUE,VALUE,... as `parse_axis` reads it, or with the changes in place of values."""
+        values = self.changes or self.values
+        return f"{self.key}={','.join(msgspec.json.encode(value).decode() for value in values)}"
+
+    def points(self) -> list[tuple[Any, Mapping[str, Any]]]:
+        """Each value, with the keys that it changes and their values."""
+        changes = self.changes or [{self.key: value} for value in self.values]
+        return list(zip(self.values, changes, strict=True))
+
+
+def parse_axis(text: str) -> GridAxis:
+    """The grid that a user writes: `control.epsilon=0.5:8:10` or `control.scheme=committed,none`.
+
+    Raises:
+        ConfigError: the text has another form, or a value twice.
+    """
+    key, equals, given = (part.strip() for part in text.partition("="))
+    wrong = ConfigError(f"--grid: got {text!r}, expected {FORM}")
+    if not (key and equals and given):
+        raise wrong
+    ends = given.split(":")
+    try:
+        values = _linear(*ends) if len(ends) == 3 else _listed(given)
+    except ValueError:
+        raise wrong from None
+    if key == "seed":
+        raise ConfigError("--grid: got 'seed', expected another key: it counts the runs of a cell")
+    if not values:
+        raise wrong
+    for value in values:
+        if values.count(value) > 1:
+            raise ConfigError(f"--grid: {key}: got {value!r} twice, expected values that differ")
+    return GridAxis(key, tuple(values))
+
+
+def _linear(start: str, stop: str, count: str) -> list[float]:
+    """Evenly spaced values, ends included; whole numbers where both ends and all between are."""
+    first, last, n = float(start), float(stop), int(count)
+    if n < 2 or not math.isfinite(first - last):
+        raise ValueError
+    values = [first + (last - first) * i / (n - 1) for i in range(n)]
+    whole = all(value.is_integer() for value in values) and not {*".eE"} & {*start, *stop}
+    return [int(value) for value in values] if whole else values
+
+
+def _listed(given: str) -> list[Any]:
+    """Values between commas, as in TOML; a bare word is a text."""
+    try:
+        return tomllib.loads(f"values = [{given}]")["values"]
+    except ValueError:
+        return [_value(part.strip()) for part in given.split(",")]
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except ValueError:
+        # A text that needs no quotes: a name, or a path.
+        if not text or {*text} & {*"\"'[]{}=:"}:
+            raise
+        return text
+
+
+class FlightTask(msgspec.Struct, frozen=True):
+    """Some runs of a cell, flown together."""
+
+    cell: int
+    """Number of the cell in its sweep, from 0 on."""
+    chunk: int
+    """Number of the task in its cell, from 0 on."""
+    name: str
+    """Name of the scenario, for the summaries."""
+    scenario: Scenario
+    """What is flown, but for the seed."""
+    seeds: tuple[int, ...]
+    """Seed of each run."""
+
+
+class Done(msgspec.Struct, frozen=True):
+    """What came of a task; an entry of a sweep's journal."""
+
+    cell: int
+    """Number of the task's cell."""
+    chunk: int
+    """Number of the task in its cell."""
+    runs: tuple[Summary, ...]
+    """Summary of each run, in the order of the seeds."""
+
+
+Results = Mapping[tuple[int, int], Done]
+"""What is done of a sweep, by cell and chunk."""
+
+
+def results(entries: Iterable[Done]) -> Results:
+    """What is done of a sweep, from the entries of its journal."""
+    return {(done.cell, done.chunk): done for done in entries}
+
+
+def fly(task: FlightTask) -> Done:
+    """Fly all runs of a task in virtual time."""
+    return Done(task.cell, task.chunk, summaries(task.name, task.scenario, task.seeds))
+
+
+def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> tuple[Summary, ...]:
+    """Summaries of flights of a scenario in virtual time, one a seed."""
+    flown = zip(seeds, fly_batch(scenario, seeds), strict=True)
+    return tuple(
+        summarise(replace(scenario, seed=seed), name, each.client, each.server, each.netem)
+        for seed, each in flown
+    )
+
+
+class Sweep:
+    """A grid of scenarios, and the number of flights of each.
+
+    Args:
+        name: name of the scenario, for messages and summaries.
+        scenario: what is the same in all cells.
+        axes: what differs between cells; the last axis changes fastest.
+        runs: number of flights of each cell.
+
+    Raises:
+        ConfigError: a cell that cannot be flown, or a key given twice.
+    """
+
+    def __init__(self, name: str, scenario: Scenario, axes: Sequence[GridAxis], runs: int) -> None:
+        self.name, self.scenario, self.axes, self.runs = name, scenario, tuple(axes), runs
+        keys = [axis.key for axis in axes]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise ConfigError(f"--grid: {key}: got it twice, expected each key once")
+        if scenario.seed + runs - 1 > SEED_MAX:
+            most = SEED_MAX - runs + 1
+            raise ConfigError(f"seed: got {scenario.seed}, expected at most {most} for {runs} runs")
+        points = list(itertools.product(*(axis.points() for axis in axes)))
+        self.cells = [tuple(value for value, _ in cell) for cell in points]
+        """Values of each cell, in the order of the axes."""
+        self.chunks = -(-runs // CHUNK)
+        """Number of tasks of each cell."""
+        self._scenarios = [
+            self._scenario({key: value for _, changes in cell for key, value in changes.items()})
+            for cell in points
+        ]
+
+    def _scenario(self, changes: Mapping[str, Any]) -> Scenario:
+        table = reading.to_table(self.scenario)
+        lay(changes, table)
+        where = ", ".join(f"{key}={value}" for key, value in changes.items())
+        return reading.check(table, f"{self.name} with {where}" if where else self.name)
+
+    def tasks(self) -> Iterator[FlightTask]:
+        """All tasks, cell by cell."""
+        first = self.scenario.seed
+        for cell, scenario in enumerate(self._scenarios):
+            for chunk in range(self.chunks):
+                runs = range(chunk * CHUNK, min(self.runs, (chunk + 1) * CHUNK))
+                seeds = tuple(first + run for run in runs)
+                yield FlightTask(cell, chunk, self.name, scenario, seeds)
+
+    def todo(self, done: Results) -> list[FlightTask]:
+        """Tasks that are not done yet."""
+        return [task for task in self.tasks() if (task.cell, task.chunk) not in done]
+
+    def settings(self) -> dict[str, Any]:
+        """All that the results follow from, as plain values."""
+        return {
+            "name": self.name,
+            "runs": self.runs,
+            "grid": list(map(str, self.axes)),
+            "files": digests(self._scenarios),
+            "scenario": reading.to_table(self.scenario),
+        }
+
+    def runs_csv(self, done: Results) -> str:
+        """CSV table with a row for each run, cell by cell and by seed."""
+        keys = [axis.key for axis in self.axes]
+        rows = (
+            [*values, *astuple(run)]
+            for cell, values in enumerate(self.cells)
+            for run in self.of_cell(done, cell)
+        )
+        return to_csv([*keys, *Summary.__struct_fields__], rows)
+
+    def cells_csv(self, done: Results) -> str:
+        """CSV table with a row for each cell: means, and half the widths of 95 % intervals."""
+        keys = [axis.key for axis in self.axes]
+        rows = []
+        for cell, values in enumerate(self.cells):
+            runs = self.of_cell(done, cell)
+            flown = sum(run.rmse_xy is not None for run in runs)
+            row = dict(zip(keys, values, strict=True)) | {"runs": len(runs), "flown": flown}
+            rows.append(row | by_name(FIGURES, partial(estimate, runs)))
+        return rows_csv(rows)
+
+    def scenario_of(self, *values: Any) -> Scenario:
+        """Scenario of the cell with these values."""
+        return self._scenarios[self.cells.index(values)]
+
+    def of_cell(self, done: Results, cell: int) -> list[Summary]:
+        """Summaries of a cell's runs, by seed."""
+        return [run for chunk in range(self.chunks) for run in done[cell, chunk].runs]
+
+
+FIGURES = (
+    "rmse_x",
+    "rmse_y",
+    "rmse_z",
+    "rmse_xy",
+    "error_max",
+    "covered",
+    "event_ratio",
+    "uplink_packets",
+    "uplink_bytes",
+    "downlink_packets",
+    "downlink_bytes",
+    "lost",
+    "reordered",
+    "stale",
+    "age_ms_p50",
+    "age_ms_p99",
+    "aoi_s_mean",
+    "aoi_s_peak",
+    "plan_age_s_mean",
+    "effort_mps",
+    "saturated",
+    "deadline_misses",
+)
+"""Figures of a summary that make sense as a mean."""
+
+Estimate = tuple[float | None, float | None]
+"""Mean, and half the width of its 95 % interval; None where there are too few values."""
+
+
+def estimate(runs: Iterable[Summary], figure: str) -> Estimate:
+    """Mean of a figure over the runs that have it, and half the width of its 95 % interval."""
+    return interval([value for run in runs if (value := getattr(run, figure)) is not None])
+
+
+def interval(values: Sequence[float]) -> Estimate:
+    """Mean of some values, and half the width of its 95 % interval (Student's t).
+
+    The mean is None where there are no values, the interval where there are fewer than two.
+    """
+    if not values:
+        return None, None
+    mean, n = float(np.mean(values)), len(values)
+    if n < 2:
+        return mean, None
+    return mean, float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
+
+
+def by_name(figures: Iterable[str], estimate_of: Callable[[str], Estimate]) -> dict[str, Any]:
+    """Mean of each figure by its name, and half the width of its interval by NAME_ci95."""
+    found: dict[str, Any] = {}
+    for figure in figures:
+        found[figure], found[f"{figure}_ci95"] = estimate_of(figure)
+    return found

@@ -1,0 +1,494 @@
+"""Torture: the real endpoints, sealed, through a schedule of faults, with somebody who looks.
+
+    clients ── saboteur ── netem ── server          on hosts that stop, freeze, and set their clocks
+
+What is flown follows from the seed of a trial, the faults are given with it, and so it goes the
+same each time. All that fails is a `Violation` of an invariant (`lab.invariants`), or an exception
+of an endpoint. A vehicle that has landed is begun anew after a while, as an operator would.
+"""
+
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from skytether.client import secure as client_secure
+from skytether.client.endpoint import Client
+from skytether.client.failsafe import GOOD_NS
+from skytether.client.link import AGAIN_NS
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.sensor import Sensor
+from skytether.client.simulated.vehicle import SimulatedVehicle
+from skytether.client.simulated.weather import Weather
+from skytether.lab.faults import HARMLESS, Kind, ScheduledFault, Trial, schedule, shrink
+from skytether.lab.invariants import (
+    FLYING,
+    Gatekeeper,
+    Ledger,
+    Violation,
+    WatchedLife,
+    check_bounds,
+)
+from skytether.lab.saboteur import NETEM, SERVER, STRANGERS, Saboteur
+from skytether.netem.proxy import Proxy
+from skytether.server import secure as server_secure
+from skytether.server.control.clock import BUCKET_NS, BUCKETS, RECENT
+from skytether.server.control.planner import Planner
+from skytether.server.control.solver import Solver
+from skytether.server.endpoint import Server
+from skytether.server.sessions import WELCOME_NS
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import Event, ModeChanged
+from skytether.shared.core.steady import JUMP_NS, Steady
+from skytether.shared.law.model import Array, Flags
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.channel import LIFE_NS
+from skytether.shared.wire.keys import Keyring
+from skytether.shared.wire.protocol import Mode
+from skytether.sim.flight import make_keys
+from skytether.sim.world import Clock, World
+
+SABOTEUR: Address = ("saboteur", 0)
+
+CLOCK_NS = 10**7 * SECOND_NS
+"""Time that all clocks show at first [ns]: no step back leads below zero."""
+LANDED_NS = 5 * SECOND_NS
+"""Time after which a vehicle that has landed is begun anew [ns]."""
+QUIET_NS = SECOND_NS
+"""Time for which a flight goes on after it must have recovered [ns]."""
+SHORT_S = (8.0, 25.0)
+"""Time within which the faults of a short trial begin and end [s], drawn between these."""
+RESTARTED = (Kind.RESTART, "client")
+REKEYING = 0.3
+"""Share of the trials in which vehicles want new keys every REKEY_NS."""
+REKEY_NS = 4 * SECOND_NS
+STEP_FOUND_NS = (BUCKETS + RECENT) * BUCKET_NS
+"""Time after which the server has forgotten what it saw before a clock was set [ns]."""
+COMPUTE_NS = MILLISECOND_NS
+"""Time that the server takes for a step [ns]."""
+
+
+def make_scenario(seed: int) -> tuple[Scenario, int]:
+    """Scenario of a trial, and how many vehicles fly it; both are drawn from the seed."""
+    rng = stream(seed, "torture", "scenario")
+    kind = rng.choice(3, p=(0.6, 0.2, 0.2))
+    scheme = ("committed", "committed", "predictive")[kind]
+    dt_s, axes = (0.05, 0.1)[rng.choice(2, p=(0.25, 0.75))], (2, 3)[rng.integers(2)]
+    delay_s = round(float(np.exp(rng.uniform(np.log(0.005), np.log(0.4)))), 3)
+    direction = {"delay": "poisson", "minimum_s": delay_s, "slot_s": delay_s / 20.0, "loss": 0.0}
+    table: dict[str, Any] = {
+        "seed": seed,
+        "duration": 86_400.0,
+        "settle": 0.0,
+        "model": {"axes": axes, "tau_s": [0.84], "u_max": [1.6]},
+        "control": {
+            "dt": dt_s,
+            "horizon": round(2.0 / dt_s),
+            "scheme": scheme,
+            "feedback": bool(kind == 1),
+            "input_weight": 0.01,  # tight: inputs change as fast as they may
+            "input_reference": False,
+            "trigger": f"{'state_gap' if scheme == 'predictive' else 'cost_gap'} | silence(1)",
+        },
+        "reference": {
+            "shape": "figure-eight",
+            "radius_m": 2.0,
+            "period_s": 30.0,
+            "altitude_m": 3.0 if axes == 3 else 0.0,
+        },
+        "vehicle": {"exhausted": "brake", "wind": 0.05, "slew_mps2": 5.0},
+        "network": {"uplink": direction, "downlink": direction},
+        "link": {"heartbeat_s": 0.1, "timeout_s": 1.0, "age_max_s": 3.0, "connect_s": 3600.0},
+    }
+    vehicles = 1 + int(rng.random() < 0.3)
+    if rng.random() < 0.3:
+        table["sensor"] = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
+    if rng.random() < 0.3:
+        late_s, gain = rng.uniform(0.0, 0.4, axes), rng.uniform(0.8, 1.2, axes)
+        table["model"] |= {"dead_time_s": late_s.tolist(), "gain": gain.tolist()}
+    return reading.check(table, "torture"), vehicles
+
+
+def short_trial(seed: int) -> Trial:
+    """Trial of some 25 s."""
+    rng = stream(seed, "torture", "faults")
+    return Trial(seed, schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S))))
+
+
+def long_trial(seed: int, hours: float = 1.0) -> Trial:
+    """Trial of so many hours, with faults all along."""
+    return Trial(seed, schedule(stream(seed, "torture", "faults"), seconds_to_ns(3600.0 * hours)))
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What came of a trial."""
+
+    trial: Trial
+    failure: str = ""
+    """Violation or exception that ended it; empty where there was none."""
+    invariant: str = ""
+    """Name of the invariant, or `raises`."""
+    flown_s: float
+    """Time of the world [s]."""
+    counts: dict[str, int]
+    """Number of steps, lives, packets and the like, by name."""
+
+
+class Failing:
+    """Solver that says of a share of its problems that it has found nothing.
+
+    Args:
+        inner: what solves the others.
+        share: that share.
+        rng: source of chance.
+    """
+
+    def __init__(self, inner: Solver, share: float, rng: np.random.Generator) -> None:
+        self.inner = inner
+        self._share = share
+        self._rng = rng
+
+    def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
+        """See `Solver`."""
+        inputs, solved = self.inner.solve(gradient, guess)
+        failed = self._rng.random(len(solved)) < self._share
+        inputs[failed] = guess[failed]
+        return inputs, solved & ~failed
+
+
+@dataclass(slots=True)
+class TorturedVehicle:
+    """A vehicle through its lives."""
+
+    name: str
+    """Name of its host."""
+    plant: FirstOrderPlant
+    """What flies, in all of them."""
+    life: WatchedLife
+    """The present one."""
+    lives: int = 1
+    """Number of lives so far."""
+    down: int = 0
+    """Number of faults for which its host is down."""
+
+
+class Torture:
+    """A trial under way.
+
+    Args:
+        trial: what is to happen.
+    """
+
+    def __init__(self, trial: Trial) -> None:
+        self.trial = trial
+        self.scenario, count = make_scenario(trial.seed)
+        self._keyring: Keyring = make_keys(trial.seed, count)
+        rekeys = stream(trial.seed, "torture", "keys").random() < REKEYING
+        self._rekey_ns = REKEY_NS if rekeys else LIFE_NS
+        self._wrong_keys = 0
+        """Number of faults for which the server has other keys."""
+        self._chance = stream(trial.seed, "torture", "flight")
+        self.world = World(self._hear)
+        self._up, self._down = Ledger(), Ledger()
+        self._calm_ns = 0
+        """Time of the world since which nothing happens, as far as nothing does."""
+        self._under_way = 0
+        """Number of faults that last, or leave something under way."""
+        restarts = any((each.kind, each.where) == RESTARTED for each in trial.faults)
+        steps = any(each.kind is Kind.STEP and is_small(each.amount) for each in trial.faults)
+        self._step_ns = STEP_FOUND_NS if steps else 0
+        """Time that clocks take to be known again after a step that none can tell from a stall."""
+        self._recovery_ns = recovery_ns(self.scenario, restarts=restarts) + self._step_ns
+        """Time within which a vehicle flies again once nothing happens [ns]."""
+        self.counts: Counter[str] = Counter()
+        self._servers = self._netems = 0
+        names = [f"client {number}" for number in range(1, count + 1)]
+        self.saboteur = Saboteur(
+            stream(trial.seed, "torture", "saboteur"), [(name, 0) for name in names]
+        )
+        self.world.add(SABOTEUR[0], self.saboteur)
+        self.world.add(NETEM[0], self._new_netem(), clock=Clock(CLOCK_NS))
+        self.vehicles: list[TorturedVehicle] = []
+        for number, name in enumerate(names, start=1):
+            weather = Weather(self.scenario, stream(trial.seed, "wind", number))
+            plant = FirstOrderPlant(self.scenario, weather)
+            life, client = self._new_client(number, 1, plant)
+            self.vehicles.append(TorturedVehicle(name, plant, life))
+            start_ns = int(self._chance.integers(self.scenario.dt_ns))
+            self.world.add(name, client, clock=Clock(CLOCK_NS), start_ns=start_ns)
+        self.world.add(SERVER[0], self._new_server(), clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS)
+        self._down_hosts: Counter[str] = Counter()
+        """Number of faults for which each host is down."""
+        for fault in trial.faults:
+            self._plan(fault)
+        self.end_ns = trial.end_ns + self._recovery_ns + QUIET_NS
+
+    def run(self, stopped: Callable[[], bool] = lambda: False) -> Outcome:
+        """Fly it to its end, or to the first violation."""
+        failure = invariant = ""
+        try:
+            self.world.run(stopped, limit_ns=self.end_ns)
+            if not stopped():
+                self._check_end()
+        except Violation as violation:
+            failure, invariant = str(violation), violation.invariant
+        except Exception as error:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            said = f"{type(error).__name__} {error} ({where.filename}:{where.lineno})"
+            failure, invariant = f"raises: {said}", "raises"
+        for vehicle in self.vehicles:
+            self._count(vehicle.life)
+        self.counts += self.saboteur.counts
+        return Outcome(
+            trial=self.trial,
+            failure=f"{self.world.now_ns / SECOND_NS:.3f} s: {failure}" if failure else "",
+            invariant=invariant,
+            flown_s=self.world.now_ns / SECOND_NS,
+            counts=dict(self.counts),
+        )
+
+    # -- lives -------------------------------------------------------------------------------
+
+    def _boot_id(self) -> int:
+        return int(self._chance.integers(2**63)) | 2**62
+
+    def _new_server(self) -> Steady:
+        self._servers += 1
+        entropy = self._chance.bytes
+        wrong = make_keys(self.trial.seed + 1, len(self._keyring))
+        keyring = wrong if self._wrong_keys else self._keyring
+        gate = server_secure.SecureGate(keyring, entropy=entropy)
+        self._gate = Gatekeeper(gate, self._servers, self._up, self._down)
+        self._server = Server(
+            self.scenario,
+            boot_id=self._boot_id(),
+            entropy=entropy,
+            gate=self._gate,
+            room=len(self._keyring),
+        )
+        return Steady(self._server)
+
+    def _new_netem(self) -> Steady:
+        scenario = msgspec.structs.replace(self.scenario, seed=self.trial.seed + self._netems)
+        self._netems += 1
+        self._netem = Proxy(scenario, server=SERVER, flows=2 * len(self._keyring) + STRANGERS)
+        return Steady(self._netem)
+
+    def _new_client(
+        self, vehicle: int, number: int, plant: FirstOrderPlant, drifted_m: float = 0.0
+    ) -> tuple[WatchedLife, Steady]:
+        key, world = self._keyring.of(vehicle), self.world
+        life = WatchedLife(
+            client_secure.SecureLink(key, entropy=self._chance.bytes),
+            self.scenario,
+            vehicle=vehicle,
+            number=number,
+            up=self._up,
+            down=self._down,
+            clock=lambda: world.now_ns,
+            overdue=self._overdue,
+            rekey_ns=self._rekey_ns,
+            drifted_m=drifted_m,
+        )
+        sensor = Sensor(self.scenario, stream(self.trial.seed, "sensor", vehicle, number))
+        client = Client(
+            self.scenario,
+            SimulatedVehicle(self.scenario.dt_ns, plant, sensor),
+            server=SABOTEUR,
+            vehicle=vehicle,
+            boot_id=self._boot_id(),
+            link=life,
+            recorder=life,
+        )
+        return life, Steady(client)
+
+    def _renew(self, name: str) -> None:
+        """Begin another life of whatever runs on a host."""
+        self.counts[f"lives of {name.partition(' ')[0]}"] += 1
+        if name == SERVER[0]:
+            self.world.restart(name, self._new_server())
+        elif name == NETEM[0]:
+            self.world.restart(name, self._new_netem())
+        else:
+            vehicle = next(each for each in self.vehicles if each.name == name)
+            self._count(vehicle.life)
+            vehicle.lives += 1
+            number = vehicle.life.vehicle
+            drifted_m = vehicle.life.drifted_m
+            vehicle.life, client = self._new_client(number, vehicle.lives, vehicle.plant, drifted_m)
+            self.world.restart(name, client)
+
+    def _count(self, life: WatchedLife) -> None:
+        self.counts["steps"] += life.steps
+        self.counts["steps slept through"] += life.missed
+        self.counts["landed"] += life.mode is Mode.LAND
+
+    # -- faults ------------------------------------------------------------------------------
+
+    def _overdue(self) -> bool:
+        """Whether nothing has happened for so long that every vehicle must fly."""
+        return not self._under_way and self.world.now_ns - self._calm_ns > self._recovery_ns
+
+    def _plan(self, fault: ScheduledFault) -> None:
+        """Put a fault on the agenda."""
+        world = self.world
+
+        harm = int(fault.kind not in HARMLESS)
+
+        def begin() -> None:
+            self._under_way += harm
+            self.counts[f"faults: {fault.kind}"] += 1
+            act(self, fault, begins=True)
+            world.at(max(world.now_ns, fault.end_ns), end)
+
+        def end() -> None:
+            act(self, fault, begins=False)
+            world.at(fault.over_ns, over)
+
+        def over() -> None:
+            self._under_way -= harm
+            if harm:
+                self._calm_ns = world.now_ns
+
+        world.at(fault.start_ns, begin)
+
+    def hosts(self, where: str) -> list[str]:
+        """Names of the hosts that a fault befalls."""
+        return [each.name for each in self.vehicles] if where == "client" else [where]
+
+    def set_down(self, name: str, *, down: bool) -> None:
+        """Take a host down, or begin another life there once no fault keeps it down any more."""
+        self._down_hosts[name] += 1 if down else -1
+        if down:
+            self.world.stop(name)
+        elif not self._down_hosts[name]:
+            self._renew(name)
+
+    def set_keys(self, *, right: bool) -> None:
+        """Let the next lives of the server have the vehicles' keys, or others."""
+        self._wrong_keys += -1 if right else 1
+
+    def set_solver(self, share: float, *, failing: bool) -> None:
+        """Let a share of solves of the present life of the server fail, or none any more."""
+        planner = self._server.controller.planner
+        assert isinstance(planner, Planner)
+        solvers = [getattr(solver, "inner", solver) for solver in planner.solvers]
+        if failing:
+            rng = self._chance
+            solvers = [Failing(solver, share, rng) for solver in solvers]
+        planner.solvers = solvers
+
+    # -- who looks ---------------------------------------------------------------------------
+
+    def _hear(self, time_ns: int, _: str, event: Event) -> None:
+        """Check a change of mode; begin a vehicle anew that has landed."""
+        if not isinstance(event, ModeChanged):
+            return
+        vehicle = self.vehicles[event.vehicle - 1]
+        vehicle.life.check_change(event.before, event.after)
+        self.counts[f"{event.after}: {event.reason}"] += event.before != event.after
+        landed, due_ns = vehicle.life, time_ns + LANDED_NS
+        recovery_after_ns = recovery_ns(self.scenario, restarts=True) + self._step_ns
+
+        def renew() -> None:
+            if vehicle.life is landed and not self._down_hosts[vehicle.name]:
+                self._renew(vehicle.name)
+                self._calm_ns, self._recovery_ns = due_ns, recovery_after_ns
+
+        landing = event.after == str(Mode.LAND) and event.before != event.after
+        if landing and due_ns + recovery_after_ns < self.end_ns:
+            self.world.at(due_ns, renew)
+
+    def _check_end(self) -> None:
+        """Every vehicle flies, and nothing has grown beyond its bounds."""
+        for vehicle in self.vehicles:
+            life = vehicle.life
+            silent_ns = self.end_ns - life.row_ns
+            if life.row_ns < 0 or silent_ns > 3 * self.scenario.dt_ns:
+                raise Violation("recovers", f"vehicle {life.vehicle} does not fly at the end")
+            if life.mode not in FLYING and life.mode is not Mode.LAND:
+                raise Violation("recovers", f"vehicle {life.vehicle} in {life.mode} at the end")
+        check_bounds("server", self._server)
+        check_bounds("gate", self._gate.gate)
+        check_bounds("netem", self._netem)
+
+
+def is_small(step_s: float) -> bool:
+    """Whether a clock that is set ahead by so much may as well have been asleep for so long [s]."""
+    return 0 < seconds_to_ns(step_s) <= JUMP_NS
+
+
+def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
+    """Time within which a vehicle flies again once nothing happens [ns].
+
+    The end of the session is noticed; HELLO is said, a cookie and a session come; the link is good
+    for a while; a horizon comes that was planned after that.
+
+    Args:
+        scenario: what is flown.
+        restarts: whether vehicles are begun anew: the server may wait for the life before.
+    """
+    direction = scenario.network.uplink
+    trip_ns = 2 * seconds_to_ns(direction.minimum_s + 8 * direction.slot_s)
+    noticed_ns = WELCOME_NS if restarts else seconds_to_ns(scenario.link.timeout_s)
+    return noticed_ns + 2 * AGAIN_NS + GOOD_NS + 4 * trip_ns + 4 * scenario.dt_ns
+
+
+def act(  # noqa: PLR0912 - a branch for each kind of fault
+    torture: Torture, fault: ScheduledFault, *, begins: bool
+) -> None:
+    """Do what a fault does when it begins, or when it ends."""
+    world, dt_ns = torture.world, torture.scenario.dt_ns
+    names = torture.hosts(fault.where)
+    match fault.kind:
+        case Kind.STEP if begins:
+            for name in names:
+                world.set_clock(name, step_ns=seconds_to_ns(fault.amount))
+        case Kind.STEP:
+            pass
+        case Kind.SKEW:
+            for name in names:
+                world.set_clock(name, drift_ppb=round(1000 * fault.amount) if begins else 0)
+        case Kind.RESTART:
+            for name in names:
+                torture.set_down(name, down=begins)
+        case Kind.KEYS:
+            torture.set_keys(right=not begins)
+            torture.set_down(SERVER[0], down=True)
+            torture.set_down(SERVER[0], down=False)
+        case Kind.FREEZE:
+            for name in names:
+                (world.freeze if begins else world.thaw)(name)
+        case Kind.SOLVER:
+            torture.set_solver(fault.amount, failing=begins)
+        case Kind.OVERLOAD:
+            world.set_compute(SERVER[0], round(fault.amount * dt_ns) if begins else COMPUTE_NS)
+        case _ if begins:
+            torture.saboteur.begin(fault, world.now_ns)
+            world.rearm(SABOTEUR[0])
+        case _:
+            torture.saboteur.end(fault)
+
+
+def fly(trial: Trial, stopped: Callable[[], bool] = lambda: False) -> Outcome:
+    """Fly a trial to its end, or to the first violation."""
+    return Torture(trial).run(stopped)
+
+
+def shrunk(outcome: Outcome) -> Outcome:
+    """The outcome of the shortest schedule of a failed trial that violates the same invariant."""
+
+    def fails(faults: tuple[ScheduledFault, ...]) -> bool:
+        return fly(replace(outcome.trial, faults=faults)).invariant == outcome.invariant
+
+    faults, until_ns = outcome.trial.faults, seconds_to_ns(outcome.flown_s)
+    begun = tuple(fault for fault in faults if fault.start_ns <= until_ns)
+    faults = shrink(begun if fails(begun) else faults, fails)
+    return fly(replace(outcome.trial, faults=faults))

@@ -1,0 +1,1 @@
+"""The library: what `import skytether` offers beside the commands; `docs/python.md` shows it."""

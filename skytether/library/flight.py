@@ -1,0 +1,257 @@
+"""A flight from Python: its arrays, summary and events, its picture and its file."""
+
+from dataclasses import replace
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.figures import flights as figures
+from skytether.shared.base import extras
+from skytether.shared.base.errors import ConfigError, FlightError, RecordingError
+from skytether.shared.base.hint import hint
+from skytether.shared.core.aboard import VehicleEvent
+from skytether.shared.core.events import Event, Failure, RecordIncomplete
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.feed import Figures, Rows, Said
+from skytether.shared.telemetry.record import (
+    PACKET_COLUMNS,
+    RECORDING,
+    FlightEvent,
+    Record,
+    client_columns,
+    plan_columns,
+    server_columns,
+)
+from skytether.shared.telemetry.record import Rows as Table
+from skytether.shared.telemetry.summary import Summary, desired, summarise
+from skytether.view.rows import Columns, arrays, readable
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+PARTS = ("client", "server", "netem", "plan")
+"""Parts of a record: rows of the vehicle's steps, the server's, of packets, and of plans."""
+UNITS = MappingProxyType({"m": "m", "mps": "m/s", "s": "s", "ns": "ns", "bytes": "B"})
+"""Unit of an array whose name ends in this word; others are counts, flags or have none."""
+
+
+class Column(NamedTuple):
+    """An array of a flight, as `Flight.columns` tells it."""
+
+    name: str
+    shape: tuple[int, ...]
+    unit: str
+    """Unit; empty for a count, a flag and what has none."""
+
+
+class Flight:
+    """A flight that was flown, or loaded from a recording.
+
+    `flight["position_m"]` is an array, one row for each step of the vehicle, of shape (steps, axes)
+    where it is a vector. Names of arrays that the server, netem and the plans have rows of begin
+    with the name of the part, as in `flight["server.event"]`. `print(flight)` lists all arrays with
+    shape and unit. Arrays cannot be written to.
+
+    Args:
+        scenario: what was flown.
+        record: the record of the flight.
+        name: name of the scenario.
+        secure: whether the link was sealed.
+    """
+
+    def __init__(
+        self, scenario: Scenario, record: Record, *, name: str, secure: bool = False
+    ) -> None:
+        self.scenario = scenario
+        """Scenario that was flown."""
+        self.name = name
+        """Name of the scenario."""
+        self.secure = secure
+        """Whether the link was sealed."""
+        # A part without rows has the columns of this scenario, wherever the record comes from.
+        parts: dict[str, Any] = {**_no_rows(scenario)}
+        parts |= {part: rows for part in PARTS if len(rows := getattr(record, part))}
+        events = tuple(each._replace(host=each.process) for each in record.events)
+        self.record = replace(record, **parts, events=events)
+        """Record as it was written: rows of each part as numpy structured arrays."""
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Array of this name.
+
+        Raises:
+            KeyError: there is none of this name.
+        """
+        try:
+            return self._arrays[name]
+        except (KeyError, TypeError):
+            raise KeyError(f"no array {name!r}; {hint(str(name), self._arrays)}") from None
+
+    def columns(self) -> tuple[Column, ...]:
+        """Name, shape and unit of every array."""
+        return tuple(
+            Column(name, array.shape, UNITS.get(name.replace(".", "_").rpartition("_")[2], ""))
+            for name, array in self._arrays.items()
+        )
+
+    @cached_property
+    def _arrays(self) -> Columns:
+        dt_s, client, server = self.scenario.control.dt, self.record.client, self.record.server
+        made: Columns = {"time_s": client["step"] * dt_s, **arrays(client)}
+        made["desired_position_m"] = desired(self.scenario, client, server)
+        for part in PARTS[1:]:
+            rows = getattr(self.record, part)
+            own = {"time_s": rows["step"] * dt_s} if "step" in rows.dtype.names else {}
+            made |= {f"{part}.{name}": array for name, array in (own | arrays(rows)).items()}
+        for array in made.values():
+            array.flags.writeable = False
+        return made
+
+    @cached_property
+    def summary(self) -> Summary:
+        """Figures of the flight; of several vehicles those of the first."""
+        client = self.record.client
+        client = client[client["vehicle"] == client["vehicle"][:1]]
+        others = self.record.server, self.record.netem
+        return summarise(self.scenario, self.name, client, *others, secure=self.secure)
+
+    @property
+    def events(self) -> tuple[FlightEvent, ...]:
+        """Events of the flight in their order: time in the flight, process, and the event."""
+        return self.record.events
+
+    @property
+    def failure(self) -> Failure | None:
+        """Event after which the vehicle could not fly; None after a flight to the end."""
+        return self.record.failure
+
+    @extras.named()
+    def plot(self) -> "Figure":
+        """Picture of the flight: the path over the reference, and when packets went up.
+
+        Raises:
+            FlightError: not a step was flown.
+        """
+        if not len(self.record.client):
+            raise FlightError(f"{self.name}: no step was flown: {self.failure or 'no vehicle'}")
+        title = f"{self.name}, seed {self.scenario.seed}"
+        return figures.drawn({title: (self.scenario, self.record)})
+
+    @extras.named()
+    def to_pandas(self, part: str = "client") -> "pandas.DataFrame":
+        """Table of a part, a column for each number, with axis and unit in its name.
+
+        Args:
+            part: "client" for the vehicle's steps, "server", "netem" for packets, or "plan".
+
+        Raises:
+            ExtraMissing: pandas is not installed.
+            KeyError: there is no such part.
+        """
+        if part not in PARTS:
+            raise KeyError(f"no part {part!r}; {hint(str(part), PARTS)}")
+        import pandas as pd
+
+        rows: Table = getattr(self.record, part)
+        time = {"time_s": rows["step"] * self.scenario.control.dt} if part != "netem" else {}
+        return pd.DataFrame(time | readable(rows))
+
+    @extras.named()
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the flight to a recording, from which `Flight.load` makes it again.
+
+        Args:
+            path: file that ends in .mcap.
+
+        Raises:
+            ConfigError: the file is called otherwise.
+            RecordingError: the file cannot be written.
+        """
+        from skytether.cli import recorder
+
+        file = Path(path)
+        if file.suffix != RECORDING:
+            raise ConfigError(f"{file}: expected a file that ends in {RECORDING}")
+        if fault := recorder.write(file, self.scenario, self.name, self.record, self.summary):
+            raise RecordingError(fault)
+
+    @classmethod
+    @extras.named()
+    def load(cls, path: str | PathLike[str]) -> "Flight":
+        """Flight of a recording, that of `save` or of `skytether fly --record`.
+
+        Raises:
+            OSError: the file cannot be read.
+            RecordingError: it is no recording, or damaged.
+        """
+        from skytether.view.recording import Recorded
+
+        pieces: dict[str, list[bytes]] = {part: [] for part in PARTS}
+        events: list[FlightEvent] = []
+        figures: dict[str, Any] = {}
+        begin_ns = 0
+        with Recorded(Path(path)) as recorded:
+            for time_ns, process, frame in recorded.frames():
+                begin_ns = frame.time_ns - time_ns
+                match frame:
+                    case Rows():
+                        pieces[frame.part].append(frame.rows)
+                    case Said():
+                        events.append(FlightEvent(time_ns, process, frame.event))
+                    case Figures():
+                        figures[process] = frame.figures
+            parts: dict[str, Any] = {**_no_rows(recorded.scenario)}
+            parts |= {
+                part: np.frombuffer(bytearray().join(pieces[part]), columns)
+                for part, columns in recorded.columns().items()
+            }
+        parts["netem"]["arrived_ns"] -= begin_ns
+        told = [each.event for each in events]
+        record = Record(
+            **parts,
+            failure=_failure(events),
+            figures=figures,
+            events=tuple(events),
+            incomplete=tuple(event for event in told if isinstance(event, RecordIncomplete)),
+        )
+        about = recorded.about
+        return cls(recorded.scenario, record, name=about.scenario, secure=about.secure)
+
+    def __repr__(self) -> str:
+        steps, seconds = len(self.record.client), self.summary.duration_s
+        return f"<Flight {self.name!r}, seed {self.scenario.seed}: {steps} steps in {seconds:g} s>"
+
+    def __str__(self) -> str:
+        rows = [(column.name, str(column.shape), column.unit) for column in self.columns()]
+        name_width, shape_width = (max(len(row[i]) for row in rows) for i in (0, 1))
+        lines = (
+            f"{name:{name_width}}  {shape:{shape_width}}  {unit}" for name, shape, unit in rows
+        )
+        return "\n".join([repr(self), *(line.rstrip() for line in lines)])
+
+
+def _no_rows(scenario: Scenario) -> dict[str, Table]:
+    """Each part of a record without a row, by its name."""
+    axes = scenario.model.axes
+    return {
+        "client": np.empty(0, client_columns(axes)),
+        "server": np.empty(0, server_columns(axes, scenario.control.scheme)),
+        "netem": np.empty(0, PACKET_COLUMNS),
+        "plan": np.empty(0, plan_columns(axes, scenario.terms().planned)),
+    }
+
+
+def _failure(events: list[FlightEvent]) -> Failure | None:
+    """Failure of the first vehicle that has one: the last event of such a vehicle."""
+    last: dict[int, Event] = {
+        each.event.vehicle: each.event
+        for each in events
+        if each.process == "client" and isinstance(each.event, VehicleEvent)
+    }
+    ends = (event for _, event in sorted(last.items()))
+    return next((event for event in ends if isinstance(event, Failure)), None)

@@ -1,0 +1,217 @@
+"""Scenarios and flights from Python: `load`, `check`, `fly` and `fly_batch`."""
+
+import threading
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from os import PathLike, fspath
+from typing import Any
+
+import msgspec
+
+from skytether.library.flight import Flight
+from skytether.shared.base import extras
+from skytether.shared.base.errors import ConfigError, FlightError
+from skytether.shared.core.endpoint import Endpoint
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shell import plugins, temporary
+
+Given = str | PathLike[str] | Scenario
+"""Name of a scenario (see `skytether scenarios`), path of a .toml file, or a scenario."""
+
+
+def load(scenario: Given, /, **keys: Any) -> Scenario:
+    """A scenario, with keys laid over it as flags are on the command line.
+
+        skytether.load("demo", duration=20, **{"control.trigger": "always"})
+
+    Args:
+        scenario: name of a scenario, path of a .toml file, or a scenario.
+        keys: keys of the scenario and their values. A dot leads into a table, as in TOML; a table
+            may be given as a mapping, too, and is laid over the scenario's own.
+
+    Raises:
+        ConfigError: there is no such scenario or key, or a value that cannot be flown.
+        TypeError: `scenario` is none of these.
+    """
+    return named(scenario, keys)[1]
+
+
+def check(scenario: Scenario | Mapping[str, Any], /, **keys: Any) -> Scenario:
+    """A scenario made by hand, every value of it checked.
+
+    Args:
+        scenario: a `Scenario`, or its tables as mappings, as a TOML file has them.
+        keys: see `load`.
+
+    Raises:
+        ConfigError: the first thing that is wrong.
+        TypeError: `scenario` is neither.
+    """
+    if isinstance(scenario, Mapping):
+        return reading.check(_laid({**scenario, **keys}, {}))
+    if not isinstance(scenario, Scenario):
+        raise TypeError(f"scenario: got {scenario!r}, expected a Scenario or a mapping of its keys")
+    return load(scenario, **keys)
+
+
+@extras.named()
+def fly(
+    scenario: Given,
+    /,
+    *,
+    udp: bool = False,
+    secure: bool = False,
+    server: Endpoint | None = None,
+    **keys: Any,
+) -> Flight:
+    """Fly a scenario: in virtual time, the same to the last bit each time, or over real UDP.
+
+    Args:
+        scenario: name of a scenario, path of a .toml file, or a scenario.
+        udp: whether server, netem and client fly as three processes on loopback, in real time.
+        secure: whether the link is sealed, with keys that are made for this flight.
+        server: endpoint that plans in place of Skytether's server, in virtual time; it has a flight
+            to itself.
+        keys: see `load`.
+
+    Returns:
+        The flight; where the vehicle could not fly, `Flight.failure` says why.
+
+    Raises:
+        ConfigError: the scenario cannot be flown, or not in this way.
+        FlightError: one of the three processes failed.
+        TypeError: an argument is of another type.
+    """
+    if server is not None:
+        _check_server(server, udp=udp, secure=secure)
+    name, flown = named(scenario, keys)
+    if server is None:
+        prepare()
+    if udp:
+        return Flight(flown, _over_udp(flown, secure=secure), name=name, secure=secure)
+    from skytether.sim import flight  # brings the planner, and its compiler
+
+    record = flight.fly(flown, secure=secure, server=server)
+    return Flight(flown, record, name=name, secure=secure)
+
+
+@extras.named()
+def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Flight]:
+    """Fly a scenario once for each seed in virtual time, several times faster than one by one.
+
+    Each flight is the one that `fly` makes with that seed, to the last bit, but for the plans,
+    which are not recorded.
+
+    Args:
+        scenario: name of a scenario, path of a .toml file, or a scenario.
+        seeds: seeds in place of the scenario's, no two alike, as in `range(100)`.
+        keys: see `load`.
+
+    Raises:
+        ConfigError: the scenario cannot be flown, or not with one of these seeds.
+        TypeError: an argument is of another type.
+    """
+    name, flown = named(scenario, keys)
+    if not isinstance(seeds, Iterable) or isinstance(seeds, str):
+        raise TypeError(f"seeds: got {seeds!r}, expected several of them, as in range(100)")
+    each = [_checked(name, flown, {"seed": seed}) for seed in seeds]
+    numbers = [run.seed for run in each]
+    for number in numbers:
+        if numbers.count(number) > 1:
+            raise ConfigError(f"seeds: got {number} twice, expected seeds that differ")
+    prepare()
+    from skytether.sim import flight  # brings the planner, and its compiler
+
+    records = flight.fly_batch(flown, numbers)
+    return [Flight(run, record, name=name) for run, record in zip(each, records, strict=True)]
+
+
+def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
+    """Name of a scenario, of one that was made by hand its title, and the scenario; see `load`."""
+    plugins.load()  # of installed packages, once in a process
+    if isinstance(scenario, Scenario):
+        name, given = scenario.title, scenario
+    elif isinstance(scenario, str | PathLike):
+        name = fspath(scenario)
+        given = reading.load(name)
+    else:
+        expected = "expected the name of a scenario, a .toml file or a Scenario"
+        raise TypeError(f"scenario: got {scenario!r}, {expected}")
+    return name, _checked(name, given, keys)
+
+
+def prepare() -> None:
+    """Compile what plans where this machine has not yet, which is said on stderr."""
+    import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
+    from skytether.shared.base import kernel
+    from skytether.shell import command
+
+    command.prepare(kernel.missing())
+
+
+def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:
+    """A scenario with keys laid over it, every value checked."""
+    table = _laid(keys, msgspec.to_builtins(scenario, enc_hook=_plain))
+    return reading.check(table, f"{name or 'the scenario'}{' with these keys' if keys else ''}")
+
+
+def _laid(keys: Mapping[str, Any], table: dict[str, Any]) -> dict[str, Any]:
+    """Plain values of keys, laid over a table."""
+    plain: dict[str, Any] = msgspec.to_builtins(dict(keys), enc_hook=_plain)
+    lay(dict(flat(plain)), table)
+    return table
+
+
+def _plain(value: Any) -> Any:
+    """Plain value of a number or array of numpy, or of a path; of anything else its text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
+    """Refuse a server of one's own that cannot be flown.
+
+    Raises:
+        ConfigError: with what could be.
+        TypeError: it is no endpoint.
+    """
+    if not isinstance(server, Endpoint):
+        raise TypeError(f"server: got {server!r}, expected an Endpoint")
+    if udp:
+        raise ConfigError("udp: got True with a server of your own, which flies in virtual time")
+    if secure:
+        said = "got True with a server of your own, which could not open what is sealed"
+        raise ConfigError(f"secure: {said}")
+
+
+def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
+    """Fly over UDP, in a thread: the caller's may have an event loop already, as in a notebook."""
+    from skytether.cli import processes
+    from skytether.shell.command import CommandError
+    from skytether.shell.log import LogLine
+
+    said: list[LogLine] = []
+    stopped = threading.Event()
+    with (
+        temporary.folder() as parts,
+        ThreadPoolExecutor(1) as pool,
+        ExitStack() as stack,
+    ):
+        stack.callback(stopped.set)  # Ctrl-C: the processes are ended in order before it goes on
+        flying = pool.submit(
+            processes.run,
+            scenario,
+            parts,
+            on_second=lambda _: None,
+            interrupted=stopped.is_set,
+            on_event=said.append,
+            secure=secure,
+        )
+        try:
+            shortfalls = flying.result()
+        except CommandError as error:
+            raise FlightError(str(error)) from None
+        return processes.record_of(parts, scenario, shortfalls, said)

@@ -1,0 +1,116 @@
+"""Sweeps from Python: `sweep` flies every combination of some keys' values."""
+
+import multiprocessing
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from skytether.lab import sweep as lab
+from skytether.library.flying import Given, named, prepare
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.hint import hint
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.summary import Summary
+
+
+@dataclass(frozen=True, slots=True)
+class Swept:
+    """One combination of a sweep, and its flights."""
+
+    keys: Mapping[str, Any]
+    """Value of each key of the grid."""
+    scenario: Scenario
+    """Scenario that was flown, with the first of the seeds."""
+    runs: tuple[Summary, ...]
+    """Summary of each flight, by seed."""
+
+    def mean(self, figure: str) -> lab.Estimate:
+        """Mean of a figure of the summaries, and half the width of its 95 % interval.
+
+        The mean is None where no flight has the figure, the interval where fewer than two have it.
+
+        Raises:
+            KeyError: it is no figure of a summary that has a mean.
+        """
+        if figure not in lab.FIGURES:
+            raise KeyError(f"no figure {figure!r}; {hint(str(figure), lab.FIGURES)}")
+        return lab.estimate(self.runs, figure)
+
+
+def sweep(
+    scenario: Given,
+    grid: Mapping[str, Iterable[Any]],
+    /,
+    *,
+    runs: int = 50,
+    workers: int = 1,
+    **keys: Any,
+) -> list[Swept]:
+    """Fly every combination of some keys' values in virtual time, several times each.
+
+        skytether.sweep("demo", {"control.trigger": ["always", "cost_gap"]}, runs=20)
+
+    Args:
+        scenario: name of a scenario, path of a .toml file, or a scenario.
+        grid: values of each key that is swept; the last key changes fastest.
+        runs: number of flights of each combination, with seeds that count up from the scenario's.
+        workers: number of processes that fly; 1 for this one alone. A script that has more needs
+            `if __name__ == "__main__":`, as with `multiprocessing`. The results are the same.
+        keys: see `skytether.load`.
+
+    Raises:
+        ConfigError: a combination that cannot be flown.
+        TypeError: an argument is of another type.
+    """
+    for argument, value in (("runs", runs), ("workers", workers)):
+        if not isinstance(value, int) or value < 1:
+            raise ConfigError(f"{argument}: got {value!r}, expected a whole number from 1 on")
+    name, flown = named(scenario, keys)
+    axes = [_axis(key, values) for key, values in _items(grid)]
+    plan = lab.Sweep(name, flown, axes, runs)
+    tasks = list(plan.tasks())
+    prepare()
+    if workers == 1:
+        done = lab.results(map(lab.fly, tasks))
+    else:
+        spawned = multiprocessing.get_context("spawn")  # a fork may hold a lock that nobody opens
+        with ProcessPoolExecutor(workers, spawned) as pool:
+            done = lab.results(pool.map(lab.fly, tasks))
+    names = [axis.key for axis in axes]
+    return [
+        Swept(
+            dict(zip(names, values, strict=True)),
+            plan.scenario_of(*values),
+            tuple(plan.of_cell(done, number)),
+        )
+        for number, values in enumerate(plan.cells)
+    ]
+
+
+def _items(grid: Mapping[str, Iterable[Any]]) -> Iterable[tuple[str, Iterable[Any]]]:
+    if not isinstance(grid, Mapping):
+        raise TypeError(f"grid: got {grid!r}, expected lists of values by their keys")
+    return grid.items()
+
+
+def _axis(key: str, values: Iterable[Any]) -> lab.GridAxis:
+    """One key of the grid.
+
+    Raises:
+        ConfigError: the key is not swept, or has no values, or one twice.
+        TypeError: its values are no list.
+    """
+    if key == "seed":
+        raise ConfigError("grid: got 'seed', expected another key: it counts the runs")
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise TypeError(f"grid: {key}: got {values!r}, expected a list of values")
+    plain = [msgspec.to_builtins(value, enc_hook=lambda each: each.tolist()) for value in values]
+    if not plain:
+        raise ConfigError(f"grid: {key}: got no values, expected at least one")
+    for value in plain:
+        if plain.count(value) > 1:
+            raise ConfigError(f"grid: {key}: got {value!r} twice, expected values that differ")
+    return lab.GridAxis(key, tuple(plain))

@@ -1,0 +1,88 @@
+"""Messages of MAVLink from bytes, whatever these are, and to bytes.
+
+A frame begins with 0xFD (MAVLink 2) or 0xFE (MAVLink 1), and has its length and a checksum. What
+does not fit is passed over a byte at a time: a frame that was cut off takes none with it that
+follows.
+"""
+
+from typing import Any
+
+from skytether.mavlink.dialect import dialect
+
+Message = Any
+"""Message of pymavlink, which knows no types: its fields are its attributes."""
+
+FRAME_BYTES_MAX = 280
+"""Longest frame: 10 of head, 255, 2 of checksum and 13 of signature [B]."""
+SIGNED = 0x01
+"""Flag of a frame that has a signature."""
+
+
+class Codec:
+    """Reads and writes frames, for one end of a link.
+
+    Args:
+        system: number of this system.
+        component: number of this component.
+        stream: whether frames come in pieces, as over a serial line or TCP; a datagram has whole
+            ones.
+    """
+
+    def __init__(self, system: int, component: int, *, stream: bool = False) -> None:
+        self._mavlink = dialect.MAVLink(None, system, component)
+        self._stream = stream
+        self._rest = bytearray()
+        self.garbage_bytes = 0
+        """Bytes so far that belong to no frame."""
+
+    def encode(self, message: Message) -> bytes:
+        """Frame of a message, with the next number."""
+        mavlink = self._mavlink
+        frame: bytes = message.pack(mavlink)
+        mavlink.seq = (mavlink.seq + 1) % 256
+        return bytes(frame)
+
+    def decode(self, data: bytes) -> list[Message]:
+        """Messages in some bytes, the oldest first; never fails."""
+        waiting = self._rest + data
+        messages, at, end = [], 0, len(waiting)
+        while at < end:
+            length = _length(waiting, at)
+            if length and at + length > end and self._stream:
+                break  # the rest is still to come
+            message = self._one(waiting[at : at + length]) if length <= end - at else None
+            if message is None:
+                self.garbage_bytes += 1
+                at += 1
+            else:
+                messages.append(message)
+                at += length
+        self._rest = waiting[at:]
+        return messages
+
+    def _one(self, frame: bytearray) -> Message | None:
+        """Message of a frame, None where it is none."""
+        if not frame:
+            return None
+        number = int.from_bytes(frame[7:10], "little") if frame[0] == 0xFD else frame[5]
+        if number not in dialect.mavlink_map:  # without its type there is no checking it
+            return None
+        try:
+            return self._mavlink.decode(frame)
+        except (dialect.MAVError, UnicodeDecodeError):
+            return None
+
+
+def _length(data: bytearray, at: int) -> int:
+    """Length of the frame that begins here; 0 where none does.
+
+    Where its head is cut off, it is taken for one of the longest.
+    """
+    left = len(data) - at
+    if data[at] == 0xFD:
+        if left < 3:
+            return FRAME_BYTES_MAX
+        return 12 + data[at + 1] + (13 if data[at + 2] & SIGNED else 0)
+    if data[at] == 0xFE:
+        return FRAME_BYTES_MAX if left < 2 else 8 + data[at + 1]
+    return 0

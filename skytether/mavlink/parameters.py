@@ -1,0 +1,51 @@
+"""Values of parameters on the wire: a float, whatever type the parameter has.
+
+ArduPilot converts an integer into a float, PX4 puts its bits into one (`MAV_PROTOCOL_CAPABILITY_
+PARAM_ENCODE_C_CAST`, `…_BYTEWISE`).
+"""
+
+import math
+import struct
+
+from skytether.mavlink.dialect import dialect
+
+FLOAT = int(dialect.MAV_PARAM_TYPE_REAL32)
+INTEGER = int(dialect.MAV_PARAM_TYPE_INT32)
+INTEGERS = frozenset(
+    {
+        int(dialect.MAV_PARAM_TYPE_UINT8),
+        int(dialect.MAV_PARAM_TYPE_INT8),
+        int(dialect.MAV_PARAM_TYPE_UINT16),
+        int(dialect.MAV_PARAM_TYPE_INT16),
+        int(dialect.MAV_PARAM_TYPE_UINT32),
+        INTEGER,
+    }
+)
+"""Types of parameters that are whole numbers of at most four bytes."""
+
+
+def type_of(value: float) -> int:
+    """Type that a parameter with this value has: of 32 bits."""
+    return INTEGER if isinstance(value, int) else FLOAT
+
+
+def to_wire(value: float, *, bytewise: bool) -> float:
+    """Float that is sent for a value.
+
+    Args:
+        value: an int for a parameter of type INTEGER.
+        bytewise: whether its bits are sent, as PX4 does.
+    """
+    if bytewise and isinstance(value, int):
+        bits: float = struct.unpack("<f", struct.pack("<i", value))[0]
+        return bits
+    return float(value)
+
+
+def from_wire(value: float, kind: int, *, bytewise: bool) -> float | None:
+    """Value of a parameter of a type, int where that is whole; None where it is no number."""
+    if kind not in INTEGERS:
+        return value if kind == FLOAT and math.isfinite(value) else None
+    if bytewise:
+        return int(struct.unpack("<i", struct.pack("<f", value))[0])
+    return round(value) if math.isfinite(value) else None

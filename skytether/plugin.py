@@ -1,0 +1,27 @@
+"""Names that a plug-in imports: the decorators, and the types of what its functions are given.
+
+docs/triggers.md has triggers, docs/targets.md references, docs/vehicles.md vehicles.
+"""
+
+from skytether.client.vehicle import Measurement, Vehicle
+from skytether.client.vehicles import vehicle
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.scenario.trajectories import reference
+from skytether.shared.scenario.triggers import Compared, Situation, Trigger, Verdict, above, trigger
+
+__all__ = [
+    "Compared",
+    "ControlConfig",
+    "Measurement",
+    "Reference",
+    "Scenario",
+    "Situation",
+    "Trigger",
+    "Vehicle",
+    "Verdict",
+    "above",
+    "reference",
+    "trigger",
+    "vehicle",
+]

@@ -1,0 +1,148 @@
+"""Frames: what a quadrotor is made of, with the source of each number.
+
+Rotor k turns with the speed ω_k [rad/s], pushes with k_T ω_k² along the body's axis and turns the
+body with k_M ω_k² about it. In the air each rotor drags with ω_k diag(k_d, k_d, k_z) times its own
+airspeed, and the whole body with c |v| v. That is the model of rotorpy (Folk, Paulos, Kumar,
+"RotorPy: A Python-based Multirotor Simulator with Aerodynamics for Education and Research", 2023).
+"""
+
+from typing import NamedTuple
+
+
+class Frame(NamedTuple):
+    """A quadrotor in X with rotors 1 front right, 2 back left, 3 front left, 4 back right."""
+
+    mass_kg: float
+    """Mass [kg]."""
+    roll_inertia: float
+    """Moment of inertia about the forward axis [kg m²]."""
+    pitch_inertia: float
+    """Moment of inertia about the right axis [kg m²]."""
+    yaw_inertia: float
+    """Moment of inertia about the axis of thrust [kg m²]."""
+    arm_x_m: float
+    """Distance of each rotor from the centre, forward or backward [m]."""
+    arm_y_m: float
+    """Distance of each rotor from the centre, to the right or left [m]."""
+    thrust: float
+    """Thrust k_T of a rotor over its speed squared [N s²]."""
+    torque: float
+    """Torque k_M of a rotor over its speed squared [N m s²]."""
+    rotor_drag: float
+    """Drag k_d of a rotor in its plane, over its speed and its airspeed [N s²/m]."""
+    inflow_drag: float
+    """Drag k_z of a rotor along its axis, over its speed and its airspeed [N s²/m]."""
+    body_drag: float
+    """Drag c of the body over its airspeed squared [N s²/m²]."""
+    rotor_lag_s: float
+    """Time constant of a rotor's speed [s]."""
+    rotor_max: float
+    """Largest speed of a rotor with a full battery [rad/s]."""
+    cells: int
+    """Number of cells of the battery, in series."""
+    capacity_ah: float
+    """Charge of the full battery [A h]."""
+    resistance_ohm: float
+    """Inner resistance of the battery [Ω]."""
+    hover_a: float
+    """Current of the battery in hover [A]."""
+    attitude_gain: float
+    """Rate of turning over the error of the attitude [1/s]."""
+    rate_gain: float
+    """Angular acceleration over the error of the rate [1/s]."""
+    rate_damping: float
+    """Angular acceleration taken back for each unit there is: it makes the lag of rotors
+    shorter."""
+
+    @property
+    def hover(self) -> float:
+        """Speed of each rotor in hover [rad/s]."""
+        return float((self.mass_kg * GRAVITY / (4.0 * self.thrust)) ** 0.5)
+
+
+GRAVITY = 9.81
+"""Acceleration of gravity [m/s²]."""
+
+CRAZYFLIE = Frame(
+    mass_kg=0.03,
+    roll_inertia=1.43e-5,
+    pitch_inertia=1.43e-5,
+    yaw_inertia=2.89e-5,
+    arm_x_m=0.0304,
+    arm_y_m=0.0304,
+    thrust=2.3e-8,
+    torque=7.8e-10,
+    rotor_drag=1.02506e-6,
+    inflow_drag=7.553e-7,
+    body_drag=0.0,
+    rotor_lag_s=0.072,
+    rotor_max=2500.0,
+    cells=1,
+    capacity_ah=0.25,
+    resistance_ohm=0.15,
+    hover_a=2.1,
+    attitude_gain=6.0,
+    rate_gain=72.0,
+    rate_damping=3.0,
+)
+"""Crazyflie 2.0: body, rotors and lag as in rotorpy 3.0 (`crazyflie_params.py`), which has them of
+Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", ETH Zürich 2015, of
+Bitcraze's measurements, and the lag of Eschmann et al., "Data-Driven System Identification of
+Quadrotors Subject to Motor Delays", 2024. Battery and its current: 250 mAh and a flight of 7
+minutes, as Bitcraze says; the resistance is assumed, of a cell of that size."""
+
+KG15 = Frame(
+    mass_kg=1.5,
+    roll_inertia=0.029125,
+    pitch_inertia=0.029125,
+    yaw_inertia=0.055225,
+    arm_x_m=0.13,
+    arm_y_m=0.21,
+    thrust=5.84e-6,
+    torque=3.504e-7,
+    rotor_drag=1.75e-4,
+    inflow_drag=0.0,
+    body_drag=0.0,
+    rotor_lag_s=0.02,
+    rotor_max=1100.0,
+    cells=3,
+    capacity_ah=5.1,
+    resistance_ohm=0.02,
+    hover_a=18.0,
+    attitude_gain=6.5,
+    rate_gain=60.0,
+    rate_damping=1.0,
+)
+"""3DR Iris, 1.5 kg: body, rotors and drag as PX4's model for Gazebo (`models/iris/iris.sdf`) has
+them; its rotors are 0.22 m (front) and 0.20 m (back) to the side, and lag 0.0125 s up and 0.025 s
+down, where these are in between. Battery: the Iris' 5.1 Ah in three cells and its flight of 16 to
+22 minutes; the resistance is assumed, of a battery of that size."""
+
+SIH = Frame(
+    mass_kg=1.0,
+    roll_inertia=0.025,
+    pitch_inertia=0.025,
+    yaw_inertia=0.03,
+    arm_x_m=0.2,
+    arm_y_m=0.2,
+    thrust=5.0e-6,
+    torque=1.0e-7,
+    rotor_drag=3.57e-4,
+    inflow_drag=3.57e-4,
+    body_drag=0.0,
+    rotor_lag_s=0.05,
+    rotor_max=1000.0,
+    cells=3,
+    capacity_ah=5.1,
+    resistance_ohm=0.02,
+    hover_a=12.0,
+    attitude_gain=6.5,
+    rate_gain=60.0,
+    rate_damping=3.0,
+)
+"""PX4's simulator in hardware: `sih_params.c` of PX4 1.17, with the 1000 rad/s that rotorpy
+gives its rotors. Its drag of 1 N for each m/s is that of the rotors here, in hover. It has no
+battery: this one is a 1.5 kg frame's."""
+
+FRAMES = {"crazyflie": CRAZYFLIE, "1.5kg": KG15, "sih": SIH}
+"""Frames by name."""

@@ -1,0 +1,153 @@
+"""A quadrotor that flies the velocity it is told, in steps of 2 ms.
+
+Outside this room: x north, y east, altitude up.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from skytether.quadrotor.air import Air
+from skytether.quadrotor.body import STATES, STEP_NS
+from skytether.quadrotor.frames import Frame
+from skytether.quadrotor.loops import Gains, Quad, drain, fly
+from skytether.shared.base.kernel import plain
+from skytether.shared.law.model import Array
+
+UP = np.array([1.0, 1.0, -1.0])
+"""Signs between down and altitude."""
+
+
+class Attitude(NamedTuple):
+    """Attitude and rates of the body."""
+
+    roll: float
+    """Roll, to the right [rad]."""
+    pitch: float
+    """Pitch, nose up [rad]."""
+    yaw: float
+    """Heading, from north to east [rad]."""
+    rates: tuple[float, float, float]
+    """Rates about the axes forward, right and down [rad/s]."""
+
+
+class Battery(NamedTuple):
+    """State of the battery."""
+
+    charge: float
+    """Charge left, from 1 to 0."""
+    voltage: float
+    """Voltage [V]."""
+    current: float
+    """Current [A]."""
+
+
+class Quadrotor:
+    """A quadrotor in its air.
+
+    Args:
+        frame: what it is made of.
+        gains: gains of its autopilot's loop of velocity.
+        rng: chance of its gusts, for this vehicle alone.
+        position: where it is, at rest [m]; shape (3,).
+        ground_m: altitude of the ground [m]; None: there is none.
+        charge: charge of its battery, from 0 to 1; endless: it stays full.
+        hovers: whether it begins in hover, with its rotors turning.
+    """
+
+    def __init__(
+        self,
+        frame: Frame,
+        gains: Gains,
+        rng: np.random.Generator,
+        *,
+        position: Array,
+        ground_m: float | None = None,
+        charge: float | Literal["endless"] = 1.0,
+        hovers: bool = True,
+    ) -> None:
+        if charge == "endless":
+            frame, charge = frame._replace(capacity_ah=np.inf), 1.0
+        self.frame, self._rng = frame, rng
+        self.gains = gains
+        """Gains of its autopilot's loop of velocity."""
+        self._ground = np.inf if ground_m is None else -ground_m
+        self.on = hovers
+        """Whether the rotors turn."""
+        x = np.zeros(STATES)
+        x[:3], x[6] = UP * position, 1.0
+        x[13:] = frame.hover if hovers else 0.0
+        empty = np.zeros(3)
+        self._quad = Quad(
+            x, np.zeros(9), empty, empty.copy(), empty.copy(), np.array([charge, 0.0, 0.0])
+        )
+        plain(drain)(frame, x, self._quad.battery)
+        self._air = Air(np.zeros(3), np.zeros(1), np.zeros(5))
+        self._rest_ns = 0
+
+    def blow(self, steady_mps: Sequence[float], turbulence_mps: float) -> None:
+        """Let other winds blow from now on.
+
+        Args:
+            steady_mps: velocity of steady wind along the first axes [m/s; x, y, z].
+            turbulence_mps: wind speed 6 m above ground that the gusts belong to [m/s].
+        """
+        steady = np.zeros(3)
+        steady[: len(steady_mps)] = steady_mps
+        self._air.steady[:] = UP * steady
+        self._air.turbulence[0] = turbulence_mps
+
+    def advance(self, velocity: Array, duration_ns: int) -> None:
+        """Fly for some time; what is no whole number of steps is flown with the next.
+
+        Args:
+            velocity: velocity that is wanted [m/s]; shape (3,).
+            duration_ns: time [ns].
+        """
+        steps, self._rest_ns = divmod(self._rest_ns + duration_ns, STEP_NS)
+        if not steps:
+            return
+        turbulent = self._air.turbulence[0] > 0.0
+        drawn = self._rng.standard_normal((steps, 3)) if turbulent else np.zeros((steps, 3))
+        target = UP * velocity
+        fly(self.frame, self.gains, self._quad, self._air, drawn, target, self._ground, self.on)
+
+    def position(self) -> Array:
+        """Position [m]; shape (3,)."""
+        return UP * self._quad.x[:3]
+
+    def velocity(self) -> Array:
+        """Velocity [m/s]; shape (3,)."""
+        return UP * self._quad.x[3:6]
+
+    def wanted_position(self) -> Array:
+        """Position where its loops want it to be now [m]; shape (3,).
+
+        Without gains that catch up it is where it is.
+        """
+        ahead = self._quad.wanted[6:] if self.gains.catch_up else 0.0
+        wanted: Array = UP * (self._quad.x[:3] + ahead)
+        return wanted
+
+    def attitude(self) -> Attitude:
+        """Attitude and rates."""
+        w, x, y, z = self._quad.x[6:10].tolist()
+        p, q, r = self._quad.x[10:13].tolist()
+        roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return Attitude(float(roll), float(pitch), float(yaw), (p, q, r))
+
+    def battery(self) -> Battery:
+        """State of the battery."""
+        charge, voltage, current = self._quad.battery.tolist()
+        return Battery(max(charge, 0.0), voltage, current)
+
+    def discharge(self, charge: float) -> None:
+        """Have less left in the battery."""
+        self._quad.battery[0] = min(self._quad.battery[0], charge)
+
+    def stands(self) -> bool:
+        """Whether it stands on the ground."""
+        return bool(self._quad.x[2] >= self._ground)

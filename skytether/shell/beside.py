@@ -1,0 +1,99 @@
+"""A recording beside a process: another process reads its feed and writes an MCAP file of it.
+
+The process that flies waits for no disk and imports nothing for it. When it ends, or is killed, the
+recorder's standard input ends, and the recorder ends its file.
+"""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+
+from skytether.shared.scenario.reading import to_toml
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import plugins, temporary
+
+PATIENCE_S = 30.0
+"""Longest time for which a recorder may end its file [s]."""
+
+
+class Told(msgspec.Struct, frozen=True, kw_only=True):
+    """What a recorder has to know before the first frame."""
+
+    path: str
+    """File of the recording."""
+    feed: str
+    """Socket of the feed."""
+    process: str
+    """Name of the process."""
+    name: str
+    """Name of the scenario."""
+    scenario: str
+    """The scenario, as TOML."""
+    secure: bool
+    """Whether the link is sealed."""
+    plugins: list[str]
+    """Python files with triggers and references."""
+
+
+class RecorderError(Exception):
+    """Error: something is missing in the recording; the message is a line about it."""
+
+
+@contextmanager
+def socket_of(feed: Path | None) -> Iterator[Path]:
+    """Socket of a feed: the one that was asked for, or one in a folder that nobody else can see."""
+    if feed:
+        yield feed
+        return
+    with temporary.folder() as folder:
+        yield folder / "feed"
+
+
+@contextmanager
+def recorder(
+    path: Path, feed: Path, process: str, name: str, scenario: Scenario, *, secure: bool
+) -> Iterator[None]:
+    """Have a feed recorded for as long as the block takes; the feed ends with the block.
+
+    Raises:
+        RecorderError: not all of it is recorded.
+    """
+    told = Told(
+        path=str(path),
+        feed=str(feed),
+        process=process,
+        name=name,
+        scenario=to_toml(scenario).decode(),
+        secure=secure,
+        plugins=plugins.flags()[1::2],
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-P", "-m", "skytether.cli.recorder"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C is for the process that flies
+    )
+    assert child.stdin is not None
+    assert child.stdout is not None
+    try:
+        child.stdin.write(msgspec.json.encode(told) + b"\n")
+        child.stdin.flush()
+        child.stdout.readline()  # it reads the feed from here on, or has ended
+        yield
+    except BrokenPipeError:
+        pass
+    finally:
+        try:
+            _, said = child.communicate(timeout=PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            _, said = child.communicate()
+            said = said or b"its recorder did not end"
+    if child.returncode:
+        lines = said.decode(errors="replace").splitlines()
+        raise RecorderError(lines[-1] if lines else f"{path}: its recorder was killed")

@@ -1,0 +1,303 @@
+"""The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
+
+All of asyncio and signals is in here and in `shell.timer`, all of sockets in `shell.udp`. The
+shell knows nothing of control or of the protocol: datagrams and time go in, datagrams and events
+come out.
+"""
+
+import asyncio
+import contextlib
+import gc
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from socket import socket
+from typing import Any
+
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form
+from skytether.shared.core.events import Event, Fault
+from skytether.shared.core.line import LINE, Line
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shell.control import Control
+from skytether.shell.feed import Feed
+from skytether.shell.stream import Stream
+from skytether.shell.timer import make_timer
+from skytether.shell.udp import (
+    Names,
+    admit_only,
+    from_kernel,
+    is_loopback,
+    kernel_drops,
+    open_socket,
+    to_kernel,
+    within_reach_of,
+)
+
+BURST_MAX = 128
+"""Most datagrams read from one socket before timers and other sockets have their turn."""
+DATAGRAM_BYTES_MAX = 65535
+RESOLVE_EVERY_S = 2.0
+"""Time after which names are looked up again [s]: a restarted host may have a new address."""
+
+
+def new_event_loop() -> asyncio.AbstractEventLoop:
+    """An event loop: uvloop's where it exists, else asyncio's own."""
+    try:
+        import uvloop
+    except ImportError:
+        return asyncio.new_event_loop()
+    return uvloop.new_event_loop()
+
+
+class Shell:
+    """Drives one endpoint.
+
+    Args:
+        endpoint: what to drive.
+        bind: address of its socket 0, where port 0 takes a free one, or that socket itself; None
+            takes a free port from which the peers can be reached. Other sockets open as the
+            endpoint uses them.
+        peers: addresses the endpoint will send to, names or numbers; the endpoint sees each as it
+            is written here, in place of whatever the kernel calls it.
+        stopwatch: measures receiving and sending.
+        forms: forms of the datagrams that may come to socket 0; without any, all may.
+        control: heeds changes in flight.
+        feed: tells readers what is recorded and said.
+        line: where socket 1 leads, of an endpoint that talks to hardware beside its peers.
+
+    Raises:
+        AddressError: the address cannot be bound, or a name cannot be found.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        bind: Address | socket | None,
+        peers: Sequence[Address] = (),
+        stopwatch: Stopwatch | None = None,
+        forms: Sequence[Form] = (),
+        control: Control | None = None,
+        feed: Feed | None = None,
+        line: Line | None = None,
+    ) -> None:
+        self.endpoint = endpoint
+        self._stopwatch = stopwatch or Stopwatch()
+        self._control, self._feed = control, feed
+        self.send_errors = 0
+        """Number of datagrams that could not be sent."""
+        self._drops = 0
+        """Number of datagrams that the kernel dropped at sockets now closed."""
+        self._names = Names(peers)
+        self._elsewhere = within_reach_of(self._names.numbers())
+        bound = bind if isinstance(bind, socket) else open_socket(bind or self._elsewhere)
+        if forms:
+            admit_only(bound, forms)
+        self._sockets = {0: bound}
+        self._stream: Stream | None = None
+        """What socket 1 is, where it is none."""
+        if line is not None:
+            with contextlib.ExitStack() as failed:
+                failed.enter_context(bound)
+                self._add(line)
+                failed.pop_all()
+        self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
+        """Where every datagram is received: making room for the longest costs more than to copy."""
+        self.address = from_kernel(bound.getsockname())
+        """Address of socket 0."""
+
+    @property
+    def is_local(self) -> bool:
+        """Whether no other machine can reach it, nor be reached."""
+        return is_loopback(self.address) and is_loopback(self._elsewhere)
+
+    def _add(self, line: Line) -> None:
+        """Let a line be socket 1."""
+        if line.kind in ("tcp", "serial"):
+            self._stream = Stream(line, self._hear_line)
+        elif line.kind == "udp":
+            self._sockets[1] = open_socket(line.address)
+        else:
+            self._names.add(line.address)
+            self._sockets[1] = open_socket(within_reach_of([self._names.number(line.address)]))
+
+    def _hear_line(self, piece: bytes) -> None:
+        try:
+            self.endpoint.receive(Datagram(piece, LINE, 1), now_ns=time.monotonic_ns())
+        finally:
+            self._after()
+
+    async def run(self, on_event: Callable[[Event], None] = lambda _: None) -> None:
+        """Drive the endpoint until it has finished, or this task is cancelled."""
+        self._loop = asyncio.get_running_loop()
+        self._done = self._loop.create_future()
+        self._on_event = on_event
+        self._armed: int | None = None
+        self._timer = make_timer(self._loop, self._wake)
+        for number in self._sockets:
+            self._listen(number)
+        if self._control:
+            self._control.begin(self._loop, self._after)
+        if self._feed:
+            self._feed.begin(self._loop)
+        beside = [self._loop.create_task(self._keep_resolving())]
+        if self._stream:
+            beside.append(self._loop.create_task(self._stream.run()))
+        try:
+            self._after()
+            await self._done
+        finally:
+            if self._control:
+                self._control.end()
+            if self._feed:
+                self._feed.end()
+            self._timer.close()
+            self.endpoint.close(now_ns=time.monotonic_ns())
+            for datagram in self.endpoint.outbox():
+                self._send(datagram)
+            self._drops = self.kernel_drops()
+            for sock in self._sockets.values():
+                self._loop.remove_reader(sock)
+                sock.close()
+            self._sockets.clear()
+            for task in beside:
+                task.cancel()
+
+    def kernel_drops(self) -> int:
+        """Number of datagrams that the kernel dropped, see `shell.udp.kernel_drops`."""
+        return self._drops + sum(map(kernel_drops, self._sockets.values()))
+
+    def _listen(self, number: int) -> None:
+        self._loop.add_reader(self._sockets[number], self._read, number)
+
+    def _read(self, number: int) -> None:
+        receive, name = self._sockets[number].recvfrom_into, self._names.name
+        room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
+        stopwatch = self._stopwatch
+        try:
+            for _ in range(BURST_MAX):
+                stopwatch.start()
+                try:
+                    size, sender = receive(room)
+                    peer = name(from_kernel(sender))
+                except BlockingIOError:
+                    break
+                except OSError:  # an earlier packet of ours found the peer's port closed
+                    continue
+                stopwatch.lap("receive")
+                hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
+        finally:  # a fault of ours goes to the loop's handler, and the flight goes on
+            self._after()
+
+    def _wake(self) -> None:
+        self._armed = None
+        now_ns, due_ns = time.monotonic_ns(), self.endpoint.next_wake_ns()
+        try:
+            if due_ns is not None and due_ns <= now_ns:
+                self.endpoint.wake(now_ns=now_ns)
+        finally:
+            self._after()
+
+    def _after(self) -> None:
+        """Send what the endpoint wants sent, arm its timer, hand on its events and its rows."""
+        endpoint = self.endpoint
+        self._stopwatch.start()
+        for datagram in endpoint.outbox():
+            self._send(datagram)
+        self._stopwatch.lap("send")
+        due_ns = endpoint.next_wake_ns()
+        if due_ns != self._armed:
+            self._armed = due_ns
+            self._timer.set(due_ns)
+        if endpoint.finished and not self._done.done():
+            self._done.set_result(None)
+        for event in endpoint.events():
+            self._on_event(event)
+        if self._feed:
+            self._feed.take()
+
+    def _send(self, datagram: Datagram) -> None:
+        payload, peer, number = datagram
+        if peer == LINE:
+            self.send_errors += not (self._stream and self._stream.send(payload))
+            return
+        try:
+            sock = self._sockets.get(number)
+            if sock is None:
+                sock = self._sockets[number] = open_socket(self._elsewhere)
+                self._listen(number)
+            sock.sendto(payload, to_kernel(self._names.number(peer)))
+        except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet
+            self.send_errors += 1
+
+    async def _keep_resolving(self) -> None:
+        while self._names.may_change:
+            await asyncio.sleep(RESOLVE_EVERY_S)
+            found: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
+            # No executor: it would be waited for at the end, and where a name is gone a look-up
+            # can take 20 s.
+            threading.Thread(target=self._look_up, args=(found,), daemon=True).start()
+            self._names.learn(await found)
+
+    def _look_up(self, found: "asyncio.Future[dict[Address, Address]]") -> None:
+        numbers = self._names.look_up()
+
+        def tell() -> None:
+            if not found.done():
+                found.set_result(numbers)
+
+        with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
+            self._loop.call_soon_threadsafe(tell)
+
+
+def run(
+    shells: list[Shell],
+    *,
+    on_start: Callable[[], None] = lambda: None,
+    on_event: Callable[[Event], None] = lambda _: None,
+    on_usr1: Callable[[], None] = lambda: None,
+    on_second: Callable[[], None] = lambda: None,
+) -> None:
+    """Drive several endpoints in this process until all have finished, or SIGINT or SIGTERM comes.
+
+    Args:
+        on_start: called once signals are heeded and the endpoints are about to be driven.
+        on_event: called with each event of an endpoint, and with each fault of its code.
+        on_usr1: called at SIGUSR1.
+        on_second: called about once a second.
+    """
+    # Everything imported so far lives on; without this, a collection of it pauses for 13 ms.
+    gc.collect()
+    gc.freeze()
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        task = asyncio.gather(*(shell.run(on_event) for shell in shells))
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, task.cancel)
+        # The loop would let SIGUSR1 end the process once it is closed itself.
+        signal.signal(signal.SIGUSR1, lambda *_: loop.call_soon_threadsafe(on_usr1))
+        loop.set_exception_handler(lambda _, context: on_event(_fault(context)))
+
+        def tick() -> None:
+            loop.call_later(1.0, tick)
+            on_second()
+
+        tick()
+        on_start()
+        try:
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        finally:
+            signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(main())
+
+
+def _fault(context: dict[str, Any]) -> Fault:
+    """What the loop has caught, as an event."""
+    error = context.get("exception")
+    trace = traceback.format_exception(error) if error else [context["message"]]
+    return Fault(traceback="".join(trace))

@@ -1,0 +1,400 @@
+"""The feed's socket: a process tells whoever looks on, and waits for nobody.
+
+All of it happens in the process's own loop, between two steps, and nothing in it blocks: what a
+reader does not take at once waits for it, up to a bound, and a reader whose bound is full is
+dropped. `shared.telemetry.feed` has the frames; `Subscriber` is the other end.
+"""
+
+import selectors
+import socket
+import threading
+import time
+from asyncio import AbstractEventLoop, TimerHandle
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skytether.shared.core.events import Event
+from skytether.shared.telemetry.feed import (
+    FeedError,
+    Figures,
+    Frame,
+    Opened,
+    Reader,
+    Rows,
+    Said,
+    described,
+    encode,
+)
+from skytether.shell.local import Local
+
+READERS_MAX = 8
+"""Most readers at once; others are turned away, and counted."""
+WAITING_BYTES_MAX = 4 * 1024 * 1024
+"""Bytes that wait for a reader; one for which there are more is dropped, and counted."""
+BACKLOG_BYTES_MAX = 1024 * 1024
+"""Bytes of the newest frames that are kept for readers to come."""
+ROWS_BYTES_MAX = 256 * 1024
+"""Bytes of rows from which a frame takes no more of them."""
+SEND_BYTES_MAX = 64 * 1024
+"""Most bytes that a reader is sent in one turn of the loop."""
+GATHER_S = 0.01
+"""Time for which frames gather before they are sent [s]."""
+REST_S = 0.02
+"""Time from one reader to the next that is let in [s]: who comes again and again costs little."""
+PATIENCE_S = 0.5
+"""Longest time to wait at the end until readers have all [s]."""
+
+READ_BYTES = 256 * 1024
+"""Most bytes that are read of a feed at a time."""
+AGAIN_S = 1.0
+"""Time from one attempt to reach a process to the next [s]."""
+
+
+class _Part:
+    """Rows of one part of the record that no frame has taken yet."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.rows: list[bytes] = []
+
+    def write(self, rows: bytes) -> None:
+        """Take whole rows."""
+        self.rows.append(rows)
+
+    def frames(self, now_ns: int) -> Iterator[bytes]:
+        """Frames of all rows, none of which remain."""
+        rows, self.rows = self.rows, []
+        first = size = 0
+        for last, piece in enumerate(rows, start=1):
+            size += len(piece)
+            if size >= ROWS_BYTES_MAX or last == len(rows):
+                together = b"".join(rows[first:last])
+                yield encode(Rows(part=self.name, time_ns=now_ns, rows=together))
+                first, size = last, 0
+
+
+class _Reader:
+    """Somebody who reads, and what he has not taken yet."""
+
+    def __init__(self, connection: socket.socket, pieces: Iterator[bytes]) -> None:
+        connection.setblocking(False)
+        self.connection = connection
+        self._waiting = deque(pieces)
+        self._bytes = sum(map(len, self._waiting))
+        self._begin = 0
+        """Number of bytes of the first piece that are sent."""
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether something waits."""
+        return bool(self._waiting)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether more waits than may."""
+        return self._bytes > WAITING_BYTES_MAX
+
+    def add(self, piece: bytes) -> None:
+        """Let a piece wait."""
+        self._waiting.append(piece)
+        self._bytes += len(piece)
+
+    def send(self) -> None:
+        """Send what there is room for, and no more than a turn's.
+
+        Raises:
+            OSError: the reader is gone.
+        """
+        left = SEND_BYTES_MAX
+        while self._waiting and left > 0:
+            begin, piece = self._begin, self._waiting[0]
+            try:
+                sent = self.connection.send(memoryview(piece)[begin : begin + left])
+            except BlockingIOError:
+                return
+            left -= sent
+            self._bytes -= sent
+            self._begin += sent
+            if self._begin == len(piece):
+                self._waiting.popleft()
+                self._begin = 0
+
+    def finish(self, patience_s: float) -> None:
+        """Send all there is, but do not wait for longer.
+
+        Raises:
+            OSError: the reader is gone, or takes too long.
+        """
+        until_s = time.monotonic() + patience_s
+        while self._waiting:
+            self.connection.settimeout(max(until_s - time.monotonic(), 0.001))
+            self.send()
+
+
+class Feed:
+    """The feed of a process.
+
+    It is used by the thread that drives the endpoint, and by no other.
+
+    Args:
+        path: where the socket is made, see `Local`.
+
+    Raises:
+        LocalError: it cannot be made there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._local = Local(path, socket.SOCK_STREAM)
+        self._local.socket.listen(READERS_MAX)
+        self._columns: dict[str, np.dtype[np.void]] = {}
+        self._parts: list[_Part] = []
+        self._fresh: list[bytes] = []
+        """Frames that nobody was sent yet."""
+        self._backlog: deque[bytes] = deque()
+        """The newest of all others; each item is one frame, or several."""
+        self._backlog_bytes = 0
+        self._readers: list[_Reader] = []
+        self._behind: set[_Reader] = set()
+        """Readers that the loop tells of once they have room."""
+        self._loop: AbstractEventLoop | None = None
+        self._armed: TimerHandle | None = None
+        self._opened: Callable[[], Opened] | None = None
+        self._dropped = self._refused = 0
+
+    def part(self, name: str, columns: np.dtype[np.void]) -> _Part:
+        """Sink of the rows of a part of the record, which the feed has from now on."""
+        self._columns[name] = columns
+        self._parts.append(_Part(name))
+        return self._parts[-1]
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """Parts of the record, as `Opened` names them."""
+        return described(self._columns)
+
+    def open(self, opened: Callable[[], Opened]) -> None:
+        """Let readers in once the loop begins.
+
+        Args:
+            opened: makes the frame that a reader gets first.
+        """
+        self._opened = opened
+
+    def begin(self, loop: AbstractEventLoop) -> None:
+        """Tell readers from now on, in a loop."""
+        self._loop = loop
+        self._listen()
+
+    def take(self) -> None:
+        """Make frames of the rows that were made just now."""
+        for part in self._parts:
+            if part.rows:
+                for frame in part.frames(time.monotonic_ns()):
+                    self._add(frame)
+
+    def say(self, event: Event) -> None:
+        """Tell of an event."""
+        self.take()
+        self._add(encode(Said(time_ns=time.monotonic_ns(), event=event)))
+
+    def count(self, figures: Mapping[str, Any]) -> None:
+        """Tell the figures of the process."""
+        self._add(encode(Figures(time_ns=time.monotonic_ns(), figures=dict(figures))))
+
+    def figures(self) -> dict[str, Any]:
+        """Numbers of the feed itself, as in `Endpoint.figures`."""
+        return {
+            "readers": len(self._readers),
+            "dropped": self._dropped,
+            "refused": self._refused,
+        }
+
+    def end(self) -> None:
+        """Tell nobody anything in the loop any more."""
+        if self._loop is None:
+            return
+        self._loop.remove_reader(self._local.socket)
+        for reader in self._behind:
+            self._loop.remove_writer(reader.connection)
+        self._behind.clear()
+        if self._armed is not None:
+            self._armed.cancel()
+            self._armed = None
+        self._loop = None
+
+    def close(self) -> None:
+        """Send readers the rest, with some patience, and remove the socket."""
+        self.end()
+        self.take()
+        self._send()
+        until_s = time.monotonic() + PATIENCE_S
+        for reader in self._readers:
+            with suppress(OSError):
+                reader.finish(until_s - time.monotonic())
+            reader.connection.close()
+        self._readers.clear()
+        self._local.close()
+
+    def _add(self, frame: bytes) -> None:
+        self._fresh.append(frame)
+        if not self._readers:
+            self._send()
+        elif self._armed is None and self._loop is not None:
+            self._armed = self._loop.call_later(GATHER_S, self._send)
+
+    def _send(self) -> None:
+        """Hand on the frames that have gathered."""
+        self._armed = None
+        if not self._fresh:
+            return
+        piece = b"".join(self._fresh)
+        self._fresh.clear()
+        self._keep(piece)
+        for reader in tuple(self._readers):
+            reader.add(piece)
+            if reader.is_full:
+                self._drop(reader)
+            elif reader not in self._behind:
+                self._go_on(reader)
+
+    def _keep(self, piece: bytes) -> None:
+        self._backlog.append(piece)
+        self._backlog_bytes += len(piece)
+        while self._backlog_bytes > BACKLOG_BYTES_MAX:
+            self._backlog_bytes -= len(self._backlog.popleft())
+
+    def _go_on(self, reader: _Reader) -> None:
+        """Send a reader more; the loop goes on with it where it is behind then."""
+        try:
+            reader.send()
+        except OSError:
+            self._forget(reader)
+            return
+        if self._loop is None or reader.is_behind == (reader in self._behind):
+            return
+        if reader.is_behind:
+            self._behind.add(reader)
+            self._loop.add_writer(reader.connection, self._go_on, reader)
+        else:
+            self._behind.discard(reader)
+            self._loop.remove_writer(reader.connection)
+
+    def _drop(self, reader: _Reader) -> None:
+        self._dropped += 1
+        self._forget(reader)
+
+    def _forget(self, reader: _Reader) -> None:
+        if self._loop is not None and reader in self._behind:
+            self._loop.remove_writer(reader.connection)
+        self._behind.discard(reader)
+        self._readers.remove(reader)
+        reader.connection.close()
+
+    def _listen(self) -> None:
+        if self._loop is not None:
+            self._loop.add_reader(self._local.socket, self._let_in)
+
+    def _let_in(self) -> None:
+        """Let the next reader in, and rest."""
+        assert self._loop is not None
+        assert self._opened is not None
+        self._loop.remove_reader(self._local.socket)
+        self._loop.call_later(REST_S, self._listen)
+        try:
+            connection, _ = self._local.socket.accept()
+        except OSError:  # it is gone already, or too many files are open
+            return
+        if len(self._readers) == READERS_MAX:
+            self._refused += 1
+            connection.close()
+            return
+        self._send()
+        reader = _Reader(connection, chain((encode(self._opened()),), self._backlog))
+        self._readers.append(reader)
+        self._go_on(reader)
+
+
+class Subscriber:
+    """Reads the feeds of processes in a thread of its own, and begins anew where one has ended.
+
+    Args:
+        paths: sockets of the feeds by a name of the process; there need be nobody yet.
+        take: called in the thread with a name and each frame; a feed begins with `Opened`.
+        lost: called in the thread with a name, where a feed that had begun has ended.
+    """
+
+    def __init__(
+        self,
+        paths: Mapping[str, Path],
+        take: Callable[[str, Frame], None],
+        lost: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._paths = dict(paths)
+        self._take, self._lost = take, lost
+        self._selector = selectors.DefaultSelector()
+        self._ours, self._waker = socket.socketpair()
+        self._selector.register(self._ours, selectors.EVENT_READ)
+        self._open: dict[str, tuple[socket.socket, Reader]] = {}
+        self._closed = False
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Read no more; returns when nothing is called any more."""
+        self._closed = True
+        self._waker.send(b"\0")
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _work(self) -> None:
+        try:
+            due_s = time.monotonic()
+            while not self._closed:
+                if time.monotonic() >= due_s:
+                    due_s = time.monotonic() + AGAIN_S
+                    for name in self._paths.keys() - self._open.keys():
+                        self._connect(name)
+                for key, _ in self._selector.select(max(due_s - time.monotonic(), 0.0)):
+                    if key.fileobj is not self._ours and not self._closed:
+                        self._read(key.data)
+        finally:
+            for connection, _ in self._open.values():
+                connection.close()
+            self._selector.close()
+            self._ours.close()
+            self._waker.close()
+
+    def _connect(self, name: str) -> None:
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        connection.setblocking(False)
+        try:
+            connection.connect(str(self._paths[name]))
+        except OSError:  # nobody is there, or he has no time
+            connection.close()
+            return
+        self._open[name] = connection, Reader()
+        self._selector.register(connection, selectors.EVENT_READ, name)
+
+    def _read(self, name: str) -> None:
+        connection, reader = self._open[name]
+        try:
+            piece = connection.recv(READ_BYTES)
+            frames = reader.read(piece)
+        except BlockingIOError:
+            return
+        except (OSError, FeedError):
+            piece, frames = b"", []
+        for frame in frames:
+            if not self._closed:
+                self._take(name, frame)
+        if not piece:
+            self._selector.unregister(connection)
+            connection.close()
+            del self._open[name]
+            self._lost(name)

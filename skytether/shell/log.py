@@ -1,0 +1,126 @@
+"""The log of a process: its events on stdout, as text for an operator or as JSON for a program.
+
+A line of text begins with the local time and the name of the process.
+
+Nobody need read it. What is printed waits for its reader in a thread of its own, up to a bound; a
+standard output that is closed or full is silence, and no fault.
+"""
+
+import errno
+import sys
+import time
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from typing import Any, Literal
+
+import msgspec
+
+from skytether.shared.core.events import Counted, Event, Omitted
+from skytether.shell.limit import Limit
+from skytether.shell.writer import Writer
+
+ROOM_BYTES = 256 * 1024
+"""Lines that wait for their reader [B]."""
+TOGETHER_BYTES = 4096
+"""Most bytes of lines in one write: what a pipe takes whole, whoever else writes to it."""
+PATIENCE_S = 0.5
+"""Longest time to wait at the end for a reader [s]."""
+
+LogFormat = Literal["text", "json"]
+
+
+class LogLine(msgspec.Struct, frozen=True, kw_only=True):
+    """A line of JSON: an event, who says it, and when."""
+
+    process: str
+    """Name of the process: server, netem or client; `server.N` is worker N of a server."""
+    time_ns: int
+    """Time at which it is said [ns; CLOCK_MONOTONIC]."""
+    event: Event
+
+
+_DECODER = msgspec.json.Decoder(LogLine)
+_UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
+"""Errors that the decoder has for what is no line of a log."""
+
+
+def line_of(text: bytes) -> LogLine | None:
+    """An event, of what a process has printed; None where it is none: a traceback, or a mistake."""
+    try:
+        return _DECODER.decode(text)
+    except _UNDECODABLE:
+        return None
+
+
+class Log:
+    """The log of a process, which never waits and never fails.
+
+    Args:
+        process: name of the process.
+        form: form of its lines.
+        beside: called with each event that is said.
+    """
+
+    def __init__(
+        self, process: str, form: LogFormat, beside: Callable[[Event], None] = lambda _: None
+    ) -> None:
+        self._process = process
+        self._form = form
+        self._beside = beside
+        closed = OSError(errno.EBADF, "the standard output is closed")
+        self._writer = Writer(sys.stdout or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
+        self._limit = Limit()
+        self._unread = 0
+        """Number of lines for which there was no room, and which are not told of yet."""
+
+    def hear(self, event: Event) -> None:
+        """Take an event of an endpoint: of each kind only a few are said in a second."""
+        for told in self._limit.admit(event, now_ns=time.monotonic_ns()):
+            self.say(told)
+
+    def say(self, event: Event) -> None:
+        """Print an event, whole lines in one write: several workers may share the output."""
+        self._beside(event)
+        for line in self._lines(event):
+            if not self._writer.write(line):
+                self._unread += 1
+
+    def each_second(self, *, last: bool = False) -> None:
+        """Say what was left out; to be called once a second, and at the end."""
+        now_ns = None if last else time.monotonic_ns()
+        for omitted in self._limit.omitted(now_ns=now_ns):
+            self.say(omitted)
+        if self._unread:
+            before, self._unread = self._unread, 0
+            self.say(Omitted(kind="lines", count=before))
+            if self._unread:  # still nobody reads
+                self._unread = before
+
+    def close(self) -> None:
+        """Wait for the reader, but not for long."""
+        self._writer.close(PATIENCE_S)
+
+    def _lines(self, event: Event) -> list[bytes]:
+        if self._form == "json":
+            line = LogLine(process=self._process, time_ns=time.monotonic_ns(), event=event)
+            return [msgspec.json.encode(line) + b"\n"]
+        lines = str(event).splitlines()
+        if isinstance(event, Counted):
+            lines += rendered(event.figures, indent=2)
+        now = f"{datetime.now():%Y-%m-%d %H:%M:%S.%f}"[:-3]  # noqa: DTZ005 - the operator's own
+        # Not `encode()` alone: the name of a file need not be Unicode.
+        return [f"{now} {self._process}: {line}\n".encode(errors="replace") for line in lines]
+
+
+def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
+    """Figures as lines: names and numbers in two columns, the groups among them indented."""
+    width = max(map(len, figures), default=0)
+    lines = []
+    for name, value in figures.items():
+        if isinstance(value, Mapping):
+            lines.append(f"{'':{indent}}{name}" if value else f"{'':{indent}}{name:{width}}  none")
+            lines += rendered(value, indent=indent + 2)
+        else:
+            shown = f"{value:g}" if isinstance(value, float) else value
+            lines.append(f"{'':{indent}}{name:{width}}  {shown}")
+    return lines

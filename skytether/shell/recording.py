@@ -1,0 +1,98 @@
+"""A part of the record on its way to a file, so that no flight waits for a disk or ends with it."""
+
+import os
+from typing import BinaryIO
+
+import numpy as np
+
+from skytether.shared.core.events import RecordIncomplete
+from skytether.shared.telemetry.record import Recorder, Rows, parse
+from skytether.shell.writer import Writer
+
+ROOM_BYTES = 32 * 1024 * 1024
+"""Rows that wait for the disk [B]: those of 1000 vehicles at 20 Hz in 8 s; in memory, rows as short
+as netem's take three times as much."""
+TOGETHER_BYTES = 256 * 1024
+"""Most bytes of rows in one write."""
+PAUSE_S = 0.02
+"""Time for which rows gather [s]; as much is lost of a process that is killed."""
+PATIENCE_S = 3.0
+"""Longest time to wait at the end until all rows are written [s]."""
+
+SLOW = "the disk is too slow"
+
+
+class RecordFile:
+    """A recorder and its file; what the file does not take is missing in it, and known of.
+
+    Args:
+        name: what the operator knows the file by.
+        columns: those of its rows.
+        file: the file, open for reading and writing without a buffer; or why there is none.
+    """
+
+    def __init__(self, name: str, columns: np.dtype[np.void], file: BinaryIO | OSError) -> None:
+        self._name = name.encode(errors="replace").decode()  # a file's name need not be Unicode
+        self._file = file
+        self._writer = Writer(file, room=ROOM_BYTES, together=TOGETHER_BYTES, pause_s=PAUSE_S)
+        self.recorder = Recorder(columns, self._writer)
+        """Takes the rows; it never waits and never fails."""
+        self._header_bytes = self._writer.offered
+        self._ended = False
+        self._told = False
+
+    def news(self) -> RecordIncomplete | None:
+        """What is to be told of the record: once, after the first row was lost."""
+        reason = self._reason()
+        if reason is None or self._told:
+            return None
+        self._told = True
+        return RecordIncomplete(file=self._name, reason=reason)
+
+    def end(self) -> None:
+        """Wait until the last row is written, for as long as is reasonable."""
+        self._writer.close(PATIENCE_S)
+        self._ended = True
+
+    def fault(self) -> str | None:
+        """What is missing in the record, as a line, or None; to be asked for after `end`."""
+        reason = self._reason()
+        if reason is None:
+            return None
+        writer, row_bytes = self._writer, self.recorder.columns.itemsize
+        kept, rows = (
+            max(count - self._header_bytes, 0) // row_bytes
+            for count in (writer.written, writer.offered)
+        )
+        return f"{self._name}: {reason}: {kept} of {rows} rows are recorded"
+
+    def rows(self) -> Rows:
+        """The rows in the file, whole ones alone; to be asked for after `end`.
+
+        Raises:
+            OSError: the file cannot be read.
+        """
+        part = bytearray()
+        while not isinstance(self._file, OSError) and len(part) < self._writer.written:
+            # Not `read`, which would move the place where a late write goes.
+            count = min(self._writer.written - len(part), TOGETHER_BYTES)
+            piece = os.pread(self._file.fileno(), count, len(part))
+            if not piece:
+                break
+            part += piece
+        if len(part) < self._header_bytes:
+            return np.empty(0, self.recorder.columns)
+        return parse(bytes(part))
+
+    def close(self) -> None:
+        """Close the file, unless something is still being written to it."""
+        done = self._writer.close(0.0 if self._ended else PATIENCE_S)
+        if done and not isinstance(self._file, OSError):
+            self._file.close()
+
+    def _reason(self) -> str | None:
+        writer = self._writer
+        if writer.failure is not None:
+            return writer.failure.strerror or str(writer.failure)
+        late = self._ended and writer.written < writer.offered
+        return SLOW if writer.refused or late else None

@@ -1,0 +1,124 @@
+"""Lines of bytes, TCP and serial, driven by asyncio beside the sockets of a `Shell`.
+
+A line that has ended, or is not there yet, is opened anew each second, for as long as its endpoint
+is driven: a cable that is plugged in again is an autopilot that is heard again.
+"""
+
+import asyncio
+import contextlib
+import os
+import socket
+import termios
+import tty
+from collections.abc import Callable
+
+from skytether.shared.core.line import Line
+from skytether.shell.udp import AddressError
+
+AGAIN_S = 1.0
+"""Time after which a line that has ended is opened again [s]."""
+PIECE_BYTES = 4096
+"""Most bytes that are heard at once."""
+
+
+class Stream:
+    """A line of bytes.
+
+    Args:
+        line: where it leads, TCP or serial.
+        hear: called with each piece that has come.
+
+    Raises:
+        AddressError: no serial port runs at its rate.
+    """
+
+    def __init__(self, line: Line, hear: Callable[[bytes], None]) -> None:
+        if line.kind == "serial" and not hasattr(termios, f"B{line.number}"):
+            raise AddressError(f"{line.host}: no serial port runs at {line.number} bit/s")
+        self._line, self._hear = line, hear
+        self._end: int | None = None
+        """File descriptor of our end; None while the line is not open."""
+
+    def send(self, payload: bytes) -> bool:
+        """Send; False where it is lost, for the line is not open or cannot take all of it."""
+        if self._end is None:
+            return False
+        try:
+            return os.write(self._end, payload) == len(payload)
+        except OSError:
+            return False
+
+    async def run(self) -> None:
+        """Keep the line open, until this task is cancelled."""
+        while True:
+            with contextlib.suppress(OSError, termios.error):
+                await self._carry(await self._open())
+            await asyncio.sleep(AGAIN_S)
+
+    async def _carry(self, end: int) -> None:
+        """Hear what comes until the line ends."""
+        loop = asyncio.get_running_loop()
+        ended = loop.create_future()
+
+        def read() -> None:
+            try:
+                piece = os.read(end, PIECE_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:  # what was plugged in is not any more
+                piece = b""
+            if piece:
+                self._hear(piece)
+            elif not ended.done():
+                ended.set_result(None)
+
+        loop.add_reader(end, read)
+        self._end = end
+        try:
+            await ended
+        finally:
+            self._end = None
+            loop.remove_reader(end)
+            os.close(end)
+
+    async def _open(self) -> int:
+        """Open the line; returns the file descriptor of our end, which does not block.
+
+        Raises:
+            OSError: nobody is there.
+            termios.error: what is there is no serial port.
+        """
+        with contextlib.ExitStack() as failed:
+            if self._line.kind == "serial":
+                end = os.open(self._line.host, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+                failed.callback(os.close, end)
+                prepare(end, self._line.number)
+            else:
+                loop = asyncio.get_running_loop()
+                found = await loop.getaddrinfo(*self._line.address, type=socket.SOCK_STREAM)
+                family, _, _, _, address = found[0]
+                sock = failed.enter_context(socket.socket(family, socket.SOCK_STREAM))
+                sock.setblocking(False)
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                await loop.sock_connect(sock, address)
+                end = sock.detach()
+            failed.pop_all()
+        return end
+
+
+def prepare(port: int, baud: int) -> None:
+    """Let a serial port carry bytes as they are, at a rate.
+
+    Args:
+        port: its file descriptor.
+        baud: rate [bit/s], one that the system knows.
+
+    Raises:
+        termios.error: it is no serial port.
+    """
+    rate = getattr(termios, f"B{baud}")
+    tty.setraw(port)
+    settings = termios.tcgetattr(port)
+    settings[2] |= termios.CLOCAL | termios.CREAD
+    settings[4] = settings[5] = rate
+    termios.tcsetattr(port, termios.TCSANOW, settings)

@@ -1,0 +1,258 @@
+"""Sockets and names, as the shell needs them; all blocking calls about addresses are in here.
+
+An address of this machine or of a peer is `(host, port)` everywhere else. In here it meets the
+kernel's own: for IPv6 a tuple of four, whose scope (the interface of a link-local address) becomes
+part of the host, as in `fe80::1%eth0`.
+"""
+
+import contextlib
+import ipaddress
+import resource
+import socket
+import struct
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from skytether.shared.core.endpoint import Address, Form
+from skytether.shared.core.events import address_text
+
+BUFFER_BYTES = 4 * 1024 * 1024
+"""Size of a socket's buffers [B]: the default receive buffer holds 166 datagrams of 600 B."""
+
+FLOODED_BYTES = 16 * 1024 * 1024
+"""Size of the receive buffer of a socket that may be flooded [B]: at 50 000 packets a second that
+come through, what a process can read that waits for a core for half a second."""
+
+SPARE_FILES = 48
+"""Number of open files that a process may need beside its sockets, with all who look on."""
+
+_SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
+_SO_ATTACH_FILTER, _UDP_HEADER_BYTES = 26, 8
+_BYTE, _LENGTH, _IF_EQUAL, _IF_AT_LEAST, _RETURN = 0x30, 0x80, 0x15, 0x35, 0x06
+"""Instructions of a packet filter of Linux (classic BPF): load a byte, load the length, compare
+what was loaded, and let so many bytes pass."""
+
+
+class AddressError(OSError):
+    """An address that the user gave is of no use; the message says which and why."""
+
+
+def within_reach_of(peers: Iterable[Address]) -> Address:
+    """Address to bind a socket to that talks to these: a free port, on loopback if all are there.
+
+    Args:
+        peers: numeric addresses of one family; without any, IPv4 is assumed.
+    """
+    peers = list(peers)
+    six = any(":" in host for host, _ in peers)
+    loopback, anywhere = ("::1", "::") if six else ("127.0.0.1", "0.0.0.0")
+    return (loopback if all(map(is_loopback, peers)) else anywhere, 0)
+
+
+def is_loopback(address: Address) -> bool:
+    """Whether only this machine can be, or reach, an address."""
+    return _is_numeric(address[0]) and ipaddress.ip_address(address[0]).is_loopback
+
+
+def open_socket(address: Address, *, shared: bool = False) -> socket.socket:
+    """A non-blocking UDP socket with large buffers; one of IPv6 hears IPv6 alone.
+
+    Args:
+        address: a name or a number, of either family.
+        shared: several sockets may have this address; the kernel deals out peers among them.
+
+    Raises:
+        AddressError: the address cannot be bound.
+    """
+    try:
+        if not _is_numeric(address[0]):
+            address = look_up(address)
+        six = ":" in address[0]
+        sock = socket.socket(socket.AF_INET6 if six else socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            _prepare(sock, shared=shared)
+            sock.bind(to_kernel(address))
+        except OSError:
+            sock.close()
+            raise
+    except OSError as error:
+        reason = error.strerror or error
+        raise AddressError(f"cannot listen on {address_text(*address)}: {reason}") from None
+    return sock
+
+
+def _prepare(sock: socket.socket, *, shared: bool) -> None:
+    sock.setblocking(False)
+    if sock.family == socket.AF_INET6:
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+    if shared:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    _make_room(sock, socket.SO_RCVBUF, _SO_RCVBUFFORCE, BUFFER_BYTES)
+    _make_room(sock, socket.SO_SNDBUF, _SO_SNDBUFFORCE, BUFFER_BYTES)
+
+
+def _make_room(sock: socket.socket, plain: int, forced: int, size: int) -> None:
+    sock.setsockopt(socket.SOL_SOCKET, plain, size)
+    with contextlib.suppress(OSError):  # over the system's limit, for those who may
+        sock.setsockopt(socket.SOL_SOCKET, forced, size)
+
+
+def from_kernel(address: tuple[Any, ...]) -> Address:
+    """Address as the kernel gives it, without its IPv6 flow, and with a scope in the host."""
+    if len(address) == 2:
+        return address
+    host, port, _, scope = address
+    return (f"{host}%{socket.if_indextoname(scope)}" if scope else host, port)
+
+
+def to_kernel(address: Address) -> tuple[Any, ...]:
+    """Numeric address as the kernel takes it.
+
+    Raises:
+        OSError: there is no such interface as its scope.
+    """
+    host, percent, scope = address[0].partition("%")
+    return (host, address[1], 0, socket.if_nametoindex(scope)) if percent else address
+
+
+def files_max() -> int:
+    """Largest number of files that this process may open, if it asks for it."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return sys.maxsize if hard == resource.RLIM_INFINITY else hard
+
+
+def sockets_max() -> int:
+    """Largest number of sockets that this process may have beside its other files."""
+    return files_max() - SPARE_FILES
+
+
+def allow_sockets(count: int) -> None:
+    """Let this process have so many sockets open, as far as the system does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = min(count + SPARE_FILES, files_max())
+    if soft != resource.RLIM_INFINITY and wanted > soft:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
+    """Let the kernel drop datagrams of other forms; elsewhere than on Linux all come through.
+
+    What is dropped takes no room in the receive buffer and no time of the process. For what comes
+    through there is more room than usual.
+
+    Args:
+        sock: a UDP socket.
+        forms: those that pass, the most frequent first; one that is shorter than a head before its
+            own is dropped.
+    """
+    _make_room(sock, socket.SO_RCVBUF, _SO_RCVBUFFORCE, FLOODED_BYTES)
+    if sys.platform != "linux":
+        return
+    instruction = struct.Struct("=HBBI")
+    program = b""
+    for head, least, most in forms:
+        left = 2 * len(head) + 4
+        for at, byte in enumerate(head, start=_UDP_HEADER_BYTES):
+            program += instruction.pack(_BYTE, 0, 0, at)
+            left -= 2
+            program += instruction.pack(_IF_EQUAL, 0, left, byte)
+        program += instruction.pack(_LENGTH, 0, 0, 0)
+        program += instruction.pack(_IF_AT_LEAST, 0, 2, least + _UDP_HEADER_BYTES)
+        program += instruction.pack(_IF_AT_LEAST, 1, 0, most + _UDP_HEADER_BYTES + 1)
+        program += instruction.pack(_RETURN, 0, 0, 2**32 - 1)
+    program += instruction.pack(_RETURN, 0, 0, 0)
+    import ctypes  # a server's alone
+
+    code = ctypes.create_string_buffer(program, len(program))
+    filter_ = struct.pack("@HP", len(program) // instruction.size, ctypes.addressof(code))
+    sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filter_)
+
+
+def kernel_drops(sock: socket.socket) -> int:
+    """Number of datagrams that the kernel dropped; 0 where nobody says.
+
+    Its receive buffer was full, or they were of no form that is admitted.
+    """
+    try:
+        info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
+    except OSError:
+        return 0
+    return int(struct.unpack("=9I", info)[_MEMINFO_DROPS])
+
+
+class Names:
+    """Numeric addresses of peers, which an endpoint knows as the user has written them.
+
+    Raises:
+        AddressError: one of them cannot be found.
+    """
+
+    def __init__(self, peers: Iterable[Address]) -> None:
+        self._numbers: dict[Address, Address] = {}
+        self._by_number: dict[Address, Address] = {}
+        self._names: list[Address] = []
+        for peer in peers:
+            self.add(peer)
+
+    def add(self, peer: Address) -> None:
+        """Know another peer from now on; blocks.
+
+        Raises:
+            AddressError: it cannot be found.
+        """
+        try:
+            self.learn({peer: look_up(peer)})
+        except OSError as error:
+            raise AddressError(f"cannot find {peer[0]}: {error.strerror or error}") from None
+        if not _is_numeric(peer[0]):
+            self._names.append(peer)
+
+    @property
+    def may_change(self) -> bool:
+        """Whether some peers are known by name, whose number may become another."""
+        return bool(self._names)
+
+    def numbers(self) -> list[Address]:
+        """Numeric addresses of all peers."""
+        return list(self._numbers.values())
+
+    def number(self, peer: Address) -> Address:
+        """Numeric address of a peer."""
+        return self._numbers.get(peer, peer)
+
+    def name(self, number: Address) -> Address:
+        """Peer with a numeric address, as the user has written it."""
+        return self._by_number.get(number, number)
+
+    def look_up(self) -> dict[Address, Address]:
+        """All names looked up anew, without those that cannot be found just now; blocks."""
+        found = {}
+        for name in self._names:
+            with contextlib.suppress(OSError):
+                found[name] = look_up(name)
+        return found
+
+    def learn(self, found: dict[Address, Address]) -> None:
+        """Let these numbers stand for these peers from now on."""
+        self._numbers |= found
+        self._by_number = {number: name for name, number in self._numbers.items()}
+
+
+def look_up(peer: Address) -> Address:
+    """Numeric address of a name or number, of IPv4 where a name has one of each family; blocks.
+
+    Raises:
+        OSError: it cannot be found.
+    """
+    found = socket.getaddrinfo(*peer, type=socket.SOCK_DGRAM)
+    four = [entry for entry in found if entry[0] == socket.AF_INET]
+    return from_kernel((four or found)[0][4])
+
+
+def _is_numeric(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True

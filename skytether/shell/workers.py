@@ -1,0 +1,101 @@
+"""One address served by several processes, so that a server may use several cores.
+
+Each has a socket of its own at the address (SO_REUSEPORT): the kernel deals out peers among them by
+a hash of their address, so one peer always meets the same process while all of them live. When one
+ends, all do.
+"""
+
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
+from contextlib import closing
+from multiprocessing.connection import wait
+from socket import socket
+
+from skytether.shared.core.endpoint import Address
+from skytether.shell.udp import from_kernel, open_socket
+
+FORK = multiprocessing.get_context("fork")
+"""Way to start a worker: what is imported and compiled is there at once, and in memory once."""
+PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+"""Signals that are passed on to every worker; SIGINT as SIGTERM, and either of them once."""
+
+
+def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
+    """Let `count` processes work until the first of them ends; returns the worst exit code.
+
+    Args:
+        count: number of processes.
+        bind: address of all of them; port 0 takes a free one.
+        work: called in each process with its number, from 1, and its socket.
+
+    Raises:
+        AddressError: the address cannot be bound.
+    """
+    sockets = [open_socket(bind, shared=True)]
+    address = from_kernel(sockets[0].getsockname())
+    sockets += [open_socket(address, shared=True) for _ in range(count - 1)]
+    children = [
+        FORK.Process(target=_work, args=(work, number, sockets, os.getpid()))
+        for number in range(1, count + 1)
+    ]
+    # Until they are told otherwise, children would do with a signal what is meant for their parent.
+    signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)
+    for child in children:
+        child.start()
+    for sock in sockets:
+        sock.close()
+
+    ending, told = False, set()
+
+    def pass_on(number: int, _: object) -> None:
+        nonlocal ending
+        if number != signal.SIGUSR1:
+            if ending:  # a worker that is told twice would not end in order
+                return
+            number, ending = signal.SIGTERM, True
+        told.add(-number)
+        for child in children:
+            if child.is_alive() and child.pid:
+                os.kill(child.pid, number)
+
+    for number in PASSED_ON:
+        signal.signal(number, pass_on)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, PASSED_ON)
+    wait([child.sentinel for child in children])
+    pass_on(signal.SIGTERM, None)
+    for child in children:
+        child.join()
+    # A worker that was told to end before it could do so in order has not failed.
+    return max(0 if child.exitcode in told else abs(child.exitcode or 0) for child in children)
+
+
+def _work(
+    work: Callable[[int, socket], None], number: int, sockets: list[socket], parent: int
+) -> None:
+    die_with_parent()
+    if os.getppid() != parent:  # it was gone before
+        return
+    for other, sock in enumerate(sockets, start=1):
+        if other != number:
+            sock.close()
+    for passed_on in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(passed_on, signal.SIG_DFL)
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until there is what to count
+    # SIGINT stays blocked: a terminal sends it to all, and the parent passes it on as SIGTERM.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGUSR1))
+    with closing(sockets[number - 1]) as sock:
+        try:
+            work(number, sock)
+        finally:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends already
+
+
+def die_with_parent() -> None:
+    """Ask the kernel to end this process with SIGTERM once its parent is gone; runs in a child."""
+    pr_set_pdeathsig = 1
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)

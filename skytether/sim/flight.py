@@ -1,0 +1,356 @@
+"""Flights in virtual time: scenario + seed → World → record and events.
+
+**A run is the same in any company.** Runs of a batch share one server, which solves for all of them
+at once, and nothing else: each has a network, winds and clocks of its own, from its seed. Three
+things make their records equal, to the last bit, to those of the runs one by one. The server's
+ticks lie on the grid of its clock, whoever flies, and the phase that a seed draws is when its
+vehicles start. What the server computes delays what it sends, not what it hears, and it is woken
+after everybody else (`sim.world`). And what differs from run to run, vehicle and session number,
+takes as many bytes on the wire in any of them. Events are equal as well, once the vehicles of each
+run are numbered from 1.
+"""
+
+import io
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+import msgspec
+
+from skytether.client import secure as client_secure
+from skytether.client import vehicles as kinds
+from skytether.client.endpoint import Client
+from skytether.client.link import ClientLink
+from skytether.netem.proxy import Proxy
+from skytether.server import secure as server_secure
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.core.aboard import VehicleEvent
+from skytether.shared.core.change import Running
+from skytether.shared.core.endpoint import Address, Endpoint
+from skytether.shared.core.events import Event, Fault
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import (
+    PACKET_COLUMNS,
+    FlightEvent,
+    Record,
+    Recorder,
+    Rows,
+    client_columns,
+    parse,
+    plan_columns,
+    server_columns,
+)
+from skytether.shared.wire import keys
+from skytether.shared.wire.keys import Keyring
+from skytether.sim.world import Clock, World
+
+MIDNIGHT_NS = 86_400 * SECOND_NS
+"""Time that the server's clock shows at the start [ns]: no stamp may become negative."""
+BOOT_ID = 2**63 + 2**31
+"""Boot id of every endpoint: as long on the wire as a random one, and so are session numbers."""
+SERVER: Address = ("server", 0)
+COMPANY_MAX = 100
+"""Most runs that share a server; more would be no faster, and a vehicle's number takes one byte."""
+EVENTS_MAX = 65_536
+"""Events kept of a flight; older ones give way."""
+
+
+def fly(
+    scenario: Scenario,
+    *,
+    vehicles: int = 1,
+    secure: bool = False,
+    server: Endpoint | None = None,
+    beside: Mapping[str, Endpoint] = MappingProxyType({}),
+    changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
+    stopwatch: Stopwatch | None = None,
+    on_second: Callable[[int], None] = lambda _: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Record:
+    """Fly a scenario in virtual time.
+
+    The vehicles start at a phase of the server's grid given by the seed, so that its ticks fall
+    anywhere within their steps, as they do in life.
+
+    Args:
+        scenario: what to fly.
+        vehicles: number of vehicles, numbered from 1, all with the same plan and winds of their
+            own.
+        secure: whether the link is sealed, with keys from the seed.
+        server: endpoint in place of ours, which records nothing; left out: `Server`.
+        beside: endpoints of other hosts by name, as an autopilot at `vehicle.address`.
+        changes: when keys get other values in flight [s; as `Record.events` have it], and which, as
+            in `shared.core.change`; what is refused is an event, and the flight goes on.
+        stopwatch: measures the server; what it measures differs from flight to flight.
+        on_second: called with the time flown [s], once a second of it.
+        stopped: asked often; once it says so, the flight is broken off.
+    """
+    keyring = make_keys(scenario.seed, vehicles) if secure else None
+    columns, sink = plan_columns(scenario.model.axes, scenario.terms().planned), io.BytesIO()
+    plans = Recorder(columns, sink)
+    (flight,) = _fly(
+        scenario,
+        (scenario.seed,),
+        on_second,
+        stopped,
+        vehicles,
+        stopwatch,
+        keyring,
+        changes,
+        plans,
+        server,
+        beside,
+    )
+    return replace(flight, plan=parse(sink.getvalue()))
+
+
+def fly_batch(
+    scenario: Scenario,
+    seeds: Sequence[int],
+    *,
+    on_second: Callable[[int], None] = lambda _: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> list[Record]:
+    """Fly a scenario once for each of these seeds, many times faster than one by one.
+
+    Each flight is the one that `fly` makes of the scenario with that seed, to the last bit, but for
+    `figures`. Where the server takes longer than a step and so sleeps through some (which ones
+    depends on when it began), runs are flown one by one.
+
+    Args:
+        scenario: what to fly.
+        seeds: seeds in place of the scenario's, no two alike.
+        on_second, stopped: see `fly`; the time begins anew every COMPANY_MAX runs.
+
+    Raises:
+        ConfigError: a plug-in makes mistakes; a batch is to be measured, and this would be nothing.
+    """
+    in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
+    company = COMPANY_MAX if in_time else 1
+    groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
+    flights = [flight for group in groups for flight in _fly(scenario, group, on_second, stopped)]
+    for _, _, event in (event for flight in flights for event in flight.events):
+        if isinstance(event, Fault):
+            raise ConfigError(event.traceback.splitlines()[-1])
+    return flights
+
+
+class Run:
+    """The vehicles of one seed and their network, in a world with others.
+
+    Args:
+        world: where its hosts are added.
+        scenario: what to fly, with the run's seed.
+        server: the server of all runs.
+        server_rows: gives the number of rows that the server has recorded so far.
+        number: number of the run, from 0; its vehicles' numbers follow those of the runs before.
+        vehicles: number of its vehicles.
+        keyring: their keys, where the link is sealed.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        scenario: Scenario,
+        server: Endpoint,
+        server_rows: Callable[[], int],
+        number: int,
+        vehicles: int,
+        keyring: Keyring | None,
+    ) -> None:
+        self._server, self._server_rows = server, server_rows
+        self._before = number * vehicles
+        self._sinks = io.BytesIO(), io.BytesIO()
+        recorder = Recorder(client_columns(scenario.model.axes), self._sinks[0])
+        self.netem = Proxy(
+            scenario,
+            server=SERVER,
+            flows=vehicles,
+            recorder=Recorder(PACKET_COLUMNS, self._sinks[1]),
+        )
+        netem_at = world.add(f"netem {scenario.seed}", self.netem)
+        self.hosts: dict[str, Endpoint] = {netem_at[0]: self.netem}
+        """Endpoints by the names of its hosts."""
+        self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
+        simulation = scenario.simulation
+        clock = Clock(
+            MIDNIGHT_NS + seconds_to_ns(simulation.clock_offset_s),
+            round(simulation.clock_drift_ppm * 1000),
+        )
+        start_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
+        self._clients = [
+            Client(
+                scenario,
+                kinds.make(scenario, vehicle),
+                server=netem_at,
+                vehicle=self._before + vehicle,
+                boot_id=BOOT_ID,
+                link=_link(keyring, scenario.seed, self._before + vehicle),
+                recorder=recorder,
+            )
+            for vehicle in range(1, vehicles + 1)
+        ]
+        for vehicle, client in enumerate(self._clients, start=1):
+            host, _ = world.add(
+                f"client {scenario.seed}.{vehicle}",
+                client,
+                clock=clock,
+                start_ns=start_ns,
+                on_finished=self._one_has_finished,
+            )
+            self.hosts[host] = client
+        self.flying = vehicles
+        """Number of vehicles that have not finished."""
+        self._ends: tuple[int | None, int | None] = None, None
+        """Rows of the server and bytes of netem by the time the last vehicle had finished."""
+
+    def hear(self, time_ns: int, host: str, event: Event) -> None:
+        """Keep an event of its own, as if it were alone, until its last vehicle has finished."""
+        if not self.flying:
+            return
+        if isinstance(event, VehicleEvent):
+            event = msgspec.structs.replace(event, vehicle=event.vehicle - self._before)
+        self._events.append(FlightEvent(time_ns, host, event))
+
+    def _one_has_finished(self) -> None:
+        self.flying -= 1
+        if not self.flying:
+            self._ends = self._server_rows(), self._sinks[1].tell()
+
+    def flight(self, server_rows: Rows) -> Record:
+        """Make its flight, as if it had been alone.
+
+        Args:
+            server_rows: the server's part of the record, of all runs.
+        """
+        rows_end, bytes_end = self._ends
+        client = parse(self._sinks[0].getvalue()).copy()
+        netem = parse(self._sinks[1].getvalue()[:bytes_end])
+        server = server_rows[:rows_end]
+        last = self._before + len(self._clients)
+        server = server[(server["vehicle"] > self._before) & (server["vehicle"] <= last)]
+        for rows in (client, server):
+            rows["vehicle"] -= self._before
+        failure = next((client.failure for client in self._clients if client.failure), None)
+        if failure:
+            failure = msgspec.structs.replace(failure, vehicle=failure.vehicle - self._before)
+        figures = {"server": self._server.figures(), "netem": self.netem.figures()}
+        return Record(client, server, netem, failure, figures, tuple(self._events))
+
+
+def make_keys(seed: int, vehicles: int) -> Keyring:
+    """A key for each of the vehicles from 1 on, the same for the same seed."""
+    entropy = stream(seed, "keys").bytes
+    lines = [
+        keys.write(vehicle, 1, entropy(keys.SECRET_BYTES)) for vehicle in range(1, vehicles + 1)
+    ]
+    return keys.parse("keys", "".join(lines).encode())
+
+
+def _link(keyring: Keyring | None, seed: int, vehicle: int) -> ClientLink | None:
+    if keyring is None:
+        return None
+    return client_secure.SecureLink(
+        keyring.of(vehicle), entropy=stream(seed, "entropy", vehicle).bytes
+    )
+
+
+def _fly(
+    scenario: Scenario,
+    seeds: Sequence[int],
+    on_second: Callable[[int], None],
+    stopped: Callable[[], bool],
+    vehicles: int = 1,
+    stopwatch: Stopwatch | None = None,
+    keyring: Keyring | None = None,
+    changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
+    plans: Recorder | None = None,
+    own_server: Endpoint | None = None,
+    beside: Mapping[str, Endpoint] = MappingProxyType({}),
+) -> list[Record]:
+    def on_event(time_ns: int, host: str, event: Event) -> None:
+        if host == SERVER[0]:
+            if not isinstance(event, VehicleEvent):
+                for run in runs:
+                    run.hear(time_ns, host, event)
+                return
+            runs[(event.vehicle - 1) // vehicles].hear(time_ns, host, event)
+        else:
+            run_of[host].hear(time_ns, host, event)
+
+    world, sink = World(on_event), io.BytesIO()
+    entropy = stream(scenario.seed, "entropy").bytes
+    each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]
+    targets = [run.make_reference() for run in each if run.reference.shape == "target"]
+    recorder = Recorder(server_columns(scenario.model.axes, scenario.control.scheme), sink)
+    header_bytes, row_bytes = sink.tell(), recorder.columns.itemsize
+    server = own_server or Server(
+        scenario,
+        boot_id=BOOT_ID,
+        entropy=entropy,
+        gate=server_secure.SecureGate(keyring, entropy=entropy) if keyring else None,
+        room=len(seeds) * vehicles,
+        recorder=recorder,
+        plans=plans,
+        stopwatch=stopwatch,
+        references=(lambda vehicle: targets[(vehicle - 1) // vehicles]) if targets else None,
+    )
+
+    def server_rows() -> int:
+        return (sink.tell() - header_bytes) // row_bytes
+
+    runs = [
+        Run(world, run, server, server_rows, number, vehicles, keyring)
+        for number, run in enumerate(each)
+    ]
+    run_of = {host: run for run in runs for host in run.hosts} | dict.fromkeys(beside, runs[0])
+    for name, endpoint in beside.items():
+        world.add(name, endpoint)
+    # Added last, it is woken last: it has heard all there is to hear at that instant.
+    compute_ns = seconds_to_ns(scenario.simulation.compute_s)
+    world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
+    plan_changes(world, scenario, {SERVER[0]: server, **runs[0].hosts, **beside}, changes)
+    flown_s, flying = 0, runs.copy()
+
+    def over() -> bool:
+        nonlocal flown_s
+        if world.now_ns // SECOND_NS != flown_s:
+            flown_s = world.now_ns // SECOND_NS
+            on_second(flown_s)
+        while flying and not flying[-1].flying:
+            flying.pop()
+        return not flying or stopped()
+
+    longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
+    world.run(over, limit_ns=seconds_to_ns(longest_s))
+    recorded = parse(sink.getvalue())
+    return [run.flight(recorded) for run in runs]
+
+
+def plan_changes(
+    world: World,
+    scenario: Scenario,
+    endpoints: Mapping[str, Endpoint],
+    changes: Sequence[tuple[float, Mapping[str, Any]]],
+) -> None:
+    """Have keys changed in flight, each at the hosts where it can be, or refused by the first."""
+    running = {host: Running(endpoint, scenario) for host, endpoint in endpoints.items()}
+    changeable = frozenset[str]().union(*(each.changeable for each in running.values()))
+
+    def change(values: Mapping[str, Any]) -> None:
+        for i, (host, each) in enumerate(running.items()):
+            here = each.changeable if i else each.changeable | (values.keys() - changeable)
+            if own := {key: value for key, value in values.items() if key in here}:
+                with suppress(ConfigError):  # it is told as an event
+                    world.act(host, partial(each.change, own))
+
+    for time_s, values in changes:
+        world.at(seconds_to_ns(time_s), partial(change, values))

@@ -1,0 +1,93 @@
+"""Flights by a ground station in virtual time: station, netem and autopilot → a flight's record.
+
+The autopilot is to netem what a vehicle is, and the station what a server is: both meet the same
+network as a flight of Skytether with the same seed.
+"""
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.flavours import FlavourName
+from skytether.netem.proxy import Proxy
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.core.events import Event
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import (
+    PACKET_COLUMNS,
+    TRUTH_COLUMNS,
+    FlightEvent,
+    Record,
+    Recorder,
+    parse,
+)
+from skytether.sim.flight import plan_changes
+from skytether.sim.world import Clock, World
+from skytether.station.endpoint import Station
+from skytether.station.joined import joined, station_columns
+from skytether.station.laws import Law
+
+READY_S = 1.0
+"""Time from the autopilot's start until it may be armed [s]: nobody needs to wait for its filters
+here."""
+AROUND_S = 180.0
+"""Longest time that take-off and landing take [s]."""
+
+
+def fly(
+    scenario: Scenario,
+    law: Law,
+    flavour: FlavourName = "ardupilot",
+    *,
+    changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
+    on_second: Callable[[int], None] = lambda _: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Record:
+    """Fly a scenario by set-points that a ground station sends straight to an autopilot.
+
+    Args:
+        scenario: what to fly.
+        law: how set-points are chosen.
+        flavour: which autopilot.
+        changes, on_second, stopped: see `sim.flight.fly`.
+    """
+    events: list[FlightEvent] = []
+
+    def on_event(time_ns: int, host: str, event: Event) -> None:
+        events.append(FlightEvent(time_ns, host, event))
+
+    sinks = io.BytesIO(), io.BytesIO(), io.BytesIO()
+    columns = station_columns(scenario.model.axes), TRUTH_COLUMNS, PACKET_COLUMNS
+    to_station, to_truth, to_netem = map(Recorder, columns, sinks)
+    station = Station(scenario, law, to_station)
+    netem = Proxy(scenario, server=("station", 0), flows=1, recorder=to_netem)
+    autopilot = Autopilot(
+        scenario, flavour, peers=[("netem", 0)], ready_s=READY_S, recorder=to_truth
+    )
+    simulation = scenario.simulation
+    clock = Clock(
+        seconds_to_ns(max(simulation.clock_offset_s, 0.0)),
+        round(simulation.clock_drift_ppm * 1000),
+    )
+    world = World(on_event)
+    world.add("netem", netem)
+    start_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
+    world.add("autopilot", autopilot, clock=clock, start_ns=start_ns)
+    world.add("station", station)
+    plan_changes(world, scenario, {"netem": netem, "autopilot": autopilot}, changes)
+    told_s = 0
+
+    def over() -> bool:
+        nonlocal told_s
+        if world.now_ns // SECOND_NS != told_s:
+            told_s = world.now_ns // SECOND_NS
+            on_second(told_s)
+        return station.finished or stopped()
+
+    world.run(over, limit_ns=seconds_to_ns(scenario.duration + AROUND_S))
+    parts = [parse(sink.getvalue()) for sink in sinks]
+    truth = parts[1].copy()
+    truth["time_ns"] = [clock.world(time_ns) for time_ns in truth["time_ns"].tolist()]
+    return joined(scenario, parts[0], truth, parts[2], failure=station.failure, events=events)

@@ -1,0 +1,347 @@
+"""The ground station as an endpoint: from the first heartbeat of an autopilot to its landing.
+
+    heard → streams asked for, clock known → armed, climbed (`client.mavlink.launch`)
+          → a set-point at every step of the flight → landed
+
+All of it goes through a bad network: what is asked for is asked again until it is done. While a
+pilot, or the autopilot by itself, flies the vehicle, nothing is sent: who took it keeps it.
+"""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from skytether.client.mavlink.clock import BootClock
+from skytether.client.mavlink.condition import Condition
+from skytether.client.mavlink.flavours import FLAVOURS, PX4, Flavour, unfit
+from skytether.client.mavlink.launch import Launch
+from skytether.client.mavlink.positions import Positions
+from skytether.client.mavlink.vehicle import altitude
+from skytether.client.vehicle import Measurement
+from skytether.mavlink.codec import Codec, Message
+from skytether.mavlink.dialect import dialect
+from skytether.mavlink.frames import turned
+from skytether.mavlink.text import Texts
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.aboard import AutopilotText, NotTakenOff
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.core.events import Finished, Flying
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder
+from skytether.station.laws import Heard, Law, Setpoint, setpoint
+
+SYSTEM, COMPONENT = 255, int(dialect.MAV_COMP_ID_MISSIONPLANNER)
+"""Numbers of a ground station's system and component: ArduPilot listens to this system."""
+VEHICLE = 1
+"""Number of the vehicle in what is told."""
+TICK_NS = 100 * MILLISECOND_NS
+"""Time between two looks at what is due beside set-points [ns]."""
+HEARTBEAT_NS = SECOND_NS
+"""Time between two heartbeats of ours [ns]."""
+CLOCK_BEGIN_NS, CLOCK_NS = 200 * MILLISECOND_NS, 5 * SECOND_NS
+"""Time between two questions for the autopilot's clock [ns]: before the flight, and in it."""
+STREAM_NS = 500 * MILLISECOND_NS
+"""Time between two streams that are asked for [ns], one after the other, until the flight begins:
+the network loses some of these. A stream begins anew where it is asked for again, so that each must
+have its turn less often than its messages."""
+AGE_MAX_NS = 10 * SECOND_NS
+"""Largest age of a position, and longest round trip, that is of use [ns]."""
+CLOSES = 3
+"""Times that a vehicle in the air is told to land when the station ends."""
+FRAME = int(dialect.MAV_FRAME_LOCAL_NED)
+VELOCITY_ALONE, POSITION_AND_VELOCITY = 0b110111000111, 0b110111000000
+"""Type masks of set-points: neither acceleration nor yaw."""
+SET_INTERVAL = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
+LOCAL_POSITION = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+SLOW = (
+    int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE),
+    int(dialect.MAVLINK_MSG_ID_HOME_POSITION),
+)
+"""Messages that the take-off needs, once a second."""
+UNASKED = (int(dialect.MAVLINK_MSG_ID_ATTITUDE), int(dialect.MAVLINK_MSG_ID_SYS_STATUS))
+"""Messages that PX4 sends unasked, and that nobody here needs."""
+
+
+class Station(Endpoint):
+    """A ground station that flies one vehicle.
+
+    Args:
+        scenario: what is flown.
+        law: how set-points are chosen.
+        recorder: takes one row a step, see `station.joined`.
+
+    Raises:
+        ConfigError: the flight begins on the ground.
+    """
+
+    def __init__(self, scenario: Scenario, law: Law, recorder: Recorder | None = None) -> None:
+        super().__init__()
+        self._law, self._recorder = law, recorder
+        self._axes = scenario.model.axes
+        self._dt_ns, self._steps = scenario.dt_ns, scenario.steps
+        self._reference = scenario.make_reference()
+        self._altitude = altitude(scenario)
+        self._may_arm = scenario.armed
+        self._patience_ns = seconds_to_ns(scenario.mavlink.patience_s)
+        self._codec = Codec(SYSTEM, COMPONENT)
+        self._clock = BootClock(AGE_MAX_NS)
+        self._condition = Condition(0.0, 0.0)
+        self._positions = Positions(self._axes, self._clock, AGE_MAX_NS)
+        self._texts = Texts()
+        self._peer: Address | None = None
+        self._target = (0, 0)
+        """Numbers of the autopilot's system and component."""
+        self._flavour: Flavour | None = None
+        self._launch: Launch | None = None
+        self._failure: NotTakenOff | None = None
+        self._counts: Counter[str] = Counter()
+        self._since_ns: int | None = None
+        """Time since which the autopilot is waited for: to be heard, then to tell its time."""
+        self._tick_ns = self._beat_ns = self._clock_ns = self._stream_ns = 0
+        """Times of the next tick, heartbeat, question for the clock and for a stream."""
+        self._asked = 0
+        """Number of streams asked for so far."""
+        self._epoch_ns: int | None = None
+        """Time of step 0."""
+        self._step_ns = 0
+        """Time of the next set-point."""
+        self._step = 0
+        """Step that comes next."""
+        self._missed = 0
+        """Steps slept through."""
+        self._newest: Measurement | None = None
+
+    @property
+    def failure(self) -> NotTakenOff | None:
+        """Event after which there is no flight."""
+        return self._failure or (self._launch.failure if self._launch else None)
+
+    @property
+    def finished(self) -> bool:
+        """See `Endpoint`; the vehicle has landed, or cannot be flown."""
+        if not (self._is_over or self.failure):
+            return False
+        now_ns = self._tick_ns - TICK_NS
+        return self._launch is None or self._launch.is_down(now_ns=now_ns)
+
+    @property
+    def _is_over(self) -> bool:
+        return self._step >= self._steps
+
+    # -- what comes --------------------------------------------------------------------------
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        for message in self._codec.decode(datagram.payload):
+            sender = message.get_srcSystem(), message.get_srcComponent()
+            if self._peer is None and message.get_type() == "HEARTBEAT":
+                self._meet(message, sender, datagram.peer)
+            if sender != self._target or datagram.peer != self._peer:
+                self._counts["foreign"] += 1
+            elif self._launch is not None:
+                self._counts["heard"] += 1
+                self._hear(message, self._launch, now_ns)
+
+    def _meet(self, message: Message, sender: tuple[int, int], peer: Address) -> None:
+        """Take who sends a heartbeat for our autopilot, if it is one."""
+        if sender[1] != dialect.MAV_COMP_ID_AUTOPILOT1:
+            return
+        self._target, self._peer = sender, peer
+        self._since_ns = None
+        if why := unfit(message):
+            self._fail("not flown", why)
+            return
+        self._flavour = FLAVOURS[message.autopilot]
+        self._launch = Launch(
+            VEHICLE,
+            self._flavour,
+            sender,
+            altitude=self._altitude,
+            patience_ns=self._patience_ns,
+            from_takeoff=False,
+            condition=self._condition,
+            positions=self._positions,
+            events=self._events,
+        )
+
+    def _hear(self, message: Message, launch: Launch, now_ns: int) -> None:
+        self._condition.hear(message, now_ns=now_ns)
+        match message.get_type():
+            case "LOCAL_POSITION_NED":
+                self._positions.hear(message, now_ns=now_ns)
+            case "TIMESYNC":
+                self._clock.hear(message.tc1, message.ts1, now_ns=now_ns)
+            case "COMMAND_ACK":
+                launch.hear(message)
+            case "STATUSTEXT" if text := self._texts.take(message):
+                shown = "".join(each if each.isprintable() else "?" for each in text)
+                if message.severity <= dialect.MAV_SEVERITY_WARNING:
+                    launch.heard_words(shown)
+                self._events.append(
+                    AutopilotText(vehicle=VEHICLE, text=shown, severity=message.severity)
+                )
+
+    def _fail(self, doing: str, why: str) -> None:
+        self._failure = NotTakenOff(vehicle=VEHICLE, doing=doing, why=why)
+        self._events.append(self._failure)
+
+    # -- what goes ---------------------------------------------------------------------------
+
+    def next_wake_ns(self) -> int | None:
+        """See `Endpoint`."""
+        if self.finished:
+            return None
+        return min(self._tick_ns, self._step_ns) if self._streams else self._tick_ns
+
+    @property
+    def _streams(self) -> bool:
+        """Whether set-points are due: those of the flight, or zeros before a mode that needs a
+        stream of them.
+        """
+        flies = self._epoch_ns is not None and not self._is_over
+        return flies or (self._launch is not None and self._launch.streams_zeros)
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        if now_ns >= self._tick_ns:
+            self._tick_ns = now_ns + TICK_NS
+            self._tick(now_ns)
+        if self._streams and now_ns >= self._step_ns:
+            if self._epoch_ns is None:
+                self._step_ns = now_ns + self._dt_ns
+                zeros = np.zeros(self._axes)
+                self._say_setpoint(Setpoint(zeros, None))
+            else:
+                self._fly(self._epoch_ns, now_ns)
+
+    def _tick(self, now_ns: int) -> None:
+        """Ask for what is due beside set-points."""
+        launch = self._launch
+        self._wait(now_ns)
+        if launch is None or self._failure:
+            return
+        if now_ns >= self._beat_ns:
+            self._beat_ns = now_ns + HEARTBEAT_NS
+            kind, none = dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID
+            active = dialect.MAV_STATE_ACTIVE
+            self._say(dialect.MAVLink_heartbeat_message(kind, none, 0, 0, active, 3))
+        flies = self._epoch_ns is not None
+        if now_ns >= self._clock_ns:
+            self._clock_ns = now_ns + (CLOCK_NS if flies else CLOCK_BEGIN_NS)
+            self._say(dialect.MAVLink_timesync_message(0, self._clock.ask(now_ns=now_ns)))
+        if not flies:
+            self._begin(launch, now_ns)
+        for message in launch.ask(now_ns=now_ns):
+            self._say(message)
+
+    def _wait(self, now_ns: int) -> None:
+        """Wait for the autopilot, but no longer than it may take."""
+        self._since_ns = now_ns if self._since_ns is None else self._since_ns
+        if self._clock.is_known or self._failure or now_ns - self._since_ns <= self._patience_ns:
+            return
+        waited = f"in {self._patience_ns / SECOND_NS:g} s"
+        if self._launch is None:
+            self._fail(f"not heard {waited}", "no heartbeat of an autopilot has come")
+        else:
+            self._fail(f"no time told {waited}", "TIMESYNC is not answered")
+
+    def _begin(self, launch: Launch, now_ns: int) -> None:
+        """Ask for the next stream, go on with the take-off, and begin to fly after that."""
+        if now_ns >= self._stream_ns:
+            self._stream_ns = now_ns + STREAM_NS
+            self._ask_stream()
+        if self._clock.is_known and launch.take_off(may_arm=self._may_arm, now_ns=now_ns):
+            self._epoch_ns = self._step_ns = now_ns
+            self._events.append(Flying(vehicle=VEHICLE))
+
+    def _ask_stream(self) -> None:
+        intervals = {LOCAL_POSITION: self._dt_ns / 1e3, **dict.fromkeys(SLOW, 1e6)}
+        if self._flavour is PX4:
+            intervals |= dict.fromkeys(UNASKED, -1.0)
+        number, interval_us = list(intervals.items())[self._asked % len(intervals)]
+        self._asked += 1
+        self._say(
+            dialect.MAVLink_command_long_message(
+                *self._target, SET_INTERVAL, 0, float(number), interval_us, 0.0, 0.0, 0.0, 0.0, 0.0
+            )
+        )
+
+    def _fly(self, epoch_ns: int, now_ns: int) -> None:
+        """Send the set-point of the present step, unless somebody else flies the vehicle."""
+        launch = self._launch
+        assert launch is not None
+        step = min((now_ns - epoch_ns) // self._dt_ns, self._steps - 1)
+        self._missed += step - self._step
+        time_s = (now_ns - epoch_ns) / SECOND_NS
+        measured = self._positions.take(now_ns=now_ns)
+        self._newest = newest = measured[-1] if measured else self._newest
+        heard = None
+        if newest is not None and newest.position is not None:
+            then_s = (newest.stamp_ns - epoch_ns) / SECOND_NS
+            heard = Heard(then_s, np.array(newest.position))
+        chosen = setpoint(self._law, self._reference, time_s, heard)
+        obeys = self._obeys
+        if obeys:
+            self._say_setpoint(chosen)
+        self._record(step, now_ns, chosen.velocity, obeys=obeys)
+        self._step = step + 1
+        self._step_ns = epoch_ns + self._step * self._dt_ns
+        if self._is_over:
+            self._events.append(Finished(vehicle=VEHICLE, steps=self._steps, missed=self._missed))
+            launch.land(now_ns=now_ns)
+
+    @property
+    def _obeys(self) -> bool:
+        """Whether the vehicle is armed and in the mode that follows set-points, as last heard."""
+        assert self._flavour is not None
+        return self._condition.armed and self._condition.mode == self._flavour.guided
+
+    def _record(self, step: int, now_ns: int, velocity: Array, *, obeys: bool) -> None:
+        if self._recorder is None:
+            return
+        newest = self._newest
+        position = newest.position if newest and newest.position else [np.nan] * self._axes
+        age_ns = now_ns - newest.stamp_ns if newest else -1
+        late = self._positions.dropped["late"]
+        numbers = (*velocity.tolist(), *position)
+        self._recorder.append_row(now_ns, step, *numbers, age_ns, obeys, late, self._missed)
+
+    def _say_setpoint(self, chosen: Setpoint) -> None:
+        x, y, *up = chosen.velocity.tolist()
+        velocity = turned((x, y, up[0] if up else 0.0))
+        place, mask = (0.0, 0.0, 0.0), VELOCITY_ALONE
+        if chosen.position is not None:
+            x, y, *up = chosen.position.tolist()
+            place = turned((x, y, up[0] if up else self._altitude))
+            mask = POSITION_AND_VELOCITY
+        self._counts["setpoints"] += 1
+        unused = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self._say(
+            dialect.MAVLink_set_position_target_local_ned_message(
+                0, *self._target, FRAME, mask, *place, *velocity, *unused
+            )
+        )
+
+    def _say(self, message: Message) -> None:
+        assert self._peer is not None
+        self.send(self._codec.encode(message), self._peer)
+
+    def close(self, *, now_ns: int) -> None:
+        """See `Endpoint`; a vehicle in the air that is ours lands by itself."""
+        if self._launch is not None:
+            for message in self._launch.close(now_ns=now_ns) * CLOSES:
+                self._say(message)
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`."""
+        return {
+            "heard": self._counts["heard"],
+            "foreign": self._counts["foreign"],
+            "setpoints": self._counts["setpoints"],
+            "measurements": self._positions.taken,
+            "dropped": by_name(self._positions.dropped),
+            "garbage_bytes": self._codec.garbage_bytes,
+            "round_trip_ms": (self._clock.round_trip_ns or 0) / MILLISECOND_NS,
+        }

@@ -1,0 +1,93 @@
+"""A flight as a page has it: what is known of it, and the way to change it."""
+
+import contextlib
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from skytether.shared.core.change import Answer
+from skytether.shared.core.events import Changed
+from skytether.shared.telemetry.feed import Frame, Opened, Said
+from skytether.view.browser.play import PROCESSES, Operator
+from skytether.view.controls import CUT, WAYS
+from skytether.view.state import LED, State
+
+
+class PageFlight:
+    """A flight on a page.
+
+    Args:
+        title: what it is called; empty where it is alone.
+        folder: where its control sockets are; None where nothing can be changed.
+    """
+
+    def __init__(self, title: str = "", folder: Path | None = None) -> None:
+        self.title = title
+        self.state = State()
+        self.lock = threading.Lock()
+        """Held by whoever uses the state."""
+        self.values: dict[str, dict[str, Any]] = {}
+        """Keys that may change and their values, by process, as far as they are known."""
+        self.answer = ""
+        """What was said to the newest request, empty before any."""
+        self.refused = False
+        """Whether that was refused."""
+        self._before: dict[str, Any] = {}
+        """Losses from before the link was cut."""
+        self.operator = Operator(folder, self._answered) if folder else None
+
+    def take(self, process: str, frame: Frame) -> None:
+        """Take a frame; one that makes no sense is left out."""
+        with self.lock, contextlib.suppress(ValueError):
+            self.state.take(process, frame)
+        changed = (
+            isinstance(frame, Said) and isinstance(frame.event, Changed) and frame.event.key != LED
+        )
+        if process in PROCESSES and (changed or isinstance(frame, Opened)):
+            self.ask(process, {})
+
+    def lose(self, process: str) -> None:
+        """Note that a process is not heard any more."""
+        with self.lock:
+            self.state.lose(process)
+
+    # -- changes -----------------------------------------------------------------------------
+
+    def ask(self, process: str, values: Mapping[str, Any]) -> None:
+        """Ask a process for other values."""
+        if self.operator:
+            self.operator.ask(process, values)
+
+    def _answered(self, process: str, asked: Mapping[str, Any], answer: Answer | None) -> None:
+        if answer and answer.values:
+            self.values[process] = answer.values
+        elif answer and (answer.refused or LED not in asked):
+            self.refused = bool(answer.refused)
+            self.answer = answer.refused or "; ".join(map(str, answer.changed))
+        elif asked and not answer:
+            self.refused = True
+            self.answer = f"{process} does not answer: the flight is over, or it takes no changes"
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether every packet is lost."""
+        values = self.values.get("netem", {})
+        return bool(values) and all(values[key] == cut for key, cut in CUT.items())
+
+    def cut(self) -> None:
+        """Lose every packet from now on."""
+        values = self.values.get("netem")
+        if values and not self.is_cut:
+            self._before = {key: values[key] for key in CUT}
+            self.ask("netem", CUT)
+
+    def heal(self) -> None:
+        """Lose as many packets as before the link was cut, none where that is not known."""
+        if self.is_cut:
+            self.ask("netem", self._before or {f"{way}.loss": 0.0 for way in WAYS})
+
+    def close(self) -> None:
+        """Ask for nothing more."""
+        if self.operator:
+            self.operator.close()

@@ -1,0 +1,170 @@
+"""The page: flights in a browser, live, by viser.
+
+One thread draws for all browsers, as often as an eye needs and only while somebody looks.
+"""
+
+import contextlib
+import io
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import viser
+from websockets.asyncio.server import ServerConnection
+
+from skytether.shared.core.events import BrowserRefused
+from skytether.view.browser.access import Refusal, knows, may_play
+from skytether.view.browser.flight import PageFlight
+from skytether.view.browser.guard import Guard, visitor
+from skytether.view.browser.panel import More, Panel
+from skytether.view.scene import Scene
+
+MOVES_HZ = 25
+"""How often vehicles move [1/s]."""
+MOVES_TO_A_DRAWING = 5
+"""Number of moves to each drawing of lines, plots and words."""
+
+
+def _silence() -> contextlib.redirect_stdout[io.StringIO]:
+    """Keep what viser prints, even where it is told not to, off the standard output."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+class Page:
+    """Shows flights to browsers.
+
+    Args:
+        host, port: where it listens.
+        flights: what is shown.
+        now_ns: tells the time of the frames [ns]; the clock of this machine unless given.
+        token: who gives it may look, and change what flies, from anywhere; empty for nobody.
+        more: adds what else the page has to a browser.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        flights: Sequence[PageFlight],
+        *,
+        now_ns: Callable[[], int] | None = None,
+        token: str = "",
+        more: More | None = None,
+    ) -> None:
+        self._flights, self._token, self._more = flights, token, more
+        self._now_ns = now_ns or time.monotonic_ns
+        self._guard = Guard(token)
+        with _silence(), self._guard.served():
+            self._server = viser.ViserServer(host, port, verbose=False)
+        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._server.gui.set_panel_label("Skytether")
+        self._panels: dict[int, Panel] = {}
+        self._scene: Scene | None = None
+        self._shown: tuple[object, ...] = ()
+        """What the scene was made of."""
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        """Port that it listens on."""
+        return self._server.get_port()
+
+    def events(self) -> Sequence[BrowserRefused]:
+        """What there is to be told of browsers since this was called last."""
+        return self._guard.events()
+
+    def close(self) -> None:
+        """Show nothing more."""
+        self._closed.set()
+        self._thread.join()
+        with _silence():
+            self._server.stop()
+
+    def _work(self) -> None:
+        moves = 0
+        due_s = time.monotonic()
+        while not self._closed.wait(max(0.0, due_s - time.monotonic())):
+            due_s = max(due_s + 1 / MOVES_HZ, time.monotonic())
+            clients = self._server.get_clients()
+            for gone in self._panels.keys() - clients.keys():
+                del self._panels[gone]
+            if not clients:
+                continue
+            moves += 1
+            with contextlib.ExitStack() as stack:
+                for flight in self._flights:
+                    stack.enter_context(flight.lock)
+                self._show(clients, draws=moves % MOVES_TO_A_DRAWING == 0)
+
+    def _show(self, clients: Mapping[int, viser.ClientHandle], *, draws: bool) -> None:
+        states = [flight.state for flight in self._flights]
+        if not all(state.name for state in states):
+            return
+        shown = tuple(state.flights for state in states)
+        if self._scene is None or self._shown != shown:
+            self._begin(shown)
+        assert self._scene is not None
+        for number, client in clients.items():
+            if number not in self._panels:
+                with self._alone(number):
+                    self._panels[number] = self._panel(client)
+                draws = True
+                break  # one at a time: whoever keeps coming back costs no more than that
+        with self._server.atomic():
+            self._scene.move(states)
+            if draws:
+                self._scene.draw(states)
+        if draws:
+            now_ns = self._now_ns()
+            for number, panel in list(self._panels.items()):
+                if self._reads(number):
+                    with self._alone(number), clients[number].atomic():
+                        panel.show(now_ns)
+
+    def _reads(self, number: int) -> bool:
+        """Whether a browser has read what it was sent: nothing is drawn for one that has not."""
+        connection = self._connections.get(number)
+        return connection is not None and not connection.paused
+
+    @contextlib.contextmanager
+    def _alone(self, number: int) -> Iterator[None]:
+        """Let whatever goes wrong with one browser's panel cost its connection, and nobody else's.
+
+        viser sets values as browsers send them: texts for numbers, lists of any length.
+        """
+        try:
+            yield
+        except Exception:
+            self._panels.pop(number, None)
+            self._guard.count(Refusal.PANEL)
+            if connection := self._connections.get(number):
+                self._server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
+
+    def _begin(self, shown: tuple[object, ...]) -> None:
+        """Begin anew: other flights are flown."""
+        self._server.scene.reset()
+        for client in self._server.get_clients().values():
+            client.gui.reset()
+            client.scene.reset()
+        self._panels.clear()
+        titles = [flight.title for flight in self._flights]
+        self._scene = Scene(self._server, [flight.state for flight in self._flights], titles)
+        self._shown = shown
+
+    def _panel(self, client: viser.ClientHandle) -> Panel:
+        assert self._scene is not None
+        return Panel(
+            client,
+            self._flights,
+            self._scene,
+            may_play=may_play(visitor(self._connections[client.client_id]), self._token),
+            unlock=(lambda given: knows(self._token, given)) if self._token else None,
+            more=self._more,
+        )
+
+    @property
+    def _connections(self) -> dict[int, ServerConnection]:
+        """Connections of the browsers, which viser keeps to itself."""
+        return self._server._websock_server._live_connections

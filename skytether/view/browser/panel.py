@@ -1,0 +1,327 @@
+"""What one browser is shown beside the scene: words, plots and, where it may, what it can change.
+
+Everything belongs to this browser alone: who may only look has nothing that could be moved.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from skytether.view import words
+from skytether.view.browser.flight import PageFlight
+from skytether.view.controls import THRESHOLDS, Knob, Values, compared, knobs, triggers
+from skytether.view.plots import POINTS, Look, Plots, of_flight, of_network
+from skytether.view.scene import GROUND_RGB, WIDE, Scene, in_space
+from skytether.view.state import LED
+
+HELD_S = 1.5
+"""Time for which a slider that was moved is left where it is [s]."""
+FIXED = (
+    "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
+    "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
+)
+NARROW = 800
+"""Width up to which panels lie over the scene, and not beside it [pixels]."""
+MOVED_M = 0.05
+"""Distance from which on the handle of the target follows it [m]."""
+
+More = Callable[[viser.GuiApi], Callable[[], None]]
+
+
+class Panel:
+    """What one browser is shown.
+
+    Args:
+        client: the browser.
+        flights: what is flown, all of it known.
+        scene: the scene.
+        may_play: whether it may change what flies.
+        unlock: takes a token; whether it is the right one. None where there is no token.
+        more: adds what else a page has to a browser that may play; what it returns is called
+            whenever the panel is shown.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        flights: Sequence[PageFlight],
+        scene: Scene,
+        *,
+        may_play: bool,
+        unlock: Callable[[str], bool] | None,
+        more: More | None,
+    ) -> None:
+        self._client, self._flights, self._unlock = client, flights, unlock
+        self._controls: list[Controls] = []
+        gui = client.gui
+        self._dress(light=False)
+        gui.set_panel_label("Skytether")
+        if client.camera.image_width > NARROW:
+            gui.main_panel.dock_right()
+        gui.main_panel.set_width(340)
+        self._status = [gui.add_html("") for _ in flights]
+        self._more = more(gui) if more and may_play else None
+        numbers = sorted({number for each in flights for number in each.state.vehicles} or {1})
+        self._vehicle = gui.add_dropdown(
+            "Vehicle", tuple(map(str, numbers)), visible=len(numbers) > 1
+        )
+        self._play = gui.add_folder("Play", visible=any(each.operator for each in flights))
+        if not may_play:
+            self._let_look()
+        elif any(each.operator for each in flights):
+            self._let_play()
+        light = gui.add_checkbox("Light page", initial_value=False)
+
+        # viser's own grid costs a computer without a GPU a second to draw, lines nearly nothing.
+        ground = client.scene.add_line_segments(
+            "/ground", scene.ground, GROUND_RGB[False], thickness=1.0, thickness_units="screen"
+        )
+
+        @light.on_update
+        def _(_: Any) -> None:
+            self._dress(light=light.value)
+            ground.colors = np.array(GROUND_RGB[light.value], np.uint8)
+
+        titles = [each.title for each in flights]
+        axes = max(each.state.scenario.model.axes for each in flights)
+        panel = gui.add_panel()
+        with panel.add_tab("Flight"):
+            self._plots = [Plots(gui, titles, of_flight(axes))]
+        with panel.add_tab("Network"):
+            self._plots.append(Plots(gui, titles, of_network()))
+        with panel.add_tab("Events"):
+            self._said = gui.add_html("")
+        if client.camera.image_width > NARROW:
+            panel.dock_left()
+        panel.set_width(400)
+        self._scene = scene
+        self._aimed = scene.camera(WIDE)[0]
+        """Where the camera was put."""
+
+    def _dress(self, *, light: bool) -> None:
+        self._client.gui.configure_theme(
+            dark_mode=not light, show_logo=False, show_share_button=False
+        )
+
+    def _let_look(self) -> None:
+        """Say why nothing can be changed here, and what would help."""
+        with self._play:
+            said = "This page can only be looked at: it may be played with on the machine itself"
+            self._client.gui.add_html(
+                words.note(said + (", or with its token." if self._unlock else "."))
+            )
+            if self._unlock is None:
+                return
+            unlock, field = self._unlock, self._client.gui.add_text("Token", "")
+
+            @field.on_update
+            def _(_: Any) -> None:
+                if unlock(field.value.strip()) and not self._controls:
+                    field.remove()
+                    self._let_play()
+
+    def _let_play(self) -> None:
+        with self._play:
+            self._controls = [Controls(self._client, self._flights)]
+
+    def _aim(self) -> None:
+        """Show all there is in a window that changes, unless somebody has moved the camera."""
+        camera = self._client.camera
+        aim, target = self._scene.camera(camera.aspect)
+        is_ours = np.abs(camera.position - self._aimed).max() < 0.05 * self._scene.reach_m
+        if is_ours and np.abs(aim - self._aimed).max() > 0.05 * self._scene.reach_m:
+            self._aimed = aim
+            camera.position, camera.look_at = aim, target
+
+    def show(self, now_ns: int) -> None:
+        """Show flights as they are now."""
+        self._aim()
+        numbers = sorted({number for each in self._flights for number in each.state.vehicles})
+        if numbers and tuple(map(str, numbers)) != tuple(self._vehicle.options):
+            self._vehicle.options = tuple(map(str, numbers))
+            self._vehicle.visible = len(numbers) > 1
+        vehicle = int(self._vehicle.value)
+        for status, flight in zip(self._status, self._flights, strict=True):
+            status.content = words.status(flight.state, vehicle, now_ns, flight.title)
+        self._said.content = words.said([(each.title, each.state) for each in self._flights])
+        tracks = [each.state.vehicles.get(vehicle) for each in self._flights]
+        known = [track for track in tracks if track]
+        if len(known) == len(tracks):
+            end_s = max(track.time_s for track in known)
+            looks = [
+                Look(flight.state, track.curves(POINTS, end_s), now_ns)
+                for flight, track in zip(self._flights, known, strict=True)
+            ]
+            for plots in self._plots:
+                plots.draw(looks)
+        for controls in self._controls:
+            controls.show()
+        if self._more:
+            self._more()
+
+
+def assign(handle: Any, value: Any) -> None:
+    """Set the value of a handle; mypy takes viser's property for one that cannot be."""
+    handle.value = value
+
+
+class _Slider:
+    """A number that this browser can change.
+
+    What it calls back is a coroutine, here and below: viser calls these in their order, and others
+    in any.
+    """
+
+    def __init__(self, gui: viser.GuiApi, knob: Knob, ask: Callable[[Knob, float], None]) -> None:
+        self.knob = knob
+        self._slider = gui.add_slider(
+            knob.label, knob.low, knob.high, knob.step, knob.low, hint=knob.hint, visible=False
+        )
+        self._moved_s = -np.inf
+
+        @self._slider.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:  # else it was we who moved it
+                self._moved_s = time.monotonic()
+                ask(knob, float(self._slider.value))
+
+    def show(self, values: Values, *, visible: bool) -> None:
+        """Put it where the value is, unless it is being moved."""
+        self._slider.visible = visible and self.knob.key in values
+        if not self._slider.visible or time.monotonic() - self._moved_s < HELD_S:
+            return
+        number = self.knob.read(values)
+        self._slider.max = max(self._slider.max, number)
+        self._slider.min = min(self._slider.min, number)
+        if abs(self._slider.value - number) > self.knob.step / 2:
+            assign(self._slider, number)
+
+
+class Controls:
+    """What one browser can change: the same of all flights on the page."""
+
+    def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
+        self._client = client
+        self._flights = [each for each in flights if each.operator]
+        gui = client.gui
+        scenario = self._flights[0].state.scenario
+        self._cut = gui.add_button("Cut the link", color="red", icon=viser.Icon.PLUG_CONNECTED_X)
+        self._heal = gui.add_button("Heal it", color="green", icon=viser.Icon.PLUG_CONNECTED)
+        self._answer = gui.add_html("")
+        self._sliders = [_Slider(gui, knob, self._ask) for knob in knobs(scenario.model.axes)]
+        self._trigger = gui.add_dropdown(
+            "Trigger",
+            triggers(scenario.control.scheme, scenario.control.trigger),
+            initial_value=scenario.control.trigger,
+            hint="Rule for sending a plan",
+        )
+        self._thresholds = [_Slider(gui, knob, self._ask) for knob in THRESHOLDS]
+        self._armed = gui.add_checkbox("Armed", True, hint="Whether plans are flown at all")
+        gui.add_text("Scheme", scenario.control.scheme, disabled=True, hint=FIXED)
+        self._lead = _Lead(client, self._flights) if scenario.reference.shape == "live" else None
+
+        @self._cut.on_click
+        def _(_: Any) -> None:
+            for flight in self._flights:
+                flight.cut()
+
+        @self._heal.on_click
+        def _(_: Any) -> None:
+            for flight in self._flights:
+                flight.heal()
+
+        @self._trigger.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self._all("server", {"control.trigger": self._trigger.value})
+
+        @self._armed.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self._all("client", {"armed": self._armed.value})
+
+    def _all(self, process: str, values: dict[str, Any]) -> None:
+        for flight in self._flights:
+            flight.ask(process, values)
+
+    def _ask(self, knob: Knob, number: float) -> None:
+        for flight in self._flights:
+            values = flight.values.get(knob.process, {})
+            if knob.key in values:
+                flight.ask(knob.process, knob.write(values, number))
+
+    def show(self) -> None:
+        """Show what flies, and what was answered."""
+        flight = self._flights[0]
+        server = flight.values.get("server", {})
+        trigger = server.get("control.trigger", self._trigger.value)
+        if trigger != self._trigger.value:
+            scheme = flight.state.scenario.control.scheme
+            self._trigger.options = triggers(scheme, trigger)
+            assign(self._trigger, trigger)
+        keys = compared(trigger)
+        for slider in self._sliders:
+            slider.show(flight.values.get(slider.knob.process, {}), visible=True)
+        for slider in self._thresholds:
+            slider.show(server, visible=slider.knob.key in keys)
+        armed = flight.values.get("client", {}).get("armed", self._armed.value)
+        if armed != self._armed.value:
+            assign(self._armed, armed)
+        self._cut.disabled = flight.is_cut or "netem" not in flight.values
+        self._heal.disabled = not flight.is_cut
+        self._answer.content = "".join(
+            words.answer(flight.answer, refused=flight.refused) for flight in self._flights
+        )
+        if self._lead:
+            self._lead.show()
+
+
+class _Lead:
+    """The target, which this browser can drag, or put where it clicks."""
+
+    def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
+        self._flights = flights
+        self._axes = flights[0].state.scenario.model.axes
+        self._held_s = -np.inf
+        flat = self._axes == 2
+        self._handle = client.scene.add_transform_controls(
+            "/lead",
+            scale=0.6,
+            active_axes=(True, True, not flat),
+            disable_rotations=True,
+            depth_test=False,
+        )
+        client.gui.add_html(words.note("Drag the target, or click where it shall be."))
+
+        @self._handle.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self._move(np.asarray(self._handle.position))
+
+        @client.scene.on_click()
+        def _(event: viser.SceneClickEvent) -> None:
+            origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            height = self._handle.position[2] - origin[2]
+            if direction[2] * height > 0:  # else it is the sky that was clicked
+                point = origin + direction * height / direction[2]
+                self._handle.position = point
+                self._move(point)
+
+    def _move(self, point: Any) -> None:
+        self._held_s = time.monotonic()
+        for flight in self._flights:
+            flight.ask("server", {LED: [np.round(point[: self._axes], 3).tolist()]})
+
+    def show(self) -> None:
+        """Put it where the target is, unless it is being dragged."""
+        if time.monotonic() - self._held_s < HELD_S:
+            return
+        for track in list(self._flights[0].state.vehicles.values())[:1]:
+            goal = track.goal(5.0)
+            if goal is not None:
+                place = in_space(goal[None])[0]
+                if np.abs(place - self._handle.position).max() > MOVED_M:
+                    self._handle.position = place

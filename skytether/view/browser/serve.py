@@ -1,0 +1,121 @@
+"""Serving a page: where it listens, who may change what, and how it ends."""
+
+import errno
+import secrets
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import PageServed, address_text
+from skytether.shell.command import RUN, CommandError, interruptible
+from skytether.shell.feed import Subscriber
+from skytether.shell.log import Log, LogFormat
+from skytether.view.browser.access import is_loopback
+from skytether.view.browser.flight import PageFlight
+from skytether.view.browser.page import Page
+from skytether.view.browser.panel import More
+from skytether.view.browser.play import PROCESSES
+
+TOKEN_BYTES = 16
+POLL_S = 0.1
+"""Time after which Ctrl-C is noticed [s]."""
+PORTS, PORTS_TRIED = 65536, 100
+"""Number of ports there are, and most that are tried from the one that is asked for on."""
+ANYWHERE = ("0.0.0.0", "::")
+"""Hosts that are none to connect to."""
+
+
+@contextmanager
+def followed(folder: Path, title: str = "") -> Iterator[PageFlight]:
+    """Follow a flight whose processes have their feeds and control sockets in a folder."""
+    flight = PageFlight(title, folder)
+    paths = {name: folder / f"{name}.feed" for name in PROCESSES}
+    paths |= {each.name.replace(".feed", ""): each for each in folder.glob("*.feed.*")}
+    with closing(flight), closing(Subscriber(paths, flight.take, flight.lose)):
+        yield flight
+
+
+@contextmanager
+def page(
+    at: Address,
+    flights: Sequence[PageFlight],
+    *,
+    now_ns: Callable[[], int] | None = None,
+    more: More | None = None,
+) -> Iterator[tuple[Page, PageServed]]:
+    """Serve a page for as long as the block takes; yields it and its address.
+
+    Args:
+        at: where it listens; where that port is taken, on the next free one.
+        flights: what is shown.
+        now_ns, more: see `Page`.
+
+    Raises:
+        CommandError: it cannot listen there.
+    """
+    host, port = at
+    free = next_free(host, port)
+    token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
+    with closing(Page(host, free, flights, token=token, more=more, now_ns=now_ns)) as shown:
+        here = address_text("127.0.0.1" if host in ANYWHERE else host, shown.port)
+        query = f"/?websocket=ws://{here}/?token={token}" if token else ""
+        taken = address_text(*at) if port and shown.port != port else ""
+        yield shown, PageServed(address=f"http://{here}{query}", taken=taken)
+
+
+def next_free(host: str, port: int) -> int:
+    """The first port from one on where nobody listens; 0, which takes any, stays 0.
+
+    Raises:
+        CommandError: there is none, or the host is not this machine's.
+    """
+    for candidate in range(port, min(port + PORTS_TRIED, PORTS)):
+        try:
+            found = socket.getaddrinfo(
+                host, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )
+            family, kind, _, _, address = found[0]
+            with socket.socket(family, kind) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                continue
+            why = error.strerror
+            break
+        return candidate
+    else:
+        why = f"it is taken, and so are the {PORTS_TRIED - 1} ports after it"
+    raise CommandError(f"--page: {address_text(host, port)}: cannot be listened on: {why}", RUN)
+
+
+def until_told(
+    at: Address,
+    flights: Sequence[PageFlight],
+    log: LogFormat = "text",
+    *,
+    now_ns: Callable[[], int] | None = None,
+    more: More | None = None,
+) -> None:
+    """Serve a page until SIGINT or SIGTERM, and say where.
+
+    Args:
+        at, flights, now_ns, more: see `page`.
+        log: form of the log.
+
+    Raises:
+        CommandError: it cannot listen there.
+    """
+    with (
+        interruptible() as interrupted,
+        page(at, flights, now_ns=now_ns, more=more) as (shown, served),
+        closing(Log("page", log)) as out,
+    ):
+        out.say(served)
+        while not interrupted():
+            time.sleep(POLL_S)
+            for event in shown.events():
+                out.say(event)

@@ -1,0 +1,120 @@
+"""Recordings as tables: one for each part of the record, and one of the events.
+
+A column is a number with its unit in its name, as in `position_x_m`; a plan has one for each of its
+inputs (`input_x_mps_0`). What the record has numbers for, and people words, is words: `mode`,
+`reason`, `direction`, `compared`. Times that pass are in ms, as in a summary, and `error_m` is how
+far a vehicle is from where it should be.
+"""
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.figures.tables import to_csv
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.events import Counted
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import feed
+from skytether.shared.telemetry.feed import Said
+from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.summary import position_error
+from skytether.view.recording import Recorded
+from skytether.view.rows import Columns, readable
+
+PASSES_NS = ("age_ns", "solve_ns", "delay_ns")
+"""Columns of a time that passes [ns]; negative where none was measured."""
+STEPS = ("in_force", "observed_step")
+"""Columns of a step that there need not be; negative for none."""
+
+
+def tables(recorded: Recorded) -> dict[str, Columns]:
+    """Tables of a recording, by name; `time_s` is counted from its first message on.
+
+    Raises:
+        RecordingError: the file is damaged.
+    """
+    times_ns: dict[str, list[int]] = {}
+    pieces: dict[str, list[bytes]] = {}
+    events: list[tuple[float, str, str, str]] = []
+    columns = recorded.columns()
+    for time_ns, process, frame in recorded.frames():
+        if isinstance(frame, feed.Rows):
+            count = len(frame.rows) // columns[frame.part].itemsize
+            times_ns.setdefault(frame.part, []).extend([time_ns] * count)
+            pieces.setdefault(frame.part, []).append(frame.rows)
+        elif isinstance(frame, Said) and not isinstance(frame.event, Counted):
+            said = type(frame.event).__name__, str(frame.event)
+            events.append((time_ns / SECOND_NS, process, *said))
+    parts = {part: np.frombuffer(b"".join(rows), columns[part]) for part, rows in pieces.items()}
+    made = {
+        part: {"time_s": np.array(times_ns[part]) / SECOND_NS}
+        | dict(_in_ms(name, column) for name, column in readable(rows).items())
+        for part, rows in parts.items()
+    }
+    if "client" in parts:
+        client, server = parts["client"], parts.get("server")
+        made["client"]["error_m"] = _errors_m(recorded.scenario, client, server)
+    if events:
+        names = ("time_s", "process", "type", "text")
+        made["events"] = {
+            name: np.array(values)
+            for name, values in zip(names, zip(*events, strict=True), strict=True)
+        }
+    return made
+
+
+def _in_ms(name: str, column: NDArray[Any]) -> tuple[str, NDArray[Any]]:
+    """A column and its name, those of a time that passes in ms; NaN where none was measured."""
+    if name not in PASSES_NS:
+        return name, column
+    return name.replace("_ns", "_ms"), np.where(column < 0, np.nan, column / MILLISECOND_NS)
+
+
+def _errors_m(scenario: Scenario, client: Rows, server: Rows | None) -> Array:
+    """Distance of each vehicle from where it should be, at each of its rows [m]; NaN if unknown."""
+    errors_m = np.empty(len(client))
+    for number in np.unique(client["vehicle"]):
+        own = client["vehicle"] == number
+        errors_m[own] = np.linalg.norm(position_error(scenario, client[own], server), axis=1)
+    return errors_m
+
+
+def csv(columns: Columns) -> str:
+    """A table as CSV text; what is not known is empty."""
+    values = [_known(name, column) for name, column in columns.items()]
+    return to_csv(list(columns), zip(*values, strict=True))
+
+
+def parquet() -> Callable[[Columns], bytes]:
+    """What makes a Parquet file of a table.
+
+    Raises:
+        ImportError: pyarrow is not installed.
+    """
+    import pyarrow
+    from pyarrow import parquet as files
+
+    def written(columns: Columns) -> bytes:
+        file = io.BytesIO()
+        known = {
+            name: _known(name, column) if name in STEPS else column
+            for name, column in columns.items()
+        }
+        files.write_table(pyarrow.table(known), file, compression="zstd")
+        return file.getvalue()
+
+    return written
+
+
+def _known(name: str, column: NDArray[Any]) -> list[Any]:
+    """Values of a column; None for one that is not known: NaN, or -1 of a step."""
+    values: list[Any] = column.tolist()
+    if name in STEPS:
+        return [None if value < 0 else value for value in values]
+    if column.dtype.kind != "f":
+        return values
+    return [None if value != value else value for value in values]  # noqa: PLR0124 - NaN

@@ -1,0 +1,90 @@
+"""Recordings of the processes of one flight, as one recording of the flight.
+
+    frames of each, by the time of day → one file → summary of the first client's flight
+
+Each process has recorded its own part, with the scenario as it was started with. A key's value is
+that of the process that the key belongs to; what both ends predict with must be equal. Times are
+put on the clock of the first client: the difference is that of the times of day.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from heapq import merge
+from typing import BinaryIO
+
+import msgspec
+import numpy as np
+
+from skytether.shared.base.errors import RecordingError
+from skytether.shared.scenario import catalogue
+from skytether.shared.scenario.catalogue import KEYS
+from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.owners import Owner
+from skytether.shared.scenario.reading import check, to_table
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.feed import Frame, Rows
+from skytether.shared.telemetry.record import Rows as Table
+from skytether.view.frames import Timed
+from skytether.view.recording import Recorded, Recording, summary_of
+
+OWNERS = {"client": Owner.VEHICLE, "server": Owner.SERVER, "netem": Owner.NETEM}
+"""Owner of the keys whose values a process's recording has, by the part that it has rows of."""
+
+
+def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
+    """Write recordings of processes as one.
+
+    Raises:
+        OSError: the file cannot be written.
+        RecordingError: they are not of one flight, or one is damaged.
+    """
+    first = next((each for each in recordings if "client" in each.columns()), recordings[0])
+    about, scenario = first.about, _scenario(first, recordings)
+    joined = Recording(file, scenario, about)
+    streams = [_moved(each, about.offset_ns) for each in recordings]
+    for _, process, frame in merge(*streams, key=lambda timed: timed[0]):
+        joined.add(process, frame)
+    joined.finish(summary_of(scenario, about, _parts(recordings)))
+
+
+def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
+    """The scenario of a flight, each value from whom it belongs to."""
+    table = to_table(first.scenario)
+    for each in recordings:
+        terms = first.scenario.terms(), each.scenario.terms()
+        if different := catalogue.differences(*terms):
+            said = f"it is of another flight than {first.path}: {different[0]}"
+            raise RecordingError(f"{each.path}: {said}")
+        owners = {OWNERS.get(part) for part in each.columns()}
+        values = flat(to_table(each.scenario))
+        lay({key: value for key, value in values if KEYS[key].owner in owners}, table)
+    return check(table, "the scenarios together")
+
+
+def _moved(recorded: Recorded, offset_ns: int) -> Iterator[Timed]:
+    """Frames of a recording, on the clock of the one whose offset is given."""
+    late_ns = recorded.about.offset_ns - offset_ns
+    columns = recorded.columns()
+    for time_ns, process, frame in recorded.timed():
+        yield time_ns, process, _later(frame, columns, late_ns)
+
+
+def _later(frame: Frame, columns: Mapping[str, np.dtype[np.void]], late_ns: int) -> Frame:
+    """A frame with all its times moved."""
+    moved = msgspec.structs.replace(frame, time_ns=frame.time_ns + late_ns)
+    if isinstance(moved, Rows) and moved.part == "netem":
+        rows = np.frombuffer(moved.rows, columns["netem"]).copy()
+        rows["arrived_ns"] += late_ns
+        return msgspec.structs.replace(moved, rows=rows.tobytes())
+    return moved
+
+
+def _parts(recordings: Sequence[Recorded]) -> dict[str, Table]:
+    """Rows of each part, of all recordings."""
+    pieces: dict[str, list[Table]] = {}
+    for each in recordings:
+        for part, rows in each.parts().items():
+            pieces.setdefault(part, []).append(rows)
+    for part, tables in pieces.items():
+        if len({table.dtype for table in tables}) > 1:
+            raise RecordingError(f"the part {part} has other columns in one of them")
+    return {part: np.concatenate(tables) for part, tables in pieces.items()}

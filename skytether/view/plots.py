@@ -1,0 +1,263 @@
+"""The plots of a page: the last minute of one vehicle of each flight, and of their networks."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from viser import uplot
+
+from skytether.figures.colours import css
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.law.model import Array
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.view.scene import FLIGHT_RGB
+from skytether.view.state import DELAY_BIN_NS, DELAY_BINS, SPAN_S, Curves, State
+
+POINTS = 400
+"""Number of points of a line."""
+SEEN = 4.0
+"""Thresholds above which what the trigger compares is cut off."""
+SPARE = 6
+"""Number of zeros that are left at the end where they are cropped."""
+HEIGHT = 150
+"""Height of a plot [pixels]."""
+GREY = "#868e96"
+MARK = "rgba(240, 62, 62, 0.6)"
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What the plots show of a flight at a time."""
+
+    state: State
+    curves: Curves
+    now_ns: int
+
+
+Values = Callable[[Look], Array]
+
+
+@dataclass(frozen=True, slots=True)
+class PlotLine:
+    """One line of a plot, drawn for each flight or for the first alone."""
+
+    label: str
+    values: Values
+    rgb: str = ""
+    """Its colour; that of the flight unless given."""
+    dash: tuple[int, ...] = ()
+    width: float = 1.5
+    marks: bool = False
+    """Whether it is 1 where a mark across the whole plot stands, and 0 elsewhere."""
+    once: bool = False
+    """Whether it is the same of all flights."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """One plot."""
+
+    title: str
+    lines: tuple[PlotLine, ...]
+    grid: Values = lambda look: look.curves.time_s
+    log: bool = False
+    crop: bool = False
+    """Whether it ends where nothing but zeros follows."""
+
+
+def _axis(axis: int) -> tuple[PlotLine, ...]:
+    return (
+        PlotLine(
+            "reference", lambda look: look.curves.reference[:, axis], GREY, dash=(4, 4), once=True
+        ),
+        PlotLine("", lambda look: look.curves.position[:, axis]),
+    )
+
+
+def _seconds(look: Look) -> Array:
+    """Times of flight of the last seconds, one each [s]."""
+    ages_s = np.arange(-SPAN_S, 0.0) + 0.5
+    return look.state.time_s(look.now_ns) + ages_s
+
+
+def _delays(direction: int) -> Values:
+    def values(look: Look) -> Array:
+        """Mean delays on the grid, none within the seconds in which no packet got through."""
+        grid_s, seconds = look.curves.time_s, _seconds(look)
+        delays_s = look.state.network.delays_s(direction, look.now_ns)
+        known = ~np.isnan(delays_s)
+        if not known.any():
+            return np.full(len(grid_s), np.nan)
+        nearest = np.clip(np.rint(grid_s - seconds[0]).astype(int), 0, len(seconds) - 1)
+        return np.where(known[nearest], np.interp(grid_s, seconds[known], delays_s[known]), np.nan)
+
+    return values
+
+
+def _bins_ms(_: Look) -> Array:
+    return (np.arange(DELAY_BINS) + 0.5) * DELAY_BIN_NS / MILLISECOND_NS
+
+
+def _share(direction: int) -> Values:
+    def values(look: Look) -> Array:
+        counts = look.state.network.histogram(direction, look.now_ns)
+        return 100.0 * counts / max(1.0, counts.sum())
+
+    return values
+
+
+def _every_step(look: Look) -> Array:
+    return np.full(int(SPAN_S), look.state.every_step)
+
+
+def _deadline_ms(look: Look) -> Array:
+    return np.full(POINTS, look.state.scenario.dt_ns / MILLISECOND_NS)
+
+
+def _compared(look: Look) -> Array:
+    """What the trigger compares, as far as it can be seen beside its threshold."""
+    most = np.where(look.curves.threshold > 0, SEEN * look.curves.threshold, np.inf)
+    return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
+
+
+def of_flight(axes: int) -> tuple[Plot, ...]:
+    """Plots of a vehicle with so many axes."""
+    return (
+        *(Plot(f"{name} [m]", _axis(axis)) for axis, name in enumerate("xyz"[:axes])),
+        Plot(
+            "What the trigger compares, and packets",
+            (
+                PlotLine("threshold", lambda look: look.curves.threshold, GREY, dash=(4, 4)),
+                PlotLine("compared", _compared),
+                PlotLine(
+                    "sent", lambda look: look.curves.event, MARK, marks=True, width=1.0, once=True
+                ),
+            ),
+        ),
+        Plot(
+            "Age of what is flown by [s]",
+            (
+                PlotLine("age", lambda look: look.curves.age_s),
+                PlotLine("delay up", _delays(UPLINK), GREY, once=True, width=1.0),
+                PlotLine("delay down", _delays(DOWNLINK), GREY, dash=(2, 3), once=True, width=1.0),
+            ),
+        ),
+    )
+
+
+def of_network() -> tuple[Plot, ...]:
+    """Plots of packets, and of what plans cost."""
+    return (
+        Plot(
+            "Packets up in a second",
+            (
+                PlotLine("every step", _every_step, GREY, dash=(4, 4), once=True),
+                PlotLine("up", lambda look: look.state.network.rates(UPLINK, look.now_ns)),
+            ),
+            grid=_seconds,
+        ),
+        Plot(
+            "Packets by their delay [ms], %",
+            (
+                PlotLine("up", _share(UPLINK)),
+                PlotLine("down", _share(DOWNLINK), GREY, dash=(2, 3), once=True),
+            ),
+            grid=_bins_ms,
+            crop=True,
+        ),
+        Plot(
+            "Solving, against the deadline [ms]",
+            (
+                PlotLine("deadline", _deadline_ms, GREY, dash=(4, 4), once=True),
+                PlotLine("solving", lambda look: look.curves.solve_ms),
+            ),
+            log=True,
+        ),
+    )
+
+
+class Plots:
+    """The plots of one browser.
+
+    Args:
+        gui: where they are made.
+        titles: what the flights are called; empty for a flight that is alone.
+        plots: what is plotted.
+    """
+
+    def __init__(self, gui: viser.GuiApi, titles: Sequence[str], plots: Sequence[Plot]) -> None:
+        self._plots = plots
+        self._handles = [self._make(gui, plot, titles) for plot in self._plots]
+
+    @staticmethod
+    def _make(gui: viser.GuiApi, plot: Plot, titles: Sequence[str]) -> viser.GuiUplotHandle:
+        series: list[uplot.Series] = [{"label": "t"}]
+        for place, title in enumerate(titles):
+            for line in plot.lines:
+                if line.once and place:
+                    continue
+                rgb = line.rgb or css(FLIGHT_RGB[place % len(FLIGHT_RGB)])
+                label = " ".join(filter(None, ("" if line.once else title, line.label)))
+                shown: uplot.Series = {
+                    "label": label or "flown",
+                    "stroke": rgb,
+                    "width": line.width,
+                    "dash": line.dash,
+                    "points": {"show": False},
+                    "scale": "marks" if line.marks else "y",
+                }
+                series.append(shown)
+        # What is no mark lies below the scale, and is not seen.
+        marks: uplot.Scale = {"auto": False, "range": (0.5, 1.0)}
+        scales: dict[str, uplot.Scale] = {"x": {"time": False}, "marks": marks}
+        if plot.log:
+            scales["y"] = {"distr": 3}
+        nothing = (np.array([0.0, 1.0]),) * len(series)
+        return gui.add_uplot(
+            nothing,
+            tuple(series),
+            title=plot.title,
+            scales=scales,
+            legend={"show": len(series) > 2, "live": False},
+            cursor={"drag": {"x": False, "y": False, "setScale": False}},
+            height=HEIGHT,
+            padding=(2, 8, 0, 0),
+        )
+
+    def draw(self, looks: Sequence[Look]) -> None:
+        """Show flights as they are now; the first gives the times."""
+        for plot, handle in zip(self._plots, self._handles, strict=True):
+            data = [plot.grid(looks[0])]
+            for place, look in enumerate(looks):
+                data.extend(line.values(look) for line in plot.lines if not (line.once and place))
+            shown: Any = drawable(begun(cropped(data) if plot.crop else data))
+            handle.data = shown
+
+
+def cropped(data: Sequence[Array]) -> list[Array]:
+    """Data without the zeros that end all of it, but for a few."""
+    used = [int(np.flatnonzero(values).max(initial=0)) for values in data[1:]]
+    return [values[: max(used) + SPARE] for values in data]
+
+
+def begun(data: Sequence[Array]) -> list[Array]:
+    """Data from where on anything is known of a line of which not all is."""
+    missing = [np.isnan(values) for values in data[1:]]
+    begin = [int(np.argmin(gone)) for gone in missing if gone.any() and not gone.all()]
+    first = min(min(begin, default=0), len(data[0]) - 2)
+    return [values[first:] for values in data]
+
+
+def drawable(data: Sequence[Array]) -> list[Any]:
+    """Data as uPlot takes it: nothing where a line has a gap; it draws no line that has a NaN.
+
+    A list, for viser would make numbers again of all that is in a tuple.
+    """
+    return [_with_gaps(values) if np.isnan(values).any() else values for values in data]
+
+
+def _with_gaps(values: Array) -> list[float | None]:
+    return [None if math.isnan(value) else value for value in values.tolist()]

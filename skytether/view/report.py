@@ -1,0 +1,320 @@
+"""The report of a recorded flight: a page that opens offline, with figures, summary and events."""
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.figures.colours import MODE_COLOURS, PALETTE, css
+from skytether.figures.flights import draw_reference
+from skytether.figures.page import Picture, Table, rendered
+from skytether.shared.base.errors import RecordingError
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import Counted
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.reading import to_toml
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.feed import Rows as RowsFrame
+from skytether.shared.telemetry.feed import Said
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows, compared
+from skytether.shared.telemetry.summary import desired, position_error
+from skytether.shared.wire.protocol import NO_HORIZON, Mode
+from skytether.view.recording import Recorded
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+EVENTS_MAX = 400
+"""Most events on a page."""
+WIDTH = 9.0
+"""Width of a figure [inch]."""
+LETTERS: Any = {"font.size": 9, "axes.titlesize": 9, "legend.fontsize": 8}
+LETTERS |= {"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True}
+"""Settings of matplotlib for every figure."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlightReport:
+    """A report, drawn."""
+
+    title: str
+    """Heading of the page."""
+    about: str
+    """One or two sentences on what was flown."""
+    verdict: str
+    """One or two sentences on what came out."""
+    tables: Sequence[Table]
+    """Tables."""
+    pictures: Sequence[Picture]
+    """Figures."""
+    events: Sequence[tuple[str, str, str]]
+    """Time, process and sentence of each event."""
+    untold: int
+    """Number of events for which there is no room."""
+    made: Mapping[str, str]
+    """Facts about the recording, by name."""
+    toml: str
+    """Scenario as a file."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportedFlight:
+    """What is drawn of a flight: that of one vehicle, and of the network."""
+
+    scenario: Scenario
+    """What was flown."""
+    client: Rows
+    """Rows of the vehicle."""
+    server: Rows
+    """Rows of the server about it."""
+    netem: Rows
+    """Rows of the network."""
+    epoch_ns: int
+    """Time of step 0 [ns; clock of netem]."""
+
+    @property
+    def time_s(self) -> Array:
+        """Time of each row of the vehicle [s]."""
+        return self.time_of(self.client)
+
+    def time_of(self, rows: Rows) -> Array:
+        """Time of rows that have a step [s]."""
+        time_s: Array = rows["step"] * self.scenario.control.dt
+        return time_s
+
+    def spans(self) -> Iterator[tuple[Mode, slice]]:
+        """Modes one after the other, each with its rows and the first after them."""
+        modes = self.client["mode"]
+        begins = np.flatnonzero(np.diff(modes, prepend=-1))
+        for begin, end in zip(begins, [*begins[1:], len(modes)], strict=True):
+            yield Mode(modes[begin]), slice(begin, end + 1)
+
+
+def page(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> str:
+    """The page of a recording, as HTML.
+
+    Args:
+        summary: names and values of its summary.
+
+    Raises:
+        RecordingError: no vehicle has flown in it, or the file is damaged.
+    """
+    return rendered("view/report.html.jinja", drawn=_drawn(recorded, summary))
+
+
+def _drawn(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> FlightReport:
+    parts, scenario, about = recorded.parts(), recorded.scenario, recorded.about
+    client = parts.get("client")
+    if client is None or not len(client) or recorded.summary is None:
+        raise RecordingError(f"{recorded.path}: no vehicle has flown a step in it")
+    number = client["vehicle"].min()
+    epoch_ns, events = _events(recorded)
+    empty = client[:0]
+    flown = ReportedFlight(
+        scenario,
+        client[client["vehicle"] == number],
+        parts["server"][parts["server"]["vehicle"] == number] if "server" in parts else empty,
+        parts.get("netem", empty),
+        epoch_ns,
+    )
+    began = f"{about.began[:10]} {about.began[11:16]} UTC"
+    where = f"over UDP, {began}" if about.began else "in virtual time"
+    fleet = len(np.unique(client["vehicle"]))
+    others = f" Drawn is vehicle {number} of {fleet}." if fleet > 1 else ""
+    sent = "–" if recorded.summary.event_ratio is None else f"{recorded.summary.event_ratio:.1%}"
+    rmse = recorded.summary.rmse_xy
+    off = "" if rmse is None else f"The vehicle was {rmse:.3f} m off (RMSE xy); "
+    rows = [list(row) for row in summary]
+    table = Table("summary", "Summary", "What came of the flight.", "", ("figure", "value"), rows)
+    made = {
+        "scenario": recorded.name,
+        "seed": str(scenario.seed),
+        "flown": where,
+        "with": f"Skytether {about.version}",
+        "recording": recorded.path.name,
+    }
+    return FlightReport(
+        title=f"Flight of {recorded.name}, seed {scenario.seed}",
+        about=f"{recorded.summary.duration_s:g} s {where}.{others}",
+        verdict=f"{off}a horizon was sent at {sent} of the steps.",
+        tables=[table],
+        pictures=[path(flown), timeline(flown)],
+        events=events[:EVENTS_MAX],
+        untold=max(0, len(events) - EVENTS_MAX),
+        made=made,
+        toml=to_toml(scenario).decode(),
+    )
+
+
+def _events(recorded: Recorded) -> tuple[int, list[tuple[str, str, str]]]:
+    """Time of step 0 [ns], and the events with their times counted from it."""
+    columns = recorded.columns()
+    dt_ns = recorded.scenario.dt_ns
+    epoch_ns, said = None, []
+    for _, process, frame in recorded.frames():
+        if isinstance(frame, Said) and not isinstance(frame.event, Counted):
+            said.append((frame.time_ns, process, str(frame.event)))
+        elif epoch_ns is None and isinstance(frame, RowsFrame) and frame.part == "client":
+            first = np.frombuffer(frame.rows, columns["client"])[0]
+            epoch_ns = frame.time_ns - int(first["step"]) * dt_ns
+    begin_ns = epoch_ns or 0
+    return begin_ns, [
+        (f"{round((time_ns - begin_ns) / SECOND_NS, 2) + 0.0:.2f}", process, text)
+        for time_ns, process, text in said
+    ]
+
+
+def _colour(mode: Mode) -> str:
+    return css(PALETTE[MODE_COLOURS[mode]])
+
+
+def path(flown: ReportedFlight) -> Picture:
+    """The path from above, in the colours of the modes."""
+    with _figure(6.0) as figure:
+        plane = figure.subplots()
+        draw_reference(plane, flown.scenario, flown.client, flown.server)
+        position = flown.client["state"][:, :2, 0]
+        for mode, span in flown.spans():
+            x, y = with_gaps(flown.client["step"][span], position[span]).T
+            plane.plot(x, y, color=_colour(mode), linewidth=1.4)
+        plane.plot(*position[0], "ko", markersize=4, label="start")
+        plane.set_aspect("equal", adjustable="datalim")
+        plane.set_xlabel("x [m]")
+        plane.set_ylabel("y [m]")
+        plane.legend(loc="upper right")
+        _name_modes(figure, flown)
+        says = "Red and dashed where the vehicle should be, in colour where it was."
+        return Picture("path", "Path from above", says, _png(figure))
+
+
+def timeline(flown: ReportedFlight) -> Picture:
+    """What happened, over time, with the modes behind it."""
+    with _figure(10.5) as figure:
+        axes = figure.subplots(5, 1, sharex=True)
+        for draw, below in zip((_positions, _error, _trigger, _ages, _packets), axes, strict=True):
+            draw(below, flown)
+            for mode, span in flown.spans():
+                time_s = flown.time_s[span]
+                end_s = time_s[-1] + (
+                    flown.scenario.control.dt if span.stop > len(flown.client) else 0
+                )
+                below.axvspan(time_s[0], end_s, color=_colour(mode), alpha=0.13, linewidth=0)
+            if below.get_legend_handles_labels()[0]:
+                below.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        axes[-1].set_xlabel("time [s]")
+        axes[-1].set_xlim(0.0, flown.time_s[-1] + flown.scenario.control.dt)
+        figure.align_ylabels(axes)
+        _name_modes(figure, flown)
+        says = (
+            "From above: position, with the desired one dashed; distance between them; what the "
+            "trigger compares with its threshold, linear up to there and logarithmic above, and "
+            "when a horizon was sent; how old the observation behind the input was, and the plan; "
+            "packets in each second, by when they entered the network, but for those still under "
+            "way at the end. The colour behind is what the vehicle did."
+        )
+        return Picture("timeline", "What happened", says, _png(figure))
+
+
+def with_gaps(steps: NDArray[np.int64], values: Array) -> Array:
+    """Values of rows, and a NaN wherever the row of a step is missing: no line leads over it."""
+    gaps = np.flatnonzero(np.diff(steps) > 1) + 1
+    return np.insert(values.astype(np.float64), gaps, np.nan, axis=0)
+
+
+def _over_time(
+    below: "Axes", flown: ReportedFlight, rows: Rows, values: Array, *form: str, **style: Any
+) -> None:
+    """Draw values of rows over time, with gaps where there are no rows."""
+    time_s = with_gaps(rows["step"], flown.time_of(rows))
+    below.plot(time_s, with_gaps(rows["step"], values), *form, **style)
+
+
+def _positions(below: "Axes", flown: ReportedFlight) -> None:
+    position = flown.client["state"][..., 0]
+    wanted = desired(flown.scenario, flown.client, flown.server)
+    for axis, (color, name) in enumerate(zip(("k", "0.45", "#0072b2"), "xyz", strict=True)):
+        if axis < position.shape[1]:
+            _over_time(below, flown, flown.client, position[:, axis], color=color, label=name)
+            _over_time(below, flown, flown.client, wanted[:, axis], "r--", linewidth=0.8)
+    below.set_ylabel("position [m]")
+
+
+def _error(below: "Axes", flown: ReportedFlight) -> None:
+    error = np.linalg.norm(position_error(flown.scenario, flown.client, flown.server), axis=1)
+    _over_time(below, flown, flown.client, error, "k-", linewidth=1.0)
+    below.set_ylim(bottom=0.0)
+    below.set_ylabel("distance [m]")
+
+
+def _trigger(below: "Axes", flown: ReportedFlight) -> None:
+    server = flown.server
+    below.set_ylabel(flown.scenario.control.trigger.replace("_", " "))
+    if not len(server):
+        return
+    time_s = flown.time_of(server)
+    _over_time(below, flown, server, compared(server), "k-", linewidth=0.9, label="figure")
+    _over_time(below, flown, server, server["threshold"], "r--", linewidth=0.9, label="threshold")
+    sent, bottom = time_s[server["event"]], below.get_xaxis_transform()
+    style: Any = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
+    below.vlines(sent, 0.0, 0.12, **style)
+    threshold = server["threshold"][np.isfinite(server["threshold"])]
+    # What it compares spans decades while nothing can be sent; the threshold is what counts.
+    below.set_yscale("symlog", linthresh=max(threshold.max(initial=0.0), 1e-6))
+    below.set_ylim(bottom=0.0)
+
+
+def _ages(below: "Axes", flown: ReportedFlight) -> None:
+    client = flown.client
+    observed_s = np.where(client["age_ns"] >= 0, client["age_ns"] / SECOND_NS, np.nan)
+    planned_s = (client["step"] - client["in_force"]) * flown.scenario.control.dt
+    planned_s = np.where(client["in_force"] != NO_HORIZON, planned_s, np.nan)
+    _over_time(below, flown, client, observed_s, "k-", linewidth=0.9, label="observation")
+    _over_time(below, flown, client, planned_s, color="#0072b2", linewidth=0.9, label="plan")
+    below.set_ylim(bottom=0.0)
+    below.set_ylabel("age [s]")
+
+
+def _packets(below: "Axes", flown: ReportedFlight) -> None:
+    below.set_ylabel("packets per s")
+    if not len(flown.netem):
+        return
+    seconds = np.arange(int(flown.time_s[-1]) + 2)
+    # In seconds: a damaged file may have an epoch that is no number of 64 bits.
+    arrived_s = flown.netem["arrived_ns"] / SECOND_NS - flown.epoch_ns / SECOND_NS
+    for direction, name, color in ((UPLINK, "up", "k"), (DOWNLINK, "down", "#0072b2")):
+        counts, _ = np.histogram(arrived_s[flown.netem["direction"] == direction], seconds)
+        below.stairs(counts, seconds, color=color, label=name)
+    below.axhline(1.0 / flown.scenario.control.dt, color="r", linestyle="--", label="every step")
+    below.set_ylim(bottom=0.0)
+
+
+@contextmanager
+def _figure(height: float) -> "Iterator[Figure]":
+    """An empty figure of some height [inch]."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(LETTERS):
+        yield Figure(figsize=(WIDTH, height), layout="constrained")
+
+
+def _name_modes(figure: "Figure", flown: ReportedFlight) -> None:
+    """A legend of the modes that occur."""
+    from matplotlib.patches import Patch
+
+    names: dict[str, list[str]] = {}
+    for mode in sorted({mode for mode, _ in flown.spans()}):
+        names.setdefault(_colour(mode), []).append(str(mode))
+    patches = [Patch(color=color, label=", ".join(each)) for color, each in names.items()]
+    figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), frameon=False)
+
+
+def _png(figure: "Figure") -> bytes:
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=140)
+    return png.getvalue()

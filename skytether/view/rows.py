@@ -1,0 +1,281 @@
+"""Rows of the record as plain columns: a number each, with axis and unit in its name.
+
+They are what a recording and an exported table hold. A row lies in memory as before, only the names
+are others: so it comes back to the last bit. An array of the library has all axes of one quantity.
+"""
+
+from collections.abc import Iterable, Mapping
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.law.model import Array, discretise
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.triggers import Compared
+from skytether.shared.telemetry.record import (
+    DOWNLINK,
+    PACKET_COLUMNS,
+    UPLINK,
+    Reason,
+    Rows,
+    client_columns,
+    plan_columns,
+    server_columns,
+)
+from skytether.shared.wire.protocol import Mode
+
+AXES = "xyz"
+"""Names of the axes."""
+SHORT = {"inputs": "input"}
+"""Names of columns of velocities that have another one here."""
+NOT_FINITE = "not_finite"
+"""Key of a message for the columns that JSON has no numbers for."""
+NAN = np.float64(np.nan)
+"""What is meant where a message has no value."""
+WORDS: Mapping[str, Mapping[int, str]] = {
+    "mode": {mode: str(mode) for mode in Mode},
+    "reason": {reason: str(reason) for reason in Reason},
+    "compared": {figure: str(figure) for figure in Compared},
+    "direction": {UPLINK: "uplink", DOWNLINK: "downlink"},
+}
+"""Words for the numbers of some columns."""
+FIGURES = {str(figure) for figure in Compared} | {"compared", "error"}
+"""Columns of the server's part that a recording may be without: older ones have others."""
+FLOWN_S_MAX = 2 * 86_400.0
+"""Latest time of a step [s]: a scenario lasts for a day at most."""
+DELAY_NS_MAX = 86_400 * SECOND_NS
+"""Longest delay of a packet [ns]."""
+NUMBER_MAX = 1e100
+"""Largest number of a row: nothing that a flight measures, squared, overflows."""
+
+Columns = dict[str, NDArray[Any]]
+"""Columns of a table, all of one length, by name."""
+
+
+def plain(columns: np.dtype[np.void]) -> np.dtype[np.void]:
+    """Plain columns in place of those of the record, at the same places in memory.
+
+    A state, of shape (axes, 2), becomes `position_x_m`, `velocity_x_mps` and so on, with its name
+    before it unless it is `state`. Velocities, of shape (axes,), or (axes, steps) of the inputs of
+    a plan, become `input_x_mps` and so on.
+
+    Raises:
+        ValueError: a column is none of these, and no number.
+    """
+    fields: list[Any] = []
+    for name in columns.names or ():
+        kind = columns[name]
+        axes, *rest = kind.shape or (0,)
+        if not kind.shape:
+            fields.append((name, kind))
+        elif axes <= len(AXES) and (not rest or name == "inputs"):
+            shape = [tuple(rest)] if rest else []
+            fields += [
+                (f"{SHORT.get(name, name)}_{axis}_mps", kind.base, *shape) for axis in AXES[:axes]
+            ]
+        elif axes <= len(AXES) and rest == [2]:
+            before = "" if name == "state" else f"{name}_"
+            for axis in AXES[:axes]:
+                fields.append((f"{before}position_{axis}_m", kind.base))
+                fields.append((f"{before}velocity_{axis}_mps", kind.base))
+        else:
+            raise ValueError(f"column {name}: got shape {kind.shape}, expected that of a state")
+    flat = np.dtype(fields)
+    if flat.itemsize != columns.itemsize:
+        raise ValueError(f"got rows of {columns.itemsize} B, expected {flat.itemsize} B")
+    return flat
+
+
+class RowTable:
+    """Rows of a part as messages, and back.
+
+    A message has a key for each plain column. A number that is not finite is none in JSON: NaN is
+    left out, and what else there is stands in the list NOT_FINITE, as "column=bytes in memory".
+
+    Args:
+        columns: columns of the rows.
+
+    Raises:
+        ValueError: see `plain`.
+    """
+
+    def __init__(self, columns: np.dtype[np.void]) -> None:
+        self.columns = columns
+        """Columns of the rows."""
+        self.plain = plain(columns)
+        """Plain columns."""
+        self.names: tuple[str, ...] = self.plain.names or ()
+        """Names of the plain columns."""
+        kinds = {name: self.plain[name] for name in self.names if self.plain[name].base.kind == "f"}
+        self._numbers = [name for name, kind in kinds.items() if not kind.shape]
+        self._lists = [name for name, kind in kinds.items() if kind.shape]
+
+    def schema(self) -> dict[str, Any]:
+        """JSON schema of a message."""
+        properties: dict[str, Any] = {}
+        for name in self.names:
+            kind = {"b": "boolean", "f": "number"}.get(self.plain[name].base.kind, "integer")
+            several = self.plain[name].shape
+            properties[name] = (
+                {"type": "array", "items": {"type": kind}} if several else {"type": kind}
+            )
+        properties[NOT_FINITE] = {"type": "array", "items": {"type": "string"}}
+        return {"type": "object", "properties": properties}
+
+    def messages(self, rows: Rows) -> list[dict[str, Any]]:
+        """A message for each row."""
+        flat = np.ascontiguousarray(rows).view(self.plain)
+        values = [flat[name].tolist() for name in self.names]
+        messages = [dict(zip(self.names, each, strict=True)) for each in zip(*values, strict=True)]
+        for i, message in enumerate(messages):
+            odd = [name for name in self._numbers if not isfinite(message[name])]
+            odd += [name for name in self._lists if not all(map(isfinite, message[name]))]
+            for name in odd:
+                del message[name]
+                bits = flat[name][i].tobytes()
+                if bits != NAN.astype(self.plain[name].base).tobytes():
+                    message.setdefault(NOT_FINITE, []).append(f"{name}={bits.hex()}")
+        return messages
+
+    def rows(self, messages: Iterable[Mapping[str, Any]]) -> Rows:
+        """The rows that messages were made of.
+
+        Raises:
+            ValueError: these are no messages of such rows.
+        """
+        given = list(messages)
+        lists = {name: np.full(self.plain[name].shape, NAN) for name in self._lists}
+        absent = dict.fromkeys(self._numbers, NAN) | lists
+        names = [(name, absent.get(name)) for name in self.names]
+        try:
+            values = [tuple(each.get(name, default) for name, default in names) for each in given]
+            with np.errstate(over="raise"):
+                flat = np.array(values, self.plain)
+        except (TypeError, ValueError, ArithmeticError) as error:
+            raise ValueError(f"a row is none: {error}") from None
+        for i, message in enumerate(given):
+            for each in message.get(NOT_FINITE, ()):
+                name, _, bits = each.partition("=")
+                kind = self.plain[name] if name in absent else None
+                if kind is None or len(bits) != 2 * kind.itemsize:
+                    raise ValueError(f"a row has {each[:40]!r} for a number")
+                flat[name][i] = np.frombuffer(bytes.fromhex(bits), kind)[0]
+        return flat.view(self.columns)
+
+
+def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> None:
+    """Refuse columns that no flight of a scenario has in a part of its record.
+
+    There may be more of them, and other figures. Plans may have any number of inputs.
+
+    Raises:
+        ValueError: with the part and the column.
+    """
+    axes = scenario.model.axes
+    match part:
+        case "client":
+            expected = client_columns(axes)
+        case "server":
+            expected = server_columns(axes, scenario.control.scheme)
+        case "plan":
+            expected = plan_columns(axes, 1)
+        case "netem":
+            expected = PACKET_COLUMNS
+        case _:
+            raise ValueError(f"no flight has a part {part[:20]!r}")
+    plain(columns)
+    names = columns.names or ()
+    for name in {*(expected.names or ())} - FIGURES:
+        given = columns[name] if name in names else None
+        if name == "inputs" and given is not None and len(given.shape) == 2:
+            given = np.dtype((given.base, (given.shape[0], 1)))
+        if given != expected[name]:
+            raise ValueError(f"{part}: the column {name} is {given}, expected {expected[name]}")
+    figures = {*names} & FIGURES if part == "server" else set()
+    for name in figures:
+        if columns[name] != np.dtype("<u1" if name == "compared" else "<f8"):
+            raise ValueError(f"{part}: the column {name} is {columns[name]}")
+    if part == "server" and not figures & {"compared", "error"}:
+        raise ValueError("server: no column says what was compared")
+
+
+def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
+    """Refuse rows with values that no flight of a scenario comes to.
+
+    Raises:
+        ValueError: with the part, the column, what it has and what was expected.
+    """
+    most = {
+        "step": int(FLOWN_S_MAX / scenario.control.dt),
+        "begins": int(FLOWN_S_MAX / scenario.control.dt),
+        "delay_ns": DELAY_NS_MAX,
+        "arrived_ns": 2**62,
+        "age_ns": 2**62,
+        "solve_ns": 2**62,
+        **{name: len(words) - 1 for name, words in WORDS.items()},
+    }
+    least = {"age_ns": -1, "solve_ns": -1, "arrived_ns": -(2**62)}
+    for name in (rows.dtype.names or ()) if len(rows) else ():
+        values = rows[name]
+        if values.dtype.kind == "f":
+            finite = np.abs(values[np.isfinite(values)])
+            low, high, bound = 0.0, float(finite.max(initial=0.0)), NUMBER_MAX
+        elif name in most:
+            low, high, bound = int(values.min()), int(values.max()), most[name]
+        else:
+            continue
+        if low < least.get(name, 0) or high > bound:
+            got = low if low < least.get(name, 0) else high
+            raise ValueError(f"{part}: {name}: got {got}, expected {least.get(name, 0)} to {bound}")
+
+
+def readable(rows: Rows) -> Columns:
+    """Plain columns of some rows, with words for modes, and a column for each input of a plan."""
+    table = RowTable(rows.dtype)
+    flat = np.ascontiguousarray(rows).view(table.plain)
+    made: Columns = {}
+    for name in table.names:
+        if table.plain[name].shape:
+            made |= {f"{name}_{k}": each for k, each in enumerate(flat[name].T)}
+        elif name in WORDS:
+            words = WORDS[name]
+            made[name] = np.array(
+                [words.get(number, str(number)) for number in flat[name].tolist()], dtype=np.str_
+            )
+        else:
+            made[name] = flat[name]
+    return made
+
+
+def arrays(rows: Rows) -> Columns:
+    """Plain columns of some rows, those of all axes together as one array.
+
+    `position_x_m` and `position_y_m` become `position_m`, of shape (rows, axes); inputs of plans
+    have the shape (rows, axes, steps).
+    """
+    flat = np.ascontiguousarray(rows).view(plain(rows.dtype))
+    together: dict[str, list[NDArray[Any]]] = {}
+    for name in flat.dtype.names or ():
+        words = name.split("_")
+        if set(words[-2:-1]) & set(AXES):
+            del words[-2]
+        together.setdefault("_".join(words), []).append(flat[name])
+    return {
+        name: each[0] if len(each) == 1 else np.stack(each, axis=1)
+        for name, each in together.items()
+    }
+
+
+def planned(scenario: Scenario, row: np.void) -> Array:
+    """Positions along a plan [m], from the state at its beginning on; shape (steps + 1, axes).
+
+    Args:
+        scenario: what is flown.
+        row: row of the part "plan".
+    """
+    inputs = row["inputs"] + row["disturbance"][:, np.newaxis]
+    model = discretise(scenario.tau_s, scenario.control.dt)
+    return model.roll(row["state"], inputs)[:, :, 0]

@@ -1,0 +1,586 @@
+"""What a page shows of one flight: the last minute of it, made of the frames of its processes.
+
+    (process, Frame) → `State.take` → `State.vehicles`, `State.network`, `State.said`
+
+It holds the same amount of memory after a second as after a day: a ring for each vehicle, one for
+the network, and the newest events. Time is that of the frames; whoever draws says what time it is.
+"""
+
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.figures.colours import AMBER, GREEN, GREY, MODE_COLOURS, RED
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.feed import (
+    FeedError,
+    Figures,
+    Frame,
+    Opened,
+    Rows,
+    Said,
+    columns_of,
+    table,
+)
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, compared
+from skytether.shared.telemetry.record import Rows as Table
+from skytether.shared.wire.protocol import Mode
+from skytether.view.rows import check_columns, check_values, planned
+
+SPAN_S = 60.0
+"""Time that is kept [s]."""
+SLOTS_MAX = 1200
+"""Most steps that are kept of a vehicle; where a minute has more, every second or third is."""
+VEHICLES_MAX = 64
+"""Most vehicles of a flight that are shown."""
+SAID_MAX = 50
+"""Most events that are kept."""
+BIN_NS = 250 * MILLISECOND_NS
+"""Width of a bin of the network's ring [ns]."""
+BINS = int(SPAN_S * SECOND_NS) // BIN_NS
+"""Number of bins of the network's ring."""
+DELAY_BIN_NS = 20 * MILLISECOND_NS
+"""Width of a bin of a histogram of delays [ns]."""
+DELAY_BINS = 100
+"""Number of bins of a histogram of delays; the last takes all that is longer."""
+LED = "reference.points_m"
+"""Key that changes many times a second where a target is led: not worth a sentence each time."""
+LOSS_S = 10.0
+"""Time over which loss is measured [s]."""
+LOSS_HIGH = 0.3
+"""Measured loss above which a link is called degraded."""
+
+VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms")
+"""Columns of a vehicle's ring that are NaN where nothing is known."""
+ROUNDING = 1e-6
+"""Rounding tolerance of a time over the length of a slot."""
+
+DIRECTIONS = {UPLINK: "up", DOWNLINK: "down"}
+"""What the directions are called: up to the vehicle, down from it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """Something in words, and its colour."""
+
+    word: str
+    """One word for it, as in GOOD or BRAKE."""
+    text: str
+    """Sentence that says more, without a full stop."""
+    colour: str
+    """Name of its colour: grey, green, amber, red or blue."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """The last minute of a vehicle on a grid of times; NaN where nothing is known."""
+
+    time_s: Array
+    """Time of flight [s]; shape (n,)."""
+    position: Array
+    """True position [m]; shape (n, axes)."""
+    reference: Array
+    """Desired position as the server knew it then [m]; shape (n, axes)."""
+    figure: Array
+    """What the trigger compares; shape (n,)."""
+    threshold: Array
+    """What it compares that with; shape (n,)."""
+    event: Array
+    """1 where a horizon was sent, 0 elsewhere; shape (n,)."""
+    age_s: Array
+    """Age of the observation behind what is flown [s]; shape (n,)."""
+    solve_ms: Array
+    """Time that both MPCs took [ms]; shape (n,)."""
+
+
+class VehicleTrack:
+    """The last minute of one vehicle.
+
+    Args:
+        number: number of the vehicle.
+        scenario: what it flies.
+    """
+
+    def __init__(self, number: int, scenario: Scenario) -> None:
+        self.number = number
+        self._scenario = scenario
+        steps = max(1, round(SPAN_S / scenario.control.dt))
+        self._stride = -(-steps // SLOTS_MAX)
+        """Steps from one that is kept to the next."""
+        self._slot_s = self._stride * scenario.control.dt
+        self._slots = -(-steps // self._stride)
+        axes = scenario.model.axes
+        self._ring = np.zeros(
+            self._slots,
+            [
+                ("slot", "i8"),
+                ("position", "f8", (axes,)),
+                ("reference", "f8", (axes,)),
+                ("figure", "f8"),
+                ("threshold", "f8"),
+                ("event", "?"),
+                ("age_s", "f8"),
+                ("solve_ms", "f8"),
+            ],
+        )
+        self._empty = np.zeros(1, self._ring.dtype)
+        for name in VALUES:
+            self._empty[name] = np.nan
+        self._ring["slot"] = -1
+        self.row: np.void | None = None
+        """Newest row of the client's part; None without any."""
+        self.planned = 0
+        """Number of steps that the server has planned for, as far as they were seen."""
+        self.sent = 0
+        """Number of horizons that it has sent at them."""
+        self._plan: np.void | None = None
+
+    # -- what comes in -----------------------------------------------------------------------
+
+    def fly(self, rows: Table) -> None:
+        """Take rows of the client's part."""
+        at = self._at(rows["step"])
+        taken = at >= 0
+        ring, at = self._ring, at[taken]
+        ring["position"][at] = rows["state"][taken, :, 0]
+        age_ns = rows["age_ns"][taken]
+        ring["age_s"][at] = np.where(age_ns >= 0, age_ns / SECOND_NS, np.nan)
+        self.row = rows[-1].copy()
+
+    def plan(self, rows: Table) -> None:
+        """Take rows of the server's part."""
+        at = self._at(rows["step"])
+        taken = at >= 0
+        ring, at, rows = self._ring, at[taken], rows[taken]
+        ring["reference"][at] = rows["reference"][:, :, 0]
+        ring["figure"][at] = compared(rows)
+        ring["threshold"][at] = rows["threshold"]
+        np.logical_or.at(ring["event"], at, rows["event"])
+        ring["solve_ms"][at] = np.where(
+            rows["solve_ns"] >= 0, rows["solve_ns"] / MILLISECOND_NS, np.nan
+        )
+        self.planned += len(rows)
+        self.sent += int(rows["event"].sum())
+
+    def lead(self, rows: Table) -> None:
+        """Take rows of the part "plan", of which the newest is shown."""
+        self._plan = rows[-1].copy()
+
+    def _at(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Index in the ring of each step, emptied where it is new; -1 where it is not kept."""
+        slots = steps // self._stride
+        at = slots % self._slots
+        there = np.maximum(self._ring["slot"][at], self._ring["slot"].max() - self._slots)
+        new = slots > there
+        self._ring[at[new]] = self._empty
+        self._ring["slot"][at[new]] = slots[new]
+        return np.where(slots == self._ring["slot"][at], at, -1)
+
+    # -- what is shown -----------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Time of flight of the newest step that is known [s]; 0 before the first."""
+        return max(0.0, float(self._ring["slot"].max()) * self._slot_s)
+
+    @property
+    def mode(self) -> Mode:
+        """What the vehicle does."""
+        return Mode.INIT if self.row is None else Mode(self.row["mode"])
+
+    @property
+    def does(self) -> Word:
+        """What the vehicle does and why, in words."""
+        mode = self.mode
+        if self.row is None:
+            return Word("INIT", "nothing has been heard of it", GREY)
+        does, why = DOES[str(mode)], Reason(self.row["reason"])
+        if mode is Mode.COAST and self.row["covered"]:
+            does = "flies on along its plan"
+        if mode is Mode.TRACK:
+            why = Reason.HORIZON
+        return Word(mode.name, f"{does}: {why}", MODE_COLOURS[mode])
+
+    @property
+    def age_s(self) -> float:
+        """Age of the observation behind what it flies by at its newest step [s]; NaN for none."""
+        if self.row is None or self.row["age_ns"] < 0:
+            return np.nan
+        return float(self.row["age_ns"]) / SECOND_NS
+
+    def trail(self, seconds: float = SPAN_S) -> Array:
+        """True positions of the last seconds, oldest first [m]; NaN in gaps; shape (n, axes)."""
+        position: Array = self._kept(seconds)["position"]
+        return position
+
+    def goals(self, seconds: float = SPAN_S) -> Array:
+        """Desired positions of the last seconds, as `trail` has the true ones [m]."""
+        reference: Array = self._kept(seconds)["reference"]
+        return reference
+
+    def goal(self, seconds: float) -> Array | None:
+        """Newest desired position of the last seconds [m]; None where none is known."""
+        known = self.goals(seconds)
+        known = known[~np.isnan(known[:, 0])]
+        return known[-1] if len(known) else None
+
+    def ahead(self) -> Array:
+        """Positions along the newest plan from the present step on [m]; shape (n, axes).
+
+        There are none where no plan is flown.
+        """
+        axes = self._scenario.model.axes
+        if self._plan is None or (self.row is not None and not self.row["covered"]):
+            return np.empty((0, axes))
+        positions = planned(self._scenario, self._plan)
+        flown = 0 if self.row is None else int(self.row["step"] - self._plan["begins"])
+        return positions[min(max(flown, 0), len(positions)) :]
+
+    def curves(self, points: int, end_s: float | None = None) -> Curves:
+        """The last minute on a grid of so many times.
+
+        Args:
+            points: number of times.
+            end_s: time of flight at which the minute ends [s]; that of the newest step if left out.
+        """
+        end_s = self.time_s if end_s is None else end_s
+        grid_s = end_s + np.linspace(-SPAN_S, 0.0, points)
+        on_grid = self._at_slots(np.floor(grid_s / self._slot_s + ROUNDING).astype(np.int64))
+        sent_s = self._ring["slot"][self._ring["event"]] * self._slot_s
+        event = np.zeros(points)
+        at = np.searchsorted(grid_s, sent_s[sent_s >= grid_s[0]])
+        event[at[at < points]] = 1.0
+        return Curves(
+            time_s=grid_s,
+            event=event,
+            **{name: on_grid[name] for name in VALUES},
+        )
+
+    def error_m(self, seconds: float) -> float:
+        """Root mean square of the distance to the reference in the last seconds [m], or NaN."""
+        kept = self._kept(seconds)
+        away = kept["position"] - kept["reference"]
+        squares = (away**2).sum(axis=1)
+        squares = squares[~np.isnan(squares)]
+        return float(np.sqrt(squares.mean())) if len(squares) else np.nan
+
+    def _kept(self, seconds: float) -> NDArray[np.void]:
+        """Slots of the last seconds, oldest first, without what lies before the first of them."""
+        slots = self._ring["slot"]
+        recent = slots[(slots >= 0) & (slots > slots.max() - seconds / self._slot_s)]
+        return self._at_slots(np.arange(recent.min(), recent.max() + 1) if len(recent) else recent)
+
+    def _at_slots(self, slots: NDArray[np.int64]) -> NDArray[np.void]:
+        """Slots by number; empty ones where nothing is known."""
+        found = self._ring[slots % self._slots]
+        found[(found["slot"] != slots) | (slots < 0)] = self._empty
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """One direction of the network in the last seconds."""
+
+    packets_per_s: float
+    bytes_per_s: float
+    loss: float
+    """Share of its packets that were lost; NaN of none."""
+    delay_ms_p50: float
+    """Median of the delay of those that were not [ms]; NaN of none."""
+    delay_ms_p99: float
+
+
+class Network:
+    """The last minute of the network, in bins of a quarter of a second.
+
+    Args:
+        horizon_bytes: size from which on a packet up carries a horizon [B].
+    """
+
+    def __init__(self, horizon_bytes: int) -> None:
+        self._horizon_bytes = horizon_bytes
+        shape = (BINS, len(DIRECTIONS))
+        self._bin = np.full(BINS, -1, np.int64)
+        self._packets = np.zeros(shape, np.int64)
+        self._bytes = np.zeros(shape, np.int64)
+        self._lost = np.zeros(shape, np.int64)
+        self._delay_ns = np.zeros(shape, np.int64)
+        """Sum of the delays of those that were not lost [ns]."""
+        self._delays = np.zeros((*shape, DELAY_BINS), np.int64)
+        self._horizons = np.zeros((BINS, 2), np.int64)
+        """Packets up that carry a horizon, and their bytes."""
+        self.heard_ns: dict[int, int] = {}
+        """Time at which a packet of each direction last got through [ns]."""
+
+    def take(self, rows: Table, *, time_ns: int) -> None:
+        """Take rows of netem's part."""
+        number = time_ns // BIN_NS
+        at = number % BINS
+        if self._bin[at] != number:
+            if self._bin[at] > number:
+                return
+            self._bin[at] = number
+            for counts in (self._packets, self._bytes, self._lost, self._delay_ns, self._delays):
+                counts[at] = 0
+            self._horizons[at] = 0
+        direction, lost, size = rows["direction"], rows["lost"], rows["bytes"].astype(np.int64)
+        np.add.at(self._packets[at], direction, 1)
+        np.add.at(self._bytes[at], direction, size)
+        np.add.at(self._lost[at], direction, lost)
+        through = ~lost
+        there, delay_ns = direction[through], rows["delay_ns"][through]
+        np.add.at(self._delay_ns[at], there, delay_ns)
+        bins = np.minimum(delay_ns // DELAY_BIN_NS, DELAY_BINS - 1)
+        np.add.at(self._delays[at], (there, bins), 1)
+        planned = (direction == UPLINK) & (size >= self._horizon_bytes)
+        self._horizons[at] += (int(planned.sum()), int(size[planned].sum()))
+        for each in np.unique(there):
+            self.heard_ns[int(each)] = time_ns
+
+    def _since(self, seconds: float, now_ns: int) -> NDArray[np.bool_]:
+        """Which bins are of the last seconds, as far as they are over."""
+        last = now_ns // BIN_NS
+        recent: NDArray[np.bool_] = (self._bin < last) & (
+            self._bin >= last - round(seconds * SECOND_NS / BIN_NS)
+        )
+        return recent & (self._bin >= 0)
+
+    def traffic(self, direction: int, seconds: float, now_ns: int) -> Traffic:
+        """What went one way in the last seconds."""
+        recent = self._since(seconds, now_ns)
+        packets = int(self._packets[recent, direction].sum())
+        lost = int(self._lost[recent, direction].sum())
+        return Traffic(
+            packets_per_s=packets / seconds,
+            bytes_per_s=float(self._bytes[recent, direction].sum()) / seconds,
+            loss=lost / packets if packets else np.nan,
+            delay_ms_p50=self._quantile_ms(recent, direction, 0.5),
+            delay_ms_p99=self._quantile_ms(recent, direction, 0.99),
+        )
+
+    def _quantile_ms(self, recent: NDArray[np.bool_], direction: int, share: float) -> float:
+        counts = self._delays[recent, direction].sum(axis=0).cumsum()
+        if not len(counts) or not counts[-1]:
+            return np.nan
+        index = int(np.searchsorted(counts, share * counts[-1]))
+        return (index + 0.5) * DELAY_BIN_NS / MILLISECOND_NS
+
+    def histogram(self, direction: int, now_ns: int) -> Array:
+        """Number of packets of the last minute by their delay; shape (DELAY_BINS,)."""
+        recent = self._since(SPAN_S, now_ns)
+        return self._delays[recent, direction].sum(axis=0).astype(np.float64)
+
+    def rates(self, direction: int, now_ns: int) -> Array:
+        """Packets in each of the last SPAN_S seconds, oldest first; shape (SPAN_S,)."""
+        return self._by_second(self._packets[:, direction], now_ns)
+
+    def delays_s(self, direction: int, now_ns: int) -> Array:
+        """Mean delay in each of the last SPAN_S seconds [s], NaN of none; shape (SPAN_S,)."""
+        through = self._packets[:, direction] - self._lost[:, direction]
+        total_ns = self._by_second(self._delay_ns[:, direction], now_ns)
+        count = self._by_second(through, now_ns)
+        return np.where(count > 0, total_ns / np.maximum(count, 1), np.nan) / SECOND_NS
+
+    def _by_second(self, counts: NDArray[np.int64], now_ns: int) -> Array:
+        """Sums of counts by the seconds that they are old, oldest first."""
+        recent = self._since(SPAN_S, now_ns)
+        per_second = SECOND_NS // BIN_NS
+        old = (now_ns // BIN_NS - 1 - self._bin[recent]) // per_second
+        sums = np.zeros(int(SPAN_S))
+        np.add.at(sums, len(sums) - 1 - old, counts[recent])
+        return sums
+
+    def horizon_bytes(self, now_ns: int) -> float:
+        """Mean size of the last minute's packets that carry a horizon [B]; NaN of none."""
+        count, size = self._horizons[self._since(SPAN_S, now_ns)].sum(axis=0)
+        return float(size / count) if count else np.nan
+
+
+@dataclass(slots=True)
+class _Process:
+    """A process whose frames come in."""
+
+    opened: Opened
+    columns: dict[str, np.dtype[np.void]]
+    newest_ns: int = 0
+    """Time of its newest frame [ns]."""
+    seen_ns: int = -1
+    """Time up to which what comes has come before [ns]."""
+    figures: dict[str, Any] = field(default_factory=dict)
+
+
+class State:
+    """What is shown of one flight."""
+
+    def __init__(self) -> None:
+        self._processes: dict[str, _Process] = {}
+        self._lost: set[str] = set()
+        self.flights = 0
+        """Number of flights that were begun."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget what was flown."""
+        self.name = ""
+        """Name of the scenario; empty before anything is known."""
+        self.scenario = Scenario()
+        """The scenario, as the process that was heard first flies it."""
+        self.vehicles: dict[int, VehicleTrack] = {}
+        """Vehicles by number."""
+        self.omitted = 0
+        """Rows of vehicles beyond the VEHICLES_MAX that are shown."""
+        self.network = Network(0)
+        self.said: deque[tuple[float, str]] = deque(maxlen=SAID_MAX)
+        """Newest events, oldest first: time of flight [s] and sentence."""
+        self.newest_ns = 0
+        """Time of the newest frame [ns]."""
+        self.begin_ns: int | None = None
+        """Time at which the flight's step 0 began [ns]; None before anything has flown."""
+
+    # -- what comes in -----------------------------------------------------------------------
+
+    def take(self, process: str, frame: Frame) -> None:
+        """Take a frame of a process; what belongs to no flight is left out.
+
+        Raises:
+            ValueError: the frame makes no sense: its process is another version, or none of ours.
+        """
+        if isinstance(frame, Opened):
+            self._open(process, frame)
+            return
+        known = self._processes.get(process)
+        if known is None or frame.time_ns <= known.seen_ns:
+            return
+        known.newest_ns = max(known.newest_ns, frame.time_ns)
+        self.newest_ns = max(self.newest_ns, frame.time_ns)
+        if isinstance(frame, Rows):
+            self._rows(known, frame)
+        elif isinstance(frame, Said):
+            self._said(frame.event, frame.time_ns)
+        elif isinstance(frame, Figures):
+            known.figures = frame.figures
+
+    def lose(self, process: str) -> None:
+        """Note that a process is not heard any more."""
+        self._lost.add(process)
+
+    def _open(self, process: str, opened: Opened) -> None:
+        self._lost.discard(process)
+        known = self._processes.get(process)
+        if known and known.opened.time_ns == opened.time_ns:
+            known.seen_ns = known.newest_ns  # what is kept for those who come late comes again
+            return
+        try:
+            scenario = msgspec.toml.decode(opened.scenario, type=Scenario)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise FeedError(f"got no scenario: {error}") from None
+        if known and process == "client":
+            self._begin()  # another flight
+        if not self.name:
+            self.flights += 1
+            self.name = opened.name
+            self.scenario = scenario
+            terms = self.scenario.control
+            planned = 1 if terms.scheme == "dead_reckoning" else terms.horizon
+            self.network = Network(4 * self.scenario.model.axes * planned)
+        columns: dict[str, np.dtype[np.void]] = {}
+        for part, described in opened.parts.items():
+            with suppress(ValueError):
+                found = columns_of(described)
+                check_columns(part, found, self.scenario)
+                columns[part] = found
+        self._processes[process] = _Process(opened, columns)
+
+    def _rows(self, process: _Process, frame: Rows) -> None:
+        columns = process.columns.get(frame.part)
+        if columns is None:
+            return
+        rows = table(frame.rows, columns)
+        check_values(frame.part, rows, self.scenario)
+        if not len(rows):
+            return
+        if frame.part == "netem":
+            self.network.take(rows, time_ns=frame.time_ns)
+            return
+        if self.begin_ns is None:
+            self.begin_ns = frame.time_ns - int(rows["step"][-1]) * self.scenario.dt_ns
+        for number in np.unique(rows["vehicle"]).tolist():
+            track = self._track(number)
+            if track is None:
+                self.omitted += 1
+                continue
+            own = rows[rows["vehicle"] == number]
+            match frame.part:
+                case "client":
+                    track.fly(own)
+                case "server":
+                    track.plan(own)
+                case "plan":
+                    track.lead(own)
+
+    def _track(self, number: int) -> VehicleTrack | None:
+        track = self.vehicles.get(number)
+        if track is None and len(self.vehicles) < VEHICLES_MAX:
+            track = self.vehicles[number] = VehicleTrack(number, self.scenario)
+        return track
+
+    def _said(self, event: Event, time_ns: int) -> None:
+        moves = isinstance(event, Changed) and event.key == LED
+        if moves or isinstance(event, Counted | Listening | Plaintext):
+            return
+        self.said.append((self.time_s(time_ns), str(event).splitlines()[0]))
+
+    # -- what is shown -----------------------------------------------------------------------
+
+    def time_s(self, time_ns: int) -> float:
+        """Time of flight [s] at a time [ns]; 0 before it has begun."""
+        return 0.0 if self.begin_ns is None else (time_ns - self.begin_ns) / SECOND_NS
+
+    @property
+    def title(self) -> str:
+        """What the scenario shows, or else its name."""
+        return self.scenario.title or self.name
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Names of the processes that are not heard any more."""
+        return tuple(sorted(self._lost))
+
+    def figures(self, process: str) -> dict[str, Any]:
+        """Newest figures of a process; empty before there are any."""
+        known = self._processes.get(process)
+        return known.figures if known else {}
+
+    @property
+    def every_step(self) -> float:
+        """Packets a second that sending at every step would take, for all vehicles."""
+        return max(1, len(self.vehicles)) / self.scenario.control.dt
+
+    def link(self, number: int, now_ns: int) -> Word:
+        """How the link of a vehicle does, in words."""
+        track = self.vehicles.get(number)
+        if track is None or track.row is None or track.mode is Mode.INIT:
+            return Word("NONE", "there is no session yet", GREY)
+        silent_ns = self.scenario.link.timeout_s * SECOND_NS
+        for direction, name in DIRECTIONS.items():
+            heard_ns = self.network.heard_ns.get(direction)
+            if heard_ns is not None and now_ns - heard_ns > silent_ns:
+                ago_s = (now_ns - heard_ns) / SECOND_NS
+                return Word("CUT", f"nothing gets through {name} for {ago_s:.0f} s", RED)
+        if track.row["reason"] == Reason.LOST:
+            return Word("CUT", str(Reason.LOST), RED)
+        for direction, name in DIRECTIONS.items():
+            traffic = self.network.traffic(direction, LOSS_S, now_ns)
+            if traffic.loss > LOSS_HIGH:
+                return Word("DEGRADED", f"{traffic.loss:.0%} of what goes {name} is lost", AMBER)
+        if track.age_s > self.scenario.link.age_max_s / 2:
+            return Word("DEGRADED", f"what is flown by is {track.age_s:.1f} s old", AMBER)
+        return Word("GOOD", "packets come through both ways", GREEN)

@@ -1,0 +1,181 @@
+"""What a page says of a flight, as HTML."""
+
+import math
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.view.state import LOSS_S, State, Word
+
+CSS = {
+    "grey": "var(--mantine-color-gray-6)",
+    "green": "var(--mantine-color-green-8)",
+    "amber": "var(--mantine-color-orange-8)",
+    "red": "var(--mantine-color-red-8)",
+    "blue": "var(--mantine-color-blue-7)",
+    "violet": "var(--mantine-color-violet-7)",
+}
+"""Colours of words, by name."""
+NEWEST = 3
+"""Number of events that stand beside the state of a vehicle."""
+SAID_SHOWN = 50
+"""Most events that are shown."""
+
+FLOWN_S = "data-flown-s"
+"""Attribute that tells programs the time of flight [s]."""
+
+_BODY = "font-size:0.85em;line-height:1.45;padding:0 0.6em;color:var(--mantine-color-text)"
+_DIM = "color:var(--mantine-color-dimmed)"
+
+
+def badge(word: Word) -> str:
+    """A word in its colour, and the sentence behind it."""
+    chip = (
+        f"background:{CSS[word.colour]};color:#fff;border-radius:0.25em;padding:0.05em 0.5em;"
+        "font-weight:600;margin-right:0.5em;display:inline-block"
+    )
+    return f'<span style="{chip}">{escape(word.word)}</span>{escape(word.text)}'
+
+
+def number(value: float, form: str, unit: str = "") -> str:
+    """A number, or a dash where there is none."""
+    return "–" if np.isnan(value) else f"{value:{form}}{unit}"
+
+
+def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
+    """What a vehicle does and how its link is, in words and numbers."""
+    if not state.name:
+        return f'<div style="{_BODY}">{escape(title)} Nothing has been heard of a flight yet.</div>'
+    track = state.vehicles.get(vehicle)
+    head = f"<b>{escape(title or state.title)}</b>"
+    if track is None:
+        return f'<div style="{_BODY}">{head}: no vehicle {vehicle} has been heard of yet.</div>'
+    rows = [("time of flight", f"{track.time_s:.0f} s of {state.scenario.duration:g} s")]
+    rows.append(("off the reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
+    rows.append(("age of what is flown by", number(track.age_s, ".2f", " s")))
+    rows += _autopilot(state, vehicle)
+    rows += _network(state, now_ns)
+    curves_ms = track.curves(60).solve_ms
+    solved = curves_ms[~np.isnan(curves_ms)]
+    deadline_ms = state.scenario.dt_ns / MILLISECOND_NS
+    if len(solved):
+        p99 = np.quantile(solved, 0.99)
+        rows.append(("solving, p99", f"{p99:.2f} of {deadline_ms:g} ms"))
+    lines = "".join(
+        f'<tr><td style="{_DIM};padding-right:0.8em;vertical-align:top">{escape(name)}</td>'
+        f"<td>{escape(value)}</td></tr>"
+        for name, value in rows
+    )
+    gone = ""
+    if state.lost:
+        gone = f'<div style="color:{CSS["red"]}">no feed of {", ".join(state.lost)}</div>'
+    return (
+        f'<div style="{_BODY}" class="skytether-status" {FLOWN_S}="{track.time_s:.0f}">{head}'
+        f"<div>{badge(track.does)}</div>"
+        f'<div style="margin:0.3em 0">{badge(_link(state, vehicle, now_ns))}</div>{gone}'
+        f'<table style="border-spacing:0">{lines}</table>'
+        f'<div style="{_DIM};margin-top:0.3em">{_newest(state)}</div></div>'
+    )
+
+
+def _newest(state: State) -> str:
+    """The last few events, newest first."""
+    return "".join(
+        f"<div>{time_s:.1f} s {escape(text)}</div>"
+        for time_s, text in list(state.said)[: -NEWEST - 1 : -1]
+    )
+
+
+def _link(state: State, vehicle: int, now_ns: int) -> Word:
+    word = state.link(vehicle, now_ns)
+    return Word(f"link {word.word.lower()}", word.text, word.colour)
+
+
+def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
+    """Rows of what the vehicle's autopilot says of itself; none without one."""
+    told = _group(_group(state.figures("client"), "by_vehicle", str(vehicle)), "autopilot")
+    if not told:
+        return []
+    armed = "armed" if told.get("armed") else "disarmed"
+    charge, volts = 100.0 * _told(told, "battery"), _told(told, "voltage_v")
+    place = _group(told, "home")
+    home = (number(_told(place, f"{each}_deg"), ".6f", "°") for each in ("latitude", "longitude"))
+    return [
+        ("autopilot", f"{told.get('mode', '–')}, {armed}"),
+        ("battery", f"{number(charge, '.0f', ' %')}, {number(volts, '.1f', ' V')}"),
+        ("home", ", ".join(home)),
+    ]
+
+
+def _group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
+    """A group of figures within others; empty where there is none."""
+    for name in names:
+        found = figures.get(name)
+        figures = found if isinstance(found, dict) else {}
+    return figures
+
+
+def _told(figures: dict[str, Any], name: str) -> float:
+    """A figure; NaN where there is none."""
+    value = figures.get(name)
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
+    """Rows of the network's table."""
+    rows = []
+    for direction, name in ((UPLINK, "up"), (DOWNLINK, "down")):
+        traffic = state.network.traffic(direction, LOSS_S, now_ns)
+        rows.append(
+            (
+                name,
+                f"{traffic.packets_per_s:.1f} packets/s, {traffic.bytes_per_s / 1e3:.2f} kB/s",
+            )
+        )
+        if direction == UPLINK:
+            size = state.network.horizon_bytes(now_ns)
+            if not np.isnan(size):
+                rate = state.every_step
+                every = f"{rate:.0f} packets/s, {rate * size / 1e3:.2f} kB/s"
+                rows.append(("up, at every step", every))
+    lost, delays = [], []
+    for direction, name in ((UPLINK, "up"), (DOWNLINK, "down")):
+        traffic = state.network.traffic(direction, LOSS_S, now_ns)
+        lost.append(f"{number(100 * traffic.loss, '.0f')} % {name}")
+        p50, p99 = number(traffic.delay_ms_p50, ".0f"), number(traffic.delay_ms_p99, ".0f")
+        delays.append(f"{p50}, {p99} {name}")
+    rows.append((f"lost, last {LOSS_S:.0f} s", ", ".join(lost)))
+    rows.append(("delay p50, p99 [ms]", "; ".join(delays)))
+    return rows
+
+
+def said(states: Sequence[tuple[str, State]]) -> str:
+    """The newest events, newest first, a line each."""
+    events = [
+        (time_s, f"{title} {text}".strip())
+        for title, state in states
+        for time_s, text in state.said
+    ]
+    events.sort(key=lambda each: each[0], reverse=True)
+    lines = "".join(
+        f'<div><span style="{_DIM}">{time_s:.1f} s</span> {escape(text)}</div>'
+        for time_s, text in events[:SAID_SHOWN]
+    )
+    return f'<div style="{_BODY};max-height:45vh;overflow-y:auto">{lines or "Nothing yet."}</div>'
+
+
+def note(text: str) -> str:
+    """A remark."""
+    return f'<div style="{_BODY};{_DIM}">{escape(text)}</div>'
+
+
+def answer(text: str, *, refused: bool) -> str:
+    """What was answered to a request; nothing before any."""
+    if not text:
+        return ""
+    colour = CSS["red"] if refused else CSS["green"]
+    return f'<div style="{_BODY};color:{colour}">{escape(text)}</div>'

@@ -1,0 +1,247 @@
+"""A flight with a scripted autopilot in virtual time: server, netem, client and autopilot."""
+
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.faults import parse as parse_fault
+from skytether.autopilot.flavours import FlavourName
+from skytether.client import vehicles
+from skytether.client.endpoint import Client
+from skytether.mavlink.codec import Codec, Message
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.events import Event
+from skytether.shared.scenario.reading import check
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.sim.world import Clock, World
+
+SAFE: dict[FlavourName, dict[str, float]] = {
+    "ardupilot": {"GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5, "SYSID_MYGCS": 245},
+    "px4": {"COM_OBL_RC_ACT": 4},
+}
+"""Parameters with which a vehicle is flown."""
+OFFSET_NS = 86_400_000_000_000
+FIGURE = {
+    "shape": "figure-eight",
+    "radius_m": 5.0,
+    "period_s": 30.0,
+    "altitude_m": 2.0,
+}
+NONE = {"delay": "none", "loss": 0.0}
+
+
+def scenario(**table: Any) -> Scenario:
+    """A figure eight in space over a network without delay, with some keys changed."""
+    default: dict[str, Any] = {
+        "duration": 10.0,
+        "control": {"dt": 0.05},
+        "model": {"axes": 3, "tau_s": [0.5, 0.5, 0.25], "u_max": [3.0]},
+        "reference": FIGURE,
+        "vehicle": {"kind": "mavlink", "address": "udpout:autopilot:0"},
+        "network": {"uplink": NONE, "downlink": NONE},
+    }
+    for key, value in table.items():
+        default[key] = default.get(key, {}) | value if isinstance(value, dict) else value
+    return check(default, "test")
+
+
+class Tap(Endpoint):
+    """An endpoint that is overheard, and whose datagrams can be lost or made.
+
+    Args:
+        inner: the endpoint.
+    """
+
+    def __init__(self, inner: Endpoint) -> None:
+        super().__init__()
+        self.inner = inner
+        self._heard: list[tuple[int, bytes]] = []
+        """Datagrams that came, and when [ns]."""
+        self.deaf = self.dumb = False
+        """Whether nothing comes to it, or nothing of it leaves."""
+        self.alter: Callable[[Message], bytes | None] | None = None
+        """What is sent in place of each of its messages; None leaves it as it is."""
+        self.extra: list[bytes] = []
+        """Datagrams that are sent beside its own."""
+        self._reader = Codec(9, 9)
+
+    def heard(self, since_ns: int = 0) -> list[tuple[int, Message]]:
+        """Messages that came, and when [ns]."""
+        return [
+            (time_ns, message)
+            for time_ns, payload in self._heard
+            if time_ns >= since_ns
+            for message in self._reader.decode(payload)
+        ]
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        self._heard.append((now_ns, datagram.payload))
+        if not self.deaf:
+            self.inner.receive(datagram, now_ns=now_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        self.inner.wake(now_ns=now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """See `Endpoint`."""
+        return self.inner.next_wake_ns()
+
+    def outbox(self) -> list[Datagram]:
+        """See `Endpoint`."""
+        sent = self.inner.outbox()
+        if self.alter is not None:
+            sent = [self._altered(datagram) for datagram in sent]
+        if self.dumb:
+            return []
+        return sent + [Datagram(payload, ("client", 1)) for payload in self._take()]
+
+    def _altered(self, datagram: Datagram) -> Datagram:
+        assert self.alter is not None
+        (message,) = self._reader.decode(datagram.payload)
+        altered = self.alter(message)
+        return datagram if altered is None else datagram._replace(payload=altered)
+
+    def _take(self) -> list[bytes]:
+        extra, self.extra = self.extra, []
+        return extra
+
+    def events(self) -> Sequence[Event]:
+        """See `Endpoint`."""
+        return self.inner.events()
+
+
+class Air:
+    """A flight.
+
+    Args:
+        flavour: which autopilot.
+        faults: what goes wrong, as on the command line.
+        parameters: the autopilot's, in place of safe ones.
+        sets: whether the client may set them.
+        host: name of the autopilot's host; "line" is that of a line of bytes.
+        ready_s: time until the autopilot can be armed [s].
+        drift_ppm: drift of the client's clock.
+        table: keys of the scenario.
+    """
+
+    def __init__(
+        self,
+        flavour: FlavourName = "ardupilot",
+        *,
+        faults: tuple[str, ...] = (),
+        parameters: dict[str, float] | None = None,
+        sets: bool = False,
+        host: str = "autopilot",
+        ready_s: float = 1.0,
+        drift_ppm: float = 0.0,
+        **table: Any,
+    ) -> None:
+        self.scenario = scenario(**table)
+        self.autopilot = Autopilot(
+            self.scenario, flavour, ready_s=ready_s, faults=[parse_fault(each) for each in faults]
+        )
+        self.autopilot.flight.parameters |= SAFE[flavour] if parameters is None else parameters
+        self.tap = Tap(self.autopilot)
+        self.events: list[tuple[int, str, Event]] = []
+        self.world = World(lambda time_ns, host, event: self.events.append((time_ns, host, event)))
+        self._sink = io.BytesIO()
+        columns = client_columns(self.scenario.model.axes)
+        flies = vehicles.make(self.scenario, 1)
+        if sets:
+            assert flies.set_parameters()
+        self.flies: Any = flies
+        self.client = Client(
+            self.scenario,
+            flies,
+            server=("netem", 0),
+            vehicle=1,
+            boot_id=2**60,
+            recorder=Recorder(columns, self._sink),
+        )
+        clock = Clock(OFFSET_NS, round(1000 * drift_ppm))
+        self.world.add(host, self.tap)
+        self.world.add("netem", Proxy(self.scenario, server=("server", 0), flows=1))
+        self.world.add("client", self.client, clock=clock)
+        server = Server(self.scenario, boot_id=2**60, entropy=bytes)
+        self.world.add("server", server, clock=Clock(OFFSET_NS))
+
+    @property
+    def flight(self) -> Any:
+        """The scripted flight, as it truly is."""
+        return self.autopilot.flight
+
+    @property
+    def now_s(self) -> float:
+        """Time of the world [s]."""
+        return self.world.now_ns / 1e9
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
+        """Let time pass, until something is so; returns how much has passed [s]."""
+        began_ns, over = self.world.now_ns, []
+        until_ns = began_ns + round(1e9 * seconds)
+        # An action ends it: what lies behind a world's own limit is lost for the next run.
+        self.world.at(until_ns, lambda: over.append(True))
+        self.world.run(lambda: bool(over) or until(), limit_ns=until_ns)
+        return (self.world.now_ns - began_ns) / 1e9
+
+    def fly(self, seconds: float = 60.0) -> None:
+        """Let time pass until the pilot flies."""
+        self.run(seconds, lambda: bool(self.client._pilot.step))
+        assert self.client._pilot.step, [str(event) for _, _, event in self.events]
+
+    def end(self, seconds: float = 120.0) -> None:
+        """Let time pass until the client has ended."""
+        self.run(seconds, lambda: self.client.finished)
+        assert self.client.finished, self.said("client")[-5:]
+
+    def rows(self) -> Rows:
+        """What the client recorded."""
+        return parse(self._sink.getvalue())
+
+    def said(self, host: str = "client") -> list[str]:
+        """Sentences of a host's events."""
+        return [str(event) for _, name, event in self.events if name == host]
+
+    def of(self, kind: type[Event]) -> list[Any]:
+        """The client's events of a kind."""
+        return [event for _, name, event in self.events if name == "client" and type(event) is kind]
+
+    def heard(self, kind: str, since_ns: int = 0) -> list[tuple[int, Message]]:
+        """Messages of a kind that came to the autopilot."""
+        heard = self.tap.heard(since_ns)
+        return [(time_ns, each) for time_ns, each in heard if each.get_type() == kind]
+
+    def setpoints(self, since_ns: int = 0) -> list[tuple[int, Message]]:
+        """Setpoints that came to the autopilot, and when [ns]."""
+        return self.heard("SET_POSITION_TARGET_LOCAL_NED", since_ns)
+
+    def commands(self, command: int) -> list[Message]:
+        """Commands of a number that came to the autopilot."""
+        return [each for _, each in self.heard("COMMAND_LONG") if each.command == command]
+
+    def figures(self) -> dict[str, Any]:
+        """What the client counts of its autopilot."""
+        return self.client.told()["autopilot"]
+
+    def rmse(self, settle_s: float = 5.0) -> float:
+        """Error in the plane between the truth and what was desired, rms [m]."""
+        rows = self.rows()
+        dt = self.scenario.control.dt
+        times = rows["step"] * dt
+        wanted = self.scenario.make_reference()(times)[:, :2, 0]
+        error = rows["state"][:, :2, 0] - wanted
+        return float(np.sqrt(np.mean(np.sum(error[times > settle_s] ** 2, axis=1))))
+
+    def json(self) -> list[dict[str, Any]]:
+        """The client's events, as a program reads them."""
+        told = [event for _, name, event in self.events if name == "client"]
+        return [msgspec.json.decode(msgspec.json.encode(event)) for event in told]

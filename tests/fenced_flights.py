@@ -1,0 +1,118 @@
+"""Flights with a fence, of vehicles unlike their models, in wind and with hostile inputs.
+
+`python tests/fenced_flights.py --count 10000` flies as many, and tells how far over the fence the
+worst of them came.
+"""
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from skytether.client.fence import Fence
+from skytether.client.navigation import Navigation
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.weather import Weather
+from skytether.client.vehicle import Measurement
+from skytether.shared.base.chance import stream
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+
+FLIGHT_S = 20.0
+"""Length of a flight [s]."""
+BOX_M = 6.0
+"""Half the width of the box [m]."""
+
+
+def scenario(**sections: Any) -> Scenario:
+    """The scenario demo, with other keys in its sections."""
+    table = reading.to_table(reading.load("demo")) | {"duration": 30.0}
+    for section, values in sections.items():
+        table[section] = table[section] | values
+    return reading.check(table, "test")
+
+
+class Gusts(Weather):
+    """Wind that turns round at the worst of times: it blows towards the nearest bound, or away."""
+
+    def __init__(self, flown: Scenario, rng: np.random.Generator, plant_x: list[Any]) -> None:
+        super().__init__(flown, rng)
+        self._rng, self._wind = rng, flown.fence.wind_mps
+        self.x = plant_x
+        self._towards = 1.0
+
+    def blow(self) -> tuple[list[float], list[tuple[float, float]]]:
+        """What acts like an input, of each axis [m/s]; nothing shoves."""
+        if self._rng.random() < 0.05:
+            self._towards = self._rng.choice([-1.0, 1.0, 1.0])
+        wind = [float(np.sign(p)) * self._wind * self._towards / 2**0.5 for p, _ in self.x]
+        return wind, []
+
+
+def random_scenario(rng: np.random.Generator) -> Scenario:
+    """A vehicle that is not quite like its model, in a box or a circle."""
+    tau, late, u_max = rng.uniform(0.3, 1.0), rng.uniform(0.0, 0.4), rng.uniform(1.0, 5.0)
+    truth = {
+        "tau_s": [tau * rng.uniform(0.7, 1.3)],
+        "gain": [rng.uniform(0.8, 1.2)],
+        "dead_time_s": [max(0.0, late + rng.uniform(-0.1, 0.1))],
+        "brake_mps2": rng.uniform(0.5, 3.0),
+        "start_m": rng.uniform(-0.5, 0.5, 2).tolist(),
+    }
+    speed = rng.uniform(0.5, 8.0)
+    wind = rng.uniform(0.0, 0.5) * min(2.0, u_max, speed)
+    box = {"low_m": [-BOX_M, -BOX_M], "high_m": [BOX_M, BOX_M]}
+    bounds = box if rng.random() < 0.5 else {"radius_m": BOX_M}
+    return scenario(
+        model={"tau_s": [tau], "u_max": [u_max], "gain": [1.0], "dead_time_s": [late]},
+        control={"horizon": 110},
+        reference={"shape": "hover", "points_m": [[0.0, 0.0]]},
+        vehicle=truth,
+        fence={**bounds, "wind_mps": wind, "speed_mps": speed},
+    )
+
+
+def furthest_m(seed: int, *, fences: type[Fence] = Fence) -> float:
+    """How far over its fence hostile inputs get a vehicle [m]; negative where they do not."""
+    flown = random_scenario(np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    plant = FirstOrderPlant(flown, Weather(flown, stream(1, "wind")))
+    plant.weather = Gusts(flown, rng, plant.x)
+    known, fence = Navigation(flown), fences(flown)
+    u_max, home = flown.u_max.tolist(), np.array([p for p, _ in plant.x])
+    u, worst = np.zeros(2), -np.inf
+    wanted = rng.uniform(-1.0, 1.0, 2) * flown.u_max
+    for step in range(round(FLIGHT_S / flown.control.dt)):
+        state = ([p for p, _ in plant.x], [v for _, v in plant.x])
+        now_ns = step * flown.dt_ns
+        known.advance([Measurement(now_ns, *state)], u, now_ns=now_ns)
+        if rng.random() < 0.03:
+            far = rng.random() < 0.7
+            wanted = (rng.choice([-1, 1], 2) if far else rng.uniform(-1, 1, 2)) * flown.u_max
+        u = np.array(fence.limited(wanted.tolist(), known.predicted, u_max))
+        assert np.all(np.abs(u) <= flown.u_max + 1e-9)
+        assert np.hypot(*u) <= flown.fence.speed_mps + 1e-9
+        plant.advance(u)
+        position = np.array(state[0])
+        over = np.hypot(*(position - home)) - BOX_M
+        if not flown.fence.radius_m:
+            over = np.abs(position).max() - BOX_M
+        worst = max(worst, float(over))
+    return worst
+
+
+def main() -> None:
+    """Fly as many as are asked for, and tell how the worst of them ended."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--count", type=int, default=10_000)
+    parser.add_argument("--jobs", type=int, default=2)
+    options = parser.parse_args()
+    with ProcessPoolExecutor(options.jobs) as pool:
+        over = np.array(list(pool.map(furthest_m, range(options.count), chunksize=50)))
+    told = f"worst {over.max():.3f} m (seed {over.argmax()}), median {np.median(over):.3f} m"
+    print(f"{len(over)} flights, {(over > 0.0).sum()} over the fence: {told}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""A trigger, a reference and a vehicle of a package of its own."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from skytether.plugin import (
+    Measurement,
+    Reference,
+    Scenario,
+    Situation,
+    Vehicle,
+    Verdict,
+    above,
+    reference,
+    trigger,
+    vehicle,
+)
+
+
+@trigger
+def slip(now: Situation, mps: Annotated[float, Meta(ge=0)] = 0.3) -> Verdict:
+    """Sends where the velocity is off its plan by more than so many m/s."""
+    off = now.estimate[:, :, 1] - now.planned[:, :, 1]
+    return above(now, np.linalg.norm(off, axis=1), mps)
+
+
+@reference
+def slope(scenario: Scenario, mps: Annotated[float, Meta(ge=-1, le=1)]) -> Reference:
+    """Straight line along x, at so many m/s."""
+
+    def at(t: NDArray[np.float64]) -> NDArray[np.float64]:
+        state = np.zeros((*np.shape(t), scenario.model.axes, 2))
+        state[..., 0, 0], state[..., 0, 1] = mps * np.clip(t, 0.0, 1000.0), mps
+        return state
+
+    return at
+
+
+@vehicle
+class Rail(Vehicle):
+    """Vehicle that has any velocity at once, and measures its state every 30 ms."""
+
+    def __init__(self, scenario: Scenario, _: int) -> None:
+        start = scenario.make_reference()(np.zeros(()))
+        self._position, self._velocity = start[:, 0], np.zeros(scenario.model.axes)
+        self._measured_ns: int | None = None
+
+    def fly(self, velocity: NDArray[np.float64]) -> None:
+        """Fly with this velocity from the measurement on that comes next [m/s]."""
+        self._velocity = velocity
+
+    def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
+        """States at all times that are due by now."""
+        told = []
+        while self._measured_ns is None or self._measured_ns + 30_000_000 <= now_ns:
+            if self._measured_ns is not None:
+                self._position = self._position + 0.03 * self._velocity
+            self._measured_ns = (self._measured_ns or now_ns - 30_000_000) + 30_000_000
+            state = self._position.tolist(), self._velocity.tolist()
+            told.append(Measurement(self._measured_ns, *state))
+        return told

@@ -1,0 +1,753 @@
+"""A vehicle with an autopilot: the client flies the scripted ones, in virtual time.
+
+`tests/airborne.py` has the world. Each row of the failsafe on the autopilot's side, each refusal,
+and each kind of traffic that is not its own is met here.
+"""
+
+import numpy as np
+import pytest
+
+from airborne import SAFE, Air, scenario
+from skytether.autopilot.flavours import FlavourName
+from skytether.autopilot.flavours import Mode as Flown
+from skytether.client import vehicles
+from skytether.client.mavlink.port import VELOCITY_ALONE
+from skytether.mavlink.codec import Codec, Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.aboard import (
+    AutopilotFound,
+    AutopilotRefused,
+    AutopilotText,
+    NotTakenOff,
+    ParametersRead,
+    ParametersSet,
+    ParametersUnsafe,
+)
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import ModeChanged
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Mode
+
+BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
+SECOND = 1_000_000_000
+ARM, TAKE_OFF, SET_MODE = 400, 22, 176
+
+
+@pytest.fixture(scope="module", params=BOTH)
+def flown(request: pytest.FixtureRequest) -> Air:
+    """A flight of 12 s to its end, with a client whose clock drifts."""
+    air = Air(request.param, duration=12.0, drift_ppm=50.0)
+    air.fly()
+    air.end()
+    return air
+
+
+# A flight
+
+
+def test_a_flight_follows_its_reference(flown: Air) -> None:
+    """Armed, taken off, flown, landed and disarmed; the pilot's error is the model's own."""
+    assert flown.client.failure is None
+    assert flown.rmse() < 1.0
+    assert not flown.flight.armed
+    assert flown.flight.position()[2] < 0.05
+
+
+def test_setpoints_are_velocities_alone_at_the_rate_of_steps(flown: Air) -> None:
+    """Neither position nor yaw is told; there are 20 a second in flight, and none after it."""
+    sent = flown.setpoints()
+    masks = {(each.type_mask, each.coordinate_frame) for _, each in sent}
+    assert masks == {(VELOCITY_ALONE, dialect.MAV_FRAME_LOCAL_NED)}
+    times = np.array([time_ns for time_ns, _ in sent])
+    assert np.diff(times)[20:].max() < 0.06 * SECOND
+    assert np.diff(times)[20:].min() > 0.019 * SECOND
+    landing = flown.heard("COMMAND_LONG")[-1]
+    assert landing[1].command == SET_MODE
+    assert times[-1] <= landing[0]
+
+
+def test_no_setpoint_but_a_zero_comes_before_the_climb_is_over(flown: Air) -> None:
+    """PX4 needs a stream of zeros before OFFBOARD; ArduCopter is told nothing at all."""
+    (began_ns,) = [
+        time_ns for time_ns, _, event in flown.events if type(event).__name__ == "Flying"
+    ]
+    before = [each for time_ns, each in flown.setpoints() if time_ns < began_ns]
+    assert all((each.vx, each.vy, each.vz) == (0.0, 0.0, 0.0) for each in before)
+    assert bool(before) == (flown.flight.flavour.title == "PX4")
+
+
+def test_one_heartbeat_a_second_is_that_of_an_onboard_computer(flown: Air) -> None:
+    """From the first moment to the last, whatever else happens."""
+    beats = flown.heard("HEARTBEAT")
+    assert {(each.type, each.get_srcSystem(), each.get_srcComponent()) for _, each in beats} == {
+        (dialect.MAV_TYPE_ONBOARD_CONTROLLER, 245, 191)
+    }
+    times = np.array([time_ns for time_ns, _ in beats])
+    assert np.all(np.abs(np.diff(times) - SECOND) < 0.11 * SECOND)
+    assert abs(times[-1] - flown.world.now_ns) < 1.2 * SECOND
+
+
+def test_measurements_are_those_of_their_stamps(flown: Air) -> None:
+    """Altitude and all; what the client knows is 20 ms old at most, and nothing was dropped."""
+    rows = flown.rows()
+    assert np.isfinite(rows["measured"]).all()
+    told = flown.figures()
+    assert told["measurements"] > 500
+    assert {name: count for name, count in told["dropped"].items() if count} == {}
+    assert rows["estimate"][0, 2, 0] == pytest.approx(2.0, abs=0.35)
+    assert told["drift_ppm"] == pytest.approx(50.0, abs=5.0)
+
+
+def test_the_way_into_the_air_is_the_autopilots_own(flown: Air) -> None:
+    """Commands in their order, each once: the autopilot does them at once."""
+    asked = [each.command for _, each in flown.heard("COMMAND_LONG")]
+    way = [command for command in asked if command in (ARM, TAKE_OFF, SET_MODE)]
+    in_order = {"ArduCopter": [SET_MODE, ARM, TAKE_OFF], "PX4": [ARM, TAKE_OFF, SET_MODE]}
+    assert way == [*in_order[flown.flight.flavour.title], SET_MODE]
+
+
+def test_what_the_autopilot_is_and_does_in_silence_is_told(flown: Air) -> None:
+    """Before anything is armed; a parameter that it does not have is told as such."""
+    ((found,), (read,)) = flown.of(AutopilotFound), flown.of(ParametersRead)
+    assert found.name.startswith(flown.flight.flavour.title)
+    said = str(read)
+    for name, value in SAFE["px4" if found.name.startswith("PX4") else "ardupilot"].items():
+        assert f"{name} = {value:g}: " in said
+    assert ("COM_OBL_ACT = missing" in said) == found.name.startswith("PX4")
+    kinds = [type(event).__name__ for _, host, event in flown.events if host == "client"]
+    assert kinds.index("ParametersRead") < kinds.index("AutopilotText")
+
+
+def test_figures_have_what_a_pilot_looks_at(flown: Air) -> None:
+    """Battery, mode, arming, home and fence."""
+    told = flown.figures()
+    assert told["mode"] in ("LAND", "AUTO.LAND")
+    assert (told["armed"], told["garbage_bytes"]) == (0, 0)
+    assert 0.9 < told["battery"] <= 1.0
+    assert told["home"]["altitude_m"] == pytest.approx(flown.flight.flavour.home[2])
+    assert set(told["fence"]) & {"FENCE_ALT_MAX", "GF_MAX_VER_DIST"}
+
+
+# Parameters
+
+
+@pytest.mark.parametrize(
+    ("flavour", "wrong"),
+    [
+        ("ardupilot", {"GUID_TIMEOUT": 3.0}),
+        ("ardupilot", {"GUID_TIMEOUT": 0.0}),
+        ("ardupilot", {"FS_GCS_ENABLE": 0}),
+        ("ardupilot", {"FS_GCS_ENABLE": 7}),
+        ("ardupilot", {"SYSID_MYGCS": 255}),
+        ("ardupilot", {"FS_GCS_TIMEOUT": 60.0}),
+        ("px4", {"COM_OF_LOSS_T": 2.0}),
+        ("px4", {"COM_OBL_RC_ACT": 0}),
+        ("px4", {"COM_OBL_RC_ACT": 5}),
+        ("px4", {"COM_OBL_RC_ACT": 7}),
+        ("px4", {"NAV_DLL_ACT": 6}),
+    ],
+)
+def test_an_unsafe_parameter_is_a_line_and_nothing_is_armed(
+    flavour: FlavourName, wrong: dict[str, float]
+) -> None:
+    """The line has name, value and what to set; with leave to set it, it is set and flown."""
+    air = Air(flavour, parameters=SAFE[flavour] | wrong)
+    air.end(20.0)
+    failure = air.client.failure
+    assert isinstance(failure, ParametersUnsafe)
+    ((name, value),) = wrong.items()
+    (line,) = str(failure).splitlines()
+    assert line.startswith(f"vehicle 1: {name} = {value:g}: ")
+    assert ": set " in line
+    assert not air.commands(ARM)
+    assert not air.commands(SET_MODE)
+    assert not air.heard("PARAM_SET")
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_parameters_are_set_and_read_back_where_that_is_allowed(flavour: FlavourName) -> None:
+    """Those alone that are not safe, though an answer is lost; then it is ready."""
+    air = Air(flavour, parameters={}, sets=True)
+    lost: list[bytes] = []
+
+    def lose(message: Message) -> bytes | None:
+        if message.get_type() == "PARAM_VALUE" and air.heard("PARAM_SET") and not lost:
+            lost.append(b"")
+            return b""
+        return None
+
+    air.tap.alter = lose
+    air.run(20.0, lambda: air.flies.is_ready)
+    assert lost
+    before = dict(air.flight.flavour.parameters)
+    after = air.flight.parameters
+    changed = {name: after[name] for name in after if after[name] != before[name]}
+    assert changed == SAFE[flavour]
+    (told,) = air.of(ParametersSet)
+    assert {name for name, _, _ in told.changes} == set(changed)
+
+
+def test_a_parameter_that_cannot_be_set_is_refused() -> None:
+    """The autopilot answers with its old value: the vehicle is not armed."""
+    air = Air("ardupilot", parameters=SAFE["ardupilot"] | {"GUID_TIMEOUT": 3.0}, sets=True)
+    air.flight.set = lambda *_: None
+    air.end(20.0)
+    assert "GUID_TIMEOUT = 3" in str(air.client.failure)
+
+
+@pytest.mark.parametrize(
+    ("flavour", "name", "refused"),
+    [
+        ("ardupilot", "GUID_TIMEOUT", True),
+        ("ardupilot", "FENCE_RADIUS", False),
+        ("px4", "COM_OBL_RC_ACT", True),
+        ("px4", "GF_ACTION", False),
+    ],
+)
+def test_a_parameter_that_is_missing_is_refused_where_it_must_be_known(
+    flavour: FlavourName, name: str, refused: bool
+) -> None:
+    """A line says of any other that it is missing."""
+    air = Air(flavour)
+    del air.flight.parameters[name]
+    air.run(20.0, lambda: air.flies.is_ready or air.flies.failure is not None)
+    assert air.flies.is_ready != refused
+    (read,) = air.of(ParametersRead)
+    assert f"{name} = missing" in str(read)
+
+
+def test_the_newer_name_of_a_parameter_will_do() -> None:
+    """ArduPilot has renamed the one that says whose heartbeats it misses."""
+    air = Air("ardupilot")
+    air.flight.parameters["MAV_GCS_SYSID"] = air.flight.parameters.pop("SYSID_MYGCS")
+    air.flight.is_station = lambda *_: True
+    air.run(20.0, lambda: air.flies.is_ready)
+    assert air.flies.is_ready
+
+
+# Arming and taking off
+
+
+def test_what_keeps_it_from_arming_is_told_and_tried_again() -> None:
+    """Until it can be armed: ArduCopter needs its position first."""
+    air = Air("ardupilot", ready_s=8.0, mavlink={"patience_s": 20.0})
+    air.flight.why_not_armed = (  # it knows its position, and does not arm for another reason
+        lambda: "" if air.flight.now_ns > 10 * SECOND else "PreArm: Compass not calibrated"
+    )
+    air.run(30.0, lambda: air.flight.armed)
+    assert air.flight.armed
+    assert [str(each) for each in air.of(AutopilotRefused)] == [
+        "vehicle 1: its autopilot refuses to arm: failed"
+    ]
+    assert next(each.text for each in air.of(AutopilotText)) == "PreArm: Compass not calibrated"
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_who_cannot_arm_in_time_says_why_in_the_autopilots_words(flavour: FlavourName) -> None:
+    """One line, and nothing of it flies."""
+    air = Air(flavour, mavlink={"patience_s": 3.0})
+    air.flight.why_not_armed = lambda: "PreArm: Compass not calibrated"
+    air.end(30.0)
+    said = "vehicle 1: not armed in 3 s: PreArm: Compass not calibrated"
+    assert str(air.client.failure) == said
+    assert not air.setpoints()
+
+
+def test_without_a_position_nothing_is_armed() -> None:
+    """A line says so in time."""
+    air = Air("ardupilot", ready_s=60.0, mavlink={"patience_s": 3.0})
+    air.end(30.0)
+    assert str(air.client.failure) == "vehicle 1: not ready in 3 s: it does not tell where it is"
+    assert not air.commands(ARM)
+
+
+def test_without_an_autopilot_there_is_a_line() -> None:
+    """Nobody answers at its address."""
+    air = Air("ardupilot", mavlink={"patience_s": 3.0})
+    air.tap.dumb = True
+    air.end(30.0)
+    said = "vehicle 1: not heard in 3 s: no heartbeat of an autopilot has come, see vehicle.address"
+    assert str(air.client.failure) == said
+
+
+@pytest.mark.parametrize(("kind", "autopilot"), [(1, 3), (2, 18), (11, 12)])
+def test_what_does_not_hover_or_is_another_autopilot_is_refused(kind: int, autopilot: int) -> None:
+    """A plane, another autopilot, a boat."""
+    air = Air("ardupilot")
+    codec = Codec(1, 1)
+
+    def other(message: Message) -> bytes | None:
+        if message.get_type() != "HEARTBEAT":
+            return None
+        return codec.encode(dialect.MAVLink_heartbeat_message(kind, autopilot, 81, 4, 4, 3))
+
+    air.tap.alter = other
+    air.end(10.0)
+    assert isinstance(air.client.failure, NotTakenOff)
+    assert air.client.failure.doing == "not flown"
+    assert not air.heard("COMMAND_LONG")
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_an_unarmed_scenario_arms_nothing_until_somebody_arms_it(flavour: FlavourName) -> None:
+    """For as long as that takes; then it takes off."""
+    air = Air(flavour, armed=False, mavlink={"patience_s": 9.0})
+    air.run(15.0)
+    assert air.flies.is_ready
+    assert not air.client.failure
+    assert not air.commands(ARM)
+    assert not air.commands(SET_MODE)
+    armed = scenario()
+    air.world.act(
+        "client",
+        lambda now_ns: air.client.change(armed, frozenset({"armed"}), now_ns=now_ns),
+    )
+    air.fly(20.0)
+
+
+def test_a_vehicle_that_flies_in_guided_is_not_taken_off_again() -> None:
+    """It is flown where it is, from the autopilot's own origin."""
+    air = Air("ardupilot", duration=5.0)
+    in_the_air(air, Flown.GUIDED)
+    air.fly()
+    assert not air.commands(ARM)
+    assert not air.commands(TAKE_OFF)
+    assert not air.commands(SET_MODE)
+    assert air.rows()["estimate"][0, 2, 0] == pytest.approx(4.0, abs=0.2)
+
+
+def in_the_air(air: Air, mode: Flown) -> None:
+    """Have the vehicle fly at 4 m before the client comes to it."""
+    flight = air.flight
+    for _ in range(300):
+        flight.tick()
+    flight.enter(flight.flavour.number(Flown.GUIDED))
+    flight.arm()
+    flight.take_off(4.0)
+    for _ in range(3000):
+        flight.tick()
+    flight.enter(flight.flavour.number(mode))
+    air.autopilot._began_ns = -flight.now_ns
+
+
+@pytest.mark.parametrize("mode", [Flown.PILOT, Flown.RETURN])
+def test_a_vehicle_that_somebody_else_flies_is_left_to_him(mode: Flown) -> None:
+    """Its mode is not changed, and after a while a line says why it is not flown."""
+    air = Air("ardupilot", mavlink={"patience_s": 1.0})
+    in_the_air(air, mode)
+    air.end(30.0)
+    assert "it is in the air in" in str(air.client.failure)
+    assert not air.commands(SET_MODE)
+
+
+def test_a_vehicle_that_somebody_has_armed_is_left_to_him() -> None:
+    """On the ground, in a mode of a pilot's."""
+    air = Air("ardupilot", mavlink={"patience_s": 1.0})
+    air.run(1.5)
+    air.flight.enter(5)
+    air.flight.arm()
+    air.run(10.0, lambda: air.client.failure is not None)
+    assert "somebody has armed it in LOITER" in str(air.client.failure)
+    assert not air.commands(SET_MODE)
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> None:
+    """Nothing is commanded any more, and the client ends with a line."""
+    air = Air(flavour)
+    air.run(30.0, lambda: air.flight.armed and air.flight.position()[2] > 0.5)
+    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    asked = len(air.commands(SET_MODE))
+    air.end(10.0)
+    assert "it was taken over" in str(air.client.failure)
+    assert len(air.commands(SET_MODE)) == asked
+    air.world.act("client", air.client.close)
+    air.run(0.5)
+    assert len(air.commands(SET_MODE)) == asked
+    assert air.flight.mode is Flown.PILOT
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_take_off_that_does_not_climb_ends_in_a_landing(flavour: FlavourName) -> None:
+    """The vehicle is told to land, and a line says what was waited for."""
+    air = Air(flavour, mavlink={"patience_s": 2.0})
+    air.end(60.0)
+    assert str(air.client.failure).startswith("vehicle 1: not at the altitude of take-off in 2 s")
+    assert not air.flight.armed
+
+
+def test_the_flight_must_not_begin_on_the_ground() -> None:
+    """In space the altitude of take-off is that of the reference, unless it is given."""
+    with pytest.raises(ConfigError, match=r"mavlink.takeoff_m: got 'auto' at altitude 0 m"):
+        vehicles.make(scenario(reference={"altitude_m": 0.0}), 1)
+    vehicles.make(scenario(reference={"altitude_m": 0.0}, mavlink={"takeoff_m": 1.0}), 1)
+
+
+# The failsafe
+
+
+def modes(air: Air) -> list[tuple[str, str]]:
+    """Modes of the failsafe and their reasons, as far as they are told."""
+    return [(each.after, each.reason) for each in air.of(ModeChanged)]
+
+
+def flying(flavour: FlavourName, *faults: str, **table: object) -> Air:
+    """A vehicle in the air that follows a plan."""
+    air = Air(flavour, faults=faults, duration=60.0, **table)
+    air.fly()
+    air.run(5.0, lambda: air.client._failsafe.mode is Mode.TRACK)
+    air.run(1.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+    return air
+
+
+def test_who_arms_it_while_we_are_about_to_has_it() -> None:
+    """The command for our mode was not heard: it is not repeated."""
+    air = Air("ardupilot")
+    air.flight.switch = lambda _: air.flight.refusal
+    air.run(10.0, lambda: bool(air.commands(SET_MODE)))
+    air.flight.enter(5)
+    air.flight.arm()
+    air.run(0.5)
+    asked = len(air.commands(SET_MODE))
+    air.end(10.0)
+    assert "it was taken over: it is in LOITER" in str(air.client.failure)
+    assert len(air.commands(SET_MODE)) == asked
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_pilot_wins_at_once_and_is_told_nothing_more(flavour: FlavourName) -> None:
+    """His mode is not changed, and no setpoint comes."""
+    air = flying(flavour)
+    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    asked = len(air.commands(SET_MODE))
+    air.run(0.3)
+    assert air.client._failsafe.mode is Mode.MANUAL
+    quiet_ns = air.world.now_ns
+    air.run(3.0)
+    assert not air.setpoints(quiet_ns)
+    assert len(air.commands(SET_MODE)) == asked
+    assert air.flight.mode is Flown.PILOT
+    assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
+
+
+def test_a_vehicle_that_is_given_back_hovers_and_flies_on() -> None:
+    """Once the link has been good for a second; PX4 needs setpoints for that, and has none."""
+    air = flying("ardupilot")
+    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.run(1.0)
+    air.flight.enter(air.flight.flavour.number(Flown.GUIDED))
+    back_ns = air.world.now_ns
+    air.run(3.0)
+    assert ("hover", str(Reason.RETURNED)) in modes(air)
+    assert air.setpoints(back_ns)
+    assert air.client._failsafe.mode in (Mode.HOVER, Mode.TRACK)
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_disarmed_vehicle_is_never_flown_again(flavour: FlavourName) -> None:
+    """Though somebody arms it again, in our mode."""
+    air = flying(flavour)
+    air.flight.disarm(force=True)
+    air.run(0.5)
+    assert modes(air)[-1] == ("manual", str(Reason.DISARMED))
+    quiet_ns, arms = air.world.now_ns, len(air.commands(ARM))
+    air.run(3.0)
+    air.flight.number = air.flight.flavour.number(Flown.GUIDED)
+    air.flight.armed = True
+    air.run(2.0)
+    assert not air.setpoints(quiet_ns)
+    assert len(air.commands(ARM)) == arms
+    assert modes(air)[-1] == ("manual", str(Reason.DISARMED))
+
+
+def test_a_low_battery_lands_by_the_autopilots_own_landing() -> None:
+    """BRAKE, then LAND, though the autopilot itself only says so."""
+    air = flying("ardupilot")
+    air.flight.quadrotor.discharge(0.1)
+    air.run(60.0, lambda: not air.flight.armed)
+    after = [mode for mode, reason in modes(air) if reason == str(Reason.BATTERY)]
+    assert after == ["brake", "hover", "land"]
+    assert air.flight.mode_name == "LAND"
+    assert not air.flight.armed
+    assert "Battery 1 is low" in [each.text for each in air.of(AutopilotText)]
+
+
+def test_the_voltage_counts_as_well() -> None:
+    """Where a key says so; a sag of a second does not."""
+    air = flying("ardupilot", mavlink={"battery_min_v": 5.0})
+    codec = Codec(1, 1)
+
+    def weak(message: Message) -> bytes | None:
+        if message.get_type() != "SYS_STATUS":
+            return None
+        message.voltage_battery = 4900
+        return codec.encode(message)
+
+    air.tap.alter = weak
+    air.run(1.0)
+    air.tap.alter = None
+    air.run(3.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+    air.tap.alter = weak
+    air.run(3.5)
+    assert modes(air)[-1][1] == str(Reason.BATTERY)
+
+
+def test_a_low_battery_is_not_taken_off_with() -> None:
+    """The client says so, and arms nothing."""
+    air = Air("ardupilot", mavlink={"patience_s": 4.0}, vehicle={"battery": 0.18})
+    air.end(30.0)
+    said = "vehicle 1: not armed in 4 s: its battery is low, see mavlink.battery_min"
+    assert str(air.client.failure) == said
+    assert not air.commands(ARM)
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_the_autopilots_own_failsafe_is_left_alone(flavour: FlavourName) -> None:
+    """Its estimate is lost, it lands by itself: we say what it says, and command nothing."""
+    air = flying(flavour)
+    air.flight.estimates = False
+    lost_ns = air.world.now_ns
+    air.run(20.0, lambda: not air.flight.armed)
+    assert not air.flight.armed
+    assert modes(air)[-2][0] == "manual" or modes(air)[-1][0] == "manual"
+    assert all(
+        each.command != SET_MODE for time_ns, each in air.heard("COMMAND_LONG") if time_ns > lost_ns
+    )
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_lost_estimate_lands_where_the_autopilot_does_not(flavour: FlavourName) -> None:
+    """BRAKE, then the autopilot's landing: flags alone say that it is lost."""
+    air = flying(flavour)
+    air.flight.once = lambda _: False
+    air.flight.estimates = False
+    air.run(10.0, lambda: air.flight.mode is Flown.LAND)
+    assert ("land", str(Reason.ASTRAY)) in modes(air)
+    assert air.flight.mode is Flown.LAND
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_silent_autopilot_makes_it_brake_and_hover(flavour: FlavourName) -> None:
+    """After mavlink.silence_s; setpoints go on, of zero in the end; then it flies on."""
+    air = flying(flavour)
+    air.tap.dumb = True
+    silent_ns = air.world.now_ns
+    air.run(3.0)
+    rows = air.rows()
+    braking = rows[rows["reason"] == Reason.MUTE]
+    first = braking["step"][0] - air.rows()["step"][-1]
+    after_s = 3.0 + float(first) * air.scenario.control.dt
+    assert 0.45 <= after_s <= 0.65
+    assert modes(air)[-2:] == [("brake", str(Reason.MUTE)), ("hover", str(Reason.MUTE))]
+    last = [(each.vx, each.vy, each.vz) for _, each in air.setpoints(silent_ns)][-5:]
+    assert last == [(0.0, 0.0, 0.0)] * 5
+    air.tap.dumb = False
+    air.run(4.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+
+
+# When we are gone
+
+
+@pytest.mark.parametrize(("flavour", "stands"), [("ardupilot", True), ("px4", False)])
+def test_killed_we_repeat_nothing_and_the_autopilot_acts(
+    flavour: FlavourName, stands: bool
+) -> None:
+    """ArduCopter stands after its time-out and lands after that of its station; PX4 lands."""
+    air = flying(flavour)
+    air.world.stop("client")
+    killed_ns = air.world.now_ns
+    air.run(4.0)
+    assert not air.setpoints(killed_ns + 1)
+    assert np.linalg.norm(air.flight.velocity()[:2]) < 0.5
+    assert (air.flight.mode is Flown.GUIDED) == stands
+    air.run(30.0, lambda: not air.flight.armed)
+    assert not air.flight.armed
+
+
+def test_a_pilot_that_does_not_call_is_not_repeated_for_long() -> None:
+    """Though the port is driven on: after half a second nothing is sent."""
+    air = flying("ardupilot")
+    air.client._pilot.next_ns = None  # its loop has died
+    air.client._begin = lambda _: None
+    died_ns = air.world.now_ns
+    air.run(3.0)
+    times = [time_ns - died_ns for time_ns, _ in air.setpoints(died_ns)]
+    assert 0.3 * SECOND < times[-1] <= 0.56 * SECOND
+    assert air.heard("HEARTBEAT", died_ns + SECOND)
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_who_ends_in_flight_says_land_three_times(flavour: FlavourName) -> None:
+    """On Ctrl-C or SIGTERM; on the ground nothing is said, and nothing begins."""
+    air = flying(flavour)
+    before = len(air.commands(SET_MODE))
+    air.world.act("client", air.client.close)
+    air.world.stop("client")
+    air.run(0.1)
+    assert len(air.commands(SET_MODE)) == before + 3
+    assert air.flight.mode is Flown.LAND
+    air.run(30.0, lambda: not air.flight.armed)
+    assert not air.flight.armed
+
+
+def test_who_ends_on_the_ground_begins_nothing() -> None:
+    """Even where its session has just opened."""
+    air = Air("ardupilot")
+    air.run(20.0, lambda: air.client._session.number is not None)
+    asked = len(air.commands(SET_MODE))
+    air.world.act("client", air.client.close)
+    air.run(5.0)
+    assert len(air.commands(SET_MODE)) == asked
+    assert not air.flight.armed
+
+
+def test_who_ends_while_a_pilot_flies_says_nothing() -> None:
+    """The pilot always wins."""
+    air = flying("ardupilot")
+    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.run(1.0)
+    asked = len(air.commands(SET_MODE))
+    air.world.act("client", air.client.close)
+    air.run(0.5)
+    assert len(air.commands(SET_MODE)) == asked
+    assert air.flight.mode is Flown.PILOT
+
+
+# Other traffic
+
+
+def test_others_are_not_the_autopilot() -> None:
+    """Another vehicle, a ground station, an echo; answers to others; all in flight."""
+    air = flying("ardupilot")
+    others = Codec(2, 1), Codec(255, 190), Codec(1, 100), Codec(245, 191)
+    heartbeat = dialect.MAVLink_heartbeat_message(2, 3, 81, 9, 4, 3)
+    lands = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    position = dialect.MAVLink_local_position_ned_message(5000, 99.0, 99.0, -99.0, 9.0, 9.0, 9.0)
+    low = dialect.MAVLink_sys_status_message(0, 0, 0, 0, 1000, 0, 1, 0, 0, 0, 0, 0, 0)
+    before = air.figures()["dropped"]["foreign"]
+    for _ in range(50):
+        air.tap.extra += [
+            codec.encode(each) for codec in others for each in (heartbeat, lands, position, low)
+        ]
+        air.run(0.05)
+    assert air.client._failsafe.mode is Mode.TRACK
+    assert air.figures()["dropped"]["foreign"] == before + 50 * 16
+    own = Codec(1, 1)
+    ack = dialect.MAVLink_command_ack_message(ARM, 4, target_system=255, target_component=190)
+    air.tap.extra.append(own.encode(ack))
+    air.run(0.1)
+    assert air.figures()["dropped"]["for_others"] == 1
+    assert not air.of(AutopilotRefused)
+
+
+def test_stamps_that_cannot_be_are_dropped_and_counted() -> None:
+    """Doubled, out of order, ahead, old, far, not finite; what is flown by stays true."""
+    air = flying("ardupilot")
+    codec = Codec(1, 1)
+    now_ms = air.flight.now_ns // 1_000_000
+
+    def position(boot_ms: int, x: float = 50.0) -> bytes:
+        message = dialect.MAVLink_local_position_ned_message(boot_ms, x, 0.0, -2.0, 0.0, 0.0, 0.0)
+        return codec.encode(message)
+
+    before = dict(air.figures()["dropped"])
+    air.tap.extra += [
+        position(now_ms - 2000),
+        position(now_ms - 100),
+        position(now_ms + 500),
+        position(now_ms + 600_000),
+        position(now_ms, float("nan")),
+        position(now_ms, 1e9),
+    ]
+    air.run(0.2)
+    after = air.figures()["dropped"]
+    new = {name: count - before.get(name, 0) for name, count in after.items()}
+    assert {name: count for name, count in new.items() if count} == {
+        "old": 1,
+        "late": 1,
+        "impossible": 2,
+        "not_finite": 1,
+        "far": 1,
+    }
+    air.run(0.5)
+    error = air.rows()["estimate"][-1, :, 0] - np.array(air.flight.position())
+    assert np.abs(error).max() < 0.3
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_bad_line_brings_it_into_the_air_as_well(flavour: FlavourName) -> None:
+    """A fifth of what either says is lost, a tenth comes doubled, a tenth cut off."""
+    air = Air(flavour, duration=5.0)
+    rng = np.random.default_rng(1)
+    inner = air.tap.outbox
+
+    def worse() -> list[Datagram]:
+        sent = []
+        for datagram, draw in ((each, rng.random()) for each in inner()):
+            if draw >= 0.2:
+                sent.append(datagram)
+            if 0.2 <= draw < 0.3:
+                sent.append(datagram)
+            elif 0.3 <= draw < 0.4:
+                cut = datagram.payload[: int(rng.integers(0, 30))]
+                sent.append(datagram._replace(payload=cut))
+        return sent
+
+    air.tap.outbox = worse  # type: ignore[method-assign]
+    air.fly(90.0)
+    air.end()
+    assert air.client.failure is None
+    assert air.figures()["garbage_bytes"] > 0
+    assert air.figures()["dropped"]["doubled"] > 10
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_line_of_bytes_may_come_in_any_pieces(flavour: FlavourName) -> None:
+    """As TCP and serial lines bring them; the autopilot is heard as over UDP."""
+    line = {"address": "tcp:127.0.0.1:5760"}
+    air = Air(flavour, host="line", duration=3.0, vehicle=line)
+    rng, inner, held = np.random.default_rng(2), air.tap.outbox, bytearray()
+
+    def in_pieces() -> list[Datagram]:
+        sent = inner()
+        held.extend(b"".join(each.payload for each in sent))
+        pieces = []
+        while sent and len(held) > 20:
+            size = int(rng.integers(1, 60))
+            pieces.append(sent[0]._replace(payload=bytes(held[:size])))
+            del held[:size]
+        return pieces
+
+    air.tap.outbox = in_pieces  # type: ignore[method-assign]
+    air.fly()
+    assert air.figures()["garbage_bytes"] == 0
+    assert air.figures()["heard"] > 400
+
+
+@pytest.mark.parametrize(
+    ("dt", "rate", "least", "most"), [(0.1, 20, 18, 20), (0.1, 10, 10, 10), (0.02, 10, 50, 50)]
+)
+def test_setpoints_come_at_the_rate_of_steps_or_more(
+    dt: float, rate: int, least: int, most: int
+) -> None:
+    """Between two steps the velocity of the last is repeated; 50 a second are never exceeded."""
+    control = {"dt": dt, "horizon": 40}
+    air = flying("ardupilot", control=control, mavlink={"setpoints_hz": rate})
+    began_ns = air.world.now_ns
+    air.run(2.0)
+    assert 2 * least - 1 <= len(air.setpoints(began_ns)) <= 2 * most + 1
+
+
+def test_a_stream_that_stops_is_asked_for_again() -> None:
+    """As after a reboot of the autopilot's link: it has forgotten the rates."""
+    air = flying("ardupilot")
+    (peer,) = air.autopilot._peers.values()
+    number = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    del peer.streams[number]
+    air.run(5.0)
+    assert number in peer.streams
+    assert air.client._failsafe.mode in (Mode.HOVER, Mode.TRACK)

@@ -1,0 +1,172 @@
+"""Parts of a vehicle with an autopilot: its clock, what any bytes do, and what it costs to fly."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from airborne import scenario
+from skytether.client import vehicles
+from skytether.client.mavlink import safety
+from skytether.client.mavlink.clock import KNOWN, WINDOW, BootClock
+from skytether.mavlink.codec import Codec
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base import extras
+from skytether.shared.base.extras import ExtraMissing
+from skytether.shared.core.endpoint import Datagram
+
+MS, SECOND = 1_000_000, 1_000_000_000
+PEER = ("autopilot", 0)
+
+
+def timed(
+    *,
+    drift: float,
+    delays: list[tuple[int, int]],
+    every_ns: int = SECOND,
+) -> tuple[BootClock, int]:
+    """Clock after questions with these delays there and back [ns], and the time of the last."""
+    clock, now_ns = BootClock(), 100 * SECOND
+    for there_ns, back_ns in delays:
+        now_ns += every_ns
+        asked_ns = clock.ask(now_ns=now_ns)
+        boot_ns = boot(now_ns + there_ns, drift)
+        clock.hear(boot_ns, asked_ns, now_ns=now_ns + there_ns + back_ns)
+    return clock, now_ns
+
+
+def boot(local_ns: int, drift: float, offset_ns: int = 7 * SECOND) -> int:
+    """Time that the autopilot's clock shows."""
+    return round((local_ns - offset_ns) * (1.0 - drift))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.floats(-200e-6, 200e-6),
+    st.lists(
+        st.tuples(st.integers(1 * MS, 40 * MS), st.integers(1 * MS, 40 * MS)),
+        min_size=30,
+        max_size=100,
+    ),
+)
+def test_the_clock_is_known_to_half_of_the_quick_round_trips(
+    drift: float, delays: list[tuple[int, int]]
+) -> None:
+    """Whatever the clocks' drift, and however late some answers are."""
+    clock, now_ns = timed(drift=drift, delays=delays)
+    least = min(there + back for there, back in delays[-WINDOW:])
+    wrong = abs(clock.local_ns(boot(now_ns, drift)) - now_ns)
+    assert clock.is_known
+    assert wrong <= least + 2 * MS
+
+
+def test_drift_is_found() -> None:
+    """Drift of 100 ppm in 60 s of answers that take 3 to 16 ms, with the median of an autopilot."""
+    rng = np.random.default_rng(1)
+    ways = (1.5 * MS + rng.exponential(0.5 * MS, (60, 2))).astype(int).tolist()
+    clock, now_ns = timed(drift=100e-6, delays=[(there, back) for there, back in ways])
+    assert clock.drift == pytest.approx(100e-6, abs=20e-6)
+    assert abs(clock.local_ns(boot(now_ns + 5 * SECOND, 100e-6)) - now_ns - 5 * SECOND) < MS
+
+
+def test_answers_that_nobody_asked_for_count_for_nothing() -> None:
+    """Nor those that come twice, from before the question, or late."""
+    clock, now_ns = timed(drift=0.0, delays=[(MS, MS)] * KNOWN)
+    before = clock.local_ns(SECOND)
+    assert not clock.hear(1, 12345, now_ns=now_ns)
+    asked_ns = clock.ask(now_ns=now_ns)
+    assert not clock.hear(-5, asked_ns, now_ns=now_ns + MS)
+    asked_ns = clock.ask(now_ns=now_ns + MS)
+    assert not clock.hear(SECOND, asked_ns, now_ns=now_ns + 3 * SECOND)
+    assert clock.local_ns(SECOND) == before
+
+
+def test_a_clock_that_begins_anew_is_believed_after_three_answers() -> None:
+    """A reboot; one answer that is far off is none."""
+    clock, now_ns = timed(drift=0.0, delays=[(MS, MS)] * 10)
+    heard = []
+    for k in range(1, 6):
+        now_ns += SECOND
+        asked_ns = clock.ask(now_ns=now_ns)
+        heard.append(clock.hear(k * SECOND, asked_ns, now_ns=now_ns + 2 * MS))
+    assert heard == [False, False, True, True, True]
+    assert clock.local_ns(5 * SECOND) == pytest.approx(now_ns + MS, abs=MS)
+
+
+def messages() -> st.SearchStrategy[bytes]:
+    """Frames of the autopilot with a right checksum, whose content is anything."""
+
+    def frame(number: int, payload: bytes, component: int) -> bytes:
+        kind = dialect.mavlink_map[number]
+        head = bytes([len(payload), 0, 0, 0, 1, component]) + number.to_bytes(3, "little")
+        crc = dialect.x25crc(bytearray(head + payload + bytes([kind.crc_extra]))).crc
+        return b"\xfd" + head + payload + crc.to_bytes(2, "little")
+
+    wanted = [0, 1, 22, 32, 77, 111, 147, 148, 193, 230, 242, 245, 253]
+    numbers = st.sampled_from(wanted) | st.sampled_from(sorted(dialect.mavlink_map))
+    return st.builds(frame, numbers, st.binary(max_size=255), st.sampled_from([1, 1, 2]))
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.binary(max_size=80) | messages(), st.integers(0, 2 * SECOND)), max_size=12
+    ),
+    st.sampled_from([3, 12]),
+)
+def test_any_bytes_raise_nothing_and_arm_nothing(
+    datagrams: list[tuple[bytes, int]], autopilot: int
+) -> None:
+    """Nor does what is asked grow without bound: nobody said that it stands safely."""
+    flies = vehicles.make(scenario(), 1)
+    assert flies.port is not None
+    codec, now_ns = Codec(1, 1), 10 * SECOND
+    beat = codec.encode(dialect.MAVLink_heartbeat_message(2, autopilot, 81, 0, 4, 3))
+    sent = []
+    for payload, later_ns in [(beat, 0), *datagrams]:
+        now_ns += later_ns
+        flies.port.receive(Datagram(payload, PEER, 1), now_ns=now_ns)
+        while (due_ns := flies.port.next_wake_ns()) is not None and due_ns <= now_ns:
+            flies.port.wake(now_ns=now_ns)
+        flies.take_off(now_ns=now_ns)
+        flies.measurements(now_ns=now_ns)
+        flies.port.figures()
+        sent += flies.port.outbox()
+    asked = Codec(9, 9).decode(b"".join(each.payload for each in sent))
+    commands = {each.command for each in asked if each.get_type() == "COMMAND_LONG"}
+    assert commands <= {511, 512}
+    assert not any(each.get_type().startswith("SET_POSITION") for each in asked)
+    assert len(sent) < 40 * (len(datagrams) + 1)
+
+
+@given(st.lists(st.binary(max_size=300), max_size=30))
+@settings(max_examples=50, deadline=None)
+def test_a_line_of_bytes_is_bounded(pieces: list[bytes]) -> None:
+    """As over TCP or a serial line."""
+    flies = vehicles.make(scenario(vehicle={"address": "tcp:127.0.0.1:5760"}), 1)
+    assert flies.port is not None
+    for piece in pieces:
+        flies.port.receive(Datagram(piece, ("line", 0), 1), now_ns=SECOND)
+    assert flies.port.outbox() == []
+
+
+@pytest.mark.parametrize("rules", [safety.ardupilot(245), safety.px4()])
+def test_what_is_set_is_what_is_safe(rules: tuple[safety.Rule, ...]) -> None:
+    """Each rule with a wish is content with its own value; each value has words."""
+    for rule in rules:
+        if rule.wanted:
+            assert rule.is_safe(rule.value)
+            assert f"set {rule.value:g}" in rule.wanted
+        for value in (-1.0, *range(10), 0.5, 1e9):
+            assert rule.meaning(value)
+
+
+def test_the_extra_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`pip install skytether[mavlink]`."""
+    monkeypatch.setitem(__import__("sys").modules, "pymavlink", None)
+    for name in list(__import__("sys").modules):
+        if name.startswith(("skytether.mavlink", "skytether.client.mavlink", "pymavlink.")):
+            monkeypatch.delitem(__import__("sys").modules, name)
+    assert "pymavlink" in extras._extras()["mavlink"]
+    with pytest.raises(ExtraMissing, match=r"pip install 'skytether\[mavlink\]'"):
+        vehicles.make(scenario(), 1)

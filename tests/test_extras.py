@@ -1,0 +1,173 @@
+"""Extras: each command runs on what it needs, and says in one line which extra it misses."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import skytether
+from skytether.__main__ import COMMANDS
+from skytether.shared.base import extras
+
+ALL = (
+    "server",
+    "mavlink",
+    "page",
+    "plot",
+    "record",
+    "pandas",
+    "parquet",
+    "cluster",
+    "lab",
+)
+LAB = ("sweep", "envelope", "margins", "identify", "torture", "reproduce", "compare", "calibrate")
+NEEDS: dict[str, tuple[str, ...]] = {
+    "client": (),
+    "netem": (),
+    "keygen": (),
+    "scenarios": (),
+    "triggers": (),
+    "references": (),
+    "vehicles": (),
+    "set": (),
+    "server": ("server",),
+    "autopilot": ("mavlink", "server"),
+    "station": ("mavlink",),
+    "straight": ("mavlink", "server"),
+    "fly": ("server",),
+    "fleet": ("server",),
+    "duel": ("server", "page"),
+    "page": ("page",),
+    "replay": ("page", "record"),
+    "export": ("record",),
+    "recover": ("record",),
+    "join": ("record",),
+    "report": ("record",),
+    **dict.fromkeys(LAB, ("lab",)),
+}
+"""Extras that the help of each command needs: all that it imports before it knows its options."""
+
+BROUGHT = {"osqp": "jinja2", "viser": "zstandard"}
+"""Packages that bring one which we ask for in another extra."""
+
+RUN = """
+import sys
+
+sys.modules |= dict.fromkeys(sys.argv.pop(1).split(","))
+from skytether.__main__ import main
+
+sys.exit(main())
+"""
+
+
+def packages(*names: str) -> set[str]:
+    """Modules that some extras bring."""
+    found = {module for name in names for module in extras._extras()[name]}
+    return found | {BROUGHT[one] for one in found & BROUGHT.keys()}
+
+
+def run(argv: list[str], installed: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
+    """A command where only these extras are installed."""
+    missing = packages(*ALL) - packages(*installed) or {"none"}
+    return subprocess.run(
+        [sys.executable, "-P", "-c", RUN, ",".join(missing), *argv],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def refusal(prog: str, module: str, extra: str) -> str:
+    """The line that names an extra."""
+    return f"{prog}: {module} is not installed, expected it: pip install 'skytether[{extra}]'\n"
+
+
+def test_every_command_has_its_needs_told_here() -> None:
+    """A new one is added to the table above."""
+    assert set(NEEDS) == set(COMMANDS)
+
+
+def test_every_package_that_is_imported_is_asked_for() -> None:
+    """By name, not as what another one happens to bring."""
+    asked = {re.split("[^a-z0-9_-]", one)[0] for one in metadata.requires("skytether") or ()}
+    ours = {"skytether", *(name.replace("-", "_") for name in asked)}
+    imported = set()
+    for folder, _, files in os.walk(Path(skytether.__file__).parent, followlinks=True):
+        for file in files:
+            if file.endswith(".py"):
+                imported |= set(_imports(ast.parse(Path(folder, file).read_text())))
+    assert imported > {"numpy", "mcap"}
+    assert imported - sys.stdlib_module_names <= ours
+
+
+def _imports(tree: ast.AST) -> Iterator[str]:
+    """Top-level packages that a module imports, wherever in it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield str(node.module).partition(".")[0]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(name, marks=() if name in ("client", "netem", "fly") else pytest.mark.long)
+        for name in NEEDS
+        if name not in LAB[1:]
+    ],
+)
+def test_a_command_runs_with_what_it_needs_and_names_what_it_misses(command: str) -> None:
+    """Without any extra it ends with 2 and one line; with its own it knows its help.
+
+    One command of the laboratory stands for all: their package asks for the extra.
+    """
+    lists = command in ("scenarios", "triggers", "references", "vehicles")
+    shown = run([command] if lists else [command, "--help"], NEEDS[command])
+    assert (shown.returncode, shown.stderr) == (0, "")
+    if not NEEDS[command]:
+        return
+    refused = run([command, "--help"], ())
+    lines = {
+        refusal(command, module, extra) for extra in NEEDS[command] for module in packages(extra)
+    }
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr in lines
+
+
+@pytest.mark.parametrize(
+    ("argv", "installed", "extra"),
+    [
+        (["fly", "--virtual", "--figure", "a.png"], ("server",), "plot"),
+        (["fly", "--virtual", "--record", "a.mcap"], ("server",), "record"),
+        (["fleet", "--virtual", "--figure", "a.png"], ("server",), "plot"),
+        (["export", "a.mcap", "--parquet", "tables"], ("record",), "parquet"),
+    ],
+)
+def test_an_option_names_the_extra_that_it_misses_before_anything_flies(
+    argv: list[str], installed: tuple[str, ...], extra: str
+) -> None:
+    """For what most flights do without, a module is imported once it is asked for."""
+    refused = run(argv, installed)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr in {refusal(argv[0], module, extra) for module in packages(extra)}
+
+
+def test_a_library_call_names_the_extra_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The smallest of those that have the module; a module of no extra is left as it is."""
+    for module in ("mcap", "json.tool", "pytest"):
+        monkeypatch.setitem(sys.modules, module, None)
+    smallest = pytest.raises(extras.ExtraMissing, match=r"^mcap is not .*'skytether\[record\]'$")
+    with smallest, extras.named():
+        import mcap  # noqa: F401
+    with pytest.raises(ModuleNotFoundError, match=r"json\.tool") as caught, extras.named():
+        import json.tool  # noqa: F401
+    assert type(caught.value) is ModuleNotFoundError
+    with pytest.raises(extras.ExtraMissing, match=r"^mcap is not .*'skytether\[lab\]'$"):
+        extras.need("lab")

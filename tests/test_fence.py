@@ -1,0 +1,86 @@
+"""The fence: no input leads over it, whatever the model gets wrong and wherever the wind blows."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from fenced_flights import furthest_m, scenario
+from skytether.client.fence import Fence
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.events import FenceHolds
+from skytether.shared.scenario.schema import Scenario
+from skytether.sim.flight import fly
+
+
+def test_no_input_leads_over_the_fence() -> None:
+    """Time constants wrong by 30 %, gains by 20 %, dead times by 0.1 s, and wind that turns."""
+    assert max(map(furthest_m, range(30))) <= 0.0
+
+
+class WithoutMargin(Fence):
+    """A fence whose bounds are not drawn in."""
+
+    def __init__(self, flown: Scenario) -> None:
+        super().__init__(flown)
+        low, high = (each or (np.nan, np.nan) for each in (flown.fence.low_m, flown.fence.high_m))
+        self._bounds = list(zip(low, high, strict=True))
+        self._radius = flown.fence.radius_m or np.inf
+
+
+class WithoutForesight(Fence):
+    """A fence that looks at where the vehicle is, and not at where it comes to rest."""
+
+    def __init__(self, flown: Scenario) -> None:
+        super().__init__(flown)
+        self._tau = (0.0, 0.0)
+
+
+@pytest.mark.parametrize("fences", [WithoutMargin, WithoutForesight])
+def test_without_a_guard_the_fence_is_flown_over(fences: type[Fence]) -> None:
+    """Each is needed by some of the vehicles."""
+    assert max(furthest_m(seed, fences=fences) for seed in range(12)) > 0.1
+
+
+def test_a_flight_that_stays_inside_is_the_same_with_a_fence() -> None:
+    """To the last bit."""
+    free = fly(scenario()).trace_hash()
+    assert fly(scenario(fence={"radius_m": 50.0, "speed_mps": 5.0})).trace_hash() == free
+
+
+def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so() -> None:
+    """The circle of the demo is 3.1 m wide; the fence aboard ends it at x = 1 m."""
+    bounds = {"low_m": (-9.0, -9.0), "high_m": (1.0, 9.0), "wind_mps": 0.2}
+    fenced = msgspec.structs.replace(
+        scenario(), fence=msgspec.convert(bounds, type(scenario().fence))
+    )
+    record = fly(fenced)  # made, and not read: nobody has held the trajectory against it
+    assert record.client["state"][:, 0, 0].max() <= 1.0
+    assert record.client["state"][:, 0, 0].min() < -1.0
+    assert any(isinstance(each.event, FenceHolds) for each in record.events)
+
+
+@pytest.mark.parametrize(
+    ("fence", "said"),
+    [
+        ({"radius_m": 2.0}, r"fence.radius_m.*got 2.*more, for the trajectory asks"),
+        (
+            {"low_m": [-9.0, -9.0], "high_m": [1.5, 9.0]},
+            r"fence.high_m.*higher, for the trajectory",
+        ),
+        ({"low_m": [0.0, -9.0]}, r"fence.low_m.*lower, for the trajectory asks"),
+        ({"speed_mps": 0.1, "wind_mps": 0.05}, r"fence.speed_mps.*more, for the trajectory asks"),
+        (
+            {"low_m": [1.0, 1.0], "high_m": [2.0, 2.0]},
+            r"fence.high_m.*more than .* above fence.low_m",
+        ),
+        ({"radius_m": 0.5}, r"fence.radius_m.*more than"),
+        ({"speed_mps": 0.5}, r"fence.wind_mps.*less than 0.5, the vehicle's speed"),
+        ({"low_m": [1.0]}, r"fence.low_m.*2 numbers"),
+    ],
+)
+def test_what_leads_over_the_fence_is_refused(fence: dict[str, Any], said: str) -> None:
+    """The line says where and how fast the trajectory is, and how far inside the fence keeps."""
+    with pytest.raises(ConfigError, match=said):
+        scenario(fence=fence)

@@ -1,0 +1,329 @@
+"""The page's websocket with real clients: who may open it, and what may be sent by it."""
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from skytether.lab.benchmarks.hostile import (
+    BINARY,
+    CAMERA,
+    PING,
+    PROTOCOL,
+    element,
+    frame,
+    opened,
+    uploaded,
+)
+from skytether.lab.benchmarks.page import messages
+from skytether.shared.scenario import reading
+from skytether.sim import flight as virtual
+from skytether.view.browser import guard
+from skytether.view.browser.access import Refusal
+from skytether.view.browser.flight import PageFlight
+from skytether.view.browser.page import Page
+from skytether.view.frames import of_flight
+
+PATIENCE_S = 30.0
+
+
+@pytest.fixture(scope="module")
+def flown() -> PageFlight:
+    """A flight that is over."""
+    scenario = msgspec.structs.replace(reading.load("demo"), duration=10.0)
+    flight = PageFlight()
+    for _, process, frame_of_it in of_flight(scenario, "demo", virtual.fly(scenario)):
+        flight.take(process, frame_of_it)
+    return flight
+
+
+@pytest.fixture
+def page(flown: PageFlight) -> Iterator[Page]:
+    """A page of it."""
+    with closing(Page("127.0.0.1", 0, [flown], now_ns=lambda: flown.state.newest_ns)) as served:
+        yield served
+
+
+def joined(
+    page: Page, origin: str | None = None, host: str = "127.0.0.1", path: str = "/"
+) -> ClientConnection:
+    """Open a page's websocket, as a website of some origin under some name."""
+    return connect(
+        f"ws://{host}:{page.port}{path}",
+        sock=socket.create_connection(("127.0.0.1", page.port)),
+        origin=origin,  # type: ignore[arg-type]
+        subprotocols=[PROTOCOL],
+        compression=None,
+        max_size=None,
+    )
+
+
+def send(browser: ClientConnection, **message: Any) -> None:
+    """Send a message of viser's."""
+    browser.send(msgspec.msgpack.encode(message))
+
+
+def told(browser: ClientConnection, kind: str) -> dict[str, Any]:
+    """The next message of a kind."""
+    while True:
+        payload = browser.recv(timeout=PATIENCE_S)
+        assert isinstance(payload, bytes)
+        for message in messages(payload):
+            if message["type"] == kind:
+                return message
+
+
+def counts(page: Page) -> dict[Refusal, int]:
+    """How often each reason for a refusal was met."""
+    return dict(page._guard.counts)
+
+
+def until(true: Any, seconds: float = PATIENCE_S) -> None:
+    """Wait until something is true."""
+    ends_s = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < ends_s
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("origin", "host", "why"),
+    [
+        ("http://evil.example", "127.0.0.1", Refusal.ORIGIN),
+        ("http://127.0.0.1:1", "127.0.0.1", Refusal.ORIGIN),
+        ("null", "127.0.0.1", Refusal.ORIGIN),
+        ("http://evil.example:{port}", "evil.example", Refusal.HOST),
+        (None, "evil.example", Refusal.HOST),
+    ],
+)
+def test_a_website_of_a_stranger_reads_nothing(
+    page: Page, origin: str | None, host: str, why: Refusal
+) -> None:
+    """Under its own name, under none, or under one that it lets mean this machine."""
+    with pytest.raises(InvalidStatus) as refused:
+        joined(page, origin and origin.format(port=page.port), host)
+    assert refused.value.response.status_code == 403
+    assert refused.value.response.body == f"{why}\n".encode()
+    assert counts(page) == {why: 1}
+    assert [str(event) for event in page.events()] == [f"refused, 1 so far: {why}"]
+    assert not page.events()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "192.0.2.7", "[::1]"])
+def test_the_page_itself_reads_the_flight_under_any_number(page: Page, host: str) -> None:
+    """A number cannot be rebound; through a tunnel or a container it may be any."""
+    with joined(page, f"http://{host}:{page.port}", host) as browser:
+        assert browser.recv(timeout=PATIENCE_S)
+    assert not counts(page)
+
+
+def test_who_has_the_token_in_the_address_is_asked_nothing_else(flown: PageFlight) -> None:
+    """By any name, behind any proxy; a wrong token is none."""
+    with closing(Page("127.0.0.1", 0, [flown], token="secret")) as page:
+        with joined(page, "https://fleet.example", "fleet.example", "/?token=secret") as browser:
+            assert browser.recv(timeout=PATIENCE_S)
+        with pytest.raises(InvalidStatus):
+            joined(page, "https://fleet.example", "fleet.example", "/?token=guessed")
+
+
+def test_a_page_by_a_name_says_why_it_stays_empty(page: Page) -> None:
+    """Instead of waiting for its websocket for ever."""
+    for host, status in ((b"drone.example", b"403"), (b"127.0.0.1", b"200")):
+        with socket.create_connection(("127.0.0.1", page.port)) as sock:
+            sock.sendall(b"GET / HTTP/1.1\r\nHost: " + host + b"\r\n\r\n")
+            assert sock.recv(64).split()[1] == status
+
+
+def test_an_upload_is_dropped_and_a_message_of_the_page_is_not(page: Page) -> None:
+    """With the name of an element of the browser's own; nothing of it is kept."""
+    with joined(page) as browser:
+        send(browser, **CAMERA)
+        uuid = element(browser)
+        for number in range(20):
+            for message in uploaded(uuid, number):
+                browser.send(message)
+        send(browser, type="GetRenderResponseMessage", uuid=uuid, payload=bytes(9))
+        send(browser, type="ShareUrlRequest")
+        send(browser, type="GuiUpdateMessage", uuid=uuid, updates={"update_cb": 1})
+        browser.send(b"\xc1")
+        browser.send(b"\x91" * 60_000)
+        send(browser, type="GuiUpdateMessage", uuid=uuid, updates={"value": "1"})
+        until(lambda: counts(page).get(Refusal.MESSAGE) == 45)
+        (client,) = page._server.get_clients().values()
+        assert not client.gui._current_file_upload_states
+        assert not page._server.gui._current_file_upload_states
+        assert told(browser, "GuiUpdateMessage")
+    assert counts(page) == {Refusal.MESSAGE: 45}
+
+
+def test_a_huge_frame_ends_the_connection(page: Page) -> None:
+    """Before it has come: by its length; one of 64 KiB is read."""
+    with joined(page) as browser:
+        browser.send(bytes(guard.MESSAGE_BYTES_MAX))
+        until(lambda: counts(page).get(Refusal.MESSAGE))
+        with suppress(ConnectionClosed):
+            browser.send(bytes(guard.MESSAGE_BYTES_MAX + 1))
+        with pytest.raises(ConnectionClosed) as closed:
+            told(browser, "nothing")
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1009
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [frame(BINARY, b"", last=False) + frame(0, b"", last=False) * 100, frame(BINARY, b"") * 20_000],
+)
+def test_a_message_of_countless_frames_ends_the_connection(page: Page, sent: bytes) -> None:
+    """However short they are: each takes room."""
+    with closing(opened(page.port)) as sock:
+        with suppress(OSError):
+            sock.sendall(sent)
+        until(lambda: counts(page).get(Refusal.ROOM))
+        until(lambda: not page._guard.connections)
+
+
+def test_who_never_reads_is_cut_off_once_he_pings(page: Page) -> None:
+    """The answers would fill the memory; whoever does not ping is cut off by the page's pings."""
+    with closing(opened(page.port)) as sock:
+        sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
+        with suppress(OSError):  # reset, or a broken pipe
+            while not counts(page):
+                sock.sendall(frame(PING, bytes(125)) * 50)
+    until(lambda: counts(page).get(Refusal.ROOM))
+    until(lambda: not page._guard.connections)
+
+
+def test_what_a_reader_leaves_unread_is_bounded(page: Page) -> None:
+    """The newest value of each element waits for him, and no more."""
+    with closing(opened(page.port)) as sock:
+        sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
+        until(lambda: page._panels)
+        (panel,) = page._panels.values()
+        buffer = panel._client._websock_connection.get_message_buffer()
+        (connection,) = page._connections.values()
+        until(lambda: connection.paused)
+        kept = []
+        for _ in range(3):
+            for _ in range(10):
+                panel.show(0)
+            kept.append((len(buffer.message_from_id), len(buffer.id_from_redundancy_key)))
+        assert kept[0] == kept[1] == kept[2]
+        assert connection.transport.get_write_buffer_size() < 1_000_000
+
+
+def test_nothing_is_drawn_for_who_does_not_read(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever reads gets everything."""
+    with closing(opened(page.port)) as sock, joined(page) as reader:
+        sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
+        until(lambda: any(each.paused for each in page._connections.values()))
+        (deaf,) = (number for number, each in page._connections.items() if each.paused)
+        send(reader, **CAMERA)
+        until(lambda: len(page._panels) == 2)
+        drawn: list[int] = []
+        for number, panel in page._panels.items():
+            monkeypatch.setattr(panel, "show", lambda _, number=number: drawn.append(number))
+        until(lambda: len(drawn) >= 5)
+        assert deaf not in drawn
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        CAMERA | {"position": ["x"] * 9, "image_width": "wide", "image_height": 0},
+        {"type": "GuiUpdateMessage", "updates": {"value": "none"}},
+        {"type": "GuiUpdateMessage", "updates": {"value": {}}},
+        {"type": "ViewerCameraMessage"},
+    ],
+)
+def test_a_value_that_makes_no_sense_costs_nobody_else_the_page(
+    page: Page, message: dict[str, Any]
+) -> None:
+    """Who has sent it is turned away, at most."""
+    with joined(page) as other, joined(page) as browser:
+        send(other, **CAMERA)
+        assert element(other)
+        send(browser, **CAMERA)
+        uuid = element(browser)
+        send(browser, **({"uuid": uuid} if "updates" in message else {}), **message)
+        until(lambda: counts(page))
+        for _ in range(5):
+            assert told(other, "GuiUpdateMessage")
+    assert page._thread.is_alive()
+
+
+def test_browsers_beyond_the_most_are_turned_away(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Connections are counted as well, whatever they want; those that are there stay."""
+    monkeypatch.setattr(guard, "BROWSERS_MAX", 1)
+    with joined(page) as first:
+        assert first.recv(timeout=PATIENCE_S)
+        with joined(page) as second, pytest.raises(ConnectionClosed) as closed:
+            second.recv(timeout=PATIENCE_S)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1013
+        until(lambda: page._guard.connections == 1)
+        monkeypatch.setattr(guard, "CONNECTIONS_MAX", 1)
+        third = socket.create_connection(("127.0.0.1", page.port))
+        with closing(third), suppress(ConnectionError):
+            assert third.recv(1) == b""
+        assert counts(page) == {Refusal.FULL: 2}
+        assert first.ping().wait(PATIENCE_S)
+
+
+def test_a_page_of_another_version_is_told_so(page: Page) -> None:
+    """By the code that viser's browsers show; nothing is printed."""
+    with (
+        connect(f"ws://127.0.0.1:{page.port}/", subprotocols=["viser-v0"]) as browser,  # type: ignore[list-item]
+        pytest.raises(ConnectionClosed) as closed,
+    ):
+        browser.recv(timeout=PATIENCE_S)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1002
+    assert counts(page) == {Refusal.VERSION: 1}
+
+
+async def test_messages_wait_for_their_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few hundred at once are read at once, and then so many a second."""
+    now_s = 1000.0
+
+    async def sleep(pause_s: float) -> None:
+        nonlocal now_s
+        now_s += pause_s
+
+    monkeypatch.setattr(guard.asyncio, "sleep", sleep)
+    connection = guard._Connection.__new__(guard._Connection)
+    connection._due_s = 0.0
+    connection.loop = SimpleNamespace(time=lambda: now_s)  # type: ignore[assignment]
+    burst = round(guard.RATE_HZ * guard.BURST_S)
+    for _ in range(burst):
+        await connection._wait_for_its_turn()
+    assert now_s == pytest.approx(1000.0)
+    for _ in range(600):
+        await connection._wait_for_its_turn()
+    assert now_s == pytest.approx(1000.0 + 600 / guard.RATE_HZ)
+
+
+def test_a_page_is_not_served_where_viser_would_listen_without_the_guard() -> None:
+    """A version that opens its websocket in another way is refused, and not trusted."""
+    with pytest.raises(RuntimeError, match="not known"), guard.Guard("").served():
+        pass
+
+
+def test_the_first_the_tenth_and_the_hundredth_are_told() -> None:
+    """Nobody fills a log by knocking."""
+    refuses = guard.Guard("")
+    said = []
+    for _ in range(1000):
+        refuses.count(Refusal.ORIGIN)
+        said += [event.count for event in refuses.events()]
+    assert said == [1, 10, 100, 1000]

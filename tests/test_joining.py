@@ -1,0 +1,158 @@
+"""Recordings by hand: each process writes one of its own, and they become one flight."""
+
+import signal
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from skytether.cli import recorder
+from skytether.cli.export import export
+from skytether.cli.join import join
+from skytether.cli.report import report
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.feed import Frame, Rows
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Record
+from skytether.shared.telemetry.summary import summarise
+from skytether.shell import command
+from skytether.sim import flight
+from skytether.view.frames import of_flight
+from skytether.view.recording import Recorded, Recording
+from warm import Command
+
+SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=5.0, settle=3.0)
+OFFSETS_NS = {"client": 10**18, "server": 10**18 + 7 * 10**9, "netem": 10**18 - 3 * 10**9}
+"""Time of day minus the clock, of each process's computer [ns]."""
+
+
+@pytest.fixture(scope="module")
+def flown() -> Record:
+    """A flight."""
+    return flight.fly(SCENARIO)
+
+
+def recorded_by(process: str, folder: Path, flown: Record, scenario: Scenario = SCENARIO) -> Path:
+    """Recording of one process, by its own clock."""
+    path, off_ns = folder / f"{process}.mcap", OFFSETS_NS[process]
+    about = recorder._about(scenario, "demo", began=None, offset_ns=off_ns, secure=False)
+    late_ns = OFFSETS_NS["client"] - off_ns
+    with path.open("wb") as file:
+        recording = Recording(file, scenario, about)
+        for _, of, frame in of_flight(scenario, "demo", flown):
+            if of == process:
+                recording.add(process, moved(frame, late_ns))
+        recording.finish(None)
+    return path
+
+
+def moved(frame: Frame, late_ns: int) -> Frame:
+    """A frame on another clock."""
+    frame = msgspec.structs.replace(frame, time_ns=frame.time_ns + late_ns)
+    if isinstance(frame, Rows) and frame.part == "netem":
+        rows = np.frombuffer(frame.rows, PACKET_COLUMNS).copy()
+        rows["arrived_ns"] += late_ns
+        return msgspec.structs.replace(frame, rows=rows.tobytes())
+    return frame
+
+
+def together(paths: Sequence[Path], out: Path) -> int:
+    """Join recordings."""
+    return command.main(join, [*map(str, paths), "--out", str(out)], "join")
+
+
+def test_three_recordings_become_the_flight(flown: Record, tmp_path: Path) -> None:
+    """All rows, in the order of the times of day, and the summary of the whole."""
+    paths = [recorded_by(process, tmp_path, flown) for process in OFFSETS_NS]
+    out = tmp_path / "flight.mcap"
+    assert together(paths, out) == 0
+    with Recorded(out) as joined:
+        parts, times_ns = joined.parts(), [time_ns for time_ns, *_ in joined.frames()]
+        whole = summarise(SCENARIO, "demo", flown.client, flown.server, flown.netem)
+        assert joined.summary == whole
+    for part in ("client", "server", "plan", "netem"):
+        assert parts[part].tobytes() == getattr(flown, part).tobytes()
+    assert times_ns == sorted(times_ns)
+
+
+def test_each_process_says_what_is_its_own(flown: Record, tmp_path: Path) -> None:
+    """The server was started with another trigger, and netem with another loss."""
+    table = reading.to_table(SCENARIO)
+    table["control"]["trigger"] = "always"
+    server = reading.check(table)
+    table = reading.to_table(SCENARIO)
+    table["network"]["uplink"]["loss"] = 0.25
+    netem = reading.check(table)
+    scenarios = {"client": SCENARIO, "server": server, "netem": netem}
+    paths = [recorded_by(name, tmp_path, flown, own) for name, own in scenarios.items()]
+    assert together(paths, tmp_path / "flight.mcap") == 0
+    with Recorded(tmp_path / "flight.mcap") as joined:
+        assert joined.scenario.control.trigger == "always"
+        assert joined.scenario.network.uplink.loss == 0.25
+        assert joined.scenario.vehicle == SCENARIO.vehicle
+
+
+def test_what_is_not_of_one_flight_is_refused(
+    flown: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a line that says where they differ; nothing is left behind."""
+    client = recorded_by("client", tmp_path, flown)
+    table = reading.to_table(SCENARIO)
+    table["link"]["age_max_s"] = 4.0
+    server = recorded_by("server", tmp_path, flown, reading.check(table))
+    out = tmp_path / "flight.mcap"
+    assert together([client, server], out) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "it is of another flight" in line
+    assert "link.age_max_s" in line
+    assert together([client], out) == 2
+    assert together([client, server], client) == 2
+    assert not out.exists()
+    capsys.readouterr()
+
+
+def port(process: Command) -> str:
+    """Port on which a process says that it listens."""
+    line = next(line for line in process.stdout if "listening on" in line)
+    return line.split("127.0.0.1:")[1].split(",")[0].split()[0]
+
+
+def test_a_flight_by_hand_is_recorded_and_joined(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three processes, each with a file that ends in .mcap; the server is told to end."""
+    files = {name: tmp_path / f"{name}.mcap" for name in OFFSETS_NS}
+    with ExitStack() as stack:
+
+        def start(name: str, *argv: str) -> Command:
+            flags = ["--duration", "6", "--settle", "0", "--record", str(files[name])]
+            command = stack.enter_context(Command(name, "demo", *argv, *flags))
+            stack.callback(command.kill)
+            return command
+
+        server = start("server", "--bind", "127.0.0.1:0")
+        netem = start("netem", "--bind", "127.0.0.1:0", "--server", f"127.0.0.1:{port(server)}")
+        client = start("client", "--server", f"127.0.0.1:{port(netem)}")
+        said = client.stdout.read()
+        assert client.wait(120) == 0, said
+        for process in (server, netem):
+            process.send_signal(signal.SIGINT)
+            said = process.stdout.read()
+            assert process.wait(60) == 0, said
+    out = tmp_path / "flight.mcap"
+    for path in files.values():
+        assert command.main(export, [str(path), "--csv", str(tmp_path / path.stem)], "it") == 0
+    assert command.main(report, [str(files["client"]), "--out", str(tmp_path / "c.html")], "") == 0
+    assert together(list(files.values()), out) == 0
+    assert command.main(report, [str(out), "--out", str(tmp_path / "page.html")], "it") == 0
+    with Recorded(out) as joined:
+        parts, summary = joined.parts(), joined.summary
+    assert set(parts) == {"client", "server", "plan", "netem"}
+    assert parts["client"]["step"].tolist() == list(range(len(parts["client"])))
+    assert summary is not None
+    assert summary.event_ratio is not None
+    assert summary.uplink_packets
+    capsys.readouterr()

@@ -1,0 +1,540 @@
+"""`import skytether`: what it exports, what comes of it, and what it refuses."""
+
+import asyncio
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import skytether
+from skytether.cli import processes
+from skytether.shared.core.events import NoAnswer
+from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire.protocol import (
+    Hello,
+    Horizon,
+    Observation,
+    Refusal,
+    Welcome,
+    decode,
+    encode,
+)
+from skytether.shell.command import CommandError
+from skytether.sim import flight as virtual
+
+EXPORTS = [
+    "Column",
+    "ConfigError",
+    "Datagram",
+    "Endpoint",
+    "Flight",
+    "FlightError",
+    "RecordingError",
+    "Scenario",
+    "Summary",
+    "Swept",
+    "World",
+    "check",
+    "fly",
+    "fly_batch",
+    "load",
+    "sweep",
+]
+HEAVY = ("daqp", "matplotlib", "mcap", "numba", "osqp", "pandas", "rich", "scipy", "tyro", "viser")
+SHORT: dict[str, Any] = {"duration": 10, "settle": 4}
+
+
+class Constant(skytether.Endpoint):
+    """Server that tells every vehicle to fly 0.1 m/s along each axis."""
+
+    def __init__(self, scenario: skytether.Scenario) -> None:
+        super().__init__()
+        self.terms = scenario.terms()
+
+    def receive(self, datagram: skytether.Datagram, *, now_ns: int) -> None:
+        """Answer HELLO and OBSERVATION."""
+        message = decode(datagram.payload, self.terms)
+        vehicle = message.vehicle
+        if isinstance(message, Hello):
+            welcome = Welcome(vehicle, 1, message.boot_id, 1, now_ns, Refusal.ACCEPTED, self.terms)
+            self.send(encode(welcome), datagram.peer)
+        elif isinstance(message, Observation):
+            inputs = np.full((self.terms.axes, self.terms.planned), 0.1, np.float32)
+            horizon = Horizon(vehicle, 1, message.step, now_ns, message.stamp_ns, inputs)
+            self.send(encode(horizon), datagram.peer)
+
+    def wake(self, *, now_ns: int) -> None:
+        """Nothing is due."""
+
+    def next_wake_ns(self) -> None:
+        """Never."""
+
+
+class Silent(Constant):
+    """Server that answers nothing."""
+
+    def receive(self, datagram: skytether.Datagram, *, now_ns: int) -> None:
+        """Nothing."""
+
+
+@pytest.fixture(scope="module")
+def flown() -> skytether.Flight:
+    """A short flight of `demo`."""
+    return skytether.fly("demo", **SHORT)
+
+
+def test_it_exports_this_and_nothing_else() -> None:
+    """Each name is there, and `dir` has it."""
+    assert skytether.__all__ == EXPORTS
+    homes = [name for names in skytether._HOMES.values() for name in names]
+    assert sorted(homes) == EXPORTS
+    for name in EXPORTS:
+        assert getattr(skytether, name).__name__ == name
+    assert set(EXPORTS) <= set(dir(skytether))
+    with pytest.raises(AttributeError, match="module 'skytether' has no attribute 'flyy'"):
+        skytether.flyy  # noqa: B018
+    assert (resources.files("skytether") / "py.typed").is_file()
+
+
+def test_importing_it_is_light() -> None:
+    """Neither numpy nor anything heavier; no name of it brings a compiler, pictures or a page."""
+    code = f"""
+import sys, skytether
+assert "numpy" not in sys.modules and "asyncio" not in sys.modules
+skytether.Flight, skytether.fly, skytether.Scenario, skytether.World, skytether.ConfigError
+print(*(name for name in {HEAVY} if name in sys.modules))
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    assert told == "\n"
+
+
+# -- scenarios -------------------------------------------------------------------------------
+
+
+def test_keys_lie_over_a_scenario_with_dots_or_as_tables() -> None:
+    """What they do not name stays as it was; numbers of numpy are numbers."""
+    keys = {"control.trigger": "always", "network.uplink.loss": np.float64(0.25)}
+    dotted = skytether.load("demo", seed=np.int64(7), **keys)
+    network = {"uplink": {"loss": 0.25}}
+    assert dotted == skytether.load(
+        skytether.load("demo"), seed=7, control={"trigger": "always"}, network=network
+    )
+    assert (dotted.seed, dotted.network.uplink.loss, dotted.control.cost_gap) == (7, 0.25, 3.0)
+    start = skytether.load("demo", **{"vehicle.start_m": np.array([1.0, 2.0])})
+    assert start.vehicle.start_m == (1.0, 2.0)
+
+
+def test_a_scenario_is_loaded_from_a_path(tmp_path: Path) -> None:
+    """A `Path` or its text."""
+    file = tmp_path / "mine.toml"
+    file.write_text('extends = "demo"\nduration = 12\n')
+    assert skytether.load(file) == skytether.load(str(file)) == skytether.load("demo", duration=12)
+
+
+def test_a_scenario_made_by_hand_is_checked() -> None:
+    """As an object or as tables, also before it is flown."""
+    assert skytether.check({"duration": 3, "model": {"axes": 3}}).model.axes == 3
+    assert skytether.check(skytether.Scenario(seed=4), duration=3).steps == 60
+    wrong = skytether.Scenario(title="mine", duration=-1.0)
+    for refuses in (skytether.check, skytether.fly, skytether.load):
+        with pytest.raises(skytether.ConfigError, match=r"mine: duration: got -1.0, expected a"):
+            refuses(wrong)
+
+
+# -- flights ---------------------------------------------------------------------------------
+
+
+def test_a_flight_is_that_of_the_simulation(flown: skytether.Flight) -> None:
+    """To the last bit, with its events and its summary."""
+    scenario = skytether.load("demo", **SHORT)
+    record = virtual.fly(scenario)
+    assert flown.record.trace_hash() == record.trace_hash()
+    assert [each.event for each in flown.events] == [each.event for each in record.events]
+    assert {each.host for each in flown.events} == {"server", "netem", "client"}
+    parts = record.client, record.server, record.netem
+    assert flown.summary == summarise(scenario, "demo", *parts)
+    assert flown.summary.rmse_xy == pytest.approx(0.2708, abs=1e-4)
+    assert (flown.failure, flown.name, flown.scenario) == (None, "demo", scenario)
+    assert repr(flown) == "<Flight 'demo', seed 1: 200 steps in 10 s>"
+
+
+def test_arrays_have_names_shapes_and_units(flown: skytether.Flight) -> None:
+    """All of a flight's, in the order of the parts; those of the record with other names."""
+    columns = {column.name: column for column in flown.columns()}
+    assert columns["position_m"] == ("position_m", (200, 2), "m")
+    assert columns["input_mps"] == ("input_mps", (200, 2), "m/s")
+    assert columns["age_ns"].unit == "ns"
+    assert columns["netem.bytes"].unit == "B"
+    assert columns["mode"].unit == columns["server.event"].unit == ""
+    assert columns["plan.input_mps"].shape == (len(flown.record.plan), 2, 80)
+    for name, column in columns.items():
+        assert flown[name].shape == column.shape
+        assert not flown[name].flags.writeable
+    client = flown.record.client
+    assert np.array_equal(flown["position_m"], client["state"][..., 0])
+    assert np.array_equal(flown["velocity_mps"], client["state"][..., 1])
+    assert np.array_equal(
+        flown["server.planned_position_m"], flown.record.server["planned"][..., 0]
+    )
+    assert np.array_equal(flown["plan.input_mps"], flown.record.plan["inputs"])
+    assert np.array_equal(flown["time_s"], np.arange(200) * 0.05)
+    reference = flown.scenario.make_reference()
+    assert np.array_equal(flown["desired_position_m"], reference(flown["time_s"])[..., 0])
+    lines = str(flown).splitlines()
+    assert lines[0] == repr(flown)
+    assert [line.split()[0] for line in lines[1:]] == list(columns)
+
+
+def test_a_flight_comes_back_from_its_file(tmp_path: Path) -> None:
+    """To the last bit, sealed and in space; its name, events, figures and summary as well."""
+    flown = skytether.fly("demo", secure=True, duration=3, settle=0, **{"model.axes": 3})
+    flown.save(tmp_path / "flight.mcap")
+    back = skytether.Flight.load(str(tmp_path / "flight.mcap"))
+    for part in ("client", "server", "netem", "plan"):
+        before, after = getattr(flown.record, part), getattr(back.record, part)
+        assert before.dtype == after.dtype
+        assert before.tobytes() == after.tobytes()
+    assert back.events == flown.events
+    assert back.record.figures == flown.record.figures
+    assert back.summary == flown.summary
+    assert back.summary.secure
+    assert (back.name, back.scenario, back.failure) == ("demo", flown.scenario, flown.failure)
+    assert back.columns() == flown.columns()
+
+
+def test_a_flight_that_failed_says_why_and_comes_back(tmp_path: Path) -> None:
+    """Nobody has answered: there is no row, and nothing to draw."""
+    scenario = skytether.load("demo", **{"link.connect_s": 2.0})
+    flown = skytether.fly(scenario, server=Silent(scenario))
+    assert isinstance(flown.failure, NoAnswer)
+    assert flown["position_m"].shape == (0, 2)
+    assert flown.summary.rmse_xy is None
+    with pytest.raises(skytether.FlightError, match="no step was flown: vehicle 1: no answer"):
+        flown.plot()
+    flown.save(tmp_path / "flight.mcap")
+    back = skytether.Flight.load(tmp_path / "flight.mcap")
+    assert (back.failure, back.columns()) == (flown.failure, flown.columns())
+
+
+def test_a_batch_is_its_single_flights(flown: skytether.Flight) -> None:
+    """Each with its own seed; only plans are missing."""
+    one, other = skytether.fly_batch("demo", np.array([1, 5]), **SHORT)
+    assert one.record.trace_hash() == flown.record.trace_hash()
+    assert other.summary == skytether.fly("demo", seed=5, **SHORT).summary
+    assert (other.scenario.seed, other["plan.input_mps"].shape) == (5, (0, 2, 80))
+
+
+def test_a_flight_is_drawn(flown: skytether.Flight) -> None:
+    """Its path, over the reference."""
+    plane, sent = flown.plot().axes
+    assert plane.get_title() == "demo, seed 1"
+    assert np.array_equal(plane.lines[1].get_xydata(), flown["position_m"])
+    assert "sent at" in sent.get_xlabel()
+
+
+def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
+    """A column a number, words for modes."""
+    pytest.importorskip("pandas")
+    table = flown.to_pandas()
+    assert list(table.columns[:5]) == [
+        "time_s",
+        "vehicle",
+        "step",
+        "position_x_m",
+        "velocity_x_mps",
+    ]
+    assert np.array_equal(table["position_y_m"], flown["position_m"][:, 1])
+    assert table["mode"].iloc[-1] == "track"
+    assert len(flown.to_pandas("netem")) == len(flown["netem.bytes"])
+    assert "input_x_mps_79" in flown.to_pandas("plan")
+
+
+def test_without_pandas_it_says_what_to_install(
+    flown: skytether.Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one line."""
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"^pandas is not installed, .*'skytether\[pandas\]'$"):
+        flown.to_pandas()
+
+
+def test_a_server_of_ones_own_is_flown() -> None:
+    """Over the scenario's network: the vehicle flies what it says once its link is good."""
+    scenario = skytether.load("demo", duration=8, settle=0)
+    flown = skytether.fly(scenario, server=Constant(scenario))
+    planned = flown["input_mps"][flown["covered"]]
+    assert len(planned) > 80
+    assert np.unique(planned).tolist() == [np.float32(0.1)]
+    assert len(flown["server.step"]) == len(flown["plan.step"]) == 0
+    assert flown.summary.uplink_packets == (flown["netem.direction"] == 0).sum() > 100
+
+
+# -- over UDP --------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_a_flight_over_udp_is_a_flight(tmp_path: Path) -> None:
+    """Sealed, with events from 0 on; it comes back from its file."""
+    at_once = {"network.uplink.delay": "none", "network.downlink.delay": "none"}
+    flown = skytether.fly("demo", udp=True, secure=True, duration=5, settle=0, **at_once)
+    assert (flown.summary.duration_s, flown.summary.secure) == (5.0, True)
+    times_ns = [each.time_ns for each in flown.events]
+    assert times_ns[0] == 0
+    assert min(flown["netem.arrived_ns"]) > 0
+    assert max(flown["netem.arrived_ns"]) <= max(times_ns)
+    flown.save(tmp_path / "flight.mcap")
+    back = skytether.Flight.load(tmp_path / "flight.mcap")
+    assert back.record.trace_hash() == flown.record.trace_hash()
+    assert back.events == flown.events
+
+
+async def test_a_process_that_fails_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its last words; also where an event loop runs already, as in a notebook."""
+
+    def run(*_: object, **__: object) -> list[processes.Shortfall]:
+        asyncio.run(asyncio.sleep(0))
+        raise CommandError("server: killed")
+
+    monkeypatch.setattr(processes, "run", run)
+    with pytest.raises(skytether.FlightError, match="server: killed"):
+        skytether.fly("demo", udp=True)
+
+
+def test_ctrl_c_ends_the_processes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are told to end, and waited for; wherever Python was started with SIGINT ignored."""
+    ended = threading.Event()
+
+    def run(*_: object, interrupted: Callable[[], bool], **__: object) -> None:
+        main = threading.main_thread().ident
+        assert main is not None
+        signal.pthread_kill(main, signal.SIGINT)
+        while not interrupted():
+            threading.Event().wait(0.01)
+        ended.set()
+
+    monkeypatch.setattr(processes, "run", run)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            skytether.fly("demo", udp=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert ended.wait(10)
+
+
+# -- sweeps ----------------------------------------------------------------------------------
+
+GRID = {"control.trigger": ["always", "cost_gap"], "network.uplink.loss": np.array([0.0, 0.5])}
+
+
+def test_a_sweep_flies_every_combination() -> None:
+    """The last key changes fastest; each flight is that of `fly` with its seed."""
+    swept = skytether.sweep("demo", GRID, runs=2, seed=3, **SHORT)
+    assert [tuple(each.keys.values()) for each in swept] == [
+        ("always", 0.0),
+        ("always", 0.5),
+        ("cost_gap", 0.0),
+        ("cost_gap", 0.5),
+    ]
+    last = swept[-1]
+    keys = {"control.trigger": "cost_gap", "network.uplink.loss": 0.5}
+    assert last.scenario == skytether.load("demo", seed=3, **SHORT, **keys)
+    assert last.runs[1] == skytether.fly("demo", seed=4, **SHORT, **keys).summary
+    one, other = (run.rmse_xy for run in last.runs)
+    assert one is not None
+    assert other is not None
+    mean, half = last.mean("rmse_xy")
+    assert mean == pytest.approx((one + other) / 2)
+    assert half == pytest.approx(12.7062 * abs(one - other) / 2, rel=1e-4)  # t of one degree
+
+
+@pytest.mark.long
+def test_a_sweep_is_the_same_with_more_workers() -> None:
+    """Whatever process flies a run."""
+    alone = skytether.sweep("demo", GRID, runs=2, **SHORT)
+    assert skytether.sweep("demo", GRID, runs=2, workers=2, **SHORT) == alone
+
+
+# -- refusals --------------------------------------------------------------------------------
+
+
+def mine() -> Constant:
+    """A server of one's own."""
+    return Constant(skytether.load("demo"))
+
+
+REFUSALS: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
+    "an unknown scenario": (
+        lambda: skytether.fly("dmeo"),
+        skytether.ConfigError,
+        "dmeo: no such scenario; did you mean demo?",
+    ),
+    "no scenario at all": (
+        lambda: skytether.fly(42),  # type: ignore[arg-type]
+        TypeError,
+        "scenario: got 42, expected the name of a scenario, a .toml file or a Scenario",
+    ),
+    "no table": (
+        lambda: skytether.check("demo"),  # type: ignore[arg-type]
+        TypeError,
+        "scenario: got 'demo', expected a Scenario or a mapping of its keys",
+    ),
+    "an unknown key": (
+        lambda: skytether.fly("demo", duraton=3),
+        skytether.ConfigError,
+        "demo with these keys: duraton: no such key; did you mean duration?",
+    ),
+    "an unknown key with a dot": (
+        lambda: skytether.load("demo", **{"control.triger": "always"}),
+        skytether.ConfigError,
+        "demo with these keys: control.triger: no such key; did you mean trigger?",
+    ),
+    "a dot too many": (
+        lambda: skytether.load("demo", **{"seed.x": 1}),
+        skytether.ConfigError,
+        "seed.x: no such key",
+    ),
+    "a value of another type": (
+        lambda: skytether.load("demo", duration="long"),
+        skytether.ConfigError,
+        "demo with these keys: duration: got 'long', expected a number",
+    ),
+    "no table where one is": (
+        lambda: skytether.load("demo", control=5),
+        skytether.ConfigError,
+        "demo with these keys: control: got 5, expected a table",
+    ),
+    "a contradiction": (
+        lambda: skytether.fly("demo", **{"link.timeout_s": 0.1}),
+        skytether.ConfigError,
+        "demo with these keys: link.timeout_s: got 0.1, expected more than link.heartbeat_s = 0.1",
+    ),
+    "no endpoint": (
+        lambda: skytether.fly("demo", server="mine"),  # type: ignore[arg-type]
+        TypeError,
+        "server: got 'mine', expected an Endpoint",
+    ),
+    "a server of one's own over UDP": (
+        lambda: skytether.fly("demo", udp=True, server=mine()),
+        skytether.ConfigError,
+        "udp: got True with a server of your own, which flies in virtual time",
+    ),
+    "a server of one's own with keys": (
+        lambda: skytether.fly("demo", secure=True, server=mine()),
+        skytether.ConfigError,
+        "secure: got True with a server of your own, which could not open what is sealed",
+    ),
+    "no seeds": (
+        lambda: skytether.fly_batch("demo", 8),  # type: ignore[arg-type]
+        TypeError,
+        "seeds: got 8, expected several of them, as in range(100)",
+    ),
+    "no seed": (
+        lambda: skytether.fly_batch("demo", [1, -1]),
+        skytether.ConfigError,
+        "demo with these keys: seed: got -1, expected a whole number >= 0",
+    ),
+    "a seed twice": (
+        lambda: skytether.fly_batch("demo", [1, 2, 1]),
+        skytether.ConfigError,
+        "seeds: got 1 twice, expected seeds that differ",
+    ),
+    "no grid": (
+        lambda: skytether.sweep("demo", ["control.epsilon"]),  # type: ignore[arg-type]
+        TypeError,
+        "grid: got ['control.epsilon'], expected lists of values by their keys",
+    ),
+    "one value of a grid": (
+        lambda: skytether.sweep("demo", {"control.trigger": "always"}),
+        TypeError,
+        "grid: control.trigger: got 'always', expected a list of values",
+    ),
+    "no value of a grid": (
+        lambda: skytether.sweep("demo", {"control.epsilon": []}),
+        skytether.ConfigError,
+        "grid: control.epsilon: got no values, expected at least one",
+    ),
+    "a value of a grid twice": (
+        lambda: skytether.sweep("demo", {"control.epsilon": [1.0, 1]}),
+        skytether.ConfigError,
+        "grid: control.epsilon: got 1.0 twice, expected values that differ",
+    ),
+    "a grid of seeds": (
+        lambda: skytether.sweep("demo", {"seed": [1, 2]}),
+        skytether.ConfigError,
+        "grid: got 'seed', expected another key: it counts the runs",
+    ),
+    "a combination that cannot be": (
+        lambda: skytether.sweep("demo", {"control.epsilom": [1]}),
+        skytether.ConfigError,
+        "demo with control.epsilom=1: control.epsilom: no such key; did you mean epsilon?",
+    ),
+    "no runs": (
+        lambda: skytether.sweep("demo", {}, runs=0),
+        skytether.ConfigError,
+        "runs: got 0, expected a whole number from 1 on",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_what_cannot_be_is_refused_in_words(case: str) -> None:
+    """Before anything flies."""
+    attempt, kind, said = REFUSALS[case]
+    with pytest.raises(kind) as refused:
+        attempt()
+    assert str(refused.value) == said
+
+
+def test_a_flight_refuses_in_words(flown: skytether.Flight, tmp_path: Path) -> None:
+    """Unknown arrays, parts and figures, and files that are none."""
+    refusals: list[tuple[Callable[[], object], type[Exception], str]] = [
+        (
+            lambda: flown["positon_m"],
+            KeyError,
+            "no array 'positon_m'; did you mean position_m?",
+        ),
+        (
+            lambda: flown["state"],
+            KeyError,
+            "no array 'state'; did you mean stale?",
+        ),
+        (
+            lambda: flown.to_pandas("clint"),
+            KeyError,
+            "no part 'clint'; did you mean client?",
+        ),
+        (
+            lambda: flown.save(tmp_path / "flight.csv"),
+            skytether.ConfigError,
+            f"{tmp_path}/flight.csv: expected a file that ends in .mcap",
+        ),
+        (
+            lambda: flown.save(tmp_path / "nowhere" / "flight.mcap"),
+            skytether.RecordingError,
+            f"{tmp_path}/nowhere/flight.mcap: cannot be written: No such file or directory",
+        ),
+        (
+            lambda: skytether.Flight.load(__file__),
+            skytether.RecordingError,
+            f"{__file__}: it is no MCAP file, expected a recording (.mcap)",
+        ),
+        (
+            lambda: skytether.Swept({}, flown.scenario, (flown.summary,)).mean("rmse"),
+            KeyError,
+            "no figure 'rmse'; did you mean rmse_z?",
+        ),
+    ]
+    for attempt, kind, said in refusals:
+        with pytest.raises(kind) as refused:
+            attempt()
+        assert refused.value.args[0] == said

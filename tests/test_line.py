@@ -1,0 +1,163 @@
+"""Lines to a vehicle's own hardware: how they are written, and real UDP, TCP and serial ports."""
+
+import asyncio
+import os
+import pty
+import socket
+import tty
+from contextlib import suppress
+from typing import Any
+
+import pytest
+
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.line import LINE, Line, parse_line
+from skytether.shell.driver import Shell, new_event_loop
+from skytether.shell.udp import AddressError
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "peer"),
+    [
+        ("udp:0.0.0.0:14550", Line("udp", "0.0.0.0", 14550), None),
+        ("udpout:[::1]:14550", Line("udpout", "::1", 14550), ("::1", 14550)),
+        ("tcp:autopilot:5760", Line("tcp", "autopilot", 5760), LINE),
+        ("serial:/dev/ttyACM0:57600", Line("serial", "/dev/ttyACM0", 57600), LINE),
+    ],
+)
+def test_a_line_is_what_is_written(text: str, line: Line, peer: Address | None) -> None:
+    """Whoever is at its other end is known before it speaks, but where we listen."""
+    assert parse_line("vehicle.address", text) == line
+    assert line.peer == peer
+
+
+@pytest.mark.parametrize(
+    "text", ["", "udp", "udp:14550", "http:h:1", "tcp:h:70000", "serial:57600", "serial:/dev/x:0"]
+)
+def test_what_is_no_line_is_refused_with_its_key(text: str) -> None:
+    """The line says what was expected, too."""
+    with pytest.raises(ConfigError, match=r"^vehicle.address: got .*, expected udp:HOST:PORT"):
+        parse_line("vehicle.address", text)
+
+
+class Echo(Endpoint):
+    """Says what it hears at socket 1 back to whoever said it; ends once it has heard `enough`."""
+
+    def __init__(self, enough: bytes) -> None:
+        super().__init__()
+        self._enough = enough
+        self.heard = b""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
+        """Say it back."""
+        assert datagram.socket == 1
+        self.heard += datagram.payload
+        self.send(datagram.payload, datagram.peer, 1)
+
+    def wake(self, *, now_ns: int) -> None:
+        """Nothing is due."""
+
+    def next_wake_ns(self) -> None:
+        """None: it is never woken."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has heard enough."""
+        return self.heard.endswith(self._enough)
+
+
+def drive(coroutine: Any) -> Any:
+    """Run on the loop that processes run on, which is uvloop's."""
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        return runner.run(asyncio.wait_for(coroutine, 30))
+
+
+def shell(endpoint: Endpoint, line: str) -> Shell:
+    """A shell whose socket 1 is a line."""
+    return Shell(endpoint, ("127.0.0.1", 0), line=parse_line("line", line))
+
+
+def test_tcp_is_heard_and_opened_again_where_it_has_ended() -> None:
+    """The autopilot's end goes away in between; what was sent before came."""
+
+    async def main() -> tuple[bytes, list[bytes]]:
+        answers: list[bytes] = []
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write(b"first" if not answers else b"last")
+            answers.append(await reader.read(5))
+            writer.close()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        echo = Echo(b"last")
+        await shell(echo, f"tcp:127.0.0.1:{port}").run()
+        while len(answers) < 2:
+            await asyncio.sleep(0.01)
+        server.close()
+        return echo.heard, answers
+
+    heard, answers = drive(main())
+    assert heard == b"firstlast"
+    assert answers[0] == b"first"
+
+
+def test_a_serial_port_carries_bytes_as_they_are() -> None:
+    """Those that a terminal would take for an end of line, or an end, too."""
+    master, slave = pty.openpty()
+    tty.setraw(master)
+    sent = bytes(range(256))
+
+    async def main() -> bytes:
+        echo = Echo(sent)
+        running = asyncio.create_task(shell(echo, f"serial:{os.ttyname(slave)}:57600").run())
+        back = b""
+        os.set_blocking(master, False)
+        await asyncio.sleep(0.2)  # a terminal throws away what came before it was set up
+        os.write(master, sent)
+        while not (running.done() and len(back) == len(sent)):
+            await asyncio.sleep(0.01)
+            with suppress(OSError):
+                back += os.read(master, 4096)
+        return back
+
+    try:
+        assert drive(main()) == sent
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_rate_that_no_port_has_is_refused() -> None:
+    """Before anything is opened."""
+    with pytest.raises(AddressError, match="no serial port runs at 57601 bit/s"):
+        shell(Echo(b""), "serial:/dev/ttyACM0:57601")
+
+
+@pytest.mark.parametrize("kind", ["udp", "udpout"])
+def test_udp_listens_or_speaks_first(kind: str) -> None:
+    """Both are answered where what was heard came from."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.settimeout(5)
+        host, port = autopilot.getsockname()
+
+        async def main() -> bytes:
+            echo = Echo(b"fly")
+            if kind == "udp":
+                driven = shell(echo, "udp:127.0.0.1:0")
+                there = driven._sockets[1].getsockname()
+            else:
+                driven = shell(echo, f"udpout:{host}:{port}")
+                echo.send(b"hello", (host, port), 1)
+            running = asyncio.create_task(driven.run())
+            if kind == "udpout":
+                await asyncio.sleep(0)
+                hello, there = await asyncio.to_thread(autopilot.recvfrom, 100)
+                assert hello == b"hello"
+            autopilot.sendto(b"fly", there)
+            await running
+            return autopilot.recv(100)
+
+        assert drive(main()) == b"fly"

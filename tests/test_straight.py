@@ -1,0 +1,347 @@
+"""Set-points sent straight to an autopilot: the laws, the ground station, and flights by both."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skytether.__main__ import main
+from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.faults import parse as fault
+from skytether.autopilot.flavours import FlavourName
+from skytether.lab.benchmarks import autopilots
+from skytether.mavlink.codec import Codec
+from skytether.mavlink.dialect import dialect
+from skytether.netem.proxy import Proxy
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import Finished, Flying
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.reference import figure_eight
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import (
+    PACKET_COLUMNS,
+    TRUTH_COLUMNS,
+    UPLINK,
+    Record,
+    Recorder,
+)
+from skytether.shared.telemetry.summary import Summary
+from skytether.sim import straight
+from skytether.sim.world import World
+from skytether.station import laws
+from skytether.station.endpoint import Station
+from skytether.station.joined import joined, station_columns, summary_of
+from skytether.station.laws import Heard, setpoint
+
+OTHERS = (("velocity", 1.28), ("targets", 0.64))
+"""Other laws, and the RMSE xy that was measured with them [m]."""
+EIGHT = figure_eight(5.0, 30.0, 3, 5.0)
+NONE = {"delay": "none", "loss": 0.0}
+
+
+def scenario(**table: Any) -> Scenario:
+    """The scenario `autopilot`, flown for 4 s, with some keys changed."""
+    default = reading.to_table(reading.load("autopilot")) | {"duration": 4.0, "settle": 0.0}
+    for key, value in table.items():
+        default[key] = default[key] | value if isinstance(value, dict) else value
+    return reading.check(default, "test")
+
+
+def flown(law: str = "led", flavour: FlavourName = "ardupilot", **table: Any) -> Record:
+    """A flight in virtual time."""
+    return straight.fly(scenario(**table), laws.LAWS[law], flavour)  # type: ignore[index]
+
+
+# -- laws ----------------------------------------------------------------------------------------
+
+
+def test_velocity_flies_to_where_the_vehicle_should_be_now() -> None:
+    """Set-point u(t) = r'(t) + k (r(t) - y), whenever y was measured."""
+    chosen = setpoint(laws.make("velocity"), EIGHT, 4.0, Heard(3.0, np.array([1.0, 2.0, 3.0])))
+    r, v = EIGHT(np.array(4.0)).T
+    np.testing.assert_allclose(chosen.velocity, v + 0.3 * (r - [1.0, 2.0, 3.0]))
+    assert chosen.position is None
+
+
+def test_led_compares_what_was_measured_with_where_it_should_have_been_then() -> None:
+    """Set-point u(t) = r'(t + T) + k (r(t_m) - y(t_m))."""
+    law = laws.make("led", 1.0, 0.4)
+    chosen = setpoint(law, EIGHT, 4.0, Heard(3.0, np.array([1.0, 2.0, 3.0])))
+    ahead, then = EIGHT(np.array(5.0))[:, 1], EIGHT(np.array(3.0))[:, 0]
+    np.testing.assert_allclose(chosen.velocity, ahead + 0.4 * (then - [1.0, 2.0, 3.0]))
+    assert chosen.position is None
+
+
+def test_targets_leave_it_to_the_autopilot_to_regulate() -> None:
+    """Set-points p(t) = r(t + T), u(t) = r'(t + T), wherever the vehicle is."""
+    chosen = setpoint(laws.make("targets", 0.5), EIGHT, 4.0, Heard(3.9, np.zeros(3)))
+    assert chosen.position is not None
+    np.testing.assert_allclose([chosen.position, chosen.velocity], EIGHT(np.array(4.5)).T)
+
+
+@given(st.floats(-10.0, 100.0), st.floats(0.0, 10.0), st.floats(0.0, 5.0))
+def test_a_vehicle_that_was_where_it_should_be_is_told_the_desired_velocity(
+    time_s: float, lead_s: float, age_s: float
+) -> None:
+    """Whatever the lead and the age."""
+    heard = Heard(time_s - age_s, EIGHT(np.array(time_s - age_s))[:, 0])
+    chosen = setpoint(laws.make("led", lead_s), EIGHT, time_s, heard)
+    np.testing.assert_allclose(chosen.velocity, EIGHT(np.array(time_s + lead_s))[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (
+            ["--law", "velocity", "--lead", "1"],
+            "--lead: got 1, expected none with velocity",
+        ),
+        (["--law", "targets", "--gain", "1"], "--gain: got 1, expected none with targets"),
+        (["--gain", "10.5"], "--gain: got 10.5, expected 0 to 10"),
+        (["--lead", "-1"], "--lead: got -1, expected 0 to 10"),
+        (["--lead", "nan"], "--lead: got nan, expected 0 to 10"),
+    ],
+)
+def test_a_number_that_is_of_no_use_is_refused(
+    argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before anything is flown, by both commands."""
+    for name in ("straight", "station"):
+        assert main([name, *argv]) == 2
+        assert capsys.readouterr().err == f"{name}: {said}\n"
+
+
+# -- flights -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("law", "measured_m"),
+    [("led", 0.055), *(pytest.param(*each, marks=pytest.mark.long) for each in OTHERS)],
+)
+def test_it_flies_as_an_arducopter_was_measured_to(law: str, measured_m: float) -> None:
+    """RMSE xy of a whole figure eight over the paper's network, within a tenth."""
+    whole = flown(law, duration=40.0, settle=10.0)
+    summary = summary_of(scenario(duration=40.0, settle=10.0), "autopilot", whole)
+    assert summary.rmse_xy == pytest.approx(measured_m, rel=0.1)
+    _is_counted_as_flown(summary)
+
+
+def _is_counted_as_flown(summary: Summary) -> None:
+    """A set-point a step and 20 positions a second, and little beside."""
+    assert summary.uplink_packets is not None
+    assert summary.downlink_packets is not None
+    assert summary.steps <= summary.uplink_packets < 1.1 * summary.steps
+    assert summary.steps <= summary.downlink_packets < 1.2 * summary.steps
+    assert (summary.covered, summary.deadline_misses, summary.event_ratio) == (1.0, 0, None)
+
+
+def test_px4_is_flown_as_well_and_the_same_seed_flies_the_same() -> None:
+    """It needs a stream before its mode, and is told the altitude of take-off above the sea."""
+    one, other = flown("targets", "px4"), flown("targets", "px4")
+    assert one.trace_hash() == other.trace_hash()
+    assert [type(each.event) for each in one.events].count(Finished) == 1
+    assert str(one.events[-1].event) == "vehicle 1, its autopilot: Disarmed by external command"
+    np.testing.assert_allclose(one.client["state"][0, :, 0], [0.0, 0.0, 5.0], atol=0.2)
+
+
+def test_half_of_all_packets_may_be_lost() -> None:
+    """What is asked for is asked again until it is done."""
+    half = {"delay": "constant", "minimum_s": 0.2, "loss": 0.5}
+    record = flown(network={"uplink": half, "downlink": half})
+    assert record.failure is None
+    assert len(record.client) == 80
+
+
+def test_an_age_is_known_although_clocks_differ() -> None:
+    """By TIMESYNC: of a position 0.2 s under way it is 0.2 s and up to a step."""
+    late = {"delay": "constant", "minimum_s": 0.2, "loss": 0.0}
+    drifts = {"clock_drift_ppm": 500.0, "clock_offset_s": 1000.0}
+    record = flown(network={"uplink": late, "downlink": late}, simulation=drifts)
+    ages_s = record.client["age_ns"] / 1e9
+    assert 0.19 < ages_s.min() <= ages_s.max() < 0.27
+
+
+def test_after_a_cut_px4_is_not_taken_back() -> None:
+    """It has left OFFBOARD by itself; nobody here knows whether a pilot has it."""
+    scene = scenario(duration=8.0)
+    began_s = autopilots.began_ns(flown(duration=8.0, flavour="px4")) / 1e9
+    both = ("network.uplink.loss", "network.downlink.loss")
+    changes = [(began_s + 1.0, dict.fromkeys(both, 1.0)), (began_s + 4.0, dict.fromkeys(both, 0.1))]
+    record = straight.fly(scene, laws.LAWS["led"], "px4", changes=changes)
+    summary = summary_of(scene, "autopilot", record)
+    assert summary.mode == "manual"
+    assert 4.0 < summary.modes["track"] < 6.0
+    sent = record.netem[record.netem["direction"] == UPLINK]
+    since_ns = record.events[0].time_ns + (began_s + 6.0) * 1e9
+    assert (sent["arrived_ns"] > since_ns).sum() < 5  # heartbeats alone
+
+
+@pytest.mark.parametrize("way", ["uplink", "downlink"])
+def test_an_autopilot_that_is_not_reached_is_not_flown(way: str) -> None:
+    """It does not hear, or is not heard."""
+    record = flown(network={way: {"loss": 1.0}}, mavlink={"patience_s": 2.0})
+    said = {
+        "uplink": "vehicle 1: no time told in 2 s: TIMESYNC is not answered",
+        "downlink": "vehicle 1: not heard in 2 s: no heartbeat of an autopilot has come",
+    }
+    assert str(record.failure) == said[way]
+    assert not len(record.client)
+
+
+# -- the station alone ---------------------------------------------------------------------------
+
+
+class Sky:
+    """A station and an autopilot with no network between them.
+
+    Args:
+        faults: what goes wrong, as on the command line.
+    """
+
+    def __init__(self, faults: Sequence[str] = ()) -> None:
+        scene = scenario(duration=6.0, network={"uplink": NONE, "downlink": NONE})
+        self.events: list[tuple[int, object]] = []
+        self.station = Station(scene, laws.LAWS["led"])
+        self.autopilot = Autopilot(
+            scene,
+            "ardupilot",
+            peers=[("netem", 0)],
+            ready_s=0.5,
+            faults=[fault(each) for each in faults],
+        )
+        self.world = World(lambda time_ns, _, event: self.events.append((time_ns, event)))
+        self.world.add("netem", Proxy(scene, server=("station", 0), flows=1))
+        self.world.add("autopilot", self.autopilot)
+        self.world.add("station", self.station)
+
+    def run(self) -> None:
+        """Fly until the station has finished."""
+        self.world.run(lambda: self.station.finished, limit_ns=60 * 10**9)
+        assert self.station.finished
+
+
+def test_a_pilot_that_takes_over_keeps_the_vehicle() -> None:
+    """Nothing is sent from when that was heard; nor is it landed."""
+    sky = Sky(["pilot@12"])
+    sky.run()
+    began_ns = next(time_ns for time_ns, event in sky.events if isinstance(event, Flying))
+    flown_s = 12.0 - (began_ns - (sky.autopilot.flight.armed_ns or 0)) / 1e9
+    assert 20 * flown_s <= sky.station.figures()["setpoints"] <= 20 * (flown_s + 1.1)
+    assert sky.autopilot.flight.mode_name == "LOITER"
+    assert sky.autopilot.flight.flying
+
+
+@given(st.lists(st.binary(max_size=60), max_size=5), st.integers(0, 300))
+def test_bytes_of_anybody_change_nothing(garbage: list[bytes], system: int) -> None:
+    """Nor does another system's traffic; nothing is sent before an autopilot was heard."""
+    station = Station(scenario(), laws.LAWS["led"])
+    other = Codec(system % 256, 190).encode(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+    for now_ns, payload in enumerate([*garbage, other]):
+        station.receive(Datagram(payload, ("anybody", 1)), now_ns=now_ns)
+        station.wake(now_ns=now_ns)
+    assert station.outbox() == []
+    assert station.failure is None
+
+
+def test_what_is_no_quadrotor_is_not_flown() -> None:
+    """Said in words."""
+    station = Station(scenario(), laws.LAWS["led"])
+    plane = dialect.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)
+    station.receive(Datagram(Codec(1, 1).encode(plane), ("plane", 1)), now_ns=0)
+    assert "it is of MAV_TYPE 1, expected one that hovers" in str(station.failure)
+    assert station.finished
+
+
+def test_a_flight_that_begins_on_the_ground_is_refused() -> None:
+    """The autopilot could not take off to it."""
+    with pytest.raises(ConfigError, match=r"takeoff_m: got 'auto' at altitude 0 m"):
+        Station(scenario(reference={"altitude_m": 0.0}), laws.LAWS["led"])
+
+
+# -- the record ----------------------------------------------------------------------------------
+
+
+def test_the_true_state_is_taken_at_the_time_of_each_step() -> None:
+    """Between two ticks of the autopilot in between; where it told nothing, nothing is known."""
+    scene = scenario()
+    station = np.zeros(3, station_columns(3))
+    station["time_ns"], station["step"] = [0, 50_000_000, 100_000_000], [0, 1, 2]
+    truth = np.zeros(2, TRUTH_COLUMNS)
+    truth["time_ns"] = [40_000_000, 100_000_000]
+    truth["state"][1] = [[6.0, 0.6], [12.0, 1.2], [18.0, 1.8]]
+    netem = np.zeros(3, PACKET_COLUMNS)
+    netem["arrived_ns"] = [-1, 149_999_999, 150_000_000]
+    record = joined(scene, station, truth, netem)
+    assert np.isnan(record.client["state"][0]).all()
+    np.testing.assert_allclose(record.client["state"][1], truth["state"][1] / 6.0)
+    np.testing.assert_allclose(record.client["state"][2], truth["state"][1])
+    assert record.netem["arrived_ns"].tolist() == [149_999_999]
+    assert msgspec.structs.asdict(summary_of(scene, "test", record))["estimate_error_m"] is None
+
+
+def test_the_autopilot_records_where_it_truly_is_at_every_tick() -> None:
+    """By the driver's clock."""
+
+    class Sink(bytearray):
+        def write(self, piece: bytes) -> None:
+            self.extend(piece)
+
+    sink = Sink()
+    autopilot = Autopilot(
+        scenario(), "ardupilot", ready_s=0.5, recorder=Recorder(TRUTH_COLUMNS, sink)
+    )
+    for now_ns in (7_000_000, 27_000_000):
+        autopilot.wake(now_ns=now_ns)
+    rows = np.frombuffer(bytes(sink).partition(b"\n")[2], TRUTH_COLUMNS)
+    assert rows["time_ns"].tolist() == [12_000_000, 17_000_000, 22_000_000, 27_000_000]
+    np.testing.assert_array_equal(rows["state"], 0.0)
+
+
+# -- the benchmark, and real UDP -----------------------------------------------------------------
+
+
+def test_the_benchmark_makes_a_table_of_what_was_flown() -> None:
+    """Means over seeds of one flavour and air."""
+    nothing = [np.zeros(80, columns) for columns in (station_columns(3), TRUTH_COLUMNS)]
+    record = joined(scenario(), *nothing, np.zeros(0, PACKET_COLUMNS))
+    summary = summary_of(scenario(), "autopilot", record)
+    summary = msgspec.structs.replace(summary, error_max=1.0, duration_s=4.0)
+    flights = [
+        autopilots.Flown(
+            contender="led",
+            flavour="px4",
+            air="wind",
+            seed=seed,
+            whole=msgspec.structs.replace(
+                summary, rmse_xy=rmse, error_max=1.0, uplink_packets=packets, duration_s=4.0
+            ),
+            cut=msgspec.structs.replace(summary, mode="manual" if seed else "track"),
+            largest_m=float(seed),
+        )
+        for seed, rmse, packets in ((0, 0.1, 80), (1, 0.2, 120))
+    ]
+    ((name, table),) = autopilots.tables(flights).items()
+    assert name == "px4 wind"
+    ((*row,),) = table.rows
+    assert row[:4] == ["led", "0.150", "0.100 to 0.200", "1.00"]
+    assert (row[4], *row[-2:]) == ("25.0", "1.00", "1 of 2")
+
+
+@pytest.mark.long
+def test_it_flies_over_udp(tmp_path: Path) -> None:
+    """Three processes on loopback; the same figures as in virtual time, but for the machine's."""
+    file, figure = tmp_path / "summary.json", tmp_path / "flight.svg"
+    argv = ["--udp", "--duration", "12", "--settle", "6", "--json", str(file)]
+    assert main(["straight", *argv, "--figure", str(figure)]) == 0
+    summary = msgspec.json.decode(file.read_bytes(), type=Summary)
+    _is_counted_as_flown(msgspec.structs.replace(summary, deadline_misses=0))
+    scene = scenario(duration=12.0, settle=6.0)
+    virtual = summary_of(scene, "autopilot", flown(duration=12.0, settle=6.0))
+    assert summary.rmse_xy == pytest.approx(virtual.rmse_xy, abs=0.05)
+    assert figure.read_text().startswith("<?xml")
