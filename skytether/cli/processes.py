@@ -13,6 +13,7 @@ import sys
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -300,14 +301,15 @@ def fly_chain(
 def record_of(
     parts: Path, scenario: Scenario, shortfalls: Sequence[Shortfall], said: Sequence[LogLine] = ()
 ) -> Record:
-    """Record of a flight, from what its processes have left; time counts from their first line on.
+    """Record of a flight, from what its processes have left; time counts from their first event on.
 
     Args:
         parts: see `run`.
         shortfalls: what `run` has returned.
-        said: the processes' events, in their order.
+        said: the processes' events, as their lines came; the record has them by their times.
     """
     axes = scenario.model.axes
+    said = sorted(said, key=attrgetter("time_ns"))
     netem = _rows(parts / "netem", PACKET_COLUMNS).copy()
     zero_ns = said[0].time_ns if said else 0
     netem["arrived_ns"] -= zero_ns
