@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from skytether.cli.fly import _tell
-from skytether.cli.processes import Child, _read, started
+from skytether.cli.processes import Child, _read, record_of, started
 from skytether.shared.core.events import (
     Counted,
     Finished,
@@ -23,7 +23,9 @@ from skytether.shared.core.events import (
     NoFailsafe,
     Plaintext,
     RecordIncomplete,
+    SessionEnded,
 )
+from skytether.shared.scenario.reading import load
 from skytether.shell.command import CommandError
 from skytether.shell.log import LogLine
 
@@ -102,6 +104,23 @@ async def test_a_child_whose_record_is_incomplete_has_told_so(tmp_path: Path) ->
     assert told in [line.event for line in heard]
     assert (netem.fell_short, netem.failed, netem.process.returncode) == (True, False, 1)
     assert netem.last_words() == f"netem: {file}: File too large: 0 of 0 rows are recorded"
+
+
+def test_events_of_a_flight_stand_in_the_order_of_their_times(tmp_path: Path) -> None:
+    """One process's line may come before an earlier one of another; the first is time 0."""
+    said = [
+        LogLine(process="server", time_ns=7, event=SessionEnded(vehicle=1)),
+        LogLine(process="client", time_ns=5, event=Flying(vehicle=1)),
+        LogLine(process="netem", time_ns=7, event=Counted(figures={})),
+    ]
+    for part in ("client", "server", "netem"):
+        (tmp_path / part).touch()
+    record = record_of(tmp_path, load("demo"), (), said)
+    assert [(each.time_ns, each.process) for each in record.events] == [
+        (0, "client"),
+        (2, "server"),
+        (2, "netem"),
+    ]
 
 
 async def test_a_line_without_end_hides_nothing_that_follows() -> None:
