@@ -4,7 +4,8 @@
     offset = (t₁ + t₂) / 2 - b, wrong by no more than (t₂ - t₁) / 2
 
 Answers that took much longer than the quickest of the window are left out; a line through the rest
-has offset and drift.
+has offset and drift. It is moved to where no answer contradicts it: each says between which two
+numbers the offset was, and since then the clocks have drifted by no more than `DRIFT_MAX`.
 """
 
 from collections import deque
@@ -114,19 +115,32 @@ class BootClock:
         most = least + least // 2 + SPREAD_NS
         quick = [sample for sample in self._samples if sample.round_trip_ns <= most]
         self.round_trip_ns = least
-        origin = quick[-1].local_ns
-        times = [float(sample.local_ns - origin) for sample in quick]
+        newest = self._samples[-1].local_ns
+        times = [float(sample.local_ns - newest) for sample in quick]
         base = quick[-1].offset_ns
         offsets = [float(sample.offset_ns - base) for sample in quick]
         if times[-1] - times[0] < DRIFT_SPAN_NS:
-            self._line, self.drift = (origin, base + median(offsets), 0.0), 0.0
-            return
-        middle, mean = fmean(times), fmean(offsets)
-        spread = sum((time - middle) ** 2 for time in times)
-        pairs = zip(times, offsets, strict=True)
-        slope = sum((time - middle) * (offset - mean) for time, offset in pairs) / spread
-        self.drift = max(-DRIFT_MAX, min(DRIFT_MAX, slope))
-        self._line = origin, base + mean - self.drift * middle, self.drift
+            offset, self.drift = median(offsets), 0.0
+        else:
+            middle, mean = fmean(times), fmean(offsets)
+            spread = sum((time - middle) ** 2 for time in times)
+            pairs = zip(times, offsets, strict=True)
+            slope = sum((time - middle) * (offset - mean) for time, offset in pairs) / spread
+            self.drift = max(-DRIFT_MAX, min(DRIFT_MAX, slope))
+            offset = mean - self.drift * middle
+        self._line = newest, self._within(base + offset), self.drift
+
+    def _within(self, offset_ns: float) -> float:
+        """Offset at the newest answer, the nearest to this one that no answer contradicts [ns]."""
+        newest = self._samples[-1].local_ns
+        reach = [
+            sample.round_trip_ns / 2 + DRIFT_MAX * (newest - sample.local_ns)
+            for sample in self._samples
+        ]
+        pairs = list(zip(self._samples, reach, strict=True))
+        least = max(sample.offset_ns - wrong for sample, wrong in pairs)
+        most = min(sample.offset_ns + wrong for sample, wrong in pairs)
+        return max(least, min(most, offset_ns)) if least <= most else offset_ns
 
     def _offset(self, local_ns: int) -> float:
         origin_ns, offset_ns, drift = self._line
