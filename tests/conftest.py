@@ -9,12 +9,17 @@ from contextlib import nullcontext
 from functools import cache
 from typing import Any
 
+import hypothesis
 import pytest
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell's job in the background ignores Ctrl-C, and so would every command that a test starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# What is tested is the same each time; `--hypothesis-profile=fresh` draws other examples.
+hypothesis.settings.register_profile("same", derandomize=True)
+hypothesis.settings.register_profile("fresh", derandomize=False)
+hypothesis.settings.load_profile("same")
 # No flight of a test serves a page, unless the test asks for one.
 os.environ.setdefault("SKYTETHER_PAGE", "none")
 # Tests share the cores among themselves; threads for matrices of a hundred rows wait in loops.
