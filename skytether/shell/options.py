@@ -150,6 +150,8 @@ def _tell_tyro(options: type) -> None:
 
     def told(hint: Any) -> Any:
         argument = _argument(hint)
+        if hint is bool:
+            return Annotated[hint, conf.FlagCreatePairsOff]  # no --no-no-page
         if argument is None:
             return hint
         words = [conf.arg(name=argument.name, metavar=argument.metavar, help=argument.help)]
