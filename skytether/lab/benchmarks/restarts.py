@@ -329,6 +329,7 @@ def measure(counts: RestartsCounts) -> dict[str, Any]:
         for subject, way in progress(schedule(counts), "restarts"):
             lateness.sleep(counts.flight_s + float(rng.random()))
             outages.append(flight.suffer(subject, way))
+            lateness.sleep(BRAKES_S)  # what was back sooner may not be missed yet
             flight.wait_for_flight()
         lateness.sleep(counts.flight_s)
         lives = flight.end()
