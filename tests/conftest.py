@@ -16,9 +16,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell's job in the background ignores Ctrl-C, and so would every command that a test starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# What is tested is the same each time; `--hypothesis-profile=fresh` draws other examples.
-hypothesis.settings.register_profile("same", derandomize=True)
-hypothesis.settings.register_profile("fresh", derandomize=False)
+# What is tested is the same each time; `--hypothesis-profile=fresh` draws other examples. No test
+# looks at the time, for the machine may be busy.
+UNTIMED: dict[str, Any] = {
+    "deadline": None,
+    "suppress_health_check": [hypothesis.HealthCheck.too_slow],
+}
+hypothesis.settings.register_profile("same", derandomize=True, **UNTIMED)
+hypothesis.settings.register_profile("fresh", derandomize=False, **UNTIMED)
 hypothesis.settings.load_profile("same")
 # No flight of a test serves a page, unless the test asks for one.
 os.environ.setdefault("SKYTETHER_PAGE", "none")
