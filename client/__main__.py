@@ -163,4 +163,5 @@ def fly(argv: Sequence[str]) -> None:
                 command.write(options.json, msgspec.json.encode(summary))
         if failure := endpoint.failure:
             refused = isinstance(failure, SessionRefused | NoSession | ParametersUnsafe)
-            raise CommandError(str(failure), command.CONFIGURATION if refused else command.RUN)
+            said = failure.brief if isinstance(failure, ParametersUnsafe) else str(failure)
+            raise CommandError(said, command.CONFIGURATION if refused else command.RUN)

@@ -50,6 +50,7 @@ class Processes:
     def __init__(self, folder: Path, flavour: FlavourName) -> None:
         self.folder, self.flavour = folder, flavour
         self.heard: list[LogLine] = []
+        self.last_words = ""
         """Events of the client."""
         self.autopilot: list[str] = []
         """Sentences of the autopilot."""
@@ -94,6 +95,7 @@ class Processes:
             await asyncio.sleep(3.0)
             client.process.send_signal(end)
         code = await asyncio.wait_for(client.end(), 150.0)
+        self.last_words = client.last_words()
         for _ in range(200):
             if end is None or any(said.startswith("Disarm") for said in self.autopilot):
                 break
@@ -152,6 +154,10 @@ async def test_unsafe_parameters_end_with_a_line_each(tmp_path: Path) -> None:
     lines = str(failure).splitlines()
     names = [line.split(": ")[1].split(" = ")[0] for line in lines]
     assert names == ["GUID_TIMEOUT", "FS_GCS_ENABLE", "SYSID_MYGCS"]
+    assert processes.last_words == (
+        "client: vehicle 1 is not armed: GUID_TIMEOUT, FS_GCS_ENABLE, SYSID_MYGCS; "
+        "client --set-parameters sets them"
+    )
     modes = processes.events(AutopilotMode)
     assert not any(each.armed for each in modes if isinstance(each, AutopilotMode))
 

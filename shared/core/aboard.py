@@ -107,6 +107,12 @@ class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
         lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
         return "\n".join(lines)
 
+    @property
+    def brief(self) -> str:
+        """All of them in one line, by name."""
+        names = ", ".join(parameter.name for parameter in self.parameters)
+        return f"vehicle {self.vehicle} is not armed: {names}; client --set-parameters sets them"
+
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle is not flown, for its autopilot has not come into the air with it."""
