@@ -2,7 +2,6 @@
 
 import pytest
 
-from airborne import Air
 from bad_line import ARM, SET_MODE, SETTLE_S, OverLine, fly
 from skytether.autopilot.flavours import FlavourName
 from skytether.client.mavlink.condition import Condition
@@ -67,9 +66,9 @@ def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
 
 def test_this_line_spoils_what_it_says() -> None:
     """It loses a tenth, and what comes is nearly as much others' as ours."""
-    air: Air = OverLine("ardupilot", 3, armed=False)
+    air = OverLine("ardupilot", 3, armed=False)
     air.run(20.0)
-    counts, figures = air.line.counts, air.figures()  # type: ignore[attr-defined]
+    counts, figures = air.line.counts, air.figures()
     assert counts["lost"] == pytest.approx(0.1 * counts["frames"], rel=0.2)
     assert min(counts["late"], counts["doubled"], counts["cut"], counts["flipped"]) > 50
     assert figures["garbage_bytes"] > 10_000
