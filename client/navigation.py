@@ -101,7 +101,7 @@ class Navigation:
         if self._begun:
             self._filter.advance(due, swing)
         self.leapt = False
-        for measured in measurements:
+        for measured in measurements if self._begun else _newest(measurements):
             self.leapt |= self._leaps.leaps(measured)
             if self._begun:
                 self._filter.take(self._carried(measured, now_ns - self._delay_ns, due))
@@ -139,6 +139,16 @@ class Navigation:
             if position:
                 position[i] += steady * age + (known[i] - steady) * tau * (1.0 - left)
         return Measurement(to_ns, position or None, velocity if measured.velocity else None)
+
+
+def _newest(measurements: Sequence[Measurement]) -> Sequence[Measurement]:
+    """Measurements from the newest position on: a vehicle is known from there.
+
+    What was measured before the first step is of a vehicle that others flew: in its climb, the
+    autopilot. With the inputs that we know, the filter would make a disturbance of that.
+    """
+    placed = [i for i, each in enumerate(measurements) if each.position is not None]
+    return measurements[placed[-1] :] if placed else ()
 
 
 class _Leaps:

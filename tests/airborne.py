@@ -19,7 +19,7 @@ from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Event
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, Rows, client_columns, parse
 from skytether.sim.world import Clock, World
 
 SAFE: dict[FlavourName, dict[str, float]] = {
@@ -146,8 +146,14 @@ class Air:
         **table: Any,
     ) -> None:
         self.scenario = scenario(**table)
+        self.truth = io.BytesIO()
+        """Where the vehicle truly was: rows of TRUTH_COLUMNS."""
         self.autopilot = Autopilot(
-            self.scenario, flavour, ready_s=ready_s, faults=[parse_fault(each) for each in faults]
+            self.scenario,
+            flavour,
+            ready_s=ready_s,
+            faults=[parse_fault(each) for each in faults],
+            recorder=Recorder(TRUTH_COLUMNS, self.truth),
         )
         self.autopilot.flight.parameters |= SAFE[flavour] if parameters is None else parameters
         self.tap = Tap(self.autopilot)

@@ -4,6 +4,8 @@
 and each kind of traffic that is not its own is met here.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,7 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import (
     AutopilotFound,
+    AutopilotMode,
     AutopilotRefused,
     AutopilotText,
     NotTakenOff,
@@ -642,6 +645,60 @@ def test_others_are_not_the_autopilot() -> None:
     air.run(0.1)
     assert air.figures()["dropped"]["for_others"] == 1
     assert not air.of(AutopilotRefused)
+
+
+def late_heartbeat(air: Air, until: Callable[[], bool] = lambda: False) -> None:
+    """Let time pass until something is so; a heartbeat of before comes again 0.3 s later."""
+    heartbeats: list[bytes] = []
+
+    def note(message: Message) -> None:
+        if message.get_type() == "HEARTBEAT":
+            heartbeats.append(bytes(message.get_msgbuf()))
+
+    air.tap.alter = note
+    air.run(30.0, until)
+    before = heartbeats[-1]
+    air.run(0.3)
+    air.tap.extra.append(before)
+
+
+def test_a_late_heartbeat_does_not_take_the_vehicle_back_from_a_pilot() -> None:
+    """It was sent before he took over: one with a newer number has come."""
+    air = flying("ardupilot")
+
+    def in_a_second() -> bool:
+        return air.world.now_ns >= began_ns + SECOND
+
+    began_ns = air.world.now_ns
+    air.world.at(began_ns + SECOND - 1, lambda: air.flight.act(Flown.PILOT, "Pilot has taken over"))
+    late_heartbeat(air, in_a_second)
+    quiet_ns = air.world.now_ns
+    air.run(2.0)
+    assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
+    assert not air.setpoints(quiet_ns)
+    assert air.of(AutopilotMode)[-1].mode == "LOITER"
+    assert sum(each.mode == "LOITER" for each in air.of(AutopilotMode)) == 1
+
+
+def test_a_late_heartbeat_does_not_end_the_climb() -> None:
+    """It was sent before the vehicle was armed."""
+    air = Air("ardupilot")
+    late_heartbeat(air, lambda: air.flight.armed)
+    air.fly()
+    assert air.client.failure is None
+
+
+def test_an_autopilot_that_counts_anew_is_heard_after_a_pause() -> None:
+    """As after a reboot: its numbers are lower than before."""
+    air = flying("ardupilot")
+    (peer,) = air.autopilot._peers.values()
+    air.tap.dumb = True
+    air.run(2.0)
+    air.tap.dumb = False
+    peer.codec._mavlink.seq = (peer.codec._mavlink.seq - 120) % 256
+    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.run(0.5)
+    assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
 
 
 def test_stamps_that_cannot_be_are_dropped_and_counted() -> None:

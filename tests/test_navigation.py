@@ -507,3 +507,29 @@ def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
         off_m.append(np.abs(flight["estimate"] - flight["state"])[20:, :, 0].max())
     assert off_m[0] < 0.002
     assert off_m[1] > 0.01
+
+
+def test_a_flight_begins_where_the_vehicle_was_measured_last() -> None:
+    """What it did before, flown by others, is no disturbance: here it has climbed for a second."""
+    flown = scenario("autopilot")
+    measured = [
+        Measurement(n * SECOND_NS // 50, [0.0, 0.0, 4.0 + n / 50], [0.0, 0.0, 2.0 - n / 25])
+        for n in range(51)
+    ]
+    known, still = Navigation(flown), np.zeros(3)
+    begin_ns = measured[-1].stamp_ns
+    known.advance([Measurement(1, None, [9.0, 9.0, 9.0]), *measured], still, now_ns=begin_ns)
+    np.testing.assert_allclose(known.estimate, [(0.0, 0.0), (0.0, 0.0), (5.0, 0.0)])
+    later = Measurement(begin_ns + DT_NS, [0.0, 0.0, 5.0], [0.0, 0.0, 0.0])
+    known.advance([later], still, now_ns=later.stamp_ns)
+    np.testing.assert_allclose(known.predicted, known.estimate, atol=1e-9)
+
+
+def test_a_vehicle_without_a_position_is_not_known() -> None:
+    """A velocity alone begins nothing."""
+    known = Navigation(scenario())
+    known.advance([Measurement(0, None, [1.0, 0.0])], np.zeros(2), now_ns=0)
+    assert not known.is_known
+    known.advance([Measurement(DT_NS, [1.0, 2.0], [0.0, 0.0])], np.zeros(2), now_ns=DT_NS)
+    assert known.is_known
+    assert known.estimate == [(1.0, 0.0), (2.0, 0.0)]

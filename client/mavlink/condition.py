@@ -11,6 +11,11 @@ LOW_NS = 2 * SECOND_NS
 """Time for which the battery has to be low [ns]: its voltage sags where thrust is wanted."""
 FRESH_NS = 2500 * MILLISECOND_NS
 """Age up to which a heartbeat tells of now [ns]: one may be lost."""
+NUMBERS = 256
+"""Numbers of frames, after which they begin anew."""
+OVERTAKEN_NS = SECOND_NS
+"""Longest time for which a frame with a lower number than the newest counts as overtaken [ns];
+after a longer pause its sender may have begun anew."""
 KNOWS = dialect.ESTIMATOR_VELOCITY_HORIZ
 """Flag of an estimate that knows its velocity."""
 PLACED = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_POS_HORIZ_REL
@@ -38,6 +43,10 @@ class Condition:
         """Time of the newest message of the autopilot."""
         self.heartbeat_ns: int | None = None
         """Time of its newest heartbeat."""
+        self._number = 0
+        """Number of the newest frame."""
+        self._number_ns: int | None = None
+        """Time at which it came."""
         self.mode = -1
         """Number of its mode; -1 before it is known."""
         self.armed = False
@@ -59,8 +68,15 @@ class Condition:
         """Time since which the battery is low."""
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        """Take a message of the autopilot."""
+        """Take a message of the autopilot, unless a newer one has come before it.
+
+        These messages have no stamps: a heartbeat that was overtaken would give back what a pilot
+        has just taken.
+        """
         self.heard_ns = now_ns
+        if self._is_overtaken(message.get_seq(), now_ns):
+            return
+        self._number, self._number_ns = message.get_seq(), now_ns
         match message.get_type():
             case "HEARTBEAT":
                 self.heartbeat_ns = now_ns
@@ -78,6 +94,11 @@ class Condition:
                 self._bad("ESTIMATE", not knows, now_ns)
             case "HOME_POSITION":
                 self.home = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+
+    def _is_overtaken(self, number: int, now_ns: int) -> bool:
+        if self._number_ns is None or now_ns - self._number_ns > OVERTAKEN_NS:
+            return False
+        return 0 < (self._number - number) % NUMBERS < NUMBERS // 2
 
     def _hear_status(self, message: Message, now_ns: int) -> None:
         percent, millivolts = message.battery_remaining, message.voltage_battery

@@ -129,7 +129,8 @@ class Autopilot(Endpoint):
         ready_s = self._flavour.ready_s if ready_s is None else ready_s
         self.flight = PILOTS[flavour](self._flavour, quadrotor, ready_s)
         self._telling = Telling(self.flight)
-        self._script = Script(faults)
+        self.script = Script(faults)
+        """What goes wrong."""
         self._recorder = recorder
         self._began_ns: int | None = None
         """Time at which its own clock began [ns; the driver's]."""
@@ -213,7 +214,7 @@ class Autopilot(Endpoint):
         if behind_ns > BEHIND_MAX_NS:
             self._began_ns += behind_ns - BEHIND_MAX_NS
         while self._began_ns + self.flight.now_ns + TICK_NS <= now_ns:
-            self._script.play(self.flight)
+            self.script.play(self.flight)
             self.flight.tick()
             self._record(self._began_ns + self.flight.now_ns)
             self._speak()
@@ -244,7 +245,7 @@ class Autopilot(Endpoint):
 
     def _send(self, peer: Peer, message: Message) -> None:
         """Send a message to a peer, unless nothing is sent."""
-        if not self._script.silent:
+        if not self.script.silent:
             self._counts["sent"] += 1
             self.send(peer.codec.encode(message), peer.address)
 

@@ -1,0 +1,347 @@
+"""A bad line between client and autopilot, with others on it, and flights over it.
+
+`python tests/bad_line.py --minutes 60` flies for as long, and prints what came of each flight.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from heapq import heappop, heappush
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from airborne import Air
+from skytether.autopilot.flavours import FlavourName
+from skytether.autopilot.flavours import Mode as Flown
+from skytether.lab.benchmarks.autopilots import MODELS
+from skytether.mavlink.codec import Codec, Message
+from skytether.mavlink.dialect import dialect
+from skytether.mavlink.text import chunks
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.core.aboard import AutopilotMode
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.events import Flying
+from skytether.shared.scenario import reading
+from skytether.shared.telemetry.record import parse
+from skytether.shared.wire.protocol import Mode
+from skytether.station.joined import state_at
+
+CLIENT, AUTOPILOT = ("client", 1), ("autopilot", 0)
+LOST, DOUBLED, LATE, CUT, FLIPPED = 0.1, 0.05, 0.05, 0.1, 0.1
+"""Shares of frames that are lost, that come twice, that come late, and of which a part, or a copy
+with other bits, comes as well."""
+LATE_NS = 400 * MILLISECOND_NS
+"""Most by which a frame comes late [ns]."""
+OTHERS_NS = 20 * MILLISECOND_NS
+"""Time between two words of others [ns]."""
+FLIGHT_S = 240.0
+"""Length of a flight [s]."""
+SETTLE_S = 20.0
+"""Time of a flight before which its error does not count [s]: it catches up with the reference."""
+FENCE = {"low_m": [-7.0, -7.0, 2.0], "high_m": [7.0, 7.0, 8.0]}
+STATION, VEHICLE, CAMERA, TWIN = (255, 190), (2, 1), (1, 100), (245, 190)
+"""Numbers of a ground station, another vehicle, a camera aboard, and one with our own number."""
+MODES = (0, 4, 5, 6, 9, 6 << 16, 3 << 16, 4 << 16 | 6 << 24)
+"""Modes of either flavour."""
+ARM, SET_MODE = 400, 176
+
+
+class BadLine(Endpoint):
+    """A line that loses, doubles, delays and spoils frames, and on which others talk.
+
+    Args:
+        seed: of all that is drawn.
+        is_bad: whether it is; a good one hands on what it gets.
+    """
+
+    def __init__(self, seed: int, *, is_bad: bool = True) -> None:
+        super().__init__()
+        self.is_bad = is_bad
+        self._rng = np.random.default_rng(seed)
+        self._codecs = {each: Codec(*each) for each in (STATION, VEHICLE, CAMERA, TWIN)}
+        self._reader = Codec(9, 9)
+        self._held: list[tuple[int, int, bytes, Address]] = []
+        """Heap of what comes late: time [ns], number, frame and receiver."""
+        self._others_ns = 0
+        self.counts: Counter[str] = Counter()
+        """Number of each thing that was done."""
+        self.sent: list[tuple[int, Message]] = []
+        """Messages of the client's, but heartbeats and questions, and when [ns]."""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        from_client = datagram.peer == CLIENT
+        receiver = AUTOPILOT if from_client else CLIENT
+        if from_client:
+            for message in self._reader.decode(datagram.payload):
+                if message.get_type() in ("COMMAND_LONG", "SET_POSITION_TARGET_LOCAL_NED"):
+                    self.sent.append((now_ns, message))
+        self.counts["frames"] += 1
+        if not self.is_bad:
+            self.send(datagram.payload, receiver)
+            return
+        if self._happens("lost", LOST):
+            return
+        if self._happens("late", LATE):
+            self._hold(datagram.payload, receiver, now_ns)
+        else:
+            self.send(datagram.payload, receiver)
+        if self._happens("doubled", DOUBLED):
+            self._hold(datagram.payload, receiver, now_ns)
+        if self._happens("cut", CUT):
+            self.send(datagram.payload[: self._draw(len(datagram.payload))], receiver)
+        if self._happens("flipped", FLIPPED):
+            spoilt = bytearray(datagram.payload)
+            for _ in range(1 + self._draw(8)):
+                spoilt[self._draw(len(spoilt))] ^= 1 << self._draw(8)
+            self.send(bytes(spoilt), receiver)
+
+    def _draw(self, count: int) -> int:
+        return int(self._rng.integers(count))
+
+    def _happens(self, what: str, share: float) -> bool:
+        happens = self._rng.random() < share
+        self.counts[what] += happens
+        return bool(happens)
+
+    def _hold(self, payload: bytes, receiver: Address, now_ns: int) -> None:
+        heappush(self._held, (now_ns + self._draw(LATE_NS), len(self._held), payload, receiver))
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        while self._held and self._held[0][0] <= now_ns:
+            _, _, payload, receiver = heappop(self._held)
+            self.send(payload, receiver)
+        if self.is_bad and now_ns >= self._others_ns:
+            self._others_ns = now_ns + OTHERS_NS
+            self._talk(now_ns // MILLISECOND_NS)
+
+    def next_wake_ns(self) -> int | None:
+        """See `Endpoint`."""
+        if not self.is_bad:
+            return None
+        return min([self._others_ns, *(each[0] for each in self._held[:1])])
+
+    def _talk(self, now_ms: int) -> None:
+        """Let somebody say something to the client, and to the autopilot."""
+        for sender in (VEHICLE, CAMERA, STATION, TWIN):
+            said = self._foreign(now_ms)
+            self.counts["foreign"] += 1
+            self.send(self._codecs[sender].encode(said), CLIENT)
+        asked = self._asked(now_ms)
+        self.send(self._codecs[STATION].encode(asked), AUTOPILOT)
+        for receiver in (CLIENT, AUTOPILOT):
+            self.counts["random"] += 1
+            noise = self._rng.bytes(1 + self._draw(60))
+            start = (b"", b"\xfd", b"\xfe")[self._draw(3)]
+            self.send(start + noise, receiver)
+
+    def _foreign(self, now_ms: int) -> Message:
+        """Something that is another's, and would be dangerous if it were our autopilot's."""
+        rng, mode = self._rng, MODES[self._draw(len(MODES))]
+        armed, client = 128 * self._draw(2), (245, 191)
+        x, y, z, *v = rng.uniform(30.0, 99.0, 6).tolist()
+        long = dialect.MAVLink_command_long_message
+        makers: list[Callable[[], Message]] = [
+            lambda: dialect.MAVLink_heartbeat_message(2, (3, 12)[mode > 99], 1 + armed, mode, 4, 3),
+            lambda: dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3),
+            lambda: dialect.MAVLink_local_position_ned_message(now_ms, x, y, -z, *v),
+            lambda: dialect.MAVLink_extended_sys_state_message(0, 1 + self._draw(2)),
+            lambda: dialect.MAVLink_sys_status_message(0, 0, 0, 0, 9000, 0, 2, 0, 0, 0, 0, 0, 0),
+            lambda: dialect.MAVLink_ekf_status_report_message(0, 9.0, 9.0, 9.0, 9.0, 9.0),
+            lambda: dialect.MAVLink_estimator_status_message(0, 0, 9.0, 9, 9, 9, 9, 9, 9.0, 9.0),
+            lambda: dialect.MAVLink_command_ack_message(
+                (ARM, SET_MODE, 22)[self._draw(3)],
+                self._draw(5),
+                target_system=(0, *client)[self._draw(2)],
+            ),
+            lambda: dialect.MAVLink_timesync_message(now_ms * 900_000, now_ms * MILLISECOND_NS),
+            lambda: dialect.MAVLink_param_value_message(b"GUID_TIMEOUT", 30.0, 9, 500, 7),
+            lambda: dialect.MAVLink_param_value_message(b"COM_OF_LOSS_T", 30.0, 9, 500, 7),
+            lambda: dialect.MAVLink_param_set_message(1, 1, b"GUID_TIMEOUT", 30.0, 9),
+            lambda: long(*client, ARM, 0, float(self._draw(2)), 0, 0, 0, 0, 0, 0),
+            lambda: long(1, 1, SET_MODE, 0, 1.0, float(mode % 256), 0, 0, 0, 0, 0),
+            lambda: dialect.MAVLink_set_mode_message(1, 1, mode),
+            lambda: dialect.MAVLink_set_position_target_local_ned_message(
+                now_ms, 1, 1, 1, 0b110111000000, x, y, -z, *v, 0, 0, 0, 0, 0
+            ),
+            lambda: dialect.MAVLink_home_position_message(
+                1, 2, 3, 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0
+            ),
+            lambda: chunks(0, "EMERGENCY! Crash: disarming", self._draw(2))[0],
+        ]
+        return makers[self._draw(len(makers))]()
+
+    def _asked(self, now_ms: int) -> Message:
+        """Something that a ground station asks of our autopilot, or commands another vehicle.
+
+        What the autopilot answers is heard by the client as well.
+        """
+        mode = MODES[self._draw(len(MODES))]
+        long = dialect.MAVLink_command_long_message
+        makers: list[Callable[[], Message]] = [
+            lambda: dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3),
+            lambda: dialect.MAVLink_timesync_message(0, now_ms * MILLISECOND_NS),
+            lambda: dialect.MAVLink_param_request_read_message(1, 1, b"GUID_TIMEOUT", -1),
+            lambda: dialect.MAVLink_param_request_list_message(1, 1),
+            lambda: long(1, 1, 512, 0, 32.0, 0, 0, 0, 0, 0, 0),  # a position, once
+            lambda: long(1, 1, 31000, 0, 0, 0, 0, 0, 0, 0, 0),  # what it does not know
+            lambda: long(2, 1, ARM, 0, float(self._draw(2)), 21196.0, 0, 0, 0, 0, 0),
+            lambda: long(2, 1, SET_MODE, 0, 1.0, float(mode % 256), 0, 0, 0, 0, 0),
+            lambda: dialect.MAVLink_set_mode_message(2, 1, mode),
+            lambda: dialect.MAVLink_set_position_target_local_ned_message(
+                now_ms, 2, 1, 1, 0b110111000111, 0, 0, 0, 9.0, 9.0, 0, 0, 0, 0, 0, 0
+            ),
+        ]
+        return makers[self._draw(len(makers))]()
+
+
+class OverLine(Air):
+    """A flight of the scenario `autopilot` over a line.
+
+    Args:
+        flavour: which autopilot.
+        seed: of network and line.
+        is_bad: whether the line is.
+        table: keys of the scenario.
+    """
+
+    def __init__(
+        self, flavour: FlavourName, seed: int, *, is_bad: bool = True, **table: Any
+    ) -> None:
+        given = reading.to_table(reading.load("autopilot"))
+        given |= {"seed": seed, "fence": FENCE, **table}
+        given["model"] |= MODELS[flavour]
+        given["vehicle"] |= {"address": "udpout:line:0"}
+        given["mavlink"] |= {"autopilot": 1}
+        super().__init__(flavour, parameters={}, sets=True, **given)
+        self.line = BadLine(seed, is_bad=is_bad)
+        self.world.add("line", self.line)
+        self.had: list[tuple[str, bool]] = []
+        """Modes that the autopilot was in, and whether it was armed, in order."""
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
+        """See `Air`; what the autopilot does meanwhile is written down."""
+
+        def watched() -> bool:
+            now = self.flight.mode_name, self.flight.armed
+            if not self.had or self.had[-1] != now:
+                self.had.append(now)
+            return until()
+
+        return super().run(seconds, watched)
+
+    @property
+    def believed(self) -> list[tuple[str, bool]]:
+        """Modes and arming that the client has heard, in order."""
+        return [(each.mode, each.armed) for each in self.of(AutopilotMode)]
+
+    def sent(self, command: int) -> list[int]:
+        """Times at which the client sent a command [ns]."""
+        return [t for t, each in self.line.sent if getattr(each, "command", None) == command]
+
+    def setpoints_from_client(self, since_ns: int) -> int:
+        """Number of setpoints that the client has sent."""
+        return sum(t >= since_ns and not hasattr(each, "command") for t, each in self.line.sent)
+
+
+def is_in_order(part: list[Any], whole: list[Any]) -> bool:
+    """Whether a list is another one with some left out."""
+    left = iter(whole)
+    return all(each in left for each in part)
+
+
+class Figures(NamedTuple):
+    """What came of a flight."""
+
+    flavour: FlavourName
+    seed: int
+    rmse_m: float
+    """Error in the plane between the truth and the reference, rms [m]."""
+    over_m: float
+    """Furthest over the fence [m], below 0 inside."""
+    off_m: float
+    """Largest distance of the newest position that the client believed from the truth [m]."""
+    pilot_s: float
+    """Time until the client left it to a pilot who took over [s]."""
+    arms: int
+    """Commands to arm before the autopilot was armed first."""
+    frames: int
+    """Frames of client and autopilot."""
+    foreign: int
+    """Frames of others that came to the client."""
+
+
+def fly(
+    flavour: FlavourName, seed: int, *, is_bad: bool = True, duration: float = FLIGHT_S
+) -> Figures:
+    """Fly to shortly before the end, have a pilot take over, and check what must be so."""
+    air = OverLine(flavour, seed, is_bad=is_bad, duration=duration)
+    air.run(90.0, lambda: air.flight.armed)
+    armed_ns = air.world.now_ns
+    arms = air.sent(ARM)
+    assert air.flight.armed, air.said()[-5:]
+    assert arms, "it armed by itself"
+    assert arms[0] <= armed_ns
+    air.fly()
+    air.run(duration - 5.0 + float(np.random.default_rng(seed).random()))
+    assert air.client.failure is None
+    assert air.client._failsafe.mode in (Mode.TRACK, Mode.COAST), air.said()[-5:]
+    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    pilot_s = air.run(2.0, lambda: air.client._failsafe.mode is Mode.MANUAL)
+    manual_ns = air.world.now_ns
+    air.run(2.0)
+    assert air.client._failsafe.mode is Mode.MANUAL, air.said()[-5:]
+    assert not air.setpoints_from_client(manual_ns + 1)
+    assert air.flight.mode is Flown.PILOT
+    assert is_in_order(air.believed, air.had), (air.believed, air.had)
+    return _figures(air, flavour, seed, pilot_s, len(arms))
+
+
+def _figures(air: OverLine, flavour: FlavourName, seed: int, pilot_s: float, arms: int) -> Figures:
+    rows = air.rows()
+    rows = rows[rows["mode"] != Mode.MANUAL]
+    began_ns = next(t for t, _, event in air.events if isinstance(event, Flying))
+    steps_s = rows["step"] * air.scenario.control.dt
+    truth = state_at(parse(air.truth.getvalue()), began_ns + rows["step"] * air.scenario.dt_ns)
+    truth = truth[:, :, 0]
+    error = truth - air.scenario.make_reference()(steps_s)[:, :, 0]
+    settled = steps_s > SETTLE_S
+    low, high = np.array(FENCE["low_m"]), np.array(FENCE["high_m"])
+    return Figures(
+        flavour,
+        seed,
+        rmse_m=float(np.sqrt(np.mean(np.sum(error[settled, :2] ** 2, axis=1)))),
+        over_m=float(np.maximum(low - truth, truth - high).max()),
+        off_m=float(np.nanmax(np.linalg.norm(rows["measured"][:, :, 0] - truth, axis=1))),
+        pilot_s=pilot_s,
+        arms=arms,
+        frames=air.line.counts["frames"],
+        foreign=air.line.counts["foreign"],
+    )
+
+
+def main() -> None:
+    """Fly as long as is asked for, with both flavours in turn, and tell what came of it."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--minutes", type=int, default=60)
+    parser.add_argument("--jobs", type=int, default=1)
+    options = parser.parse_args()
+    count = -(-options.minutes * 60 // round(FLIGHT_S))
+    flavours: list[FlavourName] = [("ardupilot", "px4")[n % 2] for n in range(count)]
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for told in pool.map(compared, flavours, range(1, count + 1)):
+            print(told, flush=True)
+
+
+def compared(flavour: FlavourName, seed: int) -> str:
+    """Line about a flight, beside that over a good line."""
+    bad, good = fly(flavour, seed), fly(flavour, seed, is_bad=False)
+    named = ", ".join(f"{name} {value:.4g}" for name, value in list(bad._asdict().items())[2:])
+    return f"{flavour} {seed}: {named}; {bad.rmse_m / good.rmse_m:.2f} times that of a good line"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""Flights over a line that loses and spoils frames, and on which others talk: see `bad_line`."""
+
+import pytest
+
+from bad_line import ARM, SET_MODE, SETTLE_S, OverLine, fly
+from skytether.autopilot.flavours import FlavourName
+from skytether.client.mavlink.condition import Condition
+from skytether.shared.wire.protocol import Mode
+
+BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
+OFF_M = 1.5
+"""Distance from the truth below which a position was our autopilot's [m]: others are 30 m away, and
+what is a second old no more than this."""
+PILOT_S = 1.0
+"""Time within which a pilot has the vehicle [s]: a few heartbeats may be lost."""
+WORSE = 1.5
+"""Most by which a bad line may make the error larger."""
+
+
+def compare(flavour: FlavourName, seed: int, duration: float) -> None:
+    """Fly over a bad line and a good one, and compare."""
+    bad = fly(flavour, seed, duration=duration)
+    good = fly(flavour, seed, is_bad=False, duration=duration)
+    assert bad.rmse_m <= WORSE * good.rmse_m
+    assert bad.over_m <= 0.0
+    assert bad.off_m <= OFF_M
+    assert bad.pilot_s <= PILOT_S
+    assert bad.foreign > 100 * duration
+
+
+@pytest.mark.parametrize(("flavour", "seed"), [("ardupilot", 1), ("px4", 5)])
+def test_a_bad_line_changes_little(flavour: FlavourName, seed: int) -> None:
+    """No mode and no position of others is believed; it flies as it would, and a pilot wins."""
+    compare(flavour, seed, SETTLE_S + 20.0)
+
+
+def test_a_line_that_reorders_needs_what_was_overtaken_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else a mode that the autopilot has left is believed again."""
+    monkeypatch.setattr(Condition, "_is_overtaken", lambda *_: False)
+    with pytest.raises(AssertionError, match=r"AUTO\.LOITER"):
+        fly("px4", 5, duration=SETTLE_S + 5.0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_bad_line_changes_little_for_minutes(flavour: FlavourName) -> None:
+    """`python tests/bad_line.py --minutes 60` flies for an hour."""
+    compare(flavour, 2, 180.0)
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
+    """No command at all is given to a vehicle on the ground whose scenario is not armed."""
+    air = OverLine(flavour, 1, armed=False)
+    air.run(30.0)
+    assert air.client._session.number is not None
+    assert air.flight.armed_ns is None
+    assert not air.sent(ARM)
+    assert not air.sent(SET_MODE)
+    assert not air.setpoints_from_client(0)
+    assert air.client._failsafe.mode in (Mode.INIT, Mode.SYNC, Mode.READY)
+    assert air.client.failure is None
+
+
+def test_this_line_spoils_what_it_says() -> None:
+    """It loses a tenth, and what comes is nearly as much others' as ours."""
+    air = OverLine("ardupilot", 3, armed=False)
+    air.run(20.0)
+    counts, figures = air.line.counts, air.figures()
+    assert counts["lost"] == pytest.approx(0.1 * counts["frames"], rel=0.2)
+    assert min(counts["late"], counts["doubled"], counts["cut"], counts["flipped"]) > 50
+    assert figures["garbage_bytes"] > 10_000
+    assert figures["dropped"]["foreign"] > 3_000
+    assert figures["dropped"]["for_others"] > 50
+    assert figures["dropped"]["untimely"] > 10
+    assert figures["dropped"]["doubled"] + figures["dropped"]["late"] > 50

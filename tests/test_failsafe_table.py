@@ -1,0 +1,109 @@
+"""Table of faults in flights of an autopilot: what is flown keeps what the pages promise."""
+
+import math
+
+import pytest
+
+from skytether.autopilot.flavours import FlavourName
+from skytether.lab.benchmarks import failsafe
+from skytether.lab.benchmarks.failsafe import CaseName, Ending, Outcome
+
+BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
+SILENCE_S = (1.0, 1.6)
+"""Times within which a lost server is noticed: `link.timeout_s` after what was under way [s]."""
+STARTS: dict[CaseName, tuple[list[str], tuple[float, float], Ending]] = {
+    "link cut": (["BRAKE", "HOVER", "LAND"], SILENCE_S, "has landed"),
+    "link cut for 5 s": (["BRAKE", "HOVER", "TRACK"], SILENCE_S, "flies on"),
+    "server killed": (["BRAKE", "HOVER", "LAND"], SILENCE_S, "has landed"),
+    "client killed": ([], (0.0, 0.0), "has landed"),
+    "autopilot sends nothing": (["BRAKE", "HOVER"], (0.45, 0.65), "hovers"),
+    "autopilot sends nothing for 5 s": (["BRAKE", "HOVER", "TRACK"], (0.45, 0.65), "flies on"),
+    "pilot takes over": (["MANUAL"], (0.0, 0.3), "pilot has it"),
+    "battery low": (["BRAKE", "HOVER", "LAND"], (2.0, 2.6), "has landed"),
+    "estimate lost": (["MANUAL"], (0.0, 0.3), "has landed"),
+}
+"""Modes of the client after each fault, when it goes into the first of them [s], and the end."""
+STANDS_S: dict[FlavourName, float] = {"ardupilot": 4.0, "px4": 10.0}
+"""Time after which a vehicle stands, unless it flies on [s]."""
+
+
+def flown(case: CaseName, flavour: FlavourName) -> Outcome:
+    """One flight with a fault, which is held to what is promised of all of them."""
+    outcome = failsafe.fly(case, flavour, 1)
+    names, (least_s, most_s), ending = STARTS[case]
+    assert [name for name, _ in outcome.modes] == names
+    assert not names or least_s <= outcome.modes[0][1] <= most_s
+    assert outcome.ending == ending
+    assert outcome.off_path_m < 1.0
+    if ending != "flies on":
+        assert outcome.still_s <= STANDS_S[flavour]
+    assert math.isnan(outcome.down_s) == (ending != "has landed")
+    return outcome
+
+
+def test_a_lost_link_lands_after_ten_seconds_of_hovering() -> None:
+    """What the page says of `vehicle.land_after_s` is what the scenario `autopilot` has."""
+    outcome = flown("link cut", "ardupilot")
+    (_, hovers_s), (_, lands_s) = outcome.modes[1:]
+    assert lands_s - hovers_s == pytest.approx(10.0, abs=0.1)
+    assert [name for name, _ in outcome.autopilot] == ["LAND"]
+    assert outcome.moved_m == pytest.approx(3.1, abs=0.2)
+    assert outcome.down_s == pytest.approx(lands_s + 12.4, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("flavour", "mode", "least_s", "most_s"),
+    [("ardupilot", "LAND", 4.0, 5.1), ("px4", "AUTO.LAND", 1.1, 1.4)],
+)
+def test_a_client_that_is_killed_leaves_it_to_the_autopilots_time_out(
+    flavour: FlavourName, mode: str, least_s: float, most_s: float
+) -> None:
+    """FS_GCS_TIMEOUT after the last heartbeat, COM_OF_LOSS_T after the last velocity."""
+    ((name, after_s),) = flown("client killed", flavour).autopilot
+    assert name == mode
+    assert least_s <= after_s <= most_s
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("flavour", BOTH)
+@pytest.mark.parametrize("case", STARTS)
+def test_each_fault_ends_as_promised(case: CaseName, flavour: FlavourName) -> None:
+    """Modes, times and the end, of each of both."""
+    flown(case, flavour)
+
+
+def test_a_row_has_the_spread_of_its_flights() -> None:
+    """Times from least to most, largest distances, and both where they went different ways."""
+    common = {"autopilot": (), "moved_m": 1.0, "off_path_m": 0.1, "off_reference_m": 2.0}
+    outcomes = [
+        Outcome(
+            "pilot takes over",
+            "px4",
+            seed,
+            modes=modes,
+            still_s=still_s,
+            down_s=math.nan,
+            ending="pilot has it",
+            **(common | {"moved_m": float(seed)}),
+        )
+        for seed, modes, still_s in (
+            (1, (("BRAKE", 1.0), ("HOVER", 2.0)), 2.5),
+            (2, (("BRAKE", 1.25), ("HOVER", 2.0)), 3.0),
+            (3, (), math.nan),
+        )
+    ]
+    ((name, table),) = failsafe.tables(outcomes).items()
+    assert name == "failsafe px4"
+    assert table.rows == [
+        [
+            "pilot takes over",
+            "BRAKE 1.0 to 1.2, HOVER 2.0; or no change",
+            "no change",
+            "3.0",
+            "0.1",
+            "2.0",
+            "2.5 to 3.0, or never",
+            "never",
+            "pilot has it",
+        ]
+    ]
