@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from skytether.__main__ import main
 from skytether.lab import calibration
-from skytether.lab.calibration import COLUMNS, HERE, TABLE_1, UNFLYABLE, Limits, Rmse, Table1
+from skytether.lab.calibration import COLUMNS, HERE, TABLE_1, UNFLYABLE, Rmse, SearchLimits, Table1
 from skytether.lab.commands.pool import Crew
 from skytether.lab.journal import sealed
 from skytether.lab.search import Free, Optimiser, SearchPoint, Values, check_free, put
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("here")
 PAPER = reading.load("paper")
 RADIUS = Free("reference.radius_m", 0.5, 5.0)
 LAG = Free("model.tau_s.0", 0.2, 2.0)
-TENTH = Limits(packets=0.1)
+TENTH = SearchLimits(packets=0.1)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
 
 def test_the_smallest_error_may_not_be_bought_with_effort() -> None:
     """Nor with inputs at their bounds; without a limit both are free."""
-    limited = Rmse(weighs("always").scenario, Limits(effort_mps=0.3, saturated=0.1))
+    limited = Rmse(weighs("always").scenario, SearchLimits(effort_mps=0.3, saturated=0.1))
     assert limited.score(flew(0.2, 1.0, 1.0, effort_mps=0.3, saturated=0.1)) == 0.2
     assert limited.score(flew(0.2, 1.0, 1.0, effort_mps=0.33)) == pytest.approx(0.2 * 1.1**3)
     assert limited.score(flew(0.2, 1.0, 1.0, saturated=0.2)) == pytest.approx(0.2 * 2**3)

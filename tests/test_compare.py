@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from skytether.__main__ import main
 from skytether.lab import contenders
-from skytether.lab.calibration import Limits, Rmse
+from skytether.lab.calibration import Rmse, SearchLimits
 from skytether.lab.commands import pool
 from skytether.lab.comparison import (
     BYTES_UP,
@@ -106,7 +106,7 @@ def test_every_contender_in_every_case_comes_along() -> None:
     assert {name.removeprefix("compare/") for name in reading.names(COMPARED)} == set(pairs)
     for name, (contender, case) in pairs.items():
         start = contenders.search_start(contender, case, SCALE)
-        scenario, free = reading.load(f"{COMPARED}/{name}"), Rmse(start, Limits()).free()
+        scenario, free = reading.load(f"{COMPARED}/{name}"), Rmse(start, SearchLimits()).free()
         there = contenders.differences(start, case.plant)
         here = contenders.differences(scenario, case.plant)
         changed = {key for key, value in here.items() if value != there.get(key)}

@@ -26,7 +26,7 @@ from skytether.lab.benchmarks.page import messages
 from skytether.shared.scenario import reading
 from skytether.sim import flight as virtual
 from skytether.view.browser import guard
-from skytether.view.browser.access import Refusal
+from skytether.view.browser.access import TurnedAway
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.page import Page
 from skytether.view.frames import of_flight
@@ -80,7 +80,7 @@ def told(browser: ClientConnection, kind: str) -> dict[str, Any]:
                 return message
 
 
-def counts(page: Page) -> dict[Refusal, int]:
+def counts(page: Page) -> dict[TurnedAway, int]:
     """How often each reason for a refusal was met."""
     return dict(page._guard.counts)
 
@@ -96,15 +96,15 @@ def until(true: Any, seconds: float = PATIENCE_S) -> None:
 @pytest.mark.parametrize(
     ("origin", "host", "why"),
     [
-        ("http://evil.example", "127.0.0.1", Refusal.ORIGIN),
-        ("http://127.0.0.1:1", "127.0.0.1", Refusal.ORIGIN),
-        ("null", "127.0.0.1", Refusal.ORIGIN),
-        ("http://evil.example:{port}", "evil.example", Refusal.HOST),
-        (None, "evil.example", Refusal.HOST),
+        ("http://evil.example", "127.0.0.1", TurnedAway.ORIGIN),
+        ("http://127.0.0.1:1", "127.0.0.1", TurnedAway.ORIGIN),
+        ("null", "127.0.0.1", TurnedAway.ORIGIN),
+        ("http://evil.example:{port}", "evil.example", TurnedAway.HOST),
+        (None, "evil.example", TurnedAway.HOST),
     ],
 )
 def test_a_website_of_a_stranger_reads_nothing(
-    page: Page, origin: str | None, host: str, why: Refusal
+    page: Page, origin: str | None, host: str, why: TurnedAway
 ) -> None:
     """Under its own name, under none, or under one that it lets mean this machine."""
     with pytest.raises(InvalidStatus) as refused:
@@ -155,19 +155,19 @@ def test_an_upload_is_dropped_and_a_message_of_the_page_is_not(page: Page) -> No
         browser.send(b"\xc1")
         browser.send(b"\x91" * 60_000)
         send(browser, type="GuiUpdateMessage", uuid=uuid, updates={"value": "1"})
-        until(lambda: counts(page).get(Refusal.MESSAGE) == 45)
+        until(lambda: counts(page).get(TurnedAway.MESSAGE) == 45)
         (client,) = page._server.get_clients().values()
         assert not client.gui._current_file_upload_states
         assert not page._server.gui._current_file_upload_states
         assert told(browser, "GuiUpdateMessage")
-    assert counts(page) == {Refusal.MESSAGE: 45}
+    assert counts(page) == {TurnedAway.MESSAGE: 45}
 
 
 def test_a_huge_frame_ends_the_connection(page: Page) -> None:
     """Before it has come: by its length; one of 64 KiB is read."""
     with joined(page) as browser:
         browser.send(bytes(guard.MESSAGE_BYTES_MAX))
-        until(lambda: counts(page).get(Refusal.MESSAGE))
+        until(lambda: counts(page).get(TurnedAway.MESSAGE))
         with suppress(ConnectionClosed):
             browser.send(bytes(guard.MESSAGE_BYTES_MAX + 1))
         with pytest.raises(ConnectionClosed) as closed:
@@ -185,7 +185,7 @@ def test_a_message_of_countless_frames_ends_the_connection(page: Page, sent: byt
     with closing(opened(page.port)) as sock:
         with suppress(OSError):
             sock.sendall(sent)
-        until(lambda: counts(page).get(Refusal.ROOM))
+        until(lambda: counts(page).get(TurnedAway.ROOM))
         until(lambda: not page._guard.connections)
 
 
@@ -196,7 +196,7 @@ def test_who_never_reads_is_cut_off_once_he_pings(page: Page) -> None:
         with suppress(OSError):  # reset, or a broken pipe
             while not counts(page):
                 sock.sendall(frame(PING, bytes(125)) * 50)
-    until(lambda: counts(page).get(Refusal.ROOM))
+    until(lambda: counts(page).get(TurnedAway.ROOM))
     until(lambda: not page._guard.connections)
 
 
@@ -276,7 +276,7 @@ def test_browsers_beyond_the_most_are_turned_away(
         third = socket.create_connection(("127.0.0.1", page.port))
         with closing(third), suppress(ConnectionError):
             assert third.recv(1) == b""
-        assert counts(page) == {Refusal.FULL: 2}
+        assert counts(page) == {TurnedAway.FULL: 2}
         assert first.ping().wait(PATIENCE_S)
 
 
@@ -289,7 +289,7 @@ def test_a_page_of_another_version_is_told_so(page: Page) -> None:
         browser.recv(timeout=PATIENCE_S)
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == 1002
-    assert counts(page) == {Refusal.VERSION: 1}
+    assert counts(page) == {TurnedAway.VERSION: 1}
 
 
 async def test_messages_wait_for_their_turn(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -324,6 +324,6 @@ def test_the_first_the_tenth_and_the_hundredth_are_told() -> None:
     refuses = guard.Guard("")
     said = []
     for _ in range(1000):
-        refuses.count(Refusal.ORIGIN)
+        refuses.count(TurnedAway.ORIGIN)
         said += [event.count for event in refuses.events()]
     assert said == [1, 10, 100, 1000]

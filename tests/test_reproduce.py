@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from skytether.__main__ import main
 from skytether.lab import plates, report, studies
 from skytether.lab.calibration import TABLE_1
-from skytether.lab.studies import EVENT, EVERY, NONE, PERIODIC, Cell, Study
+from skytether.lab.studies import EVENT, EVERY, NONE, PERIODIC, MethodFlights, Study
 from skytether.lab.sweep import GridAxis, Sweep
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.summary import Summary, summarise
@@ -112,10 +112,10 @@ def test_jitter_grows_while_the_mean_delay_stays() -> None:
 # -- what is said of it --------------------------------------------------------------------------
 
 
-def columns() -> Mapping[str, Cell]:
+def columns() -> Mapping[str, MethodFlights]:
     """Two runs each, with errors of 1, 2 and 3."""
-    cells = {method: Cell(runs(0.1, 0.1)) for method in TABLE_1}
-    return cells | {PERIODIC: Cell(runs(0.1, 0.1, rmse=0.5), 10)}
+    cells = {method: MethodFlights(runs(0.1, 0.1)) for method in TABLE_1}
+    return cells | {PERIODIC: MethodFlights(runs(0.1, 0.1, rmse=0.5), 10)}
 
 
 def test_a_deviation_is_what_ours_is_more_than_the_papers() -> None:
@@ -133,7 +133,7 @@ def test_a_deviation_is_what_ours_is_more_than_the_papers() -> None:
 def test_the_report_says_who_wins_from_the_numbers() -> None:
     """The trigger has twice the error here; the other way round it has half."""
     worse = columns()
-    better = {**worse, EVENT: Cell(runs(0.1, rmse=0.25))}
+    better = {**worse, EVENT: MethodFlights(runs(0.1, rmse=0.25))}
     said = [
         (report.verdict(studies.table_1(each), each), report.paper_table([], each).says)
         for each in (worse, better)
@@ -146,7 +146,7 @@ def test_the_report_says_who_wins_from_the_numbers() -> None:
 
 def test_both_directions_count_in_the_total() -> None:
     """Packets and bytes."""
-    cell = Cell(runs(0.1, 0.2))
+    cell = MethodFlights(runs(0.1, 0.2))
     assert cell.estimate("total_packets") == (40.0, 0.0)
     assert cell.estimate("total_bytes") == (1000.0, 0.0)
 
@@ -157,7 +157,10 @@ def test_a_curve_is_won_only_where_intervals_are_apart() -> None:
     trigger = {0.0: runs(0.1, 0.1, rmse=2.0), 1.0: runs(0.1, 0.1, rmse=0.5), 2.0: spread}
     cells = {}
     for value, errors in trigger.items():
-        cells |= {(value, EVENT): Cell(errors), (value, PERIODIC): Cell(runs(0.1, 0.1), 10)}
+        cells |= {
+            (value, EVENT): MethodFlights(errors),
+            (value, PERIODIC): MethodFlights(runs(0.1, 0.1), 10),
+        }
     study = Study("x", "x", PAPER, GridAxis("x", (0.0, 1.0, 2.0)), 2, 0.0)
     assert plates.against_periodic(study, cells) == (1, 1)
 

@@ -22,7 +22,7 @@ from skytether.shared.telemetry.feed import Frame, Opened, Rows
 from skytether.shared.telemetry.record import RECORDING, Record
 from skytether.shared.telemetry.summary import Summary
 from skytether.shell import command, plugins
-from skytether.shell.beside import Told
+from skytether.shell.beside import RecorderOrder
 from skytether.shell.command import CommandError
 from skytether.shell.feed import Subscriber
 from skytether.view.frames import of_flight
@@ -73,8 +73,8 @@ def _about(
 
 
 def beside() -> int:
-    """Record the feed of a process as it tells on stdin (`Told`), until stdin ends."""
-    told = msgspec.json.decode(sys.stdin.buffer.readline(), type=Told)
+    """Record the feed of a process as it tells on stdin (`RecorderOrder`), until stdin ends."""
+    told = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
     plugins.load(told.plugins)
     scenario = checked(tomllib.loads(told.scenario))
     path, feeds = Path(told.path), {told.process: Path(told.feed)}

@@ -147,7 +147,7 @@ def trigger_keys(trigger: str) -> Sequence[Free]:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class SearchLimits:
     """What may be spent on a small error."""
 
     packets: float = 1.0
@@ -164,7 +164,7 @@ class Rmse:
 
     scenario: Scenario
     """What is flown, but for the keys that are searched for."""
-    limits: Limits
+    limits: SearchLimits
 
     def settings(self) -> Mapping[str, Any]:
         """Name of the objective and its limits, as plain values."""

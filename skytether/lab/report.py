@@ -16,9 +16,9 @@ from skytether.lab.studies import (
     EVERY,
     PERIODIC,
     TRAFFIC,
-    Cell,
     Cells,
     Flown,
+    MethodFlights,
     Study,
     TableEntry,
     periodic_wins,
@@ -108,7 +108,7 @@ def draw(measured: Reproduction) -> Drawn:
     return Drawn(TITLE, ABOUT, tables, pictures, verdict(entries, columns))
 
 
-def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, Cell]) -> Table:
+def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> Table:
     """Table 1, the paper's figures beside ours."""
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     rows = [
@@ -136,7 +136,7 @@ def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, Cell]) -> T
     return Table("table1", "Table 1: RMSE to the desired trajectory", says, text, heading, rows)
 
 
-def traffic_table(columns: Mapping[str, Cell]) -> Table:
+def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
     """Table of the packets and bytes that entered the network, by method."""
     text = rows_csv(
         [{"column": method} | by_name(TRAFFIC, cell.estimate) for method, cell in columns.items()]
@@ -222,7 +222,7 @@ def real_table(measured: Reproduction) -> Table:
     return Table("real", title, says, rows_csv(rows), heading, shown)
 
 
-def verdict(entries: Sequence[TableEntry], columns: Mapping[str, Cell]) -> str:
+def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> str:
     """What a reproduction came to, in two sentences."""
     off = {(e.column, e.entry): e.deviation for e in entries if e.deviation is not None}
     near = sum(within(entry, deviation) for (_, entry), deviation in off.items())
@@ -237,7 +237,7 @@ def verdict(entries: Sequence[TableEntry], columns: Mapping[str, Cell]) -> str:
     )
 
 
-def _rmse(cell: Cell) -> float:
+def _rmse(cell: MethodFlights) -> float:
     """Mean RMSE xy [m]; NaN where nothing was flown."""
     mean = cell.estimate("rmse_xy")[0]
     return float("nan") if mean is None else mean

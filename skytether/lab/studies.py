@@ -235,7 +235,7 @@ def flown(plan: Sweep, done: Results) -> Flown:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class MethodFlights:
     """Flights of one method at one value."""
 
     runs: Sequence[Summary]
@@ -253,7 +253,7 @@ class Cell:
         )
 
 
-def periodic_wins(event: Cell, periodic: Cell) -> int:
+def periodic_wins(event: MethodFlights, periodic: MethodFlights) -> int:
     """1 where periodic sending has the smaller RMSE xy, -1 where it has the larger one.
 
     The result is 0 where the 95 % intervals meet, or nothing was flown.
@@ -267,7 +267,7 @@ def periodic_wins(event: Cell, periodic: Cell) -> int:
     return (ours - theirs > margin) - (theirs - ours > margin)
 
 
-Cells = Mapping[tuple[float, str], Cell]
+Cells = Mapping[tuple[float, str], MethodFlights]
 """Cells of a study, by value and method; PERIODIC is one of the methods."""
 
 
@@ -278,10 +278,10 @@ def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly:
         firstly: what is done of the first sweep.
         secondly: what is done of the second sweep.
     """
-    found = {key: Cell(runs) for key, runs in flown(first, firstly).items()}
+    found = {key: MethodFlights(runs) for key, runs in flown(first, firstly).items()}
     periods = [keys["control.period"] for _, keys in second.axes[0].points()]
     for steps, ((value,), runs) in zip(periods, flown(second, secondly).items(), strict=True):
-        found[value, PERIODIC] = Cell(runs, steps)
+        found[value, PERIODIC] = MethodFlights(runs, steps)
     return {
         (value, method): found[value, method]
         for value in study.axis.values
@@ -311,7 +311,7 @@ WAYS = ("uplink", "downlink", "total")
 TRAFFIC = tuple(f"{way}_{what}" for way in WAYS for what in ("packets", "bytes"))
 
 
-def table_1(columns: Mapping[str, Cell]) -> list[TableEntry]:
+def table_1(columns: Mapping[str, MethodFlights]) -> list[TableEntry]:
     """Entries of Table 1 for all columns; PERIODIC, which the paper does not have, with them."""
     found = {
         (column, name): cell.estimate(name) for column, cell in columns.items() for name in ENTRIES

@@ -20,7 +20,7 @@ PATIENCE_S = 30.0
 """Longest time for which a recorder may end its file [s]."""
 
 
-class Told(msgspec.Struct, frozen=True, kw_only=True):
+class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):
     """What a recorder has to know before the first frame."""
 
     path: str
@@ -62,7 +62,7 @@ def recorder(
     Raises:
         RecorderError: not all of it is recorded.
     """
-    told = Told(
+    told = RecorderOrder(
         path=str(path),
         feed=str(feed),
         process=process,

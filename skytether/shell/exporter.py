@@ -109,7 +109,7 @@ class Collected(Collector):
 
 
 @dataclass(slots=True)
-class _Connection:
+class _Scrape:
     """Somebody who asks."""
 
     socket: socket.socket
@@ -142,7 +142,7 @@ class Metrics:
         self._ours, self._waker = socket.socketpair()
         self._selector.register(self._socket, selectors.EVENT_READ)
         self._selector.register(self._ours, selectors.EVENT_READ)
-        self._connections: dict[int, _Connection] = {}
+        self._connections: dict[int, _Scrape] = {}
         """Connections by the number of their file, the oldest first."""
         self._closed = False
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -191,10 +191,10 @@ class Metrics:
         if len(self._connections) == CONNECTIONS_MAX:
             self._end(next(iter(self._connections.values())))
         sock.setblocking(False)
-        self._connections[sock.fileno()] = _Connection(sock, time.monotonic() + PATIENCE_S)
+        self._connections[sock.fileno()] = _Scrape(sock, time.monotonic() + PATIENCE_S)
         self._selector.register(sock, selectors.EVENT_READ)
 
-    def _go_on(self, connection: _Connection) -> None:
+    def _go_on(self, connection: _Scrape) -> None:
         """Read more of a request, or send more of its answer."""
         try:
             if connection.answer is None:
@@ -216,7 +216,7 @@ class Metrics:
         if not connection.answer:
             self._end(connection)
 
-    def _end(self, connection: _Connection) -> None:
+    def _end(self, connection: _Scrape) -> None:
         del self._connections[connection.socket.fileno()]
         self._selector.unregister(connection.socket)
         with suppress(OSError):  # what was not read would take back what was sent

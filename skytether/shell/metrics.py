@@ -42,7 +42,7 @@ class Metric(NamedTuple):
     """Labels that tell it from other figures of the same metric, and their values."""
 
 
-class Sample(NamedTuple):
+class MetricValue(NamedTuple):
     """A number of a metric."""
 
     suffix: str
@@ -54,7 +54,7 @@ class Family(NamedTuple):
     """A metric and its numbers."""
 
     metric: Metric
-    samples: list[Sample]
+    samples: list[MetricValue]
 
 
 def _each_way(
@@ -412,19 +412,19 @@ def matched(figure: Path, path: tuple[str, ...]) -> dict[str, str] | None:
     return labels
 
 
-def _samples(metric: Metric, labels: dict[str, str], value: Any) -> Iterator[Sample]:
+def _samples(metric: Metric, labels: dict[str, str], value: Any) -> Iterator[MetricValue]:
     labels = {**labels, **dict(metric.labels)}
     match metric.kind:
         case "modes":
             for mode in Mode:
-                yield Sample("", {**labels, "mode": str(mode)}, float(str(mode) == value))
+                yield MetricValue("", {**labels, "mode": str(mode)}, float(str(mode) == value))
         case "histogram":
             edge = float(labels["le"]) * metric.scale
             if edge == float("inf"):
                 others = {name: text for name, text in labels.items() if name != "le"}
-                yield Sample("_bucket", labels | {"le": "+Inf"}, float(value))
-                yield Sample("_count", others, float(value))
+                yield MetricValue("_bucket", labels | {"le": "+Inf"}, float(value))
+                yield MetricValue("_count", others, float(value))
             else:
-                yield Sample("_bucket", labels | {"le": f"{edge:g}"}, float(value))
+                yield MetricValue("_bucket", labels | {"le": f"{edge:g}"}, float(value))
         case _:
-            yield Sample("", labels, float(value) * metric.scale)
+            yield MetricValue("", labels, float(value) * metric.scale)

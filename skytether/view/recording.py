@@ -101,7 +101,7 @@ _OPENED = {
 }
 
 
-class Told(msgspec.Struct, frozen=True, kw_only=True):
+class EventLine(msgspec.Struct, frozen=True, kw_only=True):
     """An event and the process that has told it."""
 
     process: str
@@ -190,7 +190,7 @@ class Recording:
         self._writer.add_attachment(0, self._now_ns, name, kind, content)
 
     def _say(self, process: str, event: Event) -> None:
-        told = Told(process=process, event=event)
+        told = EventLine(process=process, event=event)
         self._put("/said", "skytether.Said", _SAID, told, {FRAME: "Said"})
         level = foxglove.WARNING if isinstance(event, WARNINGS) else foxglove.INFO
         self._draw("/events", "Log", foxglove.log(self._now_ns, process, str(event), level))
@@ -547,7 +547,7 @@ def _frames(
                     rows.check_columns(name, _table(columns).columns, scenario)
                 yield begun.process, begun
             case "Said":
-                told = msgspec.json.decode(data, type=Told)
+                told = msgspec.json.decode(data, type=EventLine)
                 yield told.process, Said(time_ns=time_ns, event=told.event)
             case "Figures":
                 figures = msgspec.json.decode(data)

@@ -33,7 +33,7 @@ SECONDS = 3.0
 """Length of a step that is drawn and fitted [s]."""
 
 
-class Fit(NamedTuple):
+class StepFit(NamedTuple):
     """First order with dead time, and what is left over."""
 
     gain: float
@@ -54,7 +54,7 @@ def step(frame: Frame, gains: Gains, velocity: Array) -> Array:
     return np.array(rows)
 
 
-def fitted(values: Array, size: float) -> Fit:
+def fitted(values: Array, size: float) -> StepFit:
     """First order with dead time that fits velocities best."""
     times = np.arange(len(values)) * STEP_MS / 1000.0
 
@@ -64,7 +64,7 @@ def fitted(values: Array, size: float) -> Fit:
 
     found = least_squares(residual, [1.0, 0.4, 0.1], bounds=([0.0, 0.01, 0.0], np.inf))
     gain, tau_s, dead_s = found.x.tolist()
-    return Fit(gain, tau_s, dead_s, size * float(np.sqrt(np.mean(found.fun**2))))
+    return StepFit(gain, tau_s, dead_s, size * float(np.sqrt(np.mean(found.fun**2))))
 
 
 def table(axis: int, sizes: tuple[float, ...]) -> TextTable:

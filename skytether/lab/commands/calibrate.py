@@ -15,7 +15,7 @@ from rich.text import Text
 
 from skytether.figures.page import as_text
 from skytether.lab import calibration
-from skytether.lab.calibration import HERE, Limits, Rmse, Table1
+from skytether.lab.calibration import HERE, Rmse, SearchLimits, Table1
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
 from skytether.lab.journal import Journal, write
 from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
@@ -84,7 +84,7 @@ def calibrate(argv: Sequence[str]) -> None:
     options.pool.check()
     scenario = options.config
     is_rmse = options.objective == "rmse"
-    limits = Limits(packets=options.packets, effort_mps=options.effort)
+    limits = SearchLimits(packets=options.packets, effort_mps=options.effort)
     objective = Rmse(scenario, limits) if is_rmse else Table1()
     free = list(map(Free.parse, options.free)) or objective.free()
     check_free(free, scenario)

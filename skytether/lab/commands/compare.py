@@ -11,7 +11,7 @@ import tyro
 from skytether.figures.page import as_text
 from skytether.lab import comparison, contenders
 from skytether.lab.beside import Baselines, Work, floor_of, fly_aboard
-from skytether.lab.calibration import HERE, Limits, Rmse
+from skytether.lab.calibration import HERE, Rmse, SearchLimits
 from skytether.lab.commands import report_folder
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
@@ -110,7 +110,7 @@ def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
     with crew(options.pool, "searching", total, "generations") as flyers:
         for contender, case in scale.searched:
             start = contenders.search_start(contender, case, scale)
-            objective = Rmse(start, Limits(PACKETS, case.effort_mps, SATURATED))
+            objective = Rmse(start, SearchLimits(PACKETS, case.effort_mps, SATURATED))
             search = Search(
                 start=start,
                 objective=objective,

@@ -29,7 +29,7 @@ POINTS = 50
 """Number of points of a drawn curve."""
 
 
-class Feed(Text):
+class FeedTarget(Text):
     """Feed of a process, in pieces: it is none, as `FeedError` says, or frames that come back."""
 
     code: Sequence[ModuleType] = (feed,)
@@ -67,7 +67,7 @@ class Feed(Text):
                     feed.table(payload, feed.columns_of(described))
 
 
-class Page(Feed):
+class PageTarget(FeedTarget):
     """Page and recording of a flight: what its processes tell is refused, or shown and written."""
 
     code = (recording, rows, state)

@@ -6,11 +6,11 @@ from random import Random
 from types import MappingProxyType
 
 from skytether.lab.fuzz.datagrams import SCENARIOS, Decoder, EndpointInFlight
-from skytether.lab.fuzz.feeds import Feed, Page
+from skytether.lab.fuzz.feeds import FeedTarget, PageTarget
 from skytether.lab.fuzz.handshake import Holder, Strangers
 from skytether.lab.fuzz.recordings import RecordingFile
 from skytether.lab.fuzz.target import Target
-from skytether.lab.fuzz.texts import Control, LogLines, ScenarioFile
+from skytether.lab.fuzz.texts import ControlTarget, LogLines, ScenarioFile
 
 
 class Both(Target):
@@ -41,11 +41,11 @@ TARGETS: Mapping[str, Callable[[Path], Target]] = MappingProxyType(
         "sealed": lambda _: Both(*(EndpointInFlight(each, sealed=True) for each in SCENARIOS)),
         "handshake": lambda _: Strangers(),
         "holder": lambda _: Holder(),
-        "control": lambda _: Control(),
+        "control": lambda _: ControlTarget(),
         "recording": RecordingFile,
         "scenario": ScenarioFile,
-        "feed": lambda _: Feed(),
-        "page": lambda _: Page(),
+        "feed": lambda _: FeedTarget(),
+        "page": lambda _: PageTarget(),
         "log": lambda _: LogLines(),
     }
 )

@@ -102,7 +102,7 @@ class ScenarioFile(Text):
         assert np.isfinite(scenario.make_reference()(SAMPLES_S)).all()
 
 
-class Control(Text, EndpointInFlight):
+class ControlTarget(Text, EndpointInFlight):
     """Requests to the processes of a flight: each is answered, and what it changes can be flown."""
 
     code = (change, reading, contradictions, policies)

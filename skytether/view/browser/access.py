@@ -17,7 +17,7 @@ HOST_PORT = "127.0.0.1:8080"
 """Address of a page unless another is given."""
 
 
-class Refusal(Enum):
+class TurnedAway(Enum):
     """Why a browser is turned away, or what it has sent is dropped."""
 
     ORIGIN = "a website of another origin wanted to connect"
@@ -80,7 +80,7 @@ def _named(visitor: Visitor) -> tuple[str, str, str]:
     return name, host, headers.get("origin", "")
 
 
-def refusal(visitor: Visitor, token: str) -> Refusal | None:
+def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
     """Why a browser may not even look; None where it may.
 
     A number cannot be rebound as a name can, whoever's it is.
@@ -89,8 +89,8 @@ def refusal(visitor: Visitor, token: str) -> Refusal | None:
     if _has_token(visitor, token):
         return None
     if name != "localhost" and _number(name) is None:
-        return Refusal.HOST
-    return None if origin in ("", f"http://{host}") else Refusal.ORIGIN
+        return TurnedAway.HOST
+    return None if origin in ("", f"http://{host}") else TurnedAway.ORIGIN
 
 
 def may_play(visitor: Visitor, token: str) -> bool:

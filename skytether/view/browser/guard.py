@@ -30,7 +30,7 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request, Response
 
 from skytether.shared.core.events import BrowserRefused
-from skytether.view.browser.access import Refusal, Visitor, refusal
+from skytether.view.browser.access import TurnedAway, Visitor, refusal
 
 BROWSERS_MAX = 16
 """Most browsers at once."""
@@ -94,18 +94,18 @@ class Guard:
 
     def __init__(self, token: str) -> None:
         self._token = token
-        self.counts: Counter[Refusal] = Counter()
+        self.counts: Counter[TurnedAway] = Counter()
         """How often somebody was turned away, or something dropped."""
         self.connections = 0
         """Number of connections."""
         self.browsers = 0
         """Number of websockets that are open."""
-        self._news: set[Refusal] = set()
+        self._news: set[TurnedAway] = set()
         self._lock = threading.Lock()
 
     # -- what is counted ---------------------------------------------------------------------
 
-    def count(self, why: Refusal) -> None:
+    def count(self, why: TurnedAway) -> None:
         """Count somebody who is turned away, or something that is dropped."""
         with self._lock:
             self.counts[why] += 1
@@ -161,7 +161,9 @@ class Guard:
         if response is None and why:
             self.count(why)
             return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
-        if why is Refusal.HOST and request.path == "/":  # it would wait for its websocket for ever
+        if (
+            why is TurnedAway.HOST and request.path == "/"
+        ):  # it would wait for its websocket for ever
             return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
         return response
 
@@ -172,23 +174,23 @@ class Guard:
     ) -> None:
         """Let viser talk to a browser."""
         if connection.subprotocol != PROTOCOL:
-            self.count(Refusal.VERSION)
+            self.count(TurnedAway.VERSION)
             await connection.close(CloseCode.PROTOCOL_ERROR, f"Version mismatch: {PROTOCOL}")
         elif self.browsers >= BROWSERS_MAX:
-            self.count(Refusal.FULL)
-            await connection.close(CloseCode.TRY_AGAIN_LATER, str(Refusal.FULL))
+            self.count(TurnedAway.FULL)
+            await connection.close(CloseCode.TRY_AGAIN_LATER, str(TurnedAway.FULL))
         else:
             self.browsers += 1
             try:
                 await handle(connection)
             except Exception:
-                self.count(Refusal.MESSAGE)
+                self.count(TurnedAway.MESSAGE)
             finally:
                 self.browsers -= 1
 
     def _fault(self, _: asyncio.AbstractEventLoop, __: dict[str, Any]) -> None:
         """Count a message that a handler of viser's could not make sense of."""
-        self.count(Refusal.PANEL)
+        self.count(TurnedAway.PANEL)
 
 
 class _Connection(sockets.ServerConnection):
@@ -207,7 +209,7 @@ class _Connection(sockets.ServerConnection):
         transport.get_extra_info("socket").setsockopt(SOL_SOCKET, SO_SNDBUF, UNREAD_BYTES)
         self._guard.connections += 1
         if self._guard.connections > CONNECTIONS_MAX:
-            self._cut(Refusal.FULL)
+            self._cut(TurnedAway.FULL)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See `asyncio.Protocol`."""
@@ -218,12 +220,12 @@ class _Connection(sockets.ServerConnection):
         """See `asyncio.Protocol`."""
         super().data_received(data)
         if len(self.recv_messages.frames) > FRAMES_MAX:
-            self._cut(Refusal.ROOM)
+            self._cut(TurnedAway.ROOM)
 
     def process_event(self, event: Any) -> None:
         """See `websockets`: a ping is answered whether or not somebody reads the answers."""
         if isinstance(event, Frame) and event.opcode is Opcode.PING and self.paused:
-            self._cut(Refusal.ROOM)
+            self._cut(TurnedAway.ROOM)
         super().process_event(event)
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ARG002 - viser's are bytes
@@ -233,11 +235,11 @@ class _Connection(sockets.ServerConnection):
             async for piece in self._pieces():
                 pieces.append(piece)
                 if len(pieces) == PIECES_MAX:
-                    self._cut(Refusal.ROOM)
+                    self._cut(TurnedAway.ROOM)
             await self._wait_for_its_turn()
             if is_taken(message := b"".join(pieces)):
                 return message
-            self._guard.count(Refusal.MESSAGE)
+            self._guard.count(TurnedAway.MESSAGE)
 
     def _pieces(self) -> AsyncIterator[bytes]:
         return self.recv_streaming(decode=False)
@@ -248,7 +250,7 @@ class _Connection(sockets.ServerConnection):
         if self._due_s > now_s:
             await asyncio.sleep(self._due_s - now_s)
 
-    def _cut(self, why: Refusal) -> None:
+    def _cut(self, why: TurnedAway) -> None:
         self._guard.count(why)
         self.transport.abort()
 

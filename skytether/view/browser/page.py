@@ -13,7 +13,7 @@ import viser
 from websockets.asyncio.server import ServerConnection
 
 from skytether.shared.core.events import BrowserRefused
-from skytether.view.browser.access import Refusal, knows, may_play
+from skytether.view.browser.access import TurnedAway, knows, may_play
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.guard import Guard, visitor
 from skytether.view.browser.panel import More, Panel
@@ -138,7 +138,7 @@ class Page:
             yield
         except Exception:
             self._panels.pop(number, None)
-            self._guard.count(Refusal.PANEL)
+            self._guard.count(TurnedAway.PANEL)
             if connection := self._connections.get(number):
                 self._server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
 
