@@ -31,7 +31,7 @@ from skytether.shared.telemetry.record import (
     Record,
     Recorder,
 )
-from skytether.shared.telemetry.summary import Summary
+from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim import straight
 from skytether.sim.world import World
 from skytether.station import laws
@@ -331,6 +331,17 @@ def test_the_benchmark_makes_a_table_of_what_was_flown() -> None:
     ((*row,),) = table.rows
     assert row[:4] == ["led", "0.150", "0.100 to 0.200", "1.00"]
     assert (row[4], *row[-2:]) == ("25.0", "1.00", "1 of 2")
+
+
+def test_the_scenario_px4_flies_its_flavour() -> None:
+    """By the model that is written in it, and no better."""
+    table = reading.to_table(reading.load("px4")) | {"duration": 20.0, "settle": 8.0}
+    table["vehicle"] |= {"address": "udpout:autopilot:0"}
+    scene = reading.check(table, "px4")
+    record = autopilots.fly(scene, None, "px4")
+    summary = summarise(scene, "px4", record.client, record.server, record.netem)
+    assert summary.rmse_xy is not None
+    assert summary.rmse_xy < 0.2
 
 
 @pytest.mark.long
