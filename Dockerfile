@@ -1,5 +1,5 @@
-# Three images, each with what it runs and no more: `client` (netem and keygen as well), `page` and
-# `server`. What a lock file pins, and our wheel.
+# Four images, each with what it runs and no more: `client` (netem and keygen as well), `aboard` (a
+# client that speaks MAVLink), `page` and `server`. What a lock file pins, and our wheel.
 # BASE_IMAGE may be any with Python 3.11 or later and its venv; either builder of Docker will do.
 ARG BASE_IMAGE=python:3.12-slim
 
@@ -22,6 +22,13 @@ RUN /build/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /whe
 FROM tools AS client-packages
 COPY requirements-client.lock ./
 RUN $INSTALL --require-hashes -r requirements-client.lock && $TRIM
+COPY --from=wheel /wheel /wheel
+RUN $INSTALL --no-deps --no-index /wheel/*.whl
+
+
+FROM tools AS aboard-packages
+COPY requirements-mavlink.lock ./
+RUN $INSTALL --require-hashes -r requirements-mavlink.lock && $TRIM
 COPY --from=wheel /wheel /wheel
 RUN $INSTALL --no-deps --no-index /wheel/*.whl
 
@@ -61,6 +68,10 @@ CMD ["--help"]
 
 FROM bare AS client
 COPY --from=client-packages /opt/skytether /opt/skytether
+
+
+FROM bare AS aboard
+COPY --from=aboard-packages /opt/skytether /opt/skytether
 
 
 FROM bare AS page

@@ -101,7 +101,7 @@ $(FUZZ_STAMP): $(STAMP) requirements-fuzz.lock
 lock: $(UV)  ## pin what pyproject.toml asks for: one version of each package, whoever needs it
 	$(COMPILE) --extra dev pyproject.toml -o requirements-dev.lock
 	$(COMPILE) --group setup -o requirements-setup.lock
-	for need in "" client page server bench fuzz; do \
+	for need in "" client mavlink page server bench fuzz; do \
 		case "$$need" in \
 			"") extras="--extra server --extra page --extra plot";; \
 			client) extras="";; \

@@ -257,6 +257,17 @@ def test_who_cannot_arm_in_time_says_why_in_the_autopilots_words(flavour: Flavou
     assert not air.setpoints()
 
 
+@pytest.mark.parametrize("flavour", BOTH)
+def test_an_autopilot_that_ends_in_a_climb_is_told_to_be_silent(flavour: FlavourName) -> None:
+    """The altitude that was heard last is no reason: nobody knows whether it still holds."""
+    air = Air(flavour, mavlink={"patience_s": 12.0})
+    air.run(30.0, lambda: air.flight.position()[2] > 1.0)
+    air.tap.dumb = True
+    air.end(60.0)
+    said = "not at the altitude of take-off in 12 s: nothing is heard of its autopilot for "
+    assert str(air.client.failure).startswith(f"vehicle 1: {said}")
+
+
 def test_without_a_position_nothing_is_armed() -> None:
     """A line says so in time."""
     air = Air("ardupilot", ready_s=60.0, mavlink={"patience_s": 3.0})

@@ -268,7 +268,9 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether replay ", "skytether duel ")
     known += ("skytether autopilot ",)  # by test_autopilot.py
     known += ("docker compose up",)
-    known += ("docker compose --profile observe up",)  # by test_observe.py, as far as it can be
+    # By test_observe.py and test_compose.py, as far as they can be.
+    known += ("docker compose --profile observe up",)
+    known += ("SCENARIO=px4 docker compose --profile px4 up",)
     known += ("skytether autopilot ",)  # by test_aboard_udp.py
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     by_hand += ("skytether station ", "skytether autopilot ")

@@ -6,8 +6,6 @@ Neither Prometheus nor Grafana runs here; server, netem and client do.
 import asyncio
 import json
 import re
-import shutil
-import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterator
@@ -223,15 +221,3 @@ def test_the_observers_are_pinned_and_locked_in() -> None:
     assert environment["GF_AUTH_ANONYMOUS_ORG_ROLE"] == "Viewer"
     home = environment["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"]
     assert (OBSERVE / "grafana" / home.removeprefix("/etc/skytether/")).exists()
-
-
-def test_compose_understands_its_file() -> None:
-    """With the profile and without it, where Compose is."""
-    docker = shutil.which("docker")
-    if docker is None or subprocess.run([docker, "compose", "version"], check=False).returncode:
-        pytest.skip("no Compose")
-    for profile, more in (([], set()), (["--profile", "observe"], {"prometheus", "grafana"})):
-        argv = [docker, "compose", *profile, "config", "--services"]
-        done = subprocess.run(argv, cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        assert {*THREE, "keys"} | more <= set(done.stdout.split())

@@ -256,6 +256,42 @@ def test_the_wind_moves_it_and_the_loops_bring_it_to_rest() -> None:
     assert np.tan(flown_.attitude().pitch) == pytest.approx(drag, rel=0.05)
 
 
+@pytest.mark.parametrize(("integral_max", "drifts_mps"), [(PX4.integral_max, 0.0), (5.0, 0.52)])
+def test_px4_stands_in_a_wind_that_drags_with_6_newtons(
+    integral_max: float, drifts_mps: float
+) -> None:
+    """Its tilt is enough; an integral that ends at 5 m/s², which PX4's does not, lets it drift."""
+    flown_ = quadrotor(FRAMES["sih"], PX4._replace(integral_max=integral_max))
+    flown_.blow((6.0,), 0.0)
+    rows = response(flown_, (0.0, 0.0, 0.0), 40.0)
+    assert rows[-1, 3] == pytest.approx(drifts_mps, abs=0.02)
+    assert flown_.attitude().pitch < 0.8 * PX4.tilt_max
+
+
+@pytest.mark.parametrize(
+    ("frame", "gains", "least_mps", "most_mps"),
+    [(KG15, ARDUPILOT, 0.06, 0.11), (FRAMES["sih"], PX4, 0.30, 0.42)],
+)
+def test_turbulence_moves_it_as_documented(
+    frame: Frame, gains: Gains, least_mps: float, most_mps: float
+) -> None:
+    """In hover, in a wind of 6 m/s: docs/straight.md."""
+    flown_ = quadrotor(frame, gains)
+    flown_.blow((6.0,), 6.0)
+    rows = response(flown_, (0.0, 0.0, 0.0), 600.0)[6000:]
+    moved = rows[:, 3:5].std(axis=0)
+    assert np.all((least_mps < moved) & (moved < most_mps))
+
+
+@pytest.mark.parametrize(("frame", "gains"), FLOWN)
+def test_no_integral_grows_without_end(frame: Frame, gains: Gains) -> None:
+    """In a storm that no tilt stands against, for a minute."""
+    flown_ = quadrotor(frame, gains)
+    flown_.blow((60.0,), 0.0)
+    response(flown_, (0.0, 0.0, 0.0), 60.0)
+    assert np.abs(flown_._quad.integral).max() == gains.integral_max
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(0, 30 * MS), min_size=1, max_size=12))
 def test_time_may_pass_in_any_pieces(pieces: list[int]) -> None:

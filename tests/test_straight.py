@@ -1,6 +1,7 @@
 """Set-points sent straight to an autopilot: the laws, the ground station, and flights by both."""
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from skytether.__main__ import main
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import parse as fault
 from skytether.autopilot.flavours import FlavourName
-from skytether.lab.benchmarks import autopilots
+from skytether.lab.benchmarks import autopilots, autopilots_udp
+from skytether.lab.benchmarks.autopilots import Cell
 from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.netem.proxy import Proxy
@@ -31,7 +33,7 @@ from skytether.shared.telemetry.record import (
     Record,
     Recorder,
 )
-from skytether.shared.telemetry.summary import Summary
+from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim import straight
 from skytether.sim.world import World
 from skytether.station import laws
@@ -306,31 +308,45 @@ def test_the_autopilot_records_where_it_truly_is_at_every_tick() -> None:
 # -- the benchmark, and real UDP -----------------------------------------------------------------
 
 
-def test_the_benchmark_makes_a_table_of_what_was_flown() -> None:
-    """Means over seeds of one flavour and air."""
+def flight(contender: str, air: autopilots.Air, seed: int, **whole: float) -> autopilots.Flown:
+    """Figures of flights of PX4 in which nothing was flown, but for those that are given."""
     nothing = [np.zeros(80, columns) for columns in (station_columns(3), TRUTH_COLUMNS)]
     record = joined(scenario(), *nothing, np.zeros(0, PACKET_COLUMNS))
     summary = summary_of(scenario(), "autopilot", record)
     summary = msgspec.structs.replace(summary, error_max=1.0, duration_s=4.0)
+    return autopilots.Flown(
+        contender=contender,
+        flavour="px4",
+        air=air,
+        seed=seed,
+        whole=msgspec.structs.replace(summary, **whole),
+        cut=msgspec.structs.replace(summary, mode="manual" if seed else "track"),
+        largest_m=float(seed),
+    )
+
+
+def test_the_benchmark_makes_a_table_of_what_was_flown() -> None:
+    """Means over seeds of one flavour and air."""
     flights = [
-        autopilots.Flown(
-            contender="led",
-            flavour="px4",
-            air="wind",
-            seed=seed,
-            whole=msgspec.structs.replace(
-                summary, rmse_xy=rmse, error_max=1.0, uplink_packets=packets, duration_s=4.0
-            ),
-            cut=msgspec.structs.replace(summary, mode="manual" if seed else "track"),
-            largest_m=float(seed),
-        )
-        for seed, rmse, packets in ((0, 0.1, 80), (1, 0.2, 120))
+        flight("led", "wind", 0, rmse_xy=0.1, uplink_packets=80),
+        flight("led", "wind", 1, rmse_xy=0.2, uplink_packets=120),
     ]
     ((name, table),) = autopilots.tables(flights).items()
     assert name == "px4 wind"
     ((*row,),) = table.rows
     assert row[:4] == ["led", "0.150", "0.100 to 0.200", "1.00"]
     assert (row[4], *row[-2:]) == ("25.0", "1.00", "1 of 2")
+
+
+def test_the_scenario_px4_flies_its_flavour() -> None:
+    """By the model that is written in it, and no better."""
+    table = reading.to_table(reading.load("px4")) | {"duration": 20.0, "settle": 8.0}
+    table["vehicle"] |= {"address": "udpout:autopilot:0"}
+    scene = reading.check(table, "px4")
+    record = autopilots.fly(scene, None, "px4")
+    summary = summarise(scene, "px4", record.client, record.server, record.netem)
+    assert summary.rmse_xy is not None
+    assert summary.rmse_xy < 0.2
 
 
 @pytest.mark.long
@@ -345,3 +361,38 @@ def test_it_flies_over_udp(tmp_path: Path) -> None:
     virtual = summary_of(scene, "autopilot", flown(duration=12.0, settle=6.0))
     assert summary.rmse_xy == pytest.approx(virtual.rmse_xy, abs=0.05)
     assert figure.read_text().startswith("<?xml")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("contender", autopilots_udp.CONTENDERS)
+async def test_the_benchmark_flies_processes_and_cuts_their_network(
+    contender: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """True states at every step; in the cut all packets are lost, and some before and after."""
+    monkeypatch.setattr(autopilots_udp, "CUT_S", 3.0)
+    monkeypatch.setattr(autopilots_udp, "HEALED_S", 5.0)
+    cell = Cell(contender, "ardupilot", "calm", 1)
+    scene = msgspec.structs.replace(autopilots.scenario_of(cell), duration=9.0, settle=1.0)
+    record = await autopilots_udp.fly(scene, cell, tmp_path, cut=True)
+    assert record.client["step"][-1] == 179
+    assert np.all(np.abs(record.client["state"][:, 2, 0] - 5.0) < 1.0)
+    entered_s = (record.netem["arrived_ns"] - record.netem["arrived_ns"][0]) / 1e9
+    inside = (entered_s > 3.5) & (entered_s < 4.5)
+    lost = record.netem["lost"]
+    assert np.all(lost[inside])
+    assert 0.0 < np.mean(lost[entered_s < 2.5]) < 0.4
+    assert 0.0 < np.mean(lost[entered_s > 5.5]) < 0.4
+
+
+def test_what_was_flown_over_udp_has_a_row_for_each_contender_and_air() -> None:
+    """Named by autopilot, air and contender."""
+    flights = [
+        flight(contender, air, seed)
+        for seed in (1, 2)
+        for air, contender in product(("calm", "wind"), autopilots_udp.CONTENDERS)
+    ]
+    rows = autopilots_udp.table(flights).rows
+    assert [row[0] for row in rows] == [
+        f"PX4, {air}: {contender}"
+        for air, contender in product(("calm", "wind"), autopilots_udp.CONTENDERS)
+    ]

@@ -26,6 +26,8 @@ FRESH_NS = 500 * MILLISECOND_NS
 """Age up to which a position tells where the vehicle is now [ns]."""
 LAND_MAX_NS = 120 * SECOND_NS
 """Longest time that a landing is waited for [ns]."""
+QUIET_NS = 3 * SECOND_NS
+"""Silence of the autopilot that is the reason why a step is not done [ns]."""
 SILENT_MAX_NS = 10 * SECOND_NS
 """Longest silence of the autopilot in a landing that is waited for [ns]."""
 THERE_M = 0.3
@@ -213,7 +215,14 @@ class Launch:
             self._since_ns = now_ns
         if now_ns - self._since_ns > self._patience_ns:
             waited = f"{doing} in {self._patience_ns / SECOND_NS:g} s"
-            self._fail(waited, self._words or why, now_ns)
+            self._fail(waited, self._silence(now_ns) or self._words or why, now_ns)
+
+    def _silence(self, now_ns: int) -> str:
+        """Sentence about an autopilot that is heard no more; empty where it is."""
+        heard_ns = self._condition.heard_ns
+        if heard_ns is None or now_ns - heard_ns <= QUIET_NS:
+            return ""
+        return f"nothing is heard of its autopilot for {(now_ns - heard_ns) / SECOND_NS:.0f} s"
 
     def _fail(self, doing: str, why: str, now_ns: int) -> None:
         self.failure = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)

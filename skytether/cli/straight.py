@@ -107,15 +107,13 @@ def _really(
     with temporary.folder() as parts:
         file = parts / "scenario.toml"
         file.write_bytes(to_toml(scenario))
-        numbers = {"--lead": law.lead_s, "--gain": law.gain}
-        given = [f"{flag}={number}" for flag, number in numbers.items() if number is not None]
 
         def process(name: str, *argv: str) -> list[str]:
             return [name, str(file), "--record", str(parts / name), *argv]
 
         processes.fly_chain(
             [
-                process("station", "--law", law.name, *given, *processes.ANYWHERE),
+                process("station", *laws.flags(law), *processes.ANYWHERE),
                 process("netem", "--flows", "1", *processes.ANYWHERE, "--server"),
                 process(
                     "autopilot", "--flavour", options.flavour, f"--ready={virtual.READY_S}", "--to"

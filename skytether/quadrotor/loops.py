@@ -44,6 +44,8 @@ class Gains(NamedTuple):
     """Acceleration over the error of the vertical velocity [1/s]."""
     i_up: float
     """Acceleration over the integral of that error [1/s²]."""
+    integral_max: float
+    """Largest acceleration that an integral asks for [m/s²]."""
     tilt_max: float
     """Largest tilt [rad]."""
 
@@ -59,10 +61,11 @@ ARDUPILOT = Gains(
     d=0.25,
     p_up=5.0,
     i_up=2.5,
+    integral_max=10.0,
     tilt_max=0.52,
 )
 """ArduCopter 4.5: its defaults PSC_JERK_XY, WPNAV_ACCEL, PSC_JERK_Z, WPNAV_ACCEL_Z, PSC_POSXY_P,
-PSC_VELXY_P, _I and _D, PSC_VELZ_P and ANGLE_MAX."""
+PSC_VELXY_P, _I, _D and _IMAX, PSC_VELZ_P and _IMAX, and ANGLE_MAX."""
 
 PX4 = Gains(
     jerk=0.0,
@@ -75,10 +78,12 @@ PX4 = Gains(
     d=0.2,
     p_up=4.0,
     i_up=2.0,
+    integral_max=GRAVITY,
     tilt_max=0.785,
 )
 """PX4 1.17: its defaults MPC_XY_VEL_P_ACC, _I_ACC and _D_ACC, MPC_Z_VEL_P_ACC and _I_ACC and
-MPC_TILTMAX_AIR. A setpoint of velocity from outside is not shaped."""
+MPC_TILTMAX_AIR. A setpoint of velocity from outside is not shaped. Its vertical integral goes up to
+g; that in the plane as far as the largest tilt does, which is g as well."""
 
 CRAZYFLIE = Gains(
     jerk=0.0,
@@ -91,16 +96,15 @@ CRAZYFLIE = Gains(
     d=0.0,
     p_up=7.3,
     i_up=4.4,
+    integral_max=5.0,
     tilt_max=0.349,
 )
 """Crazyflie's firmware: its defaults of `position_controller_pid.c`, velocity to tilt with 25° and
 1° for each m/s, at most 20°, and to thrust 25 000 and 15 000 of 65 535, as accelerations of a
-Crazyflie."""
+Crazyflie. Its integrals end at no value that is reached; 5 m/s² is assumed."""
 
 AHEAD_MAX_M = 2.0
 """Longest way that is caught up with [m]."""
-INTEGRAL_MAX = 5.0
-"""Largest acceleration that an integral asks for [m/s²]."""
 CELL_V = (0.0, 3.3, 3.6, 3.68, 3.75, 3.82, 3.95, 4.2)
 CELL_CHARGE = (-0.05, 0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Voltage of a cell of lithium polymer at rest [V], over its charge; typical, of no cell in
@@ -178,7 +182,7 @@ def accelerate(gains: Gains, quad: Quad, out: F1) -> None:
         slower = wanted[i] - x[3 + i]
         wanted[6 + i] = clipped(wanted[6 + i] + slower * STEP_S, AHEAD_MAX_M)
         error = slower + gains.catch_up * wanted[6 + i]
-        integral[i] = clipped(integral[i] + i_ * error * STEP_S, INTEGRAL_MAX)
+        integral[i] = clipped(integral[i] + i_ * error * STEP_S, gains.integral_max)
         lead = wanted[3 + i]
         out[i] = lead + p * error + integral[i] - d * (quad.acceleration[i] - lead)
     # Height goes before distance: what is asked for in the plane gives way to the largest tilt.

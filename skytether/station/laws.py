@@ -84,6 +84,13 @@ def _number(
     return given
 
 
+def flags(law: Law) -> list[str]:
+    """Arguments that choose a law on the command line of `skytether station`."""
+    numbers = {"--lead": law.lead_s, "--gain": law.gain}
+    given = [f"{flag}={number}" for flag, number in numbers.items() if number is not None]
+    return [f"--law={law.name}", *given]
+
+
 class Heard(NamedTuple):
     """Position that was heard."""
 

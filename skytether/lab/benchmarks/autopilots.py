@@ -27,7 +27,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Flying
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import TRUTH_COLUMNS, Record, Recorder, parse
+from skytether.shared.telemetry.record import TRUTH_COLUMNS, Record, Recorder, Rows, parse
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.shell import command
@@ -120,11 +120,15 @@ def contenders(flavour: FlavourName) -> dict[str, laws.Law | None]:
     }
 
 
-def scenario_of(cell: Cell) -> Scenario:
-    """What is flown in a cell: the same for all contenders, but for keys of our own."""
+def scenario_of(cell: Cell, model: Mapping[str, Any] | None = None) -> Scenario:
+    """What is flown in a cell: the same for all contenders, but for keys of our own.
+
+    Args:
+        model: keys of the model that Skytether flies by; those of `MODELS` unless given.
+    """
     table = reading.to_table(reading.load("autopilot"))
     table["seed"] = cell.seed
-    table["model"] |= MODELS[cell.flavour]
+    table["model"] |= MODELS[cell.flavour] if model is None else model
     table["vehicle"] |= {"address": "udpout:autopilot:0", **(BLOWS if cell.air == WIND else {})}
     for name, keys in OURS.get(cell.contender, {}).items():
         table[name] |= keys
@@ -152,9 +156,20 @@ def fly(
     for name, value in SAFE[flavour].items():
         autopilot.flight.set(name, value)
     flown = flight.fly(scenario, beside={"autopilot": autopilot}, changes=changes)
+    return as_it_was(scenario, flown, parse(sink.getvalue()))
+
+
+def as_it_was(scenario: Scenario, flown: Record, truth: Rows) -> Record:
+    """Record of a flight of ours with true states, and packets from the first step to the last.
+
+    Args:
+        scenario: what was flown.
+        flown: its record, with states as the client knew them.
+        truth: rows of `record.TRUTH_COLUMNS`, on the clock of the record's events.
+    """
     times_ns = began_ns(flown) + flown.client["step"] * scenario.dt_ns
     client = flown.client.copy()
-    client["state"] = state_at(parse(sink.getvalue()), times_ns)[:, : scenario.model.axes]
+    client["state"] = state_at(truth, times_ns)[:, : scenario.model.axes]
     netem = within(flown.netem, times_ns, scenario.dt_ns)
     return replace(flown, client=client, netem=netem)
 
@@ -171,21 +186,28 @@ def fly_cell(cell: Cell) -> Flown:
         (began_s + HEALED_S, {f"network.{way}.loss": scenario.network.uplink.loss for way in both}),
     ]
     cut = fly(scenario, law, cell.flavour, changes)
+    return judged(cell, scenario, whole, cut)
+
+
+def judged(
+    cell: Cell, scenario: Scenario, whole: Record, cut: Record, *, secure: bool = False
+) -> Flown:
+    """Figures of the two flights of a cell: with the network whole, and cut for a while."""
     times_s = cut.client["step"] * scenario.control.dt
     watched = (times_s >= CUT_S) & (times_s < WATCHED_S)
     errors = np.linalg.norm(position_error(scenario, cut.client)[watched], axis=1)
+    whole_summary, cut_summary = (
+        summarise(scenario, "autopilot", flown.client, flown.server, flown.netem, secure=secure)
+        if cell.contender in OURS
+        else summary_of(scenario, "autopilot", flown)
+        for flown in (whole, cut)
+    )
     return Flown(
         **cell._asdict(),
-        whole=_summary(scenario, law, whole),
-        cut=_summary(scenario, law, cut),
+        whole=whole_summary,
+        cut=cut_summary,
         largest_m=float(errors.max()),
     )
-
-
-def _summary(scenario: Scenario, law: laws.Law | None, flown: Record) -> Summary:
-    if law is not None:
-        return summary_of(scenario, "autopilot", flown)
-    return summarise(scenario, "autopilot", flown.client, flown.server, flown.netem)
 
 
 HEADINGS = [
@@ -209,7 +231,7 @@ def tables(flights: Sequence[Flown]) -> dict[str, TextTable]:
         of_case = [each for each in flights if (each.flavour, each.air) == (flavour, air)]
         names = dict.fromkeys(each.contender for each in of_case)
         if of_case:
-            rows = [_row(name, [e for e in of_case if e.contender == name]) for name in names]
+            rows = [row(name, [e for e in of_case if e.contender == name]) for name in names]
             made[f"{flavour} {air}"] = TextTable(HEADINGS, rows)
     if near := _near(flights):
         made["actual"] = TextTable(["RMSE xy [m]", "actual", "simulated", "least to most"], near)
@@ -223,11 +245,11 @@ def _near(flights: Sequence[Flown]) -> list[list[str]]:
         case = name, "ardupilot", air
         of_case = [each for each in flights if (each.contender, each.flavour, each.air) == case]
         if of_case:
-            rows.append([f"{name}, {air}", f"{actual_m:g}", *_row(name, of_case)[1:3]])
+            rows.append([f"{name}, {air}", f"{actual_m:g}", *row(name, of_case)[1:3]])
     return rows
 
 
-def _row(name: str, flights: Sequence[Flown]) -> list[str]:
+def row(name: str, flights: Sequence[Flown]) -> list[str]:
     """Row of a contender: means over its flights, and of errors also the largest."""
     errors = [each.whole.rmse_xy or np.nan for each in flights]
 
@@ -275,7 +297,7 @@ def main() -> int:
     """Fly as the command line says, and return the exit code."""
     options = tyro.cli(AutopilotBenchmarkOptions, description=__doc__)
     seeds = range(1, options.seeds + 1)
-    flights = _kept(options.json)
+    flights = kept(options.json)
     done = {(each.contender, each.flavour, each.air, each.seed) for each in flights}
     cells = [
         Cell(name, flavour, air, seed)
@@ -298,7 +320,7 @@ def main() -> int:
     return 0
 
 
-def _kept(file: Path | None) -> list[Flown]:
+def kept(file: Path | None) -> list[Flown]:
     """Flights that a file has already."""
     if file is None or not file.exists():
         return []
