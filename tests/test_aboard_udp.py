@@ -146,6 +146,30 @@ def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
     assert "flies a plan" in run.stdout
 
 
+def test_fly_has_everything_but_the_autopilot(tmp_path: Path) -> None:
+    """It sets the parameters where it is told to, and is refused where it is not."""
+    document = (Path(__file__).parent.parent / "docs" / "fly-a-real-one.md").read_text()
+    (table,) = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    (tmp_path / "field.toml").write_text(table)
+    skytether = [sys.executable, "-P", "-m", "skytether"]
+    fly = [*skytether, "fly", "field.toml", "--duration", "4", "--settle", "0"]
+    autopilot = [*skytether, "autopilot", "field.toml", "--flavour", "ardupilot", "--ready", "2"]
+    with subprocess.Popen(autopilot, cwd=tmp_path) as stands_by:
+        try:
+            runs = [
+                subprocess.run(
+                    [*fly, *flags], cwd=tmp_path, capture_output=True, text=True, check=False
+                )
+                for flags in ((), ("--set-parameters",))
+            ]
+        finally:
+            stands_by.terminate()
+    refused, flown = runs
+    assert refused.returncode == 1
+    assert refused.stderr.splitlines()[-1].endswith("SYSID_MYGCS; --set-parameters sets them")
+    assert flown.returncode == 0, flown.stderr
+
+
 async def test_unsafe_parameters_end_with_a_line_each(tmp_path: Path) -> None:
     """Exit code 2, and nothing is armed."""
     processes = Processes(tmp_path, "ardupilot")
@@ -156,7 +180,7 @@ async def test_unsafe_parameters_end_with_a_line_each(tmp_path: Path) -> None:
     assert names == ["GUID_TIMEOUT", "FS_GCS_ENABLE", "SYSID_MYGCS"]
     assert processes.last_words == (
         "client: vehicle 1 is not armed: GUID_TIMEOUT, FS_GCS_ENABLE, SYSID_MYGCS; "
-        "client --set-parameters sets them"
+        "--set-parameters sets them"
     )
     modes = processes.events(AutopilotMode)
     assert not any(each.armed for each in modes if isinstance(each, AutopilotMode))

@@ -111,7 +111,7 @@ class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
     def brief(self) -> str:
         """All of them in one line, by name."""
         names = ", ".join(parameter.name for parameter in self.parameters)
-        return f"vehicle {self.vehicle} is not armed: {names}; client --set-parameters sets them"
+        return f"vehicle {self.vehicle} is not armed: {names}; --set-parameters sets them"
 
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):

@@ -52,6 +52,9 @@ class FlyOptions:
     """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
+    set_parameters: bool = False
+    """Set the autopilot's parameters that decide what it does in silence, where they are not safe;
+    without it, they are told, and nothing is armed."""
     control: Path | None = None
     """Folder for sockets called server, netem and client, through which keys change in flight, see
     `skytether set`; it is made where there is none. Not in virtual time."""
@@ -245,6 +248,7 @@ def _really(
             interrupted=interrupted,
             on_event=lambda line: _tell(line.event),
             secure=options.secure,
+            set_parameters=options.set_parameters,
             control=sockets,
             feeds=feeds,
         )

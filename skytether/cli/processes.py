@@ -196,6 +196,7 @@ def run(
     workers: int = 1,
     watched: bool = True,
     secure: bool = False,
+    set_parameters: bool = False,
     control: Path | None = None,
     feeds: Path | None = None,
 ) -> list[Shortfall]:
@@ -214,6 +215,7 @@ def run(
         workers: number of processes of the server.
         watched: whether server and netem record, too.
         secure: whether the link is sealed, with keys that are made for this flight.
+        set_parameters: whether the client makes its autopilot's parameters safe.
         control: folder for a socket of each process, through which keys change in flight.
         feeds: folder for the feed of each process, called as in `server.feed`; of several workers,
             as in `server.feed.1`.
@@ -244,6 +246,7 @@ def run(
     server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]
     netem = [*common("netem", recorded=watched), "--flows", str(vehicles)]
     client = [*common("client", recorded=True), *fleet, *keys]
+    client += ["--set-parameters"] * set_parameters
 
     def hear(line: LogLine) -> None:
         if isinstance(line.event, Shortfall):
@@ -363,7 +366,7 @@ async def _fly(
             while not any(task.done() for task in ended):
                 await asyncio.wait(ended, timeout=POLL_S, return_when=asyncio.FIRST_COMPLETED)
                 on_second(0.0 if flying_s is None else loop.time() - flying_s)
-                if loop.time() - began_s > timeout_s:
+                if loop.time() - (flying_s or began_s) > timeout_s:
                     raise CommandError(f"the flight has not ended in {timeout_s:.0f} s")
         finally:
             for task in ended:
