@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from airborne import Air
-from skytether.autopilot.flavours import FlavourName
-from skytether.autopilot.flavours import Mode as Flown
+from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.lab.benchmarks.autopilots import MODELS
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
@@ -289,13 +288,13 @@ def fly(
     air.run(duration - 5.0 + float(np.random.default_rng(seed).random()))
     assert air.client.failure is None
     assert air.client._failsafe.mode in (Mode.TRACK, Mode.COAST), air.said()[-5:]
-    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.flight.act(FlightMode.PILOT, "Pilot has taken over")
     pilot_s = air.run(2.0, lambda: air.client._failsafe.mode is Mode.MANUAL)
     manual_ns = air.world.now_ns
     air.run(2.0)
     assert air.client._failsafe.mode is Mode.MANUAL, air.said()[-5:]
     assert not air.setpoints_from_client(manual_ns + 1)
-    assert air.flight.mode is Flown.PILOT
+    assert air.flight.mode is FlightMode.PILOT
     assert is_in_order(air.believed, air.had), (air.believed, air.had)
     return _figures(air, flavour, seed, pilot_s, len(arms))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import parse
-from skytether.autopilot.flavours import FLAVOURS, FlavourName, Mode
+from skytether.autopilot.flavours import FLAVOURS, FlavourName, FlightMode
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
@@ -115,7 +115,7 @@ class Companion:
         assert ack.command == command
         return int(ack.result)
 
-    def mode(self, kind: Mode) -> int:
+    def mode(self, kind: FlightMode) -> int:
         """Ask for the first mode of a kind; returns the result."""
         number = self.flavour.number(kind)
         if self.flavour.bytewise:
@@ -131,7 +131,7 @@ class Companion:
         above_sea = self.flavour.home[2] if self.flavour.bytewise else 0.0
         self.run(1.0)
         if not self.flavour.bytewise:
-            assert self.mode(Mode.GUIDED) == 0
+            assert self.mode(FlightMode.GUIDED) == 0
         assert self.arm() == 0
         assert self.command(22, 0, 0, 0, 0, 0, 0, altitude + above_sea) == 0
         took = self.run(30.0, lambda: abs(self.flight.position()[2] - altitude) < 0.15)
@@ -139,7 +139,7 @@ class Companion:
         if self.flavour.bytewise:
             self.velocity = (0.0, 0.0, 0.0)
             self.run(0.5)
-            assert self.mode(Mode.GUIDED) == 0
+            assert self.mode(FlightMode.GUIDED) == 0
         return took
 
     def stream(self, rate: float, number: int = LOCAL) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from airborne import SAFE, Air, scenario
-from skytether.autopilot.flavours import FlavourName
-from skytether.autopilot.flavours import Mode as Flown
+from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
 from skytether.client.mavlink.port import VELOCITY_ALONE
 from skytether.mavlink.codec import Codec, Message
@@ -323,7 +322,7 @@ def test_an_unarmed_scenario_arms_nothing_until_somebody_arms_it(flavour: Flavou
 def test_a_vehicle_that_flies_in_guided_is_not_taken_off_again() -> None:
     """It is flown where it is, from the autopilot's own origin."""
     air = Air("ardupilot", duration=5.0)
-    in_the_air(air, Flown.GUIDED)
+    in_the_air(air, FlightMode.GUIDED)
     air.fly()
     assert not air.commands(ARM)
     assert not air.commands(TAKE_OFF)
@@ -331,12 +330,12 @@ def test_a_vehicle_that_flies_in_guided_is_not_taken_off_again() -> None:
     assert air.rows()["estimate"][0, 2, 0] == pytest.approx(4.0, abs=0.2)
 
 
-def in_the_air(air: Air, mode: Flown) -> None:
+def in_the_air(air: Air, mode: FlightMode) -> None:
     """Have the vehicle fly at 4 m before the client comes to it."""
     flight = air.flight
     for _ in range(300):
         flight.tick()
-    flight.enter(flight.flavour.number(Flown.GUIDED))
+    flight.enter(flight.flavour.number(FlightMode.GUIDED))
     flight.arm()
     flight.take_off(4.0)
     for _ in range(3000):
@@ -345,8 +344,8 @@ def in_the_air(air: Air, mode: Flown) -> None:
     air.autopilot._began_ns = -flight.now_ns
 
 
-@pytest.mark.parametrize("mode", [Flown.PILOT, Flown.RETURN])
-def test_a_vehicle_that_somebody_else_flies_is_left_to_him(mode: Flown) -> None:
+@pytest.mark.parametrize("mode", [FlightMode.PILOT, FlightMode.RETURN])
+def test_a_vehicle_that_somebody_else_flies_is_left_to_him(mode: FlightMode) -> None:
     """Its mode is not changed, and after a while a line says why it is not flown."""
     air = Air("ardupilot", mavlink={"patience_s": 1.0})
     in_the_air(air, mode)
@@ -371,7 +370,7 @@ def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> Non
     """Nothing is commanded any more, and the client ends with a line."""
     air = Air(flavour)
     air.run(30.0, lambda: air.flight.armed and air.flight.position()[2] > 0.5)
-    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.flight.act(FlightMode.PILOT, "Pilot has taken over")
     asked = len(air.commands(SET_MODE))
     air.end(10.0)
     assert "it was taken over" in str(air.client.failure)
@@ -379,7 +378,7 @@ def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> Non
     air.world.act("client", air.client.close)
     air.run(0.5)
     assert len(air.commands(SET_MODE)) == asked
-    assert air.flight.mode is Flown.PILOT
+    assert air.flight.mode is FlightMode.PILOT
 
 
 @pytest.mark.parametrize("flavour", BOTH)
@@ -434,7 +433,7 @@ def test_who_arms_it_while_we_are_about_to_has_it() -> None:
 def test_a_pilot_wins_at_once_and_is_told_nothing_more(flavour: FlavourName) -> None:
     """His mode is not changed, and no setpoint comes."""
     air = flying(flavour)
-    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.flight.act(FlightMode.PILOT, "Pilot has taken over")
     asked = len(air.commands(SET_MODE))
     air.run(0.3)
     assert air.client._failsafe.mode is Mode.MANUAL
@@ -442,16 +441,16 @@ def test_a_pilot_wins_at_once_and_is_told_nothing_more(flavour: FlavourName) -> 
     air.run(3.0)
     assert not air.setpoints(quiet_ns)
     assert len(air.commands(SET_MODE)) == asked
-    assert air.flight.mode is Flown.PILOT
+    assert air.flight.mode is FlightMode.PILOT
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
 
 
 def test_a_vehicle_that_is_given_back_hovers_and_flies_on() -> None:
     """Once the link has been good for a second; PX4 needs setpoints for that, and has none."""
     air = flying("ardupilot")
-    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.flight.act(FlightMode.PILOT, "Pilot has taken over")
     air.run(1.0)
-    air.flight.enter(air.flight.flavour.number(Flown.GUIDED))
+    air.flight.enter(air.flight.flavour.number(FlightMode.GUIDED))
     back_ns = air.world.now_ns
     air.run(3.0)
     assert ("hover", str(Reason.RETURNED)) in modes(air)
@@ -468,7 +467,7 @@ def test_a_disarmed_vehicle_is_never_flown_again(flavour: FlavourName) -> None:
     assert modes(air)[-1] == ("manual", str(Reason.DISARMED))
     quiet_ns, arms = air.world.now_ns, len(air.commands(ARM))
     air.run(3.0)
-    air.flight.number = air.flight.flavour.number(Flown.GUIDED)
+    air.flight.number = air.flight.flavour.number(FlightMode.GUIDED)
     air.flight.armed = True
     air.run(2.0)
     assert not air.setpoints(quiet_ns)
@@ -538,9 +537,9 @@ def test_a_lost_estimate_lands_where_the_autopilot_does_not(flavour: FlavourName
     air = flying(flavour)
     air.flight.once = lambda _: False
     air.flight.estimates = False
-    air.run(10.0, lambda: air.flight.mode is Flown.LAND)
+    air.run(10.0, lambda: air.flight.mode is FlightMode.LAND)
     assert ("land", str(Reason.ASTRAY)) in modes(air)
-    assert air.flight.mode is Flown.LAND
+    assert air.flight.mode is FlightMode.LAND
 
 
 @pytest.mark.parametrize("flavour", BOTH)
@@ -577,7 +576,7 @@ def test_killed_we_repeat_nothing_and_the_autopilot_acts(
     air.run(4.0)
     assert not air.setpoints(killed_ns + 1)
     assert np.linalg.norm(air.flight.velocity()[:2]) < 0.5
-    assert (air.flight.mode is Flown.GUIDED) == stands
+    assert (air.flight.mode is FlightMode.GUIDED) == stands
     air.run(30.0, lambda: not air.flight.armed)
     assert not air.flight.armed
 
@@ -603,7 +602,7 @@ def test_who_ends_in_flight_says_land_three_times(flavour: FlavourName) -> None:
     air.world.stop("client")
     air.run(0.1)
     assert len(air.commands(SET_MODE)) == before + 3
-    assert air.flight.mode is Flown.LAND
+    assert air.flight.mode is FlightMode.LAND
     air.run(30.0, lambda: not air.flight.armed)
     assert not air.flight.armed
 
@@ -622,13 +621,13 @@ def test_who_ends_on_the_ground_begins_nothing() -> None:
 def test_who_ends_while_a_pilot_flies_says_nothing() -> None:
     """The pilot always wins."""
     air = flying("ardupilot")
-    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.flight.act(FlightMode.PILOT, "Pilot has taken over")
     air.run(1.0)
     asked = len(air.commands(SET_MODE))
     air.world.act("client", air.client.close)
     air.run(0.5)
     assert len(air.commands(SET_MODE)) == asked
-    assert air.flight.mode is Flown.PILOT
+    assert air.flight.mode is FlightMode.PILOT
 
 
 # Other traffic
@@ -681,7 +680,9 @@ def test_a_late_heartbeat_does_not_take_the_vehicle_back_from_a_pilot() -> None:
         return air.world.now_ns >= began_ns + SECOND
 
     began_ns = air.world.now_ns
-    air.world.at(began_ns + SECOND - 1, lambda: air.flight.act(Flown.PILOT, "Pilot has taken over"))
+    air.world.at(
+        began_ns + SECOND - 1, lambda: air.flight.act(FlightMode.PILOT, "Pilot has taken over")
+    )
     late_heartbeat(air, in_a_second)
     quiet_ns = air.world.now_ns
     air.run(2.0)
@@ -707,7 +708,7 @@ def test_an_autopilot_that_counts_anew_is_heard_after_a_pause() -> None:
     air.run(2.0)
     air.tap.dumb = False
     peer.codec._mavlink.seq = (peer.codec._mavlink.seq - 120) % 256
-    air.flight.act(Flown.PILOT, "Pilot has taken over")
+    air.flight.act(FlightMode.PILOT, "Pilot has taken over")
     air.run(0.5)
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
 

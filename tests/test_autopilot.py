@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from companion import ADDRESS, POSITION_AND_VELOCITY, VELOCITY_ONLY, Companion
 from skytether.autopilot import faults
 from skytether.autopilot.endpoint import PEERS_MAX, Autopilot
-from skytether.autopilot.flavours import FLAVOURS, FlavourName, Mode
+from skytether.autopilot.flavours import FLAVOURS, FlavourName, FlightMode
 from skytether.autopilot.flight import Landed, Result
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Codec
@@ -167,9 +167,9 @@ def test_px4_flies_home_and_lands_after_its_time_out() -> None:
     companion.velocity = (2.0, 0.0, 0.0)
     companion.run(4.0)
     companion.velocity = None
-    assert companion.run(5.0, lambda: companion.flight.mode is not Mode.GUIDED) == pytest.approx(
-        1.2, abs=0.05
-    )
+    assert companion.run(
+        5.0, lambda: companion.flight.mode is not FlightMode.GUIDED
+    ) == pytest.approx(1.2, abs=0.05)
     assert companion.flight.mode_name == "AUTO.RTL"
     assert "Failsafe activated: no offboard signal" in companion.texts()
     companion.run(60.0, lambda: not companion.flight.armed)
@@ -185,7 +185,7 @@ def test_px4_does_what_its_parameter_says(value: int, name: str) -> None:
     for parameter, number in (("COM_OBL_RC_ACT", value), ("COM_OF_LOSS_T", 0.5)):
         set_parameter(companion, parameter, number)
     companion.velocity = None
-    past_s = companion.run(5.0, lambda: companion.flight.mode is not Mode.GUIDED)
+    past_s = companion.run(5.0, lambda: companion.flight.mode is not FlightMode.GUIDED)
     assert past_s == pytest.approx(0.7, abs=0.05)
     assert companion.flight.mode_name == name
 
@@ -206,11 +206,11 @@ def test_px4_is_not_guided_without_a_stream() -> None:
     """A refusal in words; setpoints in another mode are what it waits for."""
     companion = Companion("px4")
     companion.run(1.0)
-    assert companion.mode(Mode.GUIDED) == Result.REJECTED
+    assert companion.mode(FlightMode.GUIDED) == Result.REJECTED
     assert companion.texts()[-1] == "Switching to mode 'Offboard' is currently not possible"
     companion.velocity = (0.0, 0.0, 0.0)
     companion.run(0.2)
-    assert companion.mode(Mode.GUIDED) == Result.ACCEPTED
+    assert companion.mode(FlightMode.GUIDED) == Result.ACCEPTED
 
 
 def test_ardupilot_forgets_setpoints_of_before() -> None:
@@ -219,10 +219,10 @@ def test_ardupilot_forgets_setpoints_of_before() -> None:
     companion.climb()
     companion.velocity = (1.0, 0.0, 0.0)
     companion.run(3.0)
-    companion.mode(Mode.PILOT)
+    companion.mode(FlightMode.PILOT)
     companion.velocity = None
     companion.run(1.0)
-    assert companion.mode(Mode.GUIDED) == Result.ACCEPTED
+    assert companion.mode(FlightMode.GUIDED) == Result.ACCEPTED
     companion.run(2.0)
     assert math.hypot(*companion.flight.velocity()) < 0.1
 
@@ -265,7 +265,7 @@ def test_a_setpoint_alone_lifts_px4_and_not_ardupilot() -> None:
         companion = Companion(flavour)
         companion.velocity = (0.0, 0.0, 0.5)
         companion.run(1.0)
-        assert companion.mode(Mode.GUIDED) == 0
+        assert companion.mode(FlightMode.GUIDED) == 0
         assert companion.arm() == 0
         companion.run(3.0)
         assert companion.flight.flying is flies
@@ -311,7 +311,7 @@ def fly_with(fault: str, flavour: FlavourName, seconds: float, **keys: float) ->
 def test_a_pilot_takes_over(flavour: FlavourName) -> None:
     """At once; setpoints go on coming, and move nothing."""
     companion = fly_with("pilot@15", flavour, 3.0)
-    assert companion.flight.mode is Mode.PILOT
+    assert companion.flight.mode is FlightMode.PILOT
     assert math.hypot(*companion.flight.velocity()) < 0.2
 
 
@@ -319,8 +319,8 @@ def test_a_pilot_takes_over(flavour: FlavourName) -> None:
 def test_it_lands_where_it_does_not_know_its_place(flavour: FlavourName) -> None:
     """It tells no position meanwhile, and what it does not know."""
     companion = fly_with("estimate@15", flavour, 3.0)
-    assert companion.flight.mode is Mode.LAND
-    assert companion.mode(Mode.GUIDED) == companion.flight.refusal
+    assert companion.flight.mode is FlightMode.LAND
+    assert companion.mode(FlightMode.GUIDED) == companion.flight.refusal
     before = len(companion.all("LOCAL_POSITION_NED"))
     companion.run(1.0)
     assert len(companion.all("LOCAL_POSITION_NED")) == before
@@ -332,15 +332,15 @@ def test_it_lands_where_it_does_not_know_its_place(flavour: FlavourName) -> None
 @pytest.mark.parametrize(
     ("flavour", "keys", "mode"),
     [
-        ("ardupilot", {}, Mode.GUIDED),
-        ("ardupilot", {"BATT_FS_LOW_ACT": 1}, Mode.LAND),
-        ("ardupilot", {"BATT_FS_LOW_ACT": 2}, Mode.RETURN),
-        ("px4", {}, Mode.GUIDED),
-        ("px4", {"COM_LOW_BAT_ACT": 2}, Mode.LAND),
+        ("ardupilot", {}, FlightMode.GUIDED),
+        ("ardupilot", {"BATT_FS_LOW_ACT": 1}, FlightMode.LAND),
+        ("ardupilot", {"BATT_FS_LOW_ACT": 2}, FlightMode.RETURN),
+        ("px4", {}, FlightMode.GUIDED),
+        ("px4", {"COM_LOW_BAT_ACT": 2}, FlightMode.LAND),
     ],
 )
 def test_a_low_battery_is_told_and_does_what_the_parameter_says(
-    flavour: FlavourName, keys: dict[str, float], mode: Mode
+    flavour: FlavourName, keys: dict[str, float], mode: FlightMode
 ) -> None:
     """SYS_STATUS tells the charge."""
     companion = fly_with("battery@15", flavour, 1.0, **keys)
@@ -373,7 +373,7 @@ def test_a_lost_ground_station_sends_it_home_where_it_is_to(
     flavour: FlavourName, keys: dict[str, float], after_s: float
 ) -> None:
     """Off by default, as in both."""
-    for told, flown in ((keys, Mode.RETURN), ({}, Mode.GUIDED)):
+    for told, flown in ((keys, FlightMode.RETURN), ({}, FlightMode.GUIDED)):
         companion = Companion(flavour)
         for name, value in told.items():
             set_parameter(companion, name, value)
@@ -381,9 +381,9 @@ def test_a_lost_ground_station_sends_it_home_where_it_is_to(
         companion.climb()
         companion.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
         companion.beats, companion.velocity = False, (0.0, 0.0, 0.0)
-        left = companion.run(after_s + 1.0, lambda c=companion: c.flight.mode is Mode.RETURN)
+        left = companion.run(after_s + 1.0, lambda c=companion: c.flight.mode is FlightMode.RETURN)
         assert companion.flight.mode is flown
-        assert flown is Mode.GUIDED or left == pytest.approx(after_s, abs=0.1)
+        assert flown is FlightMode.GUIDED or left == pytest.approx(after_s, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -401,7 +401,7 @@ def test_its_own_fence_holds_it(flavour: FlavourName, keys: dict[str, float]) ->
     companion.climb()
     companion.velocity = (2.0, 0.0, 0.0)
     companion.run(8.0)
-    assert companion.flight.mode is Mode.HOLD
+    assert companion.flight.mode is FlightMode.HOLD
     assert 5.0 < companion.flight.position()[0] < 9.0
 
 

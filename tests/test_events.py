@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from skytether.shared.core.aboard import (
     AutopilotFound,
     AutopilotMode,
+    AutopilotParameter,
     AutopilotRefused,
     AutopilotText,
     NotTakenOff,
-    Parameter,
     ParametersRead,
     ParametersSet,
     ParametersUnsafe,
@@ -64,9 +64,9 @@ from skytether.shared.core.events import (
 from skytether.shared.law.terms import Difference
 from skytether.shell.log import Log, LogLine, line_of, rendered
 
-FENCE = Parameter(name="FENCE_ENABLE", value=0.0, meaning="its own fence is off")
-NONE = Parameter(name="FS_OPTIONS", value=None, meaning="why")
-UNSAFE = Parameter(
+FENCE = AutopilotParameter(name="FENCE_ENABLE", value=0.0, meaning="its own fence is off")
+NONE = AutopilotParameter(name="FS_OPTIONS", value=None, meaning="why")
+UNSAFE = AutopilotParameter(
     name="GUID_TIMEOUT", value=3.0, meaning="it flies on", wanted="0.2 to 1 s: set 1"
 )
 SENTENCES = [

@@ -23,13 +23,13 @@ from skytether.client.vehicle import Measurement, Vehicle
 from skytether.lab.commands import identify as command_of
 from skytether.lab.commands.identify import identify
 from skytether.lab.identify import outcome
-from skytether.lab.identify.fit import Fit, Numbers, Response, fit, misfit, predicted, verdict
+from skytether.lab.identify.fit import Fit, Numbers, StepResponse, fit, misfit, predicted, verdict
 from skytether.lab.identify.flight import Identifying
 from skytether.lab.identify.responses import responses
 from skytether.lab.identify.steps import (
     Experiment,
-    Plan,
-    Step,
+    ExperimentPlan,
+    FlownStep,
     default_hold_s,
     default_speeds,
     fenced,
@@ -59,7 +59,7 @@ def scenario(name: str = "demo", **sections: Any) -> Scenario:
 
 def answered(
     truth: Numbers, rng: np.random.Generator, *, noise: float = 0.0, count: int = 8
-) -> list[Response]:
+) -> list[StepResponse]:
     """Steps out and back that a vehicle of first order answers, by small steps of time."""
     made = []
     for number in range(count):
@@ -74,11 +74,11 @@ def answered(
             told.append(v)
         offset = rng.uniform(-0.3, 0.3)
         velocity = np.array(told) + offset + noise * rng.standard_normal(len(times))
-        made.append(Response(before, after, np.array([[0.0, after - before]]), times, velocity))
+        made.append(StepResponse(before, after, np.array([[0.0, after - before]]), times, velocity))
     return made
 
 
-def found(made: Sequence[Response]) -> Fit:
+def found(made: Sequence[StepResponse]) -> Fit:
     """The fit of responses that are enough."""
     best = fit(made)
     assert best is not None
@@ -114,7 +114,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert np.mean(shares) > 0.2  # none is so wide that it says nothing
 
 
-def second_order(damping: float) -> list[Response]:
+def second_order(damping: float) -> list[StepResponse]:
     """Steps that a vehicle answers which swings."""
     made = []
     for response in answered(Numbers(1.0, 0.3, 0.1), np.random.default_rng(1)):
@@ -158,7 +158,7 @@ def test_inputs_before_a_step_are_answered_as_well() -> None:
     """What has not settled when the step comes is predicted with it."""
     changes = np.array([[-1.0, 1.0], [0.0, -1.0]])
     times = np.array([0.0, 0.1, 0.5])
-    response = Response(1.0, 0.0, changes, times, times)
+    response = StepResponse(1.0, 0.0, changes, times, times)
     numbers = Numbers(2.0, 1.0, 0.1)
     rises = 1.0 - np.exp(-(times + 0.9))
     falls = np.where(times > 0.1, 1.0 - np.exp(-(times - 0.1)), 0.0)
@@ -172,9 +172,9 @@ def test_measurements_belong_to_a_step_by_their_stamps() -> None:
     measured = [Measurement(n * second // 20, [0.0], [float(n)]) for n in reversed(range(45))]
     measured.append(Measurement(second, [0.0], None))
     steps = [
-        Step(0, 0.0, 1.0, second, 2 * second),
-        Step(0, 1.0, 0.0, 2 * second, 3 * second),  # 5 measurements
-        Step(1, 1.0, 0.0, 0, second),
+        FlownStep(0, 0.0, 1.0, second, 2 * second),
+        FlownStep(0, 1.0, 0.0, 2 * second, 3 * second),  # 5 measurements
+        FlownStep(1, 1.0, 0.0, 0, second),
     ]
     (one,) = responses(inputs, measured, steps, 0)
     assert sorted(one.velocity.tolist()) == list(range(15, 40))  # and a while before it
@@ -185,10 +185,10 @@ def test_measurements_belong_to_a_step_by_their_stamps() -> None:
 
 
 def flown(
-    asked: Scenario, plan: Plan | None = None, flies: Vehicle | None = None
+    asked: Scenario, plan: ExperimentPlan | None = None, flies: Vehicle | None = None
 ) -> tuple[Identifying, World]:
     """An identification in virtual time, until its end."""
-    plan = plan or Plan(default_speeds(asked), default_hold_s(asked), 1)
+    plan = plan or ExperimentPlan(default_speeds(asked), default_hold_s(asked), 1)
     within = fenced(asked, plan)
     endpoint = Identifying(within, flies or vehicles.make(asked, 1), Experiment(within, plan))
     world = World()
@@ -245,7 +245,7 @@ def test_an_experiment_stays_inside_the_fence(seed: int) -> None:
         fence={"low_m": low.tolist(), "high_m": high.tolist(), "wind_mps": 0.5},
         reference={"shape": "hover", "points_m": [[0.0, 0.0]]},
     )
-    endpoint, _ = flown(asked, Plan((rng.uniform(0.2, 1.5),) * 2, 3.0, 2))
+    endpoint, _ = flown(asked, ExperimentPlan((rng.uniform(0.2, 1.5),) * 2, 3.0, 2))
     path = np.array([each.position for each in endpoint.measured])
     assert (path >= low).all()
     assert (path <= high).all()
@@ -263,20 +263,20 @@ def test_steps_without_room_are_not_flown() -> None:
         fence={"low_m": [-30.0, -2.2], "high_m": [30.0, 2.2]},
         reference={"shape": "hover", "points_m": [[0.0, 0.0]]},
     )
-    endpoint, _ = flown(asked, Plan((1.0, 1.0), 3.0, 1))
+    endpoint, _ = flown(asked, ExperimentPlan((1.0, 1.0), 3.0, 1))
     assert endpoint.experiment.cut == [0, 4]
     assert max(abs(each.position[1]) for each in endpoint.measured if each.position) < 0.01
     one, other = fits(endpoint)
     assert one is not None
     assert other is None
-    told = outcome.describe(outcome.Axis(1.0, 4, [], None))
+    told = outcome.describe(outcome.AxisOutcome(1.0, 4, [], None))
     assert told.startswith("too few steps (0, 4 cut), the fence leaves no room: expected a wider")
 
 
 def test_a_step_down_needs_a_floor() -> None:
     """Without one the altitude goes up and back, however little room the ceiling leaves."""
     space = {"model": {"axes": 3}, "reference": {"altitude_m": 5.0}}
-    plan = Plan((0.4, 0.4, 0.4), 3.0, 1)
+    plan = ExperimentPlan((0.4, 0.4, 0.4), 3.0, 1)
     ceiling = {"high_m": [30.0, 30.0, 7.5]}
     endpoint, _ = flown(scenario(**space, fence=ceiling), plan)
     assert endpoint.experiment.cut == [0, 0, 4]
@@ -376,7 +376,7 @@ def test_a_flight_that_is_broken_off_closes_the_line() -> None:
     """Which lets the vehicle land; what was measured is there."""
     cart = Cart()
     asked = scenario()
-    plan = Plan((0.5, 0.5), 3.0, 1)
+    plan = ExperimentPlan((0.5, 0.5), 3.0, 1)
     within = fenced(asked, plan)
     endpoint = Identifying(within, cart, Experiment(within, plan))
     world = World()
@@ -397,7 +397,7 @@ def test_an_autopilot_is_identified(flavour: Any) -> None:
         reference={"radius_m": 5.0},
         vehicle=CALM | {"kind": "mavlink", "address": "udpout:autopilot:0"},
     )
-    plan = Plan((1.0, 1.0), 3.0, 1)
+    plan = ExperimentPlan((1.0, 1.0), 3.0, 1)
     within = fenced(asked, plan)
     autopilot = Autopilot(asked, flavour, ready_s=1.0)
     autopilot.flight.parameters |= SAFE[flavour]

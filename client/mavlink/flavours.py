@@ -22,7 +22,7 @@ AIRBORNE = frozenset(
 """Types of vehicles that hover, and so can be flown."""
 
 
-class Step(Enum):
+class LaunchStep(Enum):
     """A step on the way into the air."""
 
     HOLD = auto()
@@ -50,7 +50,7 @@ class Flavour:
     """Number of the mode that stays where it is."""
     own: frozenset[int]
     """Numbers of the modes that the vehicle is in between arming and following setpoints."""
-    steps: tuple[Step, ...]
+    steps: tuple[LaunchStep, ...]
     """Way into the air."""
     streams_first: bool
     """Whether setpoints must be coming before it goes into its guided mode."""
@@ -84,7 +84,7 @@ ARDUPILOT = Flavour(
     land=9,
     hold=17,
     own=frozenset({4}),
-    steps=(Step.GUIDE, Step.ARM, Step.LIFT, Step.CLIMB),
+    steps=(LaunchStep.GUIDE, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB),
     streams_first=False,
     above_sea=False,
     bytewise=False,
@@ -115,7 +115,7 @@ PX4 = Flavour(
     land=_px4(4, 6),
     hold=_px4(4, 3),
     own=frozenset({_px4(4, 1), _px4(4, 2), _px4(4, 3), _px4(6)}),
-    steps=(Step.HOLD, Step.ARM, Step.LIFT, Step.CLIMB, Step.GUIDE),
+    steps=(LaunchStep.HOLD, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB, LaunchStep.GUIDE),
     streams_first=True,
     above_sea=True,
     bytewise=True,

@@ -10,7 +10,7 @@ once the vehicle is armed, its mode is never changed but from one of ours.
 from enum import Enum, auto
 
 from skytether.client.mavlink.condition import Condition
-from skytether.client.mavlink.flavours import Flavour, Step
+from skytether.client.mavlink.flavours import Flavour, LaunchStep
 from skytether.client.mavlink.positions import Positions
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
@@ -45,11 +45,11 @@ RESULTS = {
 """Names of answers to commands."""
 WORDS = {SET_MODE: "change its mode", ARM: "arm", TAKE_OFF: "take off"}
 NOT_DONE = {
-    Step.HOLD: "not in a mode that holds",
-    Step.GUIDE: "not in the mode that obeys us",
-    Step.ARM: "not armed",
-    Step.LIFT: "not taken off",
-    Step.CLIMB: "not at the altitude of take-off",
+    LaunchStep.HOLD: "not in a mode that holds",
+    LaunchStep.GUIDE: "not in the mode that obeys us",
+    LaunchStep.ARM: "not armed",
+    LaunchStep.LIFT: "not taken off",
+    LaunchStep.CLIMB: "not at the altitude of take-off",
 }
 
 
@@ -175,7 +175,7 @@ class Launch:
         """Go on to the first step that is not done."""
         condition, steps = self._condition, self._flavour.steps
         while self._step < len(steps):
-            armed_before = steps.index(Step.ARM) < self._step
+            armed_before = steps.index(LaunchStep.ARM) < self._step
             if armed_before and not condition.armed:
                 self._fail("not taken off", self._words or "it was disarmed", now_ns)
                 return
@@ -187,25 +187,25 @@ class Launch:
             step = steps[self._step]
             if not self._is_done(step):
                 at = f"it is at {self._positions.altitude:.1f} m"
-                self._wait(NOT_DONE[step], at if step is Step.CLIMB else "no answer", now_ns)
+                self._wait(NOT_DONE[step], at if step is LaunchStep.CLIMB else "no answer", now_ns)
                 return
-            if step is Step.ARM and self._from_takeoff:
+            if step is LaunchStep.ARM and self._from_takeoff:
                 self._positions.begin()
             self._begin_step(self._step + 1, now_ns)
         self._enter(Phase.FLYING, now_ns)
 
-    def _is_done(self, step: Step) -> bool:
+    def _is_done(self, step: LaunchStep) -> bool:
         condition = self._condition
         match step:
-            case Step.HOLD:
+            case LaunchStep.HOLD:
                 return condition.mode in self._flavour.own
-            case Step.GUIDE:
+            case LaunchStep.GUIDE:
                 return condition.mode == self._flavour.guided
-            case Step.ARM:
+            case LaunchStep.ARM:
                 return condition.armed
-            case Step.LIFT:
+            case LaunchStep.LIFT:
                 return self._accepted or condition.is_airborne
-            case Step.CLIMB:
+            case LaunchStep.CLIMB:
                 there = self._positions.altitude >= self._altitude - THERE_M
                 return there and abs(self._positions.velocity[2]) < STILL_MPS
 
@@ -234,7 +234,7 @@ class Launch:
         """Whether setpoints of zero have to run, for the next mode needs a stream of them."""
         if self.phase is not Phase.CLIMBING or not self._flavour.streams_first:
             return False
-        return self._flavour.steps[self._step] is Step.GUIDE
+        return self._flavour.steps[self._step] is LaunchStep.GUIDE
 
     # -- down again --------------------------------------------------------------------------
 
@@ -286,16 +286,16 @@ class Launch:
         if self.phase is not Phase.CLIMBING or self._closed:
             return None
         step = self._flavour.steps[self._step]
-        if step is Step.GUIDE and self._flavour.streams_first:
+        if step is LaunchStep.GUIDE and self._flavour.streams_first:
             assert self._since_ns is not None
             if now_ns - self._since_ns < STREAM_NS:
                 return None
-        modes = {Step.HOLD: self._flavour.hold, Step.GUIDE: self._flavour.guided}
+        modes = {LaunchStep.HOLD: self._flavour.hold, LaunchStep.GUIDE: self._flavour.guided}
         if step in modes:
             return self._mode_command(modes[step])
-        if step is Step.ARM:
+        if step is LaunchStep.ARM:
             return self._long(ARM, 1.0)
-        return self._lift() if step is Step.LIFT else None
+        return self._lift() if step is LaunchStep.LIFT else None
 
     def _lift(self) -> Message | None:
         altitude = self._altitude
@@ -321,7 +321,11 @@ class Launch:
             return
         if result == ACCEPTED:
             climbing = self.phase is Phase.CLIMBING
-            if command == TAKE_OFF and climbing and self._flavour.steps[self._step] is Step.LIFT:
+            if (
+                command == TAKE_OFF
+                and climbing
+                and self._flavour.steps[self._step] is LaunchStep.LIFT
+            ):
                 self._accepted = True
             return
         answer = RESULTS.get(result, f"result {result}")

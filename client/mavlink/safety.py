@@ -10,7 +10,7 @@ told that it is missing.
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from skytether.shared.core.aboard import Parameter
+from skytether.shared.core.aboard import AutopilotParameter
 
 SILENCE_MAX_S = 1.0
 """Longest time for which a vehicle may fly on without setpoints [s]."""
@@ -219,8 +219,8 @@ def _limit(value: float, where: str) -> str:
     return f"its fence is {value:g} m {where}" if value > 0.0 else f"its fence has no limit {where}"
 
 
-def judged(rule: Rule, values: Mapping[str, float]) -> Parameter:
-    """Parameter of a rule, and what is wrong with it.
+def judged(rule: Rule, values: Mapping[str, float]) -> AutopilotParameter:
+    """AutopilotParameter of a rule, and what is wrong with it.
 
     Args:
         values: values of the parameters that the autopilot has, by name.
@@ -229,7 +229,9 @@ def judged(rule: Rule, values: Mapping[str, float]) -> Parameter:
         value = values.get(name)
         if value is not None:
             wanted = "" if rule.is_safe(value) else rule.wanted
-            return Parameter(name=name, value=value, meaning=rule.meaning(value), wanted=wanted)
+            return AutopilotParameter(
+                name=name, value=value, meaning=rule.meaning(value), wanted=wanted
+            )
     meaning = "its autopilot does not have it, or does not tell"
     wanted = rule.wanted if rule.required else ""
-    return Parameter(name=rule.names[0], value=None, meaning=meaning, wanted=wanted)
+    return AutopilotParameter(name=rule.names[0], value=None, meaning=meaning, wanted=wanted)

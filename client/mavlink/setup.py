@@ -17,7 +17,7 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.aboard import (
     AutopilotFound,
-    Parameter,
+    AutopilotParameter,
     ParametersRead,
     ParametersSet,
     ParametersUnsafe,
@@ -181,13 +181,13 @@ class Setup:
             self.failure = ParametersUnsafe(vehicle=self._vehicle, parameters=wrong)
             self._events.append(self.failure)
 
-    def _begin_setting(self, unsafe: Mapping[Rule, Parameter]) -> None:
+    def _begin_setting(self, unsafe: Mapping[Rule, AutopilotParameter]) -> None:
         for rule, parameter in unsafe.items():
             if parameter.value is not None:
                 self._setting[parameter.name] = (parameter.value, rule.value)
                 self._tries[parameter.name] = 0
 
-    def _say(self, told: tuple[Parameter, ...]) -> None:
+    def _say(self, told: tuple[AutopilotParameter, ...]) -> None:
         if self._changed:
             changes = tuple(self._changed)
             self._events.append(ParametersSet(vehicle=self._vehicle, changes=changes))

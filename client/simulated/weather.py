@@ -16,7 +16,7 @@ from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 
-class Air(NamedTuple):
+class AirStep(NamedTuple):
     """What the air does over one step."""
 
     push: list[float]
@@ -54,7 +54,7 @@ class Weather:
         self._calm = self._pushed()
         """The air over a step, but for white acceleration."""
 
-    def blow(self) -> Air:
+    def blow(self) -> AirStep:
         """The air over the next step."""
         self._gusts()
         if not self._wind:
@@ -64,7 +64,7 @@ class Weather:
             (L[0][0] * n, L[1][0] * n + L[1][1] * m)
             for L, (n, m) in zip(self._wind, drawn, strict=True)
         ]
-        return Air(self._calm.push, shoves)
+        return AirStep(self._calm.push, shoves)
 
     def _gusts(self) -> None:
         """Gusts begin and end by chance, each blowing one way all along."""
@@ -79,9 +79,9 @@ class Weather:
             self._gust = self._rng.standard_normal(len(self._tau))
             self._calm = self._pushed()
 
-    def _pushed(self) -> Air:
+    def _pushed(self) -> AirStep:
         """The air now, but for white acceleration."""
         if self._gust is None:
-            return Air(self._steady_mps.tolist(), [])
+            return AirStep(self._steady_mps.tolist(), [])
         gust_mps2 = self._gust_mps2 * self._gust / np.linalg.norm(self._gust)
-        return Air((self._steady_mps + self._tau * gust_mps2).tolist(), [])
+        return AirStep((self._steady_mps + self._tau * gust_mps2).tolist(), [])

@@ -10,8 +10,8 @@ class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Number of the vehicle."""
 
 
-class Parameter(msgspec.Struct, frozen=True, kw_only=True):
-    """Parameter of an autopilot, and what it means for who flies the vehicle."""
+class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
+    """AutopilotParameter of an autopilot, and what it means for who flies the vehicle."""
 
     name: str
     value: float | None
@@ -42,7 +42,7 @@ class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
 class ParametersRead(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle has read the parameters that decide what its autopilot does in silence."""
 
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[AutopilotParameter, ...]
 
     def __str__(self) -> str:
         lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
@@ -100,7 +100,7 @@ class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
 class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle is not armed, for its autopilot would do what is not safe in silence."""
 
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[AutopilotParameter, ...]
     """Parameters that are not safe, or that could not be set."""
 
     def __str__(self) -> str:

@@ -2,8 +2,14 @@
 
 from math import hypot
 
-from skytether.autopilot.flavours import Mode
-from skytether.autopilot.flight import Flight, Limits, Result, Setpoint, Severity
+from skytether.autopilot.flavours import FlightMode
+from skytether.autopilot.flight import (
+    CompanionSetpoint,
+    OwnSpeeds,
+    PilotedVehicle,
+    Result,
+    Severity,
+)
 from skytether.quadrotor.loops import Gains
 from skytether.shared.base.units import SECOND_NS
 
@@ -11,15 +17,26 @@ LEAST = 0.1
 """Least value that a gain or a limit has, whatever its parameter says."""
 LANDED_S = 2.0
 """Time on the ground after which a landing is over [s], as measured."""
-STATION_ACTIONS = {1: Mode.RETURN, 3: Mode.RETURN, 4: Mode.RETURN, 5: Mode.LAND, 7: Mode.HOLD}
+STATION_ACTIONS = {
+    1: FlightMode.RETURN,
+    3: FlightMode.RETURN,
+    4: FlightMode.RETURN,
+    5: FlightMode.LAND,
+    7: FlightMode.HOLD,
+}
 """Modes by the value of FS_GCS_ENABLE; without a path to return on, SmartRTL is RTL."""
-BATTERY_ACTIONS = {1: Mode.LAND, 2: Mode.RETURN, 3: Mode.RETURN, 4: Mode.LAND}
+BATTERY_ACTIONS = {
+    1: FlightMode.LAND,
+    2: FlightMode.RETURN,
+    3: FlightMode.RETURN,
+    4: FlightMode.LAND,
+}
 """Modes by the value of BATT_FS_LOW_ACT."""
-FENCE_ACTIONS = {1: Mode.RETURN, 2: Mode.LAND, 4: Mode.HOLD}
+FENCE_ACTIONS = {1: FlightMode.RETURN, 2: FlightMode.LAND, 4: FlightMode.HOLD}
 """Modes by the value of FENCE_ACTION."""
 
 
-class ArduPilot(Flight):
+class ArduPilot(PilotedVehicle):
     """Flight of ArduCopter."""
 
     refusal = Result.FAILED
@@ -27,8 +44,8 @@ class ArduPilot(Flight):
     lifts_off_by_setpoint = False
 
     def why_not_armed(self) -> str:
-        """See `Flight`."""
-        if self.mode in (Mode.LAND, Mode.RETURN, Mode.HOLD):
+        """See `PilotedVehicle`."""
+        if self.mode in (FlightMode.LAND, FlightMode.RETURN, FlightMode.HOLD):
             return f"Arm: {self.mode_name} mode not armable"
         if not self.ready and self.parameters["ARMING_CHECK"]:
             return "PreArm: Need Position Estimate"
@@ -37,29 +54,29 @@ class ArduPilot(Flight):
         return ""
 
     def why_not_guided(self) -> str:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         return ""
 
     def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
-        """See `Flight`; the first part is all of it."""
+        """See `PilotedVehicle`; the first part is all of it."""
         return main
 
     def takes_setpoints(self) -> bool:
-        """See `Flight`."""
-        return self.mode is Mode.GUIDED
+        """See `PilotedVehicle`."""
+        return self.mode is FlightMode.GUIDED
 
     def altitude_of(self, told: float) -> float | None:
-        """See `Flight`; it is above home."""
+        """See `PilotedVehicle`; it is above home."""
         return told
 
     def enter_takeoff(self) -> bool:
-        """See `Flight`; GUIDED climbs by itself."""
-        return self.mode is Mode.GUIDED
+        """See `PilotedVehicle`; GUIDED climbs by itself."""
+        return self.mode is FlightMode.GUIDED
 
-    def limits(self) -> Limits:
-        """See `Flight`."""
+    def limits(self) -> OwnSpeeds:
+        """See `PilotedVehicle`."""
         p = self.parameters
-        return Limits(
+        return OwnSpeeds(
             speed=p["WPNAV_SPEED"] / 100.0,
             up=p["WPNAV_SPEED_UP"] / 100.0,
             down=p["WPNAV_SPEED_DN"] / 100.0,
@@ -71,7 +88,7 @@ class ArduPilot(Flight):
         )
 
     def gains(self) -> Gains:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         p = self.parameters
         return self.flavour.gains._replace(
             jerk=max(p["PSC_JERK_XY"], LEAST),
@@ -83,27 +100,27 @@ class ArduPilot(Flight):
         )
 
     def is_station(self, system: int, kind: int) -> bool:  # noqa: ARG002
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         return system == self.parameters["SYSID_MYGCS"]
 
     def return_altitude(self, distance: float) -> float:
-        """See `Flight`; lower where home is near."""
+        """See `PilotedVehicle`; lower where home is near."""
         cone = self.parameters["RTL_CONE_SLOPE"] * distance
         return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
 
-    def silence(self, setpoint: Setpoint) -> bool:
-        """See `Flight`; it brakes after GUID_TIMEOUT, where what it flies has a velocity."""
+    def silence(self, setpoint: CompanionSetpoint) -> bool:
+        """See `PilotedVehicle`; it brakes after GUID_TIMEOUT, if it moves."""
         past_s = (self.now_ns - setpoint.came_ns) / SECOND_NS
         return past_s > self.parameters["GUID_TIMEOUT"]
 
     def watch(self) -> None:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         p = self.parameters
         if self.station_ns is not None:
             past_s = (self.now_ns - self.station_ns) / SECOND_NS
             lost = past_s > p["FS_GCS_TIMEOUT"]
             action = STATION_ACTIONS.get(int(p["FS_GCS_ENABLE"]))
-            if lost and action and self.mode is not Mode.PILOT and self.once("station"):
+            if lost and action and self.mode is not FlightMode.PILOT and self.once("station"):
                 self.act(action, "GCS Failsafe")
         if self.quadrotor.battery().charge < self.low and self.once("battery"):
             action = BATTERY_ACTIONS.get(int(p["BATT_FS_LOW_ACT"]))
@@ -120,6 +137,6 @@ class ArduPilot(Flight):
                 self.act(action, f"Fence: {action.name.lower()}")
 
     def idle_s(self) -> float:
-        """See `Flight`."""
-        landed = self.mode in (Mode.LAND, Mode.RETURN)
+        """See `PilotedVehicle`."""
+        landed = self.mode in (FlightMode.LAND, FlightMode.RETURN)
         return LANDED_S if landed else self.parameters["DISARM_DELAY"]

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from skytether.autopilot.ardupilot import ArduPilot
-from skytether.autopilot.faults import Fault, Script
-from skytether.autopilot.flavours import FLAVOURS, FlavourName, Mode
-from skytether.autopilot.flight import TICK_NS, Flight, Result
+from skytether.autopilot.faults import Script, ScriptedFault
+from skytether.autopilot.flavours import FLAVOURS, FlavourName, FlightMode
+from skytether.autopilot.flight import TICK_NS, PilotedVehicle, Result
 from skytether.autopilot.px4 import PX4
 from skytether.autopilot.telling import HEARTBEAT, STREAMS, Telling
 from skytether.mavlink import parameters
@@ -46,7 +46,7 @@ LISTED_EACH_TICK = 2
 FORCE = 21196.0
 """Number that forces an arming or disarming."""
 
-PILOTS: dict[FlavourName, type[Flight]] = {"ardupilot": ArduPilot, "px4": PX4}
+PILOTS: dict[FlavourName, type[PilotedVehicle]] = {"ardupilot": ArduPilot, "px4": PX4}
 POSITION_IGNORED, VELOCITY_IGNORED = 0b111, 0b111000
 """Bits of the type mask of a setpoint; those of acceleration are 0b111000000."""
 ACCELERATION_IGNORED = 0b111000000
@@ -110,7 +110,7 @@ class Autopilot(Endpoint):
         *,
         peers: Sequence[Address] = (),
         ready_s: float | None = None,
-        faults: Sequence[Fault] = (),
+        faults: Sequence[ScriptedFault] = (),
         recorder: Recorder | None = None,
     ) -> None:
         super().__init__()
@@ -364,9 +364,9 @@ class Autopilot(Endpoint):
             case dialect.MAV_CMD_NAV_TAKEOFF:
                 result = flight.take_off(seventh)
             case dialect.MAV_CMD_NAV_LAND:
-                result = flight.switch(self._flavour.number(Mode.LAND))
+                result = flight.switch(self._flavour.number(FlightMode.LAND))
             case dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH:
-                result = flight.switch(self._flavour.number(Mode.RETURN))
+                result = flight.switch(self._flavour.number(FlightMode.RETURN))
             case dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
                 result = self._set_interval(_whole(first), second, peer)
             case dialect.MAV_CMD_REQUEST_MESSAGE:

@@ -4,8 +4,8 @@ import re
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
-from skytether.autopilot.flavours import Mode
-from skytether.autopilot.flight import Flight
+from skytether.autopilot.flavours import FlightMode
+from skytether.autopilot.flight import PilotedVehicle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.base.units import seconds_to_ns
@@ -18,7 +18,7 @@ LOW_CHARGE = 0.05
 """Charge that `battery` leaves."""
 
 
-class Fault(NamedTuple):
+class ScriptedFault(NamedTuple):
     """Something that goes wrong."""
 
     name: str
@@ -29,8 +29,8 @@ class Fault(NamedTuple):
     """When it is over; None: never."""
 
 
-def parse(text: str) -> Fault:
-    """Fault from NAME@SECONDS, or NAME@SECONDS-SECONDS of one that ends.
+def parse(text: str) -> ScriptedFault:
+    """ScriptedFault from NAME@SECONDS, or NAME@SECONDS-SECONDS of one that ends.
 
     Raises:
         ConfigError: it is none.
@@ -46,7 +46,7 @@ def parse(text: str) -> Fault:
     if end is not None and (name not in LASTING or float(end) <= float(begin)):
         expected = f"expected a later end, and one of {' and '.join(LASTING)} alone"
         raise ConfigError(f"--fault: got {text!r}, {expected}")
-    return Fault(
+    return ScriptedFault(
         name, seconds_to_ns(float(begin)), None if end is None else seconds_to_ns(float(end))
     )
 
@@ -58,13 +58,13 @@ class Script:
         faults: what goes wrong.
     """
 
-    def __init__(self, faults: Sequence[Fault]) -> None:
+    def __init__(self, faults: Sequence[ScriptedFault]) -> None:
         self._waiting = sorted(faults, key=lambda fault: fault.from_ns)
-        self._lasting: list[Fault] = []
+        self._lasting: list[ScriptedFault] = []
         self.silent = False
         """Whether nothing is sent."""
 
-    def play(self, flight: Flight) -> None:
+    def play(self, flight: PilotedVehicle) -> None:
         """Have go wrong what is due."""
         if flight.armed_ns is None:
             return
@@ -79,10 +79,10 @@ class Script:
                 self._lasting.remove(fault)
                 self._change(fault.name, flight, wrong=False)
 
-    def _begin(self, fault: Fault, flight: Flight) -> None:
+    def _begin(self, fault: ScriptedFault, flight: PilotedVehicle) -> None:
         match fault.name:
             case "pilot":
-                flight.act(Mode.PILOT, "Pilot has taken over")
+                flight.act(FlightMode.PILOT, "Pilot has taken over")
             case "disarm":
                 flight.disarm(force=True)
             case "battery":
@@ -90,7 +90,7 @@ class Script:
             case name:
                 self._change(name, flight, wrong=True)
 
-    def _change(self, name: str, flight: Flight, *, wrong: bool) -> None:
+    def _change(self, name: str, flight: PilotedVehicle, *, wrong: bool) -> None:
         if name == "silence":
             self.silent = wrong
         else:

@@ -16,7 +16,7 @@ Parameters = dict[str, int | float]
 """Values of parameters by name; those of whole numbers are ints."""
 
 
-class Mode(Enum):
+class FlightMode(Enum):
     """What the vehicle is doing, whatever its autopilot calls it."""
 
     PILOT = auto()
@@ -34,7 +34,7 @@ class Mode(Enum):
 
 
 @dataclass(frozen=True)
-class Flavour:
+class SimulatedFlavour:
     """An autopilot."""
 
     title: str
@@ -55,7 +55,7 @@ class Flavour:
     """Time from the command to take off until it climbs [s]."""
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], where it starts."""
-    modes: dict[int, tuple[str, Mode]]
+    modes: dict[int, tuple[str, FlightMode]]
     """Name and meaning of each of its modes, by the number in its heartbeat."""
     first: int
     """Mode that it starts in."""
@@ -64,7 +64,7 @@ class Flavour:
     parameters: Parameters
     """Its parameters when it starts."""
 
-    def number(self, mode: Mode) -> int:
+    def number(self, mode: FlightMode) -> int:
         """Number of its first mode of a kind."""
         return next(number for number, (_, kind) in self.modes.items() if kind is mode)
 
@@ -75,8 +75,8 @@ def _px4(main: int, sub: int = 0) -> int:
 
 
 LOCAL_POSITION = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
-FLAVOURS: dict[FlavourName, Flavour] = {
-    "ardupilot": Flavour(
+FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
+    "ardupilot": SimulatedFlavour(
         title="ArduCopter",
         version=(4, 5, 6),
         autopilot=int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA),
@@ -87,14 +87,14 @@ FLAVOURS: dict[FlavourName, Flavour] = {
         spool_s=3.4,
         home=(-35.363262, 149.165237, 584.0),
         modes={
-            5: ("LOITER", Mode.PILOT),
-            0: ("STABILIZE", Mode.PILOT),
-            2: ("ALT_HOLD", Mode.PILOT),
-            16: ("POSHOLD", Mode.PILOT),
-            4: ("GUIDED", Mode.GUIDED),
-            6: ("RTL", Mode.RETURN),
-            9: ("LAND", Mode.LAND),
-            17: ("BRAKE", Mode.HOLD),
+            5: ("LOITER", FlightMode.PILOT),
+            0: ("STABILIZE", FlightMode.PILOT),
+            2: ("ALT_HOLD", FlightMode.PILOT),
+            16: ("POSHOLD", FlightMode.PILOT),
+            4: ("GUIDED", FlightMode.GUIDED),
+            6: ("RTL", FlightMode.RETURN),
+            9: ("LAND", FlightMode.LAND),
+            17: ("BRAKE", FlightMode.HOLD),
         },
         first=0,
         streams={},
@@ -134,7 +134,7 @@ FLAVOURS: dict[FlavourName, Flavour] = {
             "WPNAV_SPEED_UP": 250.0,
         },
     ),
-    "px4": Flavour(
+    "px4": SimulatedFlavour(
         title="PX4",
         version=(1, 17, 0),
         autopilot=int(dialect.MAV_AUTOPILOT_PX4),
@@ -145,14 +145,14 @@ FLAVOURS: dict[FlavourName, Flavour] = {
         spool_s=1.0,
         home=(47.397742, 8.545594, 489.4),
         modes={
-            _px4(3): ("POSCTL", Mode.PILOT),
-            _px4(1): ("MANUAL", Mode.PILOT),
-            _px4(2): ("ALTCTL", Mode.PILOT),
-            _px4(6): ("OFFBOARD", Mode.GUIDED),
-            _px4(4, 3): ("AUTO.LOITER", Mode.HOLD),
-            _px4(4, 2): ("AUTO.TAKEOFF", Mode.TAKEOFF),
-            _px4(4, 5): ("AUTO.RTL", Mode.RETURN),
-            _px4(4, 6): ("AUTO.LAND", Mode.LAND),
+            _px4(3): ("POSCTL", FlightMode.PILOT),
+            _px4(1): ("MANUAL", FlightMode.PILOT),
+            _px4(2): ("ALTCTL", FlightMode.PILOT),
+            _px4(6): ("OFFBOARD", FlightMode.GUIDED),
+            _px4(4, 3): ("AUTO.LOITER", FlightMode.HOLD),
+            _px4(4, 2): ("AUTO.TAKEOFF", FlightMode.TAKEOFF),
+            _px4(4, 5): ("AUTO.RTL", FlightMode.RETURN),
+            _px4(4, 6): ("AUTO.LAND", FlightMode.LAND),
         },
         first=_px4(4, 3),
         streams={

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.autopilot.flavours import Flavour, Mode, Parameters
+from skytether.autopilot.flavours import FlightMode, Parameters, SimulatedFlavour
 from skytether.mavlink.dialect import dialect
 from skytether.quadrotor.loops import Gains
 from skytether.quadrotor.quadrotor import Quadrotor
@@ -58,7 +58,7 @@ class Landed(Enum):
     LANDING = dialect.MAV_LANDED_STATE_LANDING
 
 
-class Setpoint(NamedTuple):
+class CompanionSetpoint(NamedTuple):
     """What a companion computer wants flown."""
 
     velocity: Vector
@@ -69,7 +69,7 @@ class Setpoint(NamedTuple):
     """Time at which it came."""
 
 
-class Limits(NamedTuple):
+class OwnSpeeds(NamedTuple):
     """How fast it flies by itself."""
 
     speed: float
@@ -90,7 +90,7 @@ class Limits(NamedTuple):
     """Deceleration towards an altitude [m/s²]."""
 
 
-class Flight(ABC):
+class PilotedVehicle(ABC):
     """A vehicle with an autopilot.
 
     Args:
@@ -102,7 +102,7 @@ class Flight(ABC):
     low = 0.15
     """Charge of the battery below which it is low."""
 
-    def __init__(self, flavour: Flavour, quadrotor: Quadrotor, ready_s: float) -> None:
+    def __init__(self, flavour: SimulatedFlavour, quadrotor: Quadrotor, ready_s: float) -> None:
         self.flavour, self.quadrotor = flavour, quadrotor
         self.parameters: Parameters = dict(flavour.parameters)
         self.number = flavour.first
@@ -120,7 +120,7 @@ class Flight(ABC):
         self.station_ns: int | None = None
         """Time of the newest heartbeat of its ground station; None: there is none to be lost."""
         self._ready_ns = seconds_to_ns(ready_s)
-        self._setpoint: Setpoint | None = None
+        self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
         """Altitude to climb to [m], while it does."""
         self._climb_ns = 0
@@ -136,7 +136,7 @@ class Flight(ABC):
         quadrotor.on = False
 
     @property
-    def mode(self) -> Mode:
+    def mode(self) -> FlightMode:
         """What it is doing."""
         return self.flavour.modes[self.number][1]
 
@@ -157,7 +157,7 @@ class Flight(ABC):
             return Landed.ON_GROUND
         if self._climb is not None:
             return Landed.TAKEOFF
-        landing = self.mode is Mode.LAND or (self.mode is Mode.RETURN and self._landing)
+        landing = self.mode is FlightMode.LAND or (self.mode is FlightMode.RETURN and self._landing)
         return Landed.LANDING if landing else Landed.IN_AIR
 
     def say(self, text: str, severity: Severity = Severity.INFO) -> None:
@@ -196,10 +196,13 @@ class Flight(ABC):
         if number not in self.flavour.modes:
             return Result.DENIED
         name, kind = self.flavour.modes[number]
-        if kind in (Mode.GUIDED, Mode.TAKEOFF, Mode.RETURN, Mode.HOLD) and not self.ready:
-            self.say(f"Mode change to {name} failed: requires position", Severity.CRITICAL)
+        if (
+            kind in (FlightMode.GUIDED, FlightMode.TAKEOFF, FlightMode.RETURN, FlightMode.HOLD)
+            and not self.ready
+        ):
+            self.say(f"FlightMode change to {name} failed: requires position", Severity.CRITICAL)
             return self.refusal
-        if kind is Mode.GUIDED and (why := self.why_not_guided()):
+        if kind is FlightMode.GUIDED and (why := self.why_not_guided()):
             self.say(why, Severity.CRITICAL)
             return Result.REJECTED
         self.enter(number)
@@ -212,9 +215,9 @@ class Flight(ABC):
         self.number = number
         self._climb = self._held = None
         self._landing = False
-        if self.flavour.modes[number][1] is Mode.GUIDED:
+        if self.flavour.modes[number][1] is FlightMode.GUIDED:
             self.forget()
-        if self.mode in (Mode.LAND, Mode.RETURN) and not self.flying:
+        if self.mode in (FlightMode.LAND, FlightMode.RETURN) and not self.flying:
             self.disarm()
 
     def set(self, name: str, value: float) -> None:
@@ -222,7 +225,7 @@ class Flight(ABC):
         self.parameters[name] = value
         self.quadrotor.gains = self.gains()
 
-    def act(self, mode: Mode, why: str, severity: Severity = Severity.CRITICAL) -> None:
+    def act(self, mode: FlightMode, why: str, severity: Severity = Severity.CRITICAL) -> None:
         """Have a failsafe act: say why, and go into a mode unless it is in it."""
         self.say(why, severity)
         self.enter(self.flavour.number(mode))
@@ -243,9 +246,9 @@ class Flight(ABC):
         """Take a setpoint of a companion computer."""
         if not self.takes_setpoints():
             return
-        if self.mode is Mode.GUIDED:
+        if self.mode is FlightMode.GUIDED:
             self._climb = self._held = None  # it ends a climb, as ArduCopter has it
-        self._setpoint = Setpoint(velocity, position, self.now_ns)
+        self._setpoint = CompanionSetpoint(velocity, position, self.now_ns)
 
     def forget(self) -> None:
         """Forget what a companion computer wanted before."""
@@ -283,7 +286,7 @@ class Flight(ABC):
         """Go into the mode that climbs; returns whether it can."""
 
     @abstractmethod
-    def limits(self) -> Limits:
+    def limits(self) -> OwnSpeeds:
         """How fast it flies by itself, by its parameters."""
 
     @abstractmethod
@@ -299,7 +302,7 @@ class Flight(ABC):
         """Altitude at which it flies home from a distance [m]."""
 
     @abstractmethod
-    def silence(self, setpoint: Setpoint) -> bool:
+    def silence(self, setpoint: CompanionSetpoint) -> bool:
         """Whether setpoints have stopped, after which it does what its parameters say."""
 
     @abstractmethod
@@ -318,7 +321,7 @@ class Flight(ABC):
         if self.armed:
             if self.flying:
                 if not self.estimates and self.once("estimate"):
-                    self.act(Mode.LAND, "EKF Failsafe: position estimate lost, landing")
+                    self.act(FlightMode.LAND, "EKF Failsafe: position estimate lost, landing")
                 self.watch()
             velocity = self._guide()
             self._lift(velocity)
@@ -360,11 +363,11 @@ class Flight(ABC):
         if self._climb is not None:
             return self._climbing(self._climb)
         match self.mode:
-            case Mode.GUIDED:
+            case FlightMode.GUIDED:
                 return self._guided()
-            case Mode.RETURN:
+            case FlightMode.RETURN:
                 return self._returning()
-            case Mode.LAND:
+            case FlightMode.LAND:
                 return self._descending()
             case _:
                 return self._staying()
@@ -375,8 +378,8 @@ class Flight(ABC):
         x, y, z = self.position()
         if altitude - z < THERE_M:
             self._climb, self._held = None, (x, y, altitude)
-            if self.mode is Mode.TAKEOFF:
-                self.number = self.flavour.number(Mode.HOLD)
+            if self.mode is FlightMode.TAKEOFF:
+                self.number = self.flavour.number(FlightMode.HOLD)
         return self._toward((*self._stay_xy(), altitude))
 
     def _stay_xy(self) -> tuple[float, float]:
@@ -390,7 +393,7 @@ class Flight(ABC):
         if setpoint is None:
             return self._staying()
         if self.silence(setpoint):
-            if self.mode is not Mode.GUIDED:
+            if self.mode is not FlightMode.GUIDED:
                 return self._guide()
             # A velocity ends with its stream; a position is flown to, whoever is still there.
             return REST if setpoint.position is None else self._toward(setpoint.position)

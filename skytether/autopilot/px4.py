@@ -2,8 +2,14 @@
 
 from math import hypot, isfinite, radians, tan
 
-from skytether.autopilot.flavours import Mode
-from skytether.autopilot.flight import Flight, Limits, Result, Setpoint, Severity
+from skytether.autopilot.flavours import FlightMode
+from skytether.autopilot.flight import (
+    CompanionSetpoint,
+    OwnSpeeds,
+    PilotedVehicle,
+    Result,
+    Severity,
+)
 from skytether.mavlink.dialect import dialect
 from skytether.quadrotor.loops import Gains
 from skytether.shared.base.units import SECOND_NS
@@ -12,17 +18,17 @@ LEAST = 0.1
 """Least value that a gain has, whatever its parameter says."""
 SILENCE_LAG_S = 0.2
 """Time from the end of COM_OF_LOSS_T until it acts [s], as measured."""
-OFFBOARD_ACTIONS = {4: Mode.LAND, 5: Mode.HOLD}
+OFFBOARD_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.HOLD}
 """Modes by the value of COM_OBL_RC_ACT; all others return, where nobody has a remote control."""
-STATION_ACTIONS = {1: Mode.HOLD, 2: Mode.RETURN, 3: Mode.LAND}
+STATION_ACTIONS = {1: FlightMode.HOLD, 2: FlightMode.RETURN, 3: FlightMode.LAND}
 """Modes by the value of NAV_DLL_ACT."""
-BATTERY_ACTIONS = {2: Mode.LAND, 3: Mode.RETURN}
+BATTERY_ACTIONS = {2: FlightMode.LAND, 3: FlightMode.RETURN}
 """Modes by the value of COM_LOW_BAT_ACT."""
-FENCE_ACTIONS = {2: Mode.HOLD, 3: Mode.RETURN, 5: Mode.LAND}
+FENCE_ACTIONS = {2: FlightMode.HOLD, 3: FlightMode.RETURN, 5: FlightMode.LAND}
 """Modes by the value of GF_ACTION."""
 
 
-class PX4(Flight):
+class PX4(PilotedVehicle):
     """Flight of PX4."""
 
     refusal = Result.REJECTED
@@ -30,51 +36,51 @@ class PX4(Flight):
     lifts_off_by_setpoint = True
 
     def why_not_armed(self) -> str:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         if not self.ready:
             return "Arming denied: Resolve system health failures first"
         if self.quadrotor.battery().charge < self.parameters["BAT_LOW_THR"]:
             return "Arming denied: low battery"
-        if self.mode is Mode.PILOT:
+        if self.mode is FlightMode.PILOT:
             return "Arming denied: manual control signal lost"
         return ""
 
     def why_not_guided(self) -> str:
-        """See `Flight`; setpoints must be coming already."""
+        """See `PilotedVehicle`; setpoints must be coming already."""
         setpoint = self._setpoint
         if setpoint is None or self._past_s(setpoint) > self.parameters["COM_OF_LOSS_T"]:
             return "Switching to mode 'Offboard' is currently not possible"
         return ""
 
     def forget(self) -> None:
-        """See `Flight`; the stream that let it into OFFBOARD is what it flies."""
+        """See `PilotedVehicle`; the stream that let it into OFFBOARD is what it flies."""
 
     def mode_number(self, main: int, sub: int) -> int:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         return main << 16 | max(sub, 0) << 24
 
     def takes_setpoints(self) -> bool:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         return True
 
     def altitude_of(self, told: float) -> float | None:
-        """See `Flight`; it is told above the sea, or not at all."""
+        """See `PilotedVehicle`; it is told above the sea, or not at all."""
         if isfinite(told):
             return told - self.flavour.home[2]
         return self.parameters["MIS_TAKEOFF_ALT"]
 
     def enter_takeoff(self) -> bool:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         if not self.ready:
             return False
-        self.enter(self.flavour.number(Mode.TAKEOFF))
+        self.enter(self.flavour.number(FlightMode.TAKEOFF))
         return True
 
-    def limits(self) -> Limits:
-        """See `Flight`."""
-        p, climbs = self.parameters, self.mode is Mode.TAKEOFF
-        guided = self.mode is Mode.GUIDED
-        return Limits(
+    def limits(self) -> OwnSpeeds:
+        """See `PilotedVehicle`."""
+        p, climbs = self.parameters, self.mode is FlightMode.TAKEOFF
+        guided = self.mode is FlightMode.GUIDED
+        return OwnSpeeds(
             speed=p["MPC_XY_VEL_MAX"] if guided else p["MPC_XY_CRUISE"],
             up=p["MPC_TKO_SPEED"] if climbs else p["MPC_Z_VEL_MAX_UP"],
             down=p["MPC_Z_VEL_MAX_DN"],
@@ -86,7 +92,7 @@ class PX4(Flight):
         )
 
     def gains(self) -> Gains:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         p = self.parameters
         return self.flavour.gains._replace(
             p=max(p["MPC_XY_VEL_P_ACC"], LEAST),
@@ -95,29 +101,29 @@ class PX4(Flight):
         )
 
     def is_station(self, system: int, kind: int) -> bool:  # noqa: ARG002
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         return kind == dialect.MAV_TYPE_GCS
 
     def return_altitude(self, distance: float) -> float:
-        """See `Flight`; lower where home is near."""
+        """See `PilotedVehicle`; lower where home is near."""
         cone = distance * tan(radians(self.parameters["RTL_CONE_ANG"]))
         return min(self.parameters["RTL_RETURN_ALT"], cone)
 
-    def _past_s(self, setpoint: Setpoint) -> float:
+    def _past_s(self, setpoint: CompanionSetpoint) -> float:
         """Time since a setpoint came [s]."""
         return (self.now_ns - setpoint.came_ns) / SECOND_NS
 
-    def silence(self, setpoint: Setpoint) -> bool:
-        """See `Flight`; it leaves OFFBOARD after COM_OF_LOSS_T."""
+    def silence(self, setpoint: CompanionSetpoint) -> bool:
+        """See `PilotedVehicle`; it leaves OFFBOARD after COM_OF_LOSS_T."""
         if self._past_s(setpoint) <= self.parameters["COM_OF_LOSS_T"] + SILENCE_LAG_S:
             return False
         value = int(self.parameters["COM_OBL_RC_ACT"])
-        mode = OFFBOARD_ACTIONS.get(value, Mode.RETURN)
+        mode = OFFBOARD_ACTIONS.get(value, FlightMode.RETURN)
         self.act(mode, "Failsafe activated: no offboard signal")
         return True
 
     def watch(self) -> None:
-        """See `Flight`."""
+        """See `PilotedVehicle`."""
         p = self.parameters
         if self.station_ns is not None:
             past_s = (self.now_ns - self.station_ns) / SECOND_NS
@@ -140,6 +146,6 @@ class PX4(Flight):
                 self.act(action, f"Failsafe activated: geofence, {action.name.lower()}")
 
     def idle_s(self) -> float:
-        """See `Flight`."""
-        landed = self.mode in (Mode.LAND, Mode.RETURN)
+        """See `PilotedVehicle`."""
+        landed = self.mode in (FlightMode.LAND, FlightMode.RETURN)
         return self.parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from skytether.autopilot.flight import Flight, Landed
+from skytether.autopilot.flight import Landed, PilotedVehicle
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
@@ -30,7 +30,7 @@ class Telling:
         flight: whose state.
     """
 
-    def __init__(self, flight: Flight) -> None:
+    def __init__(self, flight: PilotedVehicle) -> None:
         self._flight = flight
 
     @property

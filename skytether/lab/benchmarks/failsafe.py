@@ -22,9 +22,8 @@ import numpy as np
 import tyro
 
 from skytether.autopilot.endpoint import Autopilot
-from skytether.autopilot.faults import Fault, FaultName, Script
-from skytether.autopilot.flavours import FlavourName
-from skytether.autopilot.flavours import Mode as Flown
+from skytether.autopilot.faults import FaultName, Script, ScriptedFault
+from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.lab.benchmarks import autopilots
@@ -185,7 +184,7 @@ class Watched:
             assert flight.armed_ns is not None
             past_ns = flight.now_ns - flight.armed_ns
             until_ns = None if for_ns is None else past_ns + for_ns
-            self.autopilot.script = Script([Fault(SCRIPTED[case], past_ns, until_ns)])
+            self.autopilot.script = Script([ScriptedFault(SCRIPTED[case], past_ns, until_ns)])
         else:
             self._cut(for_ns)
 
@@ -267,7 +266,7 @@ def _ending(watched: Watched, speed: float, modes: Changes) -> Ending:
     flight = watched.autopilot.flight
     if not flight.armed:
         return "has landed"
-    if flight.mode is Flown.PILOT:
+    if flight.mode is FlightMode.PILOT:
         return "pilot has it"
     if modes and modes[-1][0] == TRACK:
         return "flies on"

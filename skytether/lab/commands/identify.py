@@ -18,12 +18,12 @@ from skytether.lab.commands.pool import writing
 from skytether.lab.identify import outcome, picture
 from skytether.lab.identify.fit import Fit, fit, misfit, verdict
 from skytether.lab.identify.flight import Identifying
-from skytether.lab.identify.outcome import AXES, Axis, AxisTold
+from skytether.lab.identify.outcome import AXES, AxisOutcome, AxisTold
 from skytether.lab.identify.responses import responses
 from skytether.lab.identify.steps import (
     STEP_MIN_MPS,
     Experiment,
-    Plan,
+    ExperimentPlan,
     default_hold_s,
     default_speeds,
     fenced,
@@ -85,14 +85,14 @@ class IdentifyOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Flown:
+class SizeFlown:
     """What was flown with steps of one size."""
 
     flight: Identifying
-    axes: list[Axis]
+    axes: list[AxisOutcome]
 
 
-class Told(msgspec.Struct, frozen=True):
+class IdentificationTold(msgspec.Struct, frozen=True):
     """What came of an identification, for a program."""
 
     scenario: str
@@ -136,7 +136,7 @@ def identify(argv: Sequence[str]) -> None:
     _write_scenario(options, scenario, flown[0])
 
 
-def _asked(options: IdentifyOptions) -> tuple[Scenario, list[Plan]]:
+def _asked(options: IdentifyOptions) -> tuple[Scenario, list[ExperimentPlan]]:
     """The scenario with the kind of vehicle that is asked for, and what is to be flown with it.
 
     Raises:
@@ -153,7 +153,7 @@ def _asked(options: IdentifyOptions) -> tuple[Scenario, list[Plan]]:
     speeds = options.speed or default_speeds(scenario)
     sizes = [_size(scenario, "--speed", speeds)]
     sizes += [_size(scenario, "--also", (each,)) for each in options.also]
-    return scenario, [Plan(size, hold_s, options.repeats) for size in sizes]
+    return scenario, [ExperimentPlan(size, hold_s, options.repeats) for size in sizes]
 
 
 def _size(scenario: Scenario, flag: str, given: Sequence[float]) -> tuple[float, ...]:
@@ -175,7 +175,7 @@ def _size(scenario: Scenario, flag: str, given: Sequence[float]) -> tuple[float,
     return speeds
 
 
-def _fly(scenario: Scenario, plan: Plan, *, sets: bool) -> Flown:
+def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
     """Fly an experiment, in real time where the vehicle has hardware; what came of it.
 
     Args:
@@ -208,8 +208,8 @@ def _fly(scenario: Scenario, plan: Plan, *, sets: bool) -> Flown:
     axes = []
     for number, speed in enumerate(plan.speeds):
         found = responses(flight.inputs, flight.measured, steps, number)
-        axes.append(Axis(speed, cut[number], found, fit(found)))
-    return Flown(flight, axes)
+        axes.append(AxisOutcome(speed, cut[number], found, fit(found)))
+    return SizeFlown(flight, axes)
 
 
 def _doing(flight: Identifying) -> str:
@@ -255,11 +255,11 @@ def _say(line: Event | str) -> None:
 # -- what came of it -------------------------------------------------------------------------
 
 
-def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[Flown]) -> None:
+def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlown]) -> None:
     """Write what was measured and what it came to, and print it."""
     first, out = flown[0], options.out
     costs = _costs(flown) if len(flown) > 1 else []
-    told = Told(
+    told = IdentificationTold(
         scenario=options.scenario,
         kind=scenario.vehicle.kind,
         ended=first.flight.why,
@@ -281,7 +281,7 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[Flown]) 
         command.show(_cost_table(flown, costs))
 
 
-def _all_told(flown: Flown) -> list[AxisTold]:
+def _all_told(flown: SizeFlown) -> list[AxisTold]:
     return [outcome.told(name, axis) for name, axis in zip(AXES, flown.axes, strict=False)]
 
 
@@ -300,7 +300,7 @@ def _measured(flight: Identifying, axes: int) -> str:
     return to_csv(header, rows)
 
 
-def _table(flown: Flown) -> Table:
+def _table(flown: SizeFlown) -> Table:
     """Numbers of each axis, as a table."""
     table = Table(title="first order with dead time, 95 % intervals", title_justify="left")
     heading = ("axis", "step [m/s]", "steps", "gain", "time constant [s]", "dead time [s]")
@@ -316,7 +316,7 @@ def _table(flown: Flown) -> Table:
     return table
 
 
-def _costs(flown: Sequence[Flown]) -> list[dict[str, float]]:
+def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
     """Largest difference from the steps of the size asked for, by models of each size."""
     measured = [axis.responses for axis in flown[0].axes]
 
@@ -334,7 +334,7 @@ def _costs(flown: Sequence[Flown]) -> list[dict[str, float]]:
     ]
 
 
-def _cost_table(flown: Sequence[Flown], costs: Sequence[dict[str, float]]) -> Table:
+def _cost_table(flown: Sequence[SizeFlown], costs: Sequence[dict[str, float]]) -> Table:
     """What a wrong size of step costs, as a table."""
     table = Table()
     for each in ("model of [m/s]", *costs[0]):
@@ -345,7 +345,7 @@ def _cost_table(flown: Sequence[Flown], costs: Sequence[dict[str, float]]) -> Ta
     return table
 
 
-def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: Flown) -> None:
+def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: SizeFlown) -> None:
     """Write the scenario that flies by what was identified, and see that it can be flown.
 
     Raises:

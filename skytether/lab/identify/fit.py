@@ -41,7 +41,7 @@ SURE = 4.0
 """Standard errors by which a difference has to be larger than `GOOD` for a model to be refused."""
 
 
-class Response(NamedTuple):
+class StepResponse(NamedTuple):
     """What an axis answered to one step of its input."""
 
     before: float
@@ -102,7 +102,7 @@ class Fit(NamedTuple):
     """What is left over."""
 
 
-def fit(responses: Sequence[Response]) -> Fit | None:
+def fit(responses: Sequence[StepResponse]) -> Fit | None:
     """The model that fits responses of an axis best; None where there are too few to tell."""
     if len(responses) < STEPS_MIN:
         return None
@@ -115,7 +115,7 @@ def unit_response(times: Array, numbers: Numbers) -> Array:
     return -np.expm1(-np.maximum(times - numbers.dead_time_s, 0.0) / numbers.tau_s)
 
 
-def predicted(response: Response, numbers: Numbers) -> Array:
+def predicted(response: StepResponse, numbers: Numbers) -> Array:
     """Velocity that a model predicts for the measurements of a step [m/s]; shape (m,)."""
     since = response.times[:, None] - response.changes[:, 0]
     first = response.before - response.changes[response.changes[:, 0] < 0.0, 1].sum()
@@ -124,7 +124,7 @@ def predicted(response: Response, numbers: Numbers) -> Array:
     return velocity
 
 
-def remainder(response: Response, numbers: Numbers) -> Array:
+def remainder(response: StepResponse, numbers: Numbers) -> Array:
     """What a model leaves over of a step, but for what is the same all along [m/s]; shape (m,)."""
     return _centred(response.velocity - predicted(response, numbers))
 
@@ -134,7 +134,7 @@ def _centred(values: Array) -> Array:
     return centred
 
 
-def _slopes(response: Response, numbers: Numbers) -> Array:
+def _slopes(response: StepResponse, numbers: Numbers) -> Array:
     """Derivatives of the remainder by gain, time constant and dead time; shape (m, 3)."""
     gain, tau, late = numbers
     late_s = response.times[:, None] - response.changes[:, 0] - late
@@ -146,7 +146,7 @@ def _slopes(response: Response, numbers: Numbers) -> Array:
     return _centred(np.stack([by_gain, by_tau, by_late], axis=1))
 
 
-def _best(responses: Sequence[Response]) -> Numbers:
+def _best(responses: Sequence[StepResponse]) -> Numbers:
     """Numbers of least squares: the best of a grid, each with its best gain, and from there on.
 
     What is left over has a kink wherever a dead time ends at a measurement, and local minima there:
@@ -177,7 +177,7 @@ def _best(responses: Sequence[Response]) -> Numbers:
     return Numbers(projected(tau, late)[1], tau, late)
 
 
-def _projection(responses: Sequence[Response]) -> Callable[[float, float], tuple[float, float]]:
+def _projection(responses: Sequence[StepResponse]) -> Callable[[float, float], tuple[float, float]]:
     """What gives, for a time constant and a dead time, the sum of squares that is left over, and
     the gain with which it is least; all responses at once, for it is asked a thousand times.
     """
@@ -205,7 +205,7 @@ def _projection(responses: Sequence[Response]) -> Callable[[float, float], tuple
     return projected
 
 
-def _within(responses: Sequence[Response], numbers: Numbers) -> Numbers:
+def _within(responses: Sequence[StepResponse], numbers: Numbers) -> Numbers:
     """Half-widths of the intervals of numbers that fit responses best."""
     slopes = [_slopes(each, numbers) for each in responses]
     left = [remainder(each, numbers) for each in responses]
@@ -224,12 +224,12 @@ def _within(responses: Sequence[Response], numbers: Numbers) -> Numbers:
     return Numbers(*half.tolist())
 
 
-def differences(response: Response, numbers: Numbers) -> Array:
+def differences(response: StepResponse, numbers: Numbers) -> Array:
     """What a model leaves over of a step, as share of its predicted height; shape (m,)."""
     return remainder(response, numbers) / (numbers.gain * response.height)
 
 
-def misfit(responses: Sequence[Response], numbers: Numbers) -> Misfit:
+def misfit(responses: Sequence[StepResponse], numbers: Numbers) -> Misfit:
     """What a model leaves over of responses, which need not be those that it was fitted to."""
     shares = [differences(each, numbers) for each in responses]
     rms = float(np.sqrt(np.mean(np.concatenate(shares) ** 2)))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from skytether.lab.identify.fit import Fit, Numbers, Response, verdict
+from skytether.lab.identify.fit import Fit, Numbers, StepResponse, verdict
 from skytether.lab.identify.steps import STEPS, reference_speeds
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -26,14 +26,14 @@ DIGITS = 4
 """Significant digits of what is written."""
 
 
-class Axis(NamedTuple):
+class AxisOutcome(NamedTuple):
     """What came of the steps of an axis."""
 
     speed: float
     """Size of step [m/s]."""
     cut: int
     """Number of steps that the fence cut, or left no room for."""
-    responses: Sequence[Response]
+    responses: Sequence[StepResponse]
     """Responses to the steps that are used."""
     fit: Fit | None
     """The model; None where there are too few steps."""
@@ -50,7 +50,7 @@ def with_interval(name: str, numbers: Numbers, within: Numbers) -> str:
     return f"{getattr(numbers, name):.3f} ± {f'{half:.3f}' if math.isfinite(half) else '?'}"
 
 
-def describe(axis: Axis) -> str:
+def describe(axis: AxisOutcome) -> str:
     """What came of an axis, in words."""
     fit = axis.fit
     if fit is None:
@@ -60,7 +60,7 @@ def describe(axis: Axis) -> str:
     return f"{numbers}, from {axis.steps} steps of {axis.speed:g} m/s: {verdict(fit)}"
 
 
-def _remedy(axis: Axis) -> str:
+def _remedy(axis: AxisOutcome) -> str:
     """What would give more steps."""
     if axis.cut < STEPS:
         return "fly it to its end, and measure velocities"
@@ -68,7 +68,7 @@ def _remedy(axis: Axis) -> str:
 
 
 def scenario_text(
-    flown: Scenario, extends: str, base: Scenario, axes: Sequence[Axis]
+    flown: Scenario, extends: str, base: Scenario, axes: Sequence[AxisOutcome]
 ) -> bytes | None:
     """The scenario that flies by what was identified; None where an axis has no model.
 
@@ -131,7 +131,7 @@ def _rounded(number: float) -> float:
     return float(f"{number:.{DIGITS}g}")
 
 
-def _u_max(flown: Scenario, axes: Sequence[Axis], numbers: Sequence[Numbers]) -> list[float]:
+def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbers]) -> list[float]:
     """Bounds of the input [m/s]: as much as was tried, and enough for the desired trajectory."""
     wanted = reference_speeds(flown)
     most = flown.u_max.tolist()
@@ -161,7 +161,7 @@ class AxisTold(msgspec.Struct, frozen=True):
     largest_at_s: float | None = None
 
 
-def told(name: str, axis: Axis) -> AxisTold:
+def told(name: str, axis: AxisOutcome) -> AxisTold:
     """What came of an axis, for a program."""
     steps, fit = len(axis.responses), axis.fit
     if fit is None:

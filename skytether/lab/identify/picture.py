@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skytether.lab.identify.fit import GOOD, Fit, binned, differences, unit_response
-from skytether.lab.identify.outcome import AXES, Axis
+from skytether.lab.identify.outcome import AXES, AxisOutcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,7 +18,7 @@ COLOURS = {True: "tab:blue", False: "tab:orange"}
 WORDS = {True: "sets out", False: "stops"}
 
 
-def drawn(axes: Sequence[Axis]) -> "Figure":
+def drawn(axes: Sequence[AxisOutcome]) -> "Figure":
     """Steps of each axis over its model, all of height 1, and below what is left over."""
     from matplotlib.figure import Figure
 
@@ -42,7 +42,7 @@ def drawn(axes: Sequence[Axis]) -> "Figure":
     return figure
 
 
-def _draw(axis: Axis, fit: Fit, above: Any, below: Any) -> None:
+def _draw(axis: AxisOutcome, fit: Fit, above: Any, below: Any) -> None:
     """Draw the steps of an axis, each thin, and their means, thick."""
     for starts in (True, False):
         colour, curves = COLOURS[starts], []

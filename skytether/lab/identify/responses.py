@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from skytether.client.vehicle import Measurement
-from skytether.lab.identify.fit import Response
-from skytether.lab.identify.steps import Step
+from skytether.lab.identify.fit import StepResponse
+from skytether.lab.identify.steps import FlownStep
 from skytether.shared.base.units import SECOND_NS
 
 LOOKBACK = 2.0
@@ -21,9 +21,9 @@ SAMPLES_MIN = 10
 def responses(
     inputs: Sequence[tuple[int, list[float]]],
     measured: Sequence[Measurement],
-    steps: Sequence[Step],
+    steps: Sequence[FlownStep],
     axis: int,
-) -> list[Response]:
+) -> list[StepResponse]:
     """Responses of an axis to its steps; one that was hardly measured is left out.
 
     Args:
@@ -51,5 +51,5 @@ def responses(
             continue
         changes = np.stack([(flown_ns[told] - step.began_ns) / SECOND_NS, change[told]], axis=1)
         times = (stamps_ns[during] - step.began_ns) / SECOND_NS
-        found.append(Response(step.before, step.after, changes, times, velocity[during]))
+        found.append(StepResponse(step.before, step.after, changes, times, velocity[during]))
     return found

@@ -38,7 +38,7 @@ FAST = 1.3
 """How much further a vehicle may go with a step than its input says."""
 
 
-class Plan(NamedTuple):
+class ExperimentPlan(NamedTuple):
     """Experiment that is asked for."""
 
     speeds: tuple[float, ...]
@@ -54,7 +54,7 @@ class Plan(NamedTuple):
         return len(self.speeds) * self.repeats * ((STEPS + 1) * self.hold_s + 2.0)
 
 
-class Step(NamedTuple):
+class FlownStep(NamedTuple):
     """A step that was flown."""
 
     axis: int
@@ -97,7 +97,7 @@ def default_hold_s(scenario: Scenario) -> float:
     return round(min(max(slowest, HOLD_MIN_S), HOLD_MAX_S), 2)
 
 
-def fenced(scenario: Scenario, plan: Plan) -> Scenario:
+def fenced(scenario: Scenario, plan: ExperimentPlan) -> Scenario:
     """The scenario with a fence around an experiment, where it has none."""
     if scenario.fence.is_there:
         return scenario
@@ -117,7 +117,7 @@ class Experiment:
         plan: what is to be flown.
     """
 
-    def __init__(self, scenario: Scenario, plan: Plan) -> None:
+    def __init__(self, scenario: Scenario, plan: ExperimentPlan) -> None:
         self.plan = plan
         self._fence, self._u_max = Fence(scenario), scenario.u_max.tolist()
         self._hold_ns = seconds_to_ns(plan.hold_s)
@@ -127,7 +127,7 @@ class Experiment:
         self._home: list[float] = []
         self._script: Iterator[list[float]] | None = None
         self._input = [0.0] * len(plan.speeds)
-        self.steps: list[Step] = []
+        self.steps: list[FlownStep] = []
         """Steps that were flown whole."""
         self.cut = [0] * len(plan.speeds)
         """Number of steps of each axis that the fence cut, or left no room for."""
@@ -177,7 +177,7 @@ class Experiment:
                 if self._fence.holds:
                     return
             if number:
-                self.steps.append(Step(axis, before, after, began_ns, self._now_ns))
+                self.steps.append(FlownStep(axis, before, after, began_ns, self._now_ns))
             before = after
 
     def _go_home(self) -> Iterator[list[float]]:
