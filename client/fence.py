@@ -14,12 +14,12 @@ y = bound - s, u towards the bound may be at most
 of which g is taken out. T = τ + 2 Δt: slow enough for a loop whose numbers are a little wrong. The
 bounds are drawn in by
 
-    m = 0.06 s · u_max + 1.25 W (T + θ + Δt)
+    m = 0.06 s · u_max + 1.25 W (T + θ + 0.1 s + Δt)
 
 for the wind W [m/s] that the fence is to hold in, by whose push the vehicle comes to rest beyond
-where it was led: a quarter more for a gain of 0.8, and with θ and a step for wind that turns before
-anything can be done about it. Tests hold it to that, with time constants wrong by 30 %, gains by
-20 % and dead times by 0.1 s.
+where it was led: a quarter more for a gain of 0.8, and with θ, by how much it may be longer, and a
+step for wind that turns before anything can be done about it. Tests hold it to that, with time
+constants wrong by 30 %, gains by 20 % and dead times by 0.1 s.
 """
 
 import math

@@ -14,6 +14,8 @@ ERROR_S = 0.06
 """Time by which the model's errors together may lead the vehicle on at its largest speed [s]."""
 WEAK = 1.25
 """How much further wind leads a vehicle whose gain is a fifth less than the model's."""
+LATER_S = 0.1
+"""Time by which the vehicle's dead time may be longer than the model's [s]."""
 
 
 def margins(scenario: Scenario) -> list[float]:
@@ -21,7 +23,7 @@ def margins(scenario: Scenario) -> list[float]:
     terms, fence, dt = scenario.terms(), scenario.fence, scenario.control.dt
     fastest = fence.speed_mps or math.inf
     blown = [
-        WEAK * fence.wind_mps * (tau + SLOW_STEPS * dt + late + dt)
+        WEAK * fence.wind_mps * (tau + SLOW_STEPS * dt + late + LATER_S + dt)
         for tau, late in zip(terms.tau_s, terms.dead_time_s, strict=True)
     ]
     speeds = [*terms.u_max, math.hypot(*terms.u_max)]
