@@ -116,6 +116,11 @@ class Navigation:
                 self.predicted = self._inputs.predict(self.estimate, self._filter.disturbance())
             self.is_known = all(map(math.isfinite, chain.from_iterable(self.predicted)))
 
+    @property
+    def disturbance(self) -> Sequence[float]:
+        """Disturbance ŵ that the filter has found on each axis [m/s]; 0 without a filter."""
+        return self._filter.disturbance()
+
     def _carried(self, measured: Measurement, to_ns: int, due: list[float]) -> Measurement:
         """A measurement as it would be later, by eq. (1); an earlier time changes nothing.
 

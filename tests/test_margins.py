@@ -20,10 +20,10 @@ from skytether.lab.margins import (
     margin,
     timings,
 )
-from skytether.server.control.gain import feedback_gain
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.sim.flight import fly_batch

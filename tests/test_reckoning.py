@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from skytether.server.control.dead_reckoning import Reckoning
 
 from skytether.client.compensator import Compensator
-from skytether.server.control.dead_reckoning import Reckoning
 from skytether.server.control.desired import Desired
-from skytether.server.control.gain import stationary_gain
 from skytether.server.control.scheme import Foresight, foresight
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.gain import stationary_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
 from skytether.shared.telemetry.summary import position_error

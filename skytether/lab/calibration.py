@@ -173,7 +173,7 @@ class Rmse:
     def free(self) -> Sequence[Free]:
         """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
         control, table = self.scenario.control, plain(self.scenario)
-        weights = REGULATOR if control.scheme == "dead_reckoning" else WEIGHTS
+        weights = REGULATOR if control.scheme == "trajectory" else WEIGHTS
         observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
         keys = [*weights, *trigger_keys(control.trigger), *observer]
         return [key for key in keys if key.of(table) > 0.0]
