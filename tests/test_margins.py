@@ -51,10 +51,10 @@ NOISE = {"sensor__position_noise_m": 0.01, "sensor__velocity_noise_mps": 0.02}
 
 
 def test_a_regulator_aboard_has_the_variance_of_its_lyapunov_equation() -> None:
-    """Dead reckoning flies u = -K x whatever arrives: P = F P Fᵀ + W, and ρ(F)² is the growth."""
+    """Along a trajectory u = -K x, whatever arrives: P = F P Fᵀ + W, and ρ(F)² is the growth."""
     scenario = changed(
-        control__scheme="dead_reckoning",
-        control__trigger="tolerance(1)",
+        control__scheme="trajectory",
+        control__trigger="expected_gap(1)",
         control__input_weight=0.01,
     )
     assert not looks_at_state(scenario)

@@ -1,10 +1,11 @@
 """Trajectories: the vehicle is told the desired trajectory, and which one it holds is estimated.
 
 No plan is made. What is sent at step k is the desired trajectory from there on, as far as the
-server sees ahead, as a spline with as few uniform knots as keep within ERROR_M of it
-(`shared.law.spline`); where the server sees nothing ahead that is one knot, the state of the target
-at k. The vehicle regulates itself along it, so all that is known of the vehicle is its newest
-observation.
+server sees ahead, as a spline with as few uniform knots as keep within `control.spline_error_m` of
+it (`shared.law.spline`); where the server sees nothing ahead that is one knot, the state of the
+target at k. An inner knot has the mean velocity about it: that of the knot alone would make the
+input of a target that moves at random swing. The vehicle regulates itself along the spline, so all
+that is known of the vehicle is its newest observation.
 
 Which trajectory it follows is not certain: every observation acknowledges the one in force, and
 those sent since may be on their way, or lost. With the share ℓ of losses and the share S(t) of
@@ -13,14 +14,17 @@ of it will come with the probability
 
     π = (1 - ℓ) S(t) / ((1 - ℓ) S(t) + ℓ)
 
-and from the delay bound on it is lost (`server.control.delay`). The newest that comes is the one
-that is followed. So the expected gap at k + d, when a packet of now would be in force, is
+and from the delay bound d on it is lost (`server.control.delay`). The newest that comes is the one
+that is followed. So the expected gap is
 
     E[ Q_p Σ (Δp + h Δv)² ]          Δp, Δv: trajectory followed - the one known now
 
-over the axes and the cases, with the weight Q_p on the position [1/m²] and h = (1 + K_v) / K_p, the
-time by which the regulator itself weighs the two: K_p (Δp + h Δv) is by how much the input would be
-another. Where nothing has come into force the vehicle hovers where it was observed.
+over the axes and these cases, with the weight Q_p on the position [1/m²] and h = (1 + K_v) / K_p,
+the time by which the regulator itself weighs the two: K_p (Δp + h Δv) is by how much the input
+would be another. It is the mean of that at k + d, when a packet of now is in force at the latest,
+k + 2 d, when it is known whether it came, and k + 3 d, when one that is sent then would be: looking
+at k + d alone, a trajectory that ends is replaced too late if a packet is lost. Where nothing has
+come into force the vehicle hovers where it was observed.
 
 This is the scheme "trajectory", and stands in place of its planner.
 """
@@ -59,10 +63,10 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
 
-ERROR_M = 0.005
-"""Largest distance of a spline from the desired trajectory on an axis, if its knots suffice [m]."""
 ROOM = 64
 """Number of trajectories that are remembered of each vehicle: the newest that were sent."""
+CHANCES = 3
+"""Number of delay bounds ahead at whose ends trajectories are compared."""
 SURE = 1e-3
 """Probability below which what is left of the cases is not looked at."""
 TINY = 1e-9
@@ -130,6 +134,8 @@ class Settings(NamedTuple):
     """Weight Q_p on the position [1/m²]."""
     lead_s: F1
     """Time h of each axis [s]; shape (axes,)."""
+    error_m: float
+    """Largest distance of a spline from what is seen on an axis, if its knots suffice [m]."""
 
 
 class Memory(NamedTuple):
@@ -184,6 +190,7 @@ class Guidance:
             bounds=self._loop_gain * terms.u_max,
             weight=control.state_weight[0],
             lead_s=(1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY),
+            error_m=control.spline_error_m,
         )
         self._memory = Memory(
             observed=np.full(capacity, -1, dtype=np.int64),
@@ -359,19 +366,21 @@ def _gap(
     k: int,
     d: int,
 ) -> tuple[float, float]:
-    """Q_p Σ (Δp + h Δv)² at k + d of a trajectory that may be followed, and |Δp| [m].
+    """Mean of Q_p Σ (Δp + h Δv)² of a trajectory that may be followed, and |Δp| at k + d [m].
 
     Args:
         desired: what is known now, from k on [m, m/s]; shape (axes, stages, 2).
         number: of the trajectory; negative for none.
     """
     gap, away = 0.0, 0.0
-    for axis in range(len(settings.bounds)):
-        p, v = _known(settings, desired[axis], d, axis)
-        led_p, led_v = _followed(settings, memory, row, number, axis, k + d)
-        off = led_p - p + settings.lead_s[axis] * (led_v - v)
-        gap += off * off
-        away += (led_p - p) ** 2
+    for stage in range(d, CHANCES * d + 1, d):
+        for axis in range(len(settings.bounds)):
+            p, v = _known(settings, desired[axis], stage, axis)
+            led_p, led_v = _followed(settings, memory, row, number, axis, k + stage)
+            off = led_p - p + settings.lead_s[axis] * (led_v - v)
+            gap += off * off / CHANCES
+            if stage == d:
+                away += (led_p - p) ** 2
     return settings.weight * gap, np.sqrt(away)
 
 
@@ -431,7 +440,7 @@ def _appraise(
 
 @part
 def _fit(settings: Settings, desired: F3, knots: S2) -> tuple[int, int]:
-    """Fill in the fewest knots that keep within ERROR_M of what is seen, or else as many as fit.
+    """Fill in the fewest knots that keep near enough to what is seen, or else as many as fit.
 
     Args:
         desired: states from k on [m, m/s]; shape (axes, stages, 2).
@@ -448,14 +457,18 @@ def _fit(settings: Settings, desired: F3, knots: S2) -> tuple[int, int]:
         for axis in range(len(knots)):
             bound = settings.bounds[axis]
             for knot in range(count):
-                p, v = desired[axis, knot * spacing, 0], desired[axis, knot * spacing, 1]
+                at, near = knot * spacing, spacing // 2
+                p, v = desired[axis, at, 0], desired[axis, at, 1]
+                if near > 0 and 0 < knot < count - 1:
+                    way = desired[axis, at + near, 0] - desired[axis, at - near, 0]
+                    v = way / (2 * near * settings.dt_s)
                 knots[axis, 2 * knot] = p
                 knots[axis, 2 * knot + 1] = max(-bound, min(v, bound))
             some = knots[axis, : 2 * count]
             for stage in range(seen + 1):
                 p, _ = spline_at(some, spacing, settings.dt_s, stage)
                 away = max(away, abs(p - desired[axis, stage, 0]))
-        if away <= ERROR_M:
+        if away <= settings.error_m:
             break
     return count, spacing
 

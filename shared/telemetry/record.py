@@ -153,8 +153,8 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
             ("input", "<f8", (axes,)),  # û(k), or the committed input of k
             ("observed_step", "<i8"),  # of the observation behind x̂
-            # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without a plan,
-            # or without a trigger that asks for expected_gap
+            # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without
+            # a plan, or without a trigger that asks for expected_gap
             *((str(figure), "<f8") for figure in FIGURES[scheme]),
             (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, else NaN
             ("threshold", "<f8"),  # what is compared, in its unit; 0 where nothing is

@@ -125,8 +125,6 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "cost_gap": (Free("control.cost_gap", 1e-6, 1e6),),
     "expected_gap": (Free("control.cost_gap", 1e-6, 1e6),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
-    "tolerance": (Free("control.tolerance_m", 1e-4, 1e1),),
-    "delta": (Free("control.tolerance_m", 1e-4, 1e1),),
 }
 """Keys of each policy that looks at the flight, so that weights decide what it sends, too."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)

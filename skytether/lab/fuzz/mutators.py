@@ -16,6 +16,7 @@ from skytether.shared.wire.protocol import (
     Hello,
     Horizon,
     Observation,
+    Trajectory,
     Welcome,
     encode,
 )
@@ -81,6 +82,7 @@ def seeds(terms: Terms) -> list[bytes]:
             Horizon(1, 7, 5, 10, 9, inputs, feedback),
             Heartbeat(1, 7, 10, 0, 0),
             Close(1, 7),
+            Trajectory(1, 7, 5, 10, 1, 4, np.zeros((axes, 3, 2), np.float32)),
         )
     ]
 
