@@ -47,9 +47,9 @@ from skytether.shared.base.kernel import (
     F1,
     F2,
     F3,
+    F4,
     I1,
     S2,
-    S4,
     inline,
     kernel,
     part,
@@ -123,7 +123,7 @@ class Settings(NamedTuple):
     dt_ns: int
     """Length of a step [ns]."""
     dt_s: float
-    """The same [s]."""
+    """Length of a step [s]."""
     age_max: int
     """Largest age of an observation that counts [steps]."""
     seen: int
@@ -149,8 +149,8 @@ class Memory(NamedTuple):
     """State in the newest observation [m, m/s]; shape (capacity, axes, 2)."""
     sent: Annotated[NDArray[np.void], records(SENT, 2)]
     """Trajectories that were sent, a ring; shape (capacity, ROOM)."""
-    knots: S4
-    """Their knots [m, m/s]; shape (capacity, ROOM, axes, 2 KNOTS_MAX)."""
+    knots: F4
+    """Their knots as they are read aboard [m, m/s]; shape (capacity, ROOM, axes, 2 KNOTS_MAX)."""
 
 
 class Guidance:
@@ -197,7 +197,7 @@ class Guidance:
             vehicles=np.zeros(capacity, dtype=VEHICLE),
             state=np.zeros((capacity, axes, 2)),
             sent=np.zeros((capacity, ROOM), dtype=SENT),
-            knots=np.zeros((capacity, ROOM, axes, 2 * KNOTS_MAX), dtype=np.float32),
+            knots=np.zeros((capacity, ROOM, axes, 2 * KNOTS_MAX)),
         )
         fixed_s = None if given == "auto" else given
         self.delay_bound = delay.delay_bound(capacity, terms.dt_s, committed_max(terms), fixed_s)
