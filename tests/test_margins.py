@@ -56,6 +56,7 @@ def test_a_regulator_aboard_has_the_variance_of_its_lyapunov_equation() -> None:
         control__scheme="trajectory",
         control__trigger="expected_gap(1)",
         control__input_weight=0.01,
+        sensor__filter="none",
     )
     assert not looks_at_state(scenario)
     model, K = scenario.terms().model, feedback_gain(scenario)[0]

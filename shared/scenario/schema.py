@@ -124,7 +124,7 @@ class ControlConfig(Section, frozen=True):
     a new one."""
     deviation_m: OfTrigger[Amount] = 0.05
     """Distance from the plan above which the policy `deviation` sends [m]."""
-    spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.02
+    spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
     """Largest distance of a spline from the desired trajectory that the server sees [m], as far as
     16 knots reach, with the scheme "trajectory"."""
     state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
