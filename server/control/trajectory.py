@@ -264,17 +264,9 @@ class Guidance:
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; only what is sent is made, and counts."""
-        assert self._window is not None
-        _remember(
-            self._settings,
-            self._memory,
-            self.delay_bound,
-            self._window,
-            rows,
-            step,
-            event,
-            found.told,
-        )
+        window, bound = self._window, self.delay_bound
+        assert window is not None
+        _remember(self._settings, self._memory, bound, window, rows, step, event, found.told)
 
 
 @inline
@@ -358,13 +350,7 @@ def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
 
 @part
 def _gap(
-    settings: Settings,
-    memory: Memory,
-    desired: F3,
-    row: int,
-    number: int,
-    k: int,
-    d: int,
+    settings: Settings, memory: Memory, desired: F3, row: int, number: int, k: int, d: int
 ) -> tuple[float, float]:
     """Mean of Q_p Σ (Δp + h Δv)² of a trajectory that may be followed, and |Δp| at k + d [m].
 

@@ -99,7 +99,8 @@ class ControlConfig(Section, frozen=True):
     """Number of steps planned ahead, H."""
     scheme: Term[Literal["committed", "predictive", "trajectory", "none"]] = "committed"
     """Delay compensation: committed inputs; the paper's, eq. (11) and (13); the desired trajectory,
-    which the server sends as a spline and the vehicle follows by itself; or none."""
+    which the server sends as a spline and the vehicle follows by itself, with the regulator that
+    the weights in its own scenario ask for; or none."""
     feedback: Term[bool] = True
     """Whether a horizon carries the state that it starts from and a feedback gain, with which the
     vehicle comes back to the predicted states. A vehicle that can only play inputs back needs
