@@ -4,16 +4,22 @@ The rule itself is `shared.law.rule`, which the server's replay flies by as well
 needs aboard: the newest horizon, where its first inputs have led so far, and the step it came into
 force. The horizon of the newest generation wins, in whatever order they arrive (E11). Without a
 horizon the input that was flown last is braked along, and from a standstill that is hovering.
+
+A horizon that is a spline (the scheme "trajectory") is flown by the rule of `shared.law.spline`.
 """
 
 import math
 from collections.abc import Sequence
 
-from skytether.shared.law import rule
+import numpy as np
+
+from skytether.shared.law import rule, spline
 from skytether.shared.law.model import Array
 from skytether.shared.law.rule import Held, bounded, lasting, late_max
+from skytether.shared.law.spline import Guide, along
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import (
+    AXES_MAX,
     DISTURBANCE,
     FEEDBACK,
     GAIN_P,
@@ -24,17 +30,28 @@ from skytether.shared.wire.protocol import (
     Drop,
     Horizon,
     ProtocolError,
+    Trajectory,
 )
+
+NO_WIND = (0.0,) * AXES_MAX
+"""Disturbance of each axis where none is known [m/s]."""
 
 
 class Compensator:
-    """Holds the newest horizon and reads the input of any step from it."""
+    """Holds the newest horizon and reads the input of any step from it.
 
-    def __init__(self, terms: Terms) -> None:
+    Args:
+        terms: the rule of flight.
+        gain: K of the vehicle's own regulator, with which it flies along a spline; shape (axes, 2).
+            Horizons of inputs bring theirs along.
+    """
+
+    def __init__(self, terms: Terms, gain: Array | None = None) -> None:
+        self._gain = np.zeros((terms.axes, 2)) if gain is None else gain
         self._H = terms.horizon
         self._age_max = terms.age_max
         self._indexed = terms.indexed
-        self._commits = terms.commits
+        self._commits, self._dt_s = terms.commits, terms.dt_s
         self._late_max = late_max(terms.horizon)
         self._brake = terms.brake
         self._bounds = terms.u_max
@@ -43,9 +60,13 @@ class Compensator:
         """Step of stage 0: that which the horizon was made for, or that at which it was dropped."""
         self._held: list[Held] = []
         """The horizon on each axis; without one the input that was flown when it was dropped."""
+        self._guides: list[Guide] = []
+        """Spline on each axis; empty where inputs are held."""
         self._lead: list[tuple[float, float]] = []
         """State x̄ that the horizon leads to, of each axis at stage `_lead_stage` [m, m/s]."""
         self._lead_stage = 0
+        self._length = 0
+        """Number of stages for which the horizon is flown."""
         self._hold([[0.0]] * terms.axes, 1)
         self.told = [0.0] * terms.axes
         """What is flown at the step chosen for last but for the feedback, of each axis [m/s]."""
@@ -56,15 +77,15 @@ class Compensator:
         self.since = 0
         """First step that the horizon was chosen for."""
         self._new = False
-        self.observed_ns = -1
-        """Stamp of the observation that the horizon was computed from [client clock]."""
+        self.observed = -1
+        """Step of the observation that the horizon was computed from, or -1."""
         self.covered = False
         """Whether the horizon has an input for the step chosen for last; without one the vehicle
         hovers, brakes, or holds the last."""
         self.stale = 0
         """Number of horizons that came after a newer one."""
 
-    def offer(self, horizon: Horizon, step: int, observed: int) -> bool:
+    def offer(self, horizon: Horizon | Trajectory, step: int, observed: int) -> bool:
         """Take a horizon that came before the input of a step is chosen, unless a newer has come.
 
         Args:
@@ -85,7 +106,9 @@ class Compensator:
         if horizon.step <= self.newest:
             self.stale += 1
             return False
-        given = horizon.inputs.shape[1] if self._indexed else self._age_max + self._H
+        given = self._age_max + self._H
+        if self._indexed and isinstance(horizon, Horizon):
+            given = horizon.inputs.shape[1]
         length = lasting(given, horizon.step, observed, self._age_max)
         if not 0 <= observed < step:
             raise ProtocolError(Drop.OBSERVATION)
@@ -95,8 +118,11 @@ class Compensator:
             raise ProtocolError(Drop.TOO_LATE)
         self.in_force = self.newest = horizon.step
         self._new = True
-        self.observed_ns = horizon.observed_ns
+        self.observed = observed
         self._begins = horizon.step
+        if isinstance(horizon, Trajectory):
+            self._guide(horizon, length)
+            return True
         self._hold(
             horizon.inputs.tolist(),
             length,
@@ -111,7 +137,7 @@ class Compensator:
             step: the step that was flown last.
             flown_last: its input [m/s]; shape (axes,).
         """
-        self.in_force, self.observed_ns = NO_HORIZON, -1
+        self.in_force, self.observed = NO_HORIZON, -1
         self._new = self.covered = False
         self._begins = step
         self._hold(flown_last[:, None].tolist(), 1)
@@ -148,7 +174,39 @@ class Compensator:
                 self._model, inputs, self._bounds, told, strict=True
             )
         ]
+        self._guides = []
+        self._length = length
         self._lead = [(columns[LED_P], columns[LED_V]) for columns in told]
+        self._lead_stage = 0
+
+    def _guide(self, told: Trajectory, length: int) -> None:
+        """Fly along a spline from now on, for so many stages."""
+        knots = told.knots.reshape(len(told.knots), -1).tolist()
+        last = [
+            bounded(along(model, each, told.spacing, self._dt_s, length - 1), bound)
+            for model, each, bound in zip(self._model, knots, self._bounds, strict=True)
+        ]
+        speed = math.hypot(*last)
+        self._guides = [
+            Guide(
+                model=model,
+                knots=each,
+                spacing=told.spacing,
+                dt_s=self._dt_s,
+                length=length,
+                last=u,
+                speed=speed,
+                brake=self._brake,
+                bound=bound,
+                gain_p=gain_p,
+                gain_v=gain_v,
+            )
+            for model, each, u, bound, (gain_p, gain_v) in zip(
+                self._model, knots, last, self._bounds, self._gain.tolist(), strict=True
+            )
+        ]
+        self._length = length
+        self._lead = [(each[0], each[1]) for each in knots]
         self._lead_stage = 0
 
     def _comes_too_late(self, stage: int, committed: int, length: int) -> bool:
@@ -162,17 +220,26 @@ class Compensator:
         ended = bool(self._brake) and stage >= length  # braking is not begun anew
         return ended or (self._commits and stage > committed + self._late_max)
 
-    def choose(self, step: int, state: Sequence[tuple[float, float]]) -> list[float]:
+    def choose(
+        self,
+        step: int,
+        state: Sequence[tuple[float, float]],
+        disturbance: Sequence[float] = NO_WIND,
+    ) -> list[float]:
         """Input u* for `step` on each axis [m/s].
 
         Args:
             step: k, never smaller than before.
             state: position [m] and velocity [m/s] of each axis at the step.
+            disturbance: ŵ that the vehicle itself has found on each axis, of account only along a
+                spline [m/s].
         """
         if self._new:
             self.since, self._new = step, False
         stage = step - self._begins
-        self.covered = self.in_force != NO_HORIZON and stage < self._held[0].length
+        self.covered = self.in_force != NO_HORIZON and stage < self._length
+        if self._guides:
+            return self._follow(stage, state, disturbance)
         if self.feeds_back:
             self._lead_to(stage)
         axes = zip(self._held, self._lead, state, strict=True)
@@ -180,10 +247,23 @@ class Compensator:
         self.told = [told for _, told, _, _ in flown]
         return [u for u, _, _, _ in flown]
 
+    def _follow(
+        self, stage: int, state: Sequence[tuple[float, float]], disturbance: Sequence[float]
+    ) -> list[float]:
+        """Input along the spline at a stage, see `choose`."""
+        flown = []
+        for axis, (guide, w) in enumerate(zip(self._guides, disturbance, strict=False)):
+            lead = spline.guided_to(guide, self._lead_stage, stage, *self._lead[axis])
+            self._lead[axis] = lead
+            flown.append(spline.follow(guide, stage, *lead, *state[axis], w))
+        self._lead_stage = stage
+        self.told = [told for _, told in flown]
+        return [u for u, _ in flown]
+
     @property
     def feeds_back(self) -> bool:
-        """Whether the horizon that is held brings feedback."""
-        return self._held[0].feeds_back
+        """Whether what is flown is told and feedback on top of that."""
+        return bool(self._guides) or self._held[0].feeds_back
 
     def _lead_to(self, stage: int) -> None:
         """Roll x̄ on to a stage, unless it is there already."""

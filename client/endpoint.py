@@ -266,10 +266,11 @@ class Client(Endpoint):
             "dropped": by_name(self.dropped),
         }
         compensator = pilot.compensator
-        if compensator.observed_ns >= 0:
+        if compensator.observed >= 0:
             now_ns = pilot.starts_ns(pilot.flown)
             planned_ns = pilot.starts_ns(compensator.in_force)
-            told["age_ms"] = (now_ns - compensator.observed_ns) / MILLISECOND_NS
+            observed_ns = pilot.starts_ns(compensator.observed)
+            told["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
             told["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
         if self._port is not None:
             told["autopilot"] = self._port.figures()

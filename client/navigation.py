@@ -2,8 +2,8 @@
 
 What is known is what the vehicle flies by and reports: with a dead time not its state now, but the
 one in which its next input will meet it (`shared.law.dead_time`). With a sensor that measures the
-whole state as it is, at every step, nothing is filtered, unless there is a dead time: to predict
-over that, the filter's disturbance is needed.
+whole state as it is, at every step, nothing is filtered, unless the filter's disturbance is needed:
+to predict over a dead time, and to fly along a spline.
 """
 
 import math
@@ -52,8 +52,9 @@ def sensing(scenario: Scenario) -> Sensing:
 
 def filters(scenario: Scenario) -> bool:
     """Whether a scenario's vehicle has a Kalman filter."""
-    late = any(scenario.terms().dead_time_s)
-    return scenario.sensor.filter == "kalman" and (late or not sensing(scenario).exact)
+    terms = scenario.terms()
+    needs_disturbance = any(terms.dead_time_s) or terms.splines
+    return scenario.sensor.filter == "kalman" and (needs_disturbance or not sensing(scenario).exact)
 
 
 class Navigation:
@@ -115,6 +116,11 @@ class Navigation:
             if self._inputs is not None:
                 self.predicted = self._inputs.predict(self.estimate, self._filter.disturbance())
             self.is_known = all(map(math.isfinite, chain.from_iterable(self.predicted)))
+
+    @property
+    def disturbance(self) -> Sequence[float]:
+        """Disturbance ŵ that the filter has found on each axis [m/s]; 0 without a filter."""
+        return self._filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: list[float]) -> Measurement:
         """A measurement as it would be later, by eq. (1); an earlier time changes nothing.

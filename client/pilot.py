@@ -18,6 +18,7 @@ from skytether.client.fence import Fence
 from skytether.client.navigation import Navigation
 from skytether.client.vehicle import Vehicle
 from skytether.shared.law.model import Array
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.protocol import (
@@ -27,6 +28,7 @@ from skytether.shared.wire.protocol import (
     Mode,
     Observation,
     ProtocolError,
+    Trajectory,
 )
 
 LAND_MPS = 0.5
@@ -66,7 +68,8 @@ class Pilot:
         self._navigation = Navigation(scenario)
         self._failsafe = failsafe
         self._recorder = recorder
-        self.compensator = Compensator(self._terms)
+        gain = feedback_gain(scenario) if self._terms.splines else None
+        self.compensator = Compensator(self._terms, gain)
         """What chooses the input."""
         self._fence = Fence(scenario) if scenario.fence.is_there else None
         self._change_max = (
@@ -115,7 +118,7 @@ class Pilot:
 
     # -- horizons ----------------------------------------------------------------------------
 
-    def offer(self, horizon: Horizon, *, now_ns: int) -> None:
+    def offer(self, horizon: Horizon | Trajectory, *, now_ns: int) -> None:
         """Hold a horizon from now on, if it is the newest and may be flown.
 
         One that was planned when the vehicle had not yet said that it would fly it begins where the
@@ -126,9 +129,14 @@ class Pilot:
         """
         terms = self._terms
         if horizon.step > self.compensator.newest:
-            passed = self.step - horizon.step - (horizon.inputs.shape[1] - terms.planned)
+            passed = self.step - horizon.step
+            if isinstance(horizon, Horizon):
+                passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
-        observed = self._step_at(horizon.observed_ns)
+        if isinstance(horizon, Trajectory):
+            observed = horizon.step - horizon.age
+        else:
+            observed = self._step_at(horizon.observed_ns)
         if self._takes_from is None or 0 <= observed < self._takes_from:
             raise ProtocolError(Drop.NOT_TAKEN)
         try:
@@ -195,7 +203,7 @@ class Pilot:
         if self._navigation.leapt:
             failsafe.leapt(now_ns=now_ns)
         had_plan = compensator.covered
-        wanted = compensator.choose(self.step, known.predicted)
+        wanted = compensator.choose(self.step, known.predicted, known.disturbance)
         if failsafe.mode is Mode.LAND:
             wanted = [0.0] * self._terms.axes
             if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE][0] > 0.0:
@@ -278,7 +286,7 @@ class Pilot:
             return
         compensator, failsafe, known = self.compensator, self._failsafe, self._navigation
         truth = self._vehicle.truth()
-        observed_ns = compensator.observed_ns
+        observed = compensator.observed
         self._recorder.append_row(
             self._number,
             self.flown,
@@ -288,7 +296,7 @@ class Pilot:
             *self._input.tolist(),
             compensator.covered,
             compensator.in_force,
-            -1 if observed_ns < 0 else self._flown_ns - observed_ns,
+            -1 if observed < 0 else (self.flown - observed) * self._dt_ns,
             compensator.stale,
             self.missed,
             failsafe.mode,

@@ -28,6 +28,7 @@ from skytether.shared.wire.protocol import (
     Observation,
     ProtocolError,
     Refusal,
+    Trajectory,
     Welcome,
     decode,
     encode,
@@ -105,11 +106,11 @@ class ServerSession:
 
     # -- what is heard -----------------------------------------------------------------------
 
-    def hear(self, datagram: bytes, *, now_ns: int) -> Horizon | None:
+    def hear(self, datagram: bytes, *, now_ns: int) -> Horizon | Trajectory | None:
         """Take what is said in this session.
 
         Returns:
-            The horizon, where it is one.
+            The horizon or trajectory, where it is one.
 
         Raises:
             ProtocolError: it is to be dropped.
@@ -122,7 +123,7 @@ class ServerSession:
         match self._decode(payload, now_ns):
             case Welcome() as welcome:
                 self._welcome(welcome, now_ns)
-            case Horizon() as horizon:
+            case Horizon() | Trajectory() as horizon:
                 self._heard(horizon, now_ns)
                 self.idle = str(Idle.PLANS)
                 return horizon
@@ -185,12 +186,12 @@ class ServerSession:
             self._refusal = said
             self._events.append(said)
 
-    def _check(self, message: Welcome | Horizon | Heartbeat | Close) -> None:
+    def _check(self, message: Welcome | Horizon | Trajectory | Heartbeat | Close) -> None:
         named = message.vehicle, message.session
         if not self._is_open or named != (self._vehicle, self.number):
             raise ProtocolError(Drop.UNKNOWN_SESSION)
 
-    def _heard(self, message: Welcome | Horizon | Heartbeat, now_ns: int) -> None:
+    def _heard(self, message: Welcome | Horizon | Trajectory | Heartbeat, now_ns: int) -> None:
         """Note a packet of the session, and a sleep that our own clock has not told of.
 
         A leap of it may be a clock that was set, or real time that was slept through

@@ -21,7 +21,14 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import FIGURES, Recorder
-from skytether.shared.wire.protocol import FEEDBACK, LED, Heartbeat, Idle, encode, encode_horizon
+from skytether.shared.wire.protocol import (
+    FEEDBACK,
+    Heartbeat,
+    Idle,
+    Trajectory,
+    encode,
+    encode_horizon,
+)
 
 MISSES_MAX = 5
 """Number of ticks that may be missed in a second before the server calls itself degraded."""
@@ -169,6 +176,9 @@ class Ticker:
         sent, found = decisions.sent, decisions.found
         if not len(sent):
             return
+        if self._terms.splines:
+            self._send_trajectories(decisions, now_ns)
+            return
         # Bytes of one input on all axes, and of what goes with a horizon.
         width = 4 * self._terms.axes
         feedback, told = found.feedback.data.cast("B"), 0
@@ -189,6 +199,17 @@ class Ticker:
             )
             session.sent_ns, begin = now_ns, end
             self._out += session.sealed(payload)
+
+    def _send_trajectories(self, decisions: Decisions, now_ns: int) -> None:
+        sent, told, axes = decisions.sent, decisions.found.told, self._terms.axes
+        rows, step = decisions.rows[sent], decisions.step[sent]
+        age = step - self._controller.observed_step[rows]
+        columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
+        for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
+            session, knots = self._sessions.at(row), told.knots[i, :, : 2 * n].reshape(axes, n, 2)
+            message = Trajectory(session.vehicle, session.number, k, now_ns, o, spacing, knots)
+            session.sent_ns = now_ns
+            self._out += session.sealed(encode(message))
 
     def _send_heartbeats(self, now_ns: int) -> None:
         """Let vehicles that were sent nothing for a while know that the server lives."""
@@ -245,13 +266,15 @@ class Ticker:
         step, ahead = decisions.step[sent], found.ahead[sent]
         # Behind d committed inputs, another d of each vehicle.
         stages = ahead[:, None] + np.arange(self._terms.planned)
-        reckons = self._terms.reckons
+        state: Array = found.start[sent]
+        if self._terms.splines:
+            state = found.told.knots[sent, :, :2].astype(np.float64)
         plans.append(
             len(sent),
             vehicle=self._sessions.vehicle[decisions.rows[sent]],
             step=step,
             begins=step + ahead,
-            state=found.feedback[sent][:, :, LED] if reckons else found.start[sent],
+            state=state,
             inputs=np.take_along_axis(found.horizons[sent], stages[:, None], axis=2),
             disturbance=found.disturbance[sent],
         )

@@ -94,30 +94,30 @@ committing = st.builds(
     ),
 )
 """With triggers that need committed inputs."""
-reckoning = st.builds(
+guided = st.builds(
     lambda changes, control, shape: (
         changes | {"control": changes["control"] | control, "reference": {"shape": shape}}
     ),
     scenarios,
     st.fixed_dictionaries(
         {
-            "scheme": st.just("dead_reckoning"),
+            "scheme": st.just("trajectory"),
             "feedback": st.just(True),
             "trigger": st.sampled_from(
-                ["always", "tolerance(0.1) | silence(1)", "delta(0.2) & budget(5, 2)"]
+                ["always", "expected_gap(0.1) | silence(1)", "deviation(0.2) & budget(5, 2)"]
             ),
         }
     ),
     st.sampled_from(["circle", "target"]),
 )
-"""With targets that are sent as they are."""
+"""With trajectories that are sent as they are."""
 companies = st.lists(st.integers(0, 2**32 - 1), min_size=2, max_size=4, unique=True)
 phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, max_size=4)
 """None leaves them to the seeds; the others make everything fall on the same instants."""
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.one_of(scenarios, committing, reckoning), companies, phases_ms)
+@given(st.one_of(scenarios, committing, guided), companies, phases_ms)
 def test_a_run_is_the_same_in_any_company(
     changes: dict[str, Any], seeds: list[int], phases: list[int] | None
 ) -> None:

@@ -124,8 +124,8 @@ def test_stale_horizon_is_ignored_after_reordering() -> None:
     compensator = Compensator(terms())
     for made in (10, 12, 11, 12, 10):
         new = horizon(made, INPUTS + 0.01 * (made - 10), observed_ns=made)
-        compensator.offer(new, 14, 9)
-    assert (compensator.in_force, compensator.observed_ns, compensator.stale) == (12, 12, 3)
+        compensator.offer(new, 14, made - 1)
+    assert (compensator.in_force, compensator.observed, compensator.stale) == (12, 11, 3)
     np.testing.assert_allclose(chosen(compensator, 14, HERE), INPUTS[:, 2] + 0.02, rtol=1e-6)
 
 

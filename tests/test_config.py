@@ -153,7 +153,7 @@ WRONG = {
     "a scheme that is none": (
         'control.scheme = "papr"',
         (
-            "control.scheme: got 'papr', expected 'committed' or 'predictive' or 'dead_reckoning' "
+            "control.scheme: got 'papr', expected 'committed' or 'predictive' or 'trajectory' "
             "or 'none'"
         ),
     ),
@@ -161,13 +161,16 @@ WRONG = {
         'control.trigger = "often"',
         (
             "control.trigger: got 'often', expected a policy; there are always, periodic, "
-            "state_gap, cost_gap, expected_gap, deviation, tolerance, delta, silence, budget"
+            "state_gap, cost_gap, expected_gap, deviation, silence, budget"
         ),
     ),
     "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),
     "a trigger for another scheme": (
         'control.scheme = "predictive"\ncontrol.trigger = "cost_gap"',
-        ("control.scheme: got 'predictive', expected 'committed' with the trigger cost_gap"),
+        (
+            "control.scheme: got 'predictive', expected 'committed' or 'trajectory' "
+            "with the trigger cost_gap"
+        ),
     ),
     "feedback without compensation": (
         'control.scheme = "none"\ncontrol.trigger = "always"\ncontrol.feedback = true',

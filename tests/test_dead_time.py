@@ -128,12 +128,12 @@ def test_constant_wind_is_reckoned_with_while_inputs_are_on_their_way() -> None:
 # -- flights ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scheme", ["committed", "predictive", "dead_reckoning"])
+@pytest.mark.parametrize("scheme", ["committed", "predictive", "trajectory"])
 def test_a_known_dead_time_costs_hardly_anything(scheme: str) -> None:
     """Over a perfect network; ablation: the same vehicle, and a model that knows of none."""
-    reckons = scheme == "dead_reckoning"
-    control = {"scheme": scheme, "trigger": "tolerance | silence(1)" if reckons else "always"}
-    control |= {"tolerance_m": 0.01, "input_weight": 0.05}
+    splines = scheme == "trajectory"
+    control = {"scheme": scheme, "trigger": "cost_gap | silence(1)" if splines else "always"}
+    control |= {"cost_gap": 0.01, "input_weight": 0.05}
     model = {"tau_s": [0.47], "gain": 1.0, "dead_time_s": [0.27, 0.24], "u_max": [3.0]}
     without = model | {"dead_time_s": 0.0}
     late = {"dead_time_s": model["dead_time_s"]}

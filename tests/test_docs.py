@@ -62,7 +62,7 @@ def skytether(line: str) -> list[str]:
                 "skytether id",
             )
         )
-        and "--control" not in line
+        and "--control " not in line  # by test_the_documented_changes_are_made_in_flight
         and "mavlink" not in line  # there is no autopilot to be heard; by test_identify.py
         and "--record" not in line
         and "--plugin" not in line  # by test_plugins.py

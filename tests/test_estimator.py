@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.controller import Controller
-from skytether.server.control.gain import feedback_gain
 from skytether.server.control.predictive import Estimator
 from skytether.server.control.scheme import Foresight, foresight
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Indices, discretise
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation

@@ -43,6 +43,7 @@ from skytether.shared.telemetry.feed import (
     table,
 )
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, parse, plan_columns
+from skytether.shared.wire.protocol import Message, Trajectory
 from skytether.shell import command
 from skytether.shell.driver import Shell, run
 from skytether.shell.feed import (
@@ -648,21 +649,28 @@ def test_a_subscriber_begins_anew_where_a_process_does(
 # -- plans -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scheme", ["committed", "predictive", "none", "dead_reckoning"])
+@pytest.mark.parametrize("scheme", ["committed", "predictive", "none", "trajectory"])
 def test_the_plans_told_are_those_that_are_sent(
     scheme: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each horizon has a row: its inputs behind the committed ones, and where they begin."""
-    sent, encode_horizon = [], tick.encode_horizon
+    sent, encode_horizon, encode = [], tick.encode_horizon, tick.encode
 
     def spied(vehicle: int, session: int, step: int, *rest: Any) -> bytes:
         sent.append((vehicle, step, np.frombuffer(rest[2], np.float32).reshape(2, -1).copy()))
         return bytes(encode_horizon(vehicle, session, step, *rest))
 
+    def watched(message: Message) -> bytes:
+        if isinstance(message, Trajectory):
+            inputs = message.knots[:, :1, 1].copy()
+            sent.append((message.vehicle, message.step, inputs))
+        return bytes(encode(message))
+
     monkeypatch.setattr(tick, "encode_horizon", spied)
+    monkeypatch.setattr(tick, "encode", watched)
     raw = reading.to_table(DEMO) | {"duration": 6.0, "settle": 2.0}
     raw["control"] |= {"scheme": scheme, "trigger": "always"}
-    raw["control"] |= {"feedback": scheme == "dead_reckoning", "observer_s": 0.0}
+    raw["control"] |= {"feedback": scheme == "trajectory", "observer_s": 0.0}
     raw["vehicle"]["wind"] = 0.0
     flown = reading.check(raw, "test")
     terms = flown.terms()
@@ -682,7 +690,7 @@ def test_the_plans_told_are_those_that_are_sent(
     made = own[np.isin(own["step"], one["step"])]
     if scheme in ("predictive", "none"):
         np.testing.assert_array_equal(one["state"], made["estimate"])
-    elif scheme == "dead_reckoning":
+    elif scheme == "trajectory":
         np.testing.assert_allclose(one["state"], made["reference"], atol=1e-5)
     else:  # where it was to be, it has come to be, but for what it never heard of
         steps = flight_.client[flight_.client["vehicle"] == 1]

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 
-from skytether.server.control.gain import feedback_gain
-from skytether.server.control.gain import stationary_gain as gain_for
 from skytether.shared.law.model import Array, discretise, white_acceleration
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import stationary_gain as gain_for
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.sim.flight import fly
 

@@ -20,10 +20,10 @@ from skytether.lab.margins import (
     margin,
     timings,
 )
-from skytether.server.control.gain import feedback_gain
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.sim.flight import fly_batch
@@ -51,11 +51,12 @@ NOISE = {"sensor__position_noise_m": 0.01, "sensor__velocity_noise_mps": 0.02}
 
 
 def test_a_regulator_aboard_has_the_variance_of_its_lyapunov_equation() -> None:
-    """Dead reckoning flies u = -K x whatever arrives: P = F P Fᵀ + W, and ρ(F)² is the growth."""
+    """Along a trajectory u = -K x, whatever arrives: P = F P Fᵀ + W, and ρ(F)² is the growth."""
     scenario = changed(
-        control__scheme="dead_reckoning",
-        control__trigger="tolerance(1)",
+        control__scheme="trajectory",
+        control__trigger="expected_gap(1)",
         control__input_weight=0.01,
+        sensor__filter="none",
     )
     assert not looks_at_state(scenario)
     model, K = scenario.terms().model, feedback_gain(scenario)[0]

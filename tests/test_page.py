@@ -120,7 +120,7 @@ def test_every_slider_asks_for_what_the_processes_take(axes: int) -> None:
 def test_every_trigger_that_is_offered_can_be_flown() -> None:
     """With the scheme for which it is offered."""
     demo = reading.load("demo")
-    for scheme in ("committed", "predictive", "none", "dead_reckoning"):
+    for scheme in ("committed", "predictive", "none", "trajectory"):
         offered = triggers(scheme, "always")
         assert "always" in offered
         for trigger in offered:
@@ -128,7 +128,7 @@ def test_every_trigger_that_is_offered_can_be_flown() -> None:
                 demo.control,
                 scheme=scheme,
                 trigger=trigger,
-                feedback=scheme == "dead_reckoning",
+                feedback=scheme == "trajectory",
             )
             reading.check(reading.to_table(msgspec.structs.replace(demo, control=control)))
     assert triggers("committed", "periodic(7)")[0] == "periodic(7)"

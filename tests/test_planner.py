@@ -453,7 +453,7 @@ def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
         ahead = rng.integers(0, H + 1, len(rows))
         found = crowd(rng, ahead)
         found.start[rng.random(len(rows)) < 0.05, rng.integers(2), 0] = np.nan
-        other = Foresight(*(field.copy() for field in found))
+        other = Foresight(*(field.copy() for field in found[:-1]), found.told)
         one = plan(compiled, rows, starts[rows] - ahead, found)
         same(one, plan(around, rows, starts[rows] - ahead, other))
         unsolved += np.count_nonzero(~one.figures["solved"])
@@ -550,7 +550,7 @@ def test_vehicles_hours_apart_are_planned_for_as_if_alone() -> None:
             found = crowd(rng, np.zeros(BLOCK, dtype=np.int64))
             made = plan(together, rows, step, found)
             for row, single in singles.items():
-                one = Foresight(*(field[row : row + 1].copy() for field in found))
+                one = Foresight(*(field[row : row + 1].copy() for field in found[:-1]), found.told)
                 alone = plan(single, np.array([0]), step[row : row + 1], one)
                 np.testing.assert_array_equal(made.inputs[:, row], alone.inputs[:, 0])
                 np.testing.assert_array_equal(made.states[row], alone.states[0])

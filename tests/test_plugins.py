@@ -239,9 +239,9 @@ def test_what_is_held_aboard_is_known_with_committed_inputs_alone(tmp_path: Path
     assert said == f"the trigger look: ValueError: {known}; where it fails, it sends"
 
 
-@pytest.mark.parametrize("scheme", ["predictive", "none", "dead_reckoning"])
+@pytest.mark.parametrize("scheme", ["predictive", "none", "trajectory"])
 def test_every_other_field_is_known_with_every_scheme(scheme: str, tmp_path: Path) -> None:
-    """With dead reckoning a plan is the velocity alone."""
+    """With a trajectory a plan is the velocity alone."""
     code = """
         @trigger
         def look(now):

@@ -134,12 +134,10 @@ def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
 @pytest.mark.parametrize(
     ("name", "needed", "given"),
     [
-        ("cost_gap", "'committed'", "predictive"),
-        ("deviation", "'committed'", "dead_reckoning"),
-        ("tolerance", "'dead_reckoning'", "committed"),
-        ("delta", "'dead_reckoning'", "none"),
-        ("expected_gap", "'committed'", "predictive"),
-        ("state_gap", "'committed' or 'predictive' or 'none'", "dead_reckoning"),
+        ("cost_gap", "'committed' or 'trajectory'", "predictive"),
+        ("deviation", "'committed' or 'trajectory'", "none"),
+        ("expected_gap", "'committed' or 'trajectory'", "predictive"),
+        ("state_gap", "'committed' or 'predictive' or 'none'", "trajectory"),
     ],
 )
 def test_what_is_compared_needs_a_scheme_that_has_it(name: str, needed: str, given: str) -> None:
@@ -152,7 +150,7 @@ def test_what_is_compared_needs_a_scheme_that_has_it(name: str, needed: str, giv
         f"mine: control.scheme: got {given!r}, expected {needed} with the trigger {name}"
     )
     for scheme in needed.replace("'", "").split(" or "):
-        feedback = scheme == "dead_reckoning"
+        feedback = scheme == "trajectory"
         reading.check({"control": control | {"scheme": scheme, "feedback": feedback}}, "mine")
 
 
@@ -196,9 +194,6 @@ def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
     except PolicyError:
         said = refusal(text)
         assert said.startswith("mine: control.trigger: got ")
-    except ConfigError as error:
-        said = str(error)
-        assert said.endswith(("with the trigger tolerance", "with the trigger delta"))
     assert bool(said) or found
     assert len(said.splitlines()) == bool(said)
     assert all(TRIGGERS[one.name].takes(one.values) for one in found)

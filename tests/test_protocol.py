@@ -29,6 +29,7 @@ from skytether.shared.wire.protocol import (
     Mode,
     Observation,
     ProtocolError,
+    Trajectory,
     Welcome,
     decode,
     encode,
@@ -116,6 +117,20 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Heartbeat, u16, u32, stamp, st.sampled_from(Idle), st.integers(0, 1)),
     st.builds(Close, u16, u32),
 )
+trajectories = st.builds(
+    Trajectory,
+    u16,
+    u32,
+    step,
+    stamp,
+    st.integers(-(2**15), 2**32 - 1),
+    st.integers(1, 2**16 - 1),
+    arrays(
+        "<f4",
+        st.tuples(st.just(2), st.integers(1, 16), st.just(2)),
+        elements=st.floats(allow_nan=False, allow_infinity=False, width=32),
+    ),
+)
 
 
 def same(one: Message, other: Message) -> bool:
@@ -128,8 +143,14 @@ def same(one: Message, other: Message) -> bool:
 
 @given(messages)
 def test_every_message_is_read_as_it_was_written(message: Message) -> None:
-    """Round trip of all six."""
+    """Round trip of all six of a scheme that plans."""
     assert same(decode(encode(message), TERMS), message)
+
+
+@given(trajectories)
+def test_a_trajectory_is_read_as_it_was_written(message: Message) -> None:
+    """By a vehicle that flies along one."""
+    assert same(decode(encode(message), TERMS._replace(scheme="trajectory")), message)
 
 
 @pytest.mark.parametrize("axes", [2, 3])
@@ -201,7 +222,7 @@ def terms_with(**wrong: object) -> list[object]:
         (OBSERVATION, 0, 1, "version"),
         (OBSERVATION, 0, True, "version"),
         (OBSERVATION, 1, 0, "type"),
-        (OBSERVATION, 1, 7, "type"),
+        (OBSERVATION, 1, 8, "type"),
         (OBSERVATION, 1, "3", "type"),
         (OBSERVATION, 2, 2**16, "field"),
         (OBSERVATION, 2, True, "field"),

@@ -22,7 +22,7 @@ COLUMN_SETS = {
     "client in 2-D": client_columns(2),
     "client in 3-D": client_columns(3),
     "server in 2-D": server_columns(2, "committed"),
-    "server in 3-D, dead reckoning": server_columns(3, "dead_reckoning"),
+    "server in 3-D, trajectory": server_columns(3, "trajectory"),
     "netem": PACKET_COLUMNS,
 }
 

@@ -8,12 +8,12 @@ import pytest
 from skytether.client.compensator import Compensator
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.committed import Replay
-from skytether.server.control.gain import feedback_gain
 from skytether.server.control.planner import Planner
 from skytether.server.control.scheme import Foresight, foresight
 from skytether.shared.law import rule
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
 from skytether.shared.telemetry.summary import summarise

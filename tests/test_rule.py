@@ -12,7 +12,6 @@ from skytether.client.compensator import Compensator
 from skytether.server.control import law
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.committed import Replay
-from skytether.server.control.gain import feedback_gain
 from skytether.server.control.scheme import Foresight, foresight
 from skytether.shared.base.kernel import part
 from skytether.shared.law import rule
@@ -28,6 +27,7 @@ from skytether.shared.law.rule import (
     led_back,
     remaining,
 )
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observation

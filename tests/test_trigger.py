@@ -429,15 +429,11 @@ def test_both_sides_are_told_whichever_is_recorded(compares: tuple[bool, bool]) 
 
 def test_scenario_names_its_trigger() -> None:
     """Every policy that a scenario may name is made, with the scenario's keys for its arguments."""
-    control = ControlConfig(
-        period=4, epsilon=2.0, decay_rate=0.0, cost_gap=7.0, deviation_m=8.0, tolerance_m=9.0
-    )
+    control = ControlConfig(period=4, epsilon=2.0, decay_rate=0.0, cost_gap=7.0, deviation_m=8.0)
     thresholds = {
         "state_gap": 2.0,
         "cost_gap": 7.0,
         "deviation": 8.0,
-        "tolerance": 9.0,
-        "delta": 9.0,
         "always": 0.0,
         "periodic": 0.0,
     }
@@ -451,7 +447,7 @@ def test_scenario_names_its_trigger() -> None:
 
 LEAVES = (
     *("always", "periodic(3)", "state_gap(1, 1)", "cost_gap(1)"),
-    *("deviation(1)", "silence(0.5)", "budget(2, 2)", "tolerance(1)", "delta(1)"),
+    *("deviation(1)", "silence(0.5)", "budget(2, 2)"),
 )
 trees = st.recursive(
     st.sampled_from(LEAVES),
@@ -474,7 +470,7 @@ def encounters(rng: np.random.Generator, n: int, ticks: int) -> Iterator[Figures
         step = np.where(rng.random(n) < 0.05, 0, step + rng.integers(1, 6, n))
         figures["step"] = step
         figures["fresh"] = (rng.random(n) < 0.1) | (tick == 0) | (step == 0)
-        for name in ("state_gap", "cost_gap", "deviation_m", "left_m", "moved_m"):
+        for name in ("state_gap", "cost_gap", "deviation_m"):
             figures[name] = rng.uniform(0.0, 2.0, n)
         yield figures
 

@@ -3,8 +3,8 @@
     observations → x̂(k), x̂(k+d) (`replay` or `estimator`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`planner`) → event? (`trigger`) → what is sent, remembered.
 
-With the schemes "predictive" and "none" d is 0; with "dead_reckoning" nothing is planned, and
-`reckoning` stands in place of estimator and planner. Every vehicle is planned for at every step,
+With the schemes "predictive" and "none" d is 0; with "trajectory" nothing is planned, and
+`trajectory` stands in place of estimator and planner. Every vehicle is planned for at every step,
 for planning is a small part of what a step costs.
 """
 
@@ -16,16 +16,16 @@ import numpy as np
 
 from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.control.committed import Replay
-from skytether.server.control.dead_reckoning import Reckoning
 from skytether.server.control.desired import Desired
-from skytether.server.control.gain import feedback_gain
 from skytether.server.control.planner import Figures, Planner
 from skytether.server.control.predictive import Estimator
 from skytether.server.control.scheme import DOUBTS, Foresight, Scheme, foresight
+from skytether.server.control.trajectory import Guidance
 from skytether.shared.base.kernel import B1, I1, kernel
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.triggers import Known, Situation, Verdict, make_trigger
@@ -95,10 +95,12 @@ class Controller:
         """What is known of the desired trajectories."""
         gain = feedback_gain(scenario)
         self._scheme: Scheme
-        self.planner: Planner | Reckoning
+        self.planner: Planner | Guidance
         """Plans of every vehicle, or what is sent in place of a plan."""
-        if terms.reckons:
-            self._scheme = self.planner = Reckoning(terms, gain, self.desired, room, block)
+        if terms.splines:
+            self._scheme = self.planner = Guidance(
+                terms, control, gain, self.desired, clock, room, block
+            )
         else:
             self._scheme = (
                 Replay(terms, control, gain, room, clock)
@@ -134,7 +136,12 @@ class Controller:
         self._trigger = make_trigger(control, self._room, self.faults.append)
         doubts = DOUBTS if self._trigger.doubts else 0
         self._found = found = foresight(
-            self._block, terms.axes, terms.planned, committed_max(terms), doubts
+            self._block,
+            terms.axes,
+            terms.planned,
+            committed_max(terms),
+            doubts,
+            splines=terms.splines,
         )
         self._known = Known(
             model=terms.model,

@@ -101,6 +101,9 @@ class Desired:
         """How much later than its step each axis of a page is [s]; shape (axes,)."""
         left = (seen_s - self._ahead_s) / terms.dt_s + TINY
         self._outlook = Outlook(left.astype(np.int64), late_s - self._ahead_s)
+        left_min = H if self._all else int(self._outlook.reach.min())
+        self.seen = max(min(left_min, H), 0)
+        """Steps behind k that are seen on every axis, H at most."""
         self._bound_m = wanted.radius_m if wanted.shape == "target" else np.inf
         """Coordinate at which a prediction turns round [m]."""
         self._references = references

@@ -74,10 +74,6 @@ class PlanFigures:
     """Mean of that cost where packets in flight may be lost [cost]."""
     deviation_m: float
     """Largest distance between what was sent and the generator's plan before [m]; 0 where fresh."""
-    left_m: float
-    """Dead reckoning: how far the target is from where both ends expect it [m]."""
-    moved_m: float
-    """Dead reckoning: how far the target has moved since it was sent last [m]; 0 where fresh."""
     fresh: bool
     """Whether it is at its first step, or behind a gap that no plan reached over."""
     solved: bool

@@ -1,7 +1,7 @@
 """What the schemes of delay compensation have in common: what is foreseen, and asked of each.
 
 `server.control.committed` is "committed", `server.control.predictive` "predictive" and "none",
-`server.control.dead_reckoning` "dead_reckoning".
+`server.control.trajectory` "trajectory".
 """
 
 from collections import Counter
@@ -11,7 +11,19 @@ import numpy as np
 
 from skytether.shared.base.kernel import F2, F3, F4, I1, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
-from skytether.shared.wire.protocol import FEEDBACK, Observation
+from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
+
+
+class Splines(NamedTuple):
+    """Trajectories that are sent in place of horizons; no vehicles with the other schemes."""
+
+    knots: S3
+    """Position [m] and velocity [m/s] of one knot after the other; shape
+    (block, axes, 2 KNOTS_MAX)."""
+    number: I1
+    """Number of knots; shape (block,)."""
+    spacing: I1
+    """Steps from one knot to the next; shape (block,)."""
 
 
 class Foresight(NamedTuple):
@@ -49,15 +61,19 @@ class Foresight(NamedTuple):
     (block, axes, most + H)."""
     feedback: S3
     """What goes with a horizon, see `wire.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
+    told: Splines
+    """Trajectories that are sent, with the scheme "trajectory"."""
 
 
 DOUBTS = 4
 """Number of horizons in flight whose loss is reckoned with."""
 
 
-def foresight(block: int, axes: int, H: int, most: int, doubts: int = 0) -> Foresight:
+def foresight(
+    block: int, axes: int, H: int, most: int, doubts: int = 0, *, splines: bool = False
+) -> Foresight:
     """Room for a block of vehicles, whose delay bounds are at most `most`."""
-    states = (block, axes, 2)
+    states, told = (block, axes, 2), block if splines else 0
     return Foresight(
         estimate=np.zeros(states),
         ahead=np.zeros(block, dtype=np.int64),
@@ -71,6 +87,11 @@ def foresight(block: int, axes: int, H: int, most: int, doubts: int = 0) -> Fore
         disturbance=np.zeros((block, axes)),
         horizons=np.zeros((block, axes, most + H), dtype=np.float32),
         feedback=np.zeros((block, axes, FEEDBACK), dtype=np.float32),
+        told=Splines(
+            knots=np.zeros((told, axes, 2 * KNOTS_MAX), dtype=np.float32),
+            number=np.ones(told, dtype=np.int64),
+            spacing=np.ones(told, dtype=np.int64),
+        ),
     )
 
 

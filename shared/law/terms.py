@@ -90,7 +90,7 @@ class Terms(NamedTuple):
     @property
     def indexed(self) -> bool:
         """Whether the vehicle reads a horizon by the step it is at, and not always its first."""
-        return self.scheme not in ("dead_reckoning", "none")
+        return self.scheme not in ("trajectory", "none")
 
     @property
     def commits(self) -> bool:
@@ -98,19 +98,19 @@ class Terms(NamedTuple):
         return self.scheme == "committed"
 
     @property
-    def reckons(self) -> bool:
-        """Whether horizons bring no plan, but the state that the vehicle goes on from."""
-        return self.scheme == "dead_reckoning"
+    def splines(self) -> bool:
+        """Whether a spline of the desired trajectory is sent, and no inputs."""
+        return self.scheme == "trajectory"
 
     @property
     def planned(self) -> int:
         """Number of a horizon's inputs behind the committed ones: H, or 1 without a plan."""
-        return 1 if self.reckons else self.horizon
+        return 1 if self.splines else self.horizon
 
     @property
     def reach(self) -> int:
         """Steps behind the committed ones for which a horizon is good: H, or the age bound."""
-        return self.age_max if self.reckons else self.horizon
+        return self.age_max if self.splines else self.horizon
 
     @property
     def age_max(self) -> int:

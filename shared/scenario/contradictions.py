@@ -72,8 +72,8 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
             repr(sensor.filter),
             "'kalman' with sensor.velocity_every_s = 'never'",
         )
-    if control.scheme == "dead_reckoning" and not control.feedback:
-        yield "control.feedback", "false", "true with control.scheme = 'dead_reckoning'"
+    if control.scheme == "trajectory" and not control.feedback:
+        yield "control.feedback", "false", "true with control.scheme = 'trajectory'"
     if control.scheme == "none" and control.feedback:
         yield "control.feedback", "true", "false with control.scheme = 'none'"
     yield from _too_slow(scenario)

@@ -97,10 +97,10 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
     """Number of steps planned ahead, H."""
-    scheme: Term[Literal["committed", "predictive", "dead_reckoning", "none"]] = "committed"
-    """Delay compensation: committed inputs; the paper's, eq. (11) and (13); dead reckoning, where
-    the server sends the state of the desired trajectory and the vehicle goes on from there without
-    a plan; or none."""
+    scheme: Term[Literal["committed", "predictive", "trajectory", "none"]] = "committed"
+    """Delay compensation: committed inputs; the paper's, eq. (11) and (13); the desired trajectory,
+    which the server sends as a spline and the vehicle follows by itself, with the regulator that
+    the weights in its own scenario ask for; or none."""
     feedback: Term[bool] = True
     """Whether a horizon carries the state that it starts from and a feedback gain, with which the
     vehicle comes back to the predicted states. A vehicle that can only play inputs back needs
@@ -125,9 +125,9 @@ class ControlConfig(Section, frozen=True):
     a new one."""
     deviation_m: OfTrigger[Amount] = 0.05
     """Distance from the plan above which the policy `deviation` sends [m]."""
-    tolerance_m: OfTrigger[Amount] = 0.1
-    """Distance above which dead reckoning sends [m]: of the desired position from the predicted one
-    with the policy `tolerance`, from the one sent last with `delta`."""
+    spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
+    """Largest distance of a spline from the desired trajectory that the server sees [m], as far as
+    16 knots reach, with the scheme "trajectory"."""
     state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: OfServer[tuple[Amount, Amount]] = (50.0, 20.0)

@@ -41,7 +41,7 @@ class Known(NamedTuple):
     dt_s: float
     """Length of a step [s]."""
     planned: int
-    """Number of inputs of a plan, H; 1 with dead reckoning."""
+    """Number of inputs of a plan, H; 1 without a plan."""
     ahead: Indices
     """Delay bound d [steps]; shape (block,)."""
     horizons: NDArray[np.float32]
@@ -75,7 +75,7 @@ class Situation(NamedTuple):
 
     @property
     def plan(self) -> Array:
-        """New plan: the inputs from k+d on [m/s]; shape (n, axes, H), H = 1 with dead reckoning."""
+        """New plan: the inputs from k+d on [m/s]; shape (n, axes, H), H = 1 without a plan."""
         n, known = len(self.rows), self.known
         stages = known.ahead[:n, None] + np.arange(known.planned)
         inputs = np.take_along_axis(known.horizons[:n], stages[:, None], axis=2)
@@ -130,9 +130,7 @@ class Compared(IntEnum):
     COST_GAP = 2
     EXPECTED_GAP = 3
     DEVIATION_M = 4
-    LEFT_M = 5
-    MOVED_M = 6
-    OWN = 7
+    OWN = 7  # 5 and 6 are figures of older recordings
     """Figure of a plug-in's policy, in a unit that it knows itself."""
 
     def __str__(self) -> str:
@@ -297,7 +295,7 @@ class StateGap(Trigger):
         self._event_step[rows], self._event_gap[rows] = figures["step"], figures["state_gap"]
 
 
-@trigger(schemes=("committed",))
+@trigger(schemes=("committed", "trajectory"))
 def cost_gap(
     situation: Situation, c: Annotated[float, Meta(ge=0), DefaultKey("cost_gap")]
 ) -> Verdict:
@@ -305,7 +303,7 @@ def cost_gap(
     return above(situation, Compared.COST_GAP, c)
 
 
-@trigger(name="expected_gap", schemes=("committed",))
+@trigger(name="expected_gap", schemes=("committed", "trajectory"))
 class ExpectedGap(Trigger):
     """Sends where flying on is expected to cost more than c, as packets in flight may be lost."""
 
@@ -324,7 +322,7 @@ class ExpectedGap(Trigger):
         return above(situation, Compared.EXPECTED_GAP, self._most)
 
 
-@trigger(schemes=("committed",))
+@trigger(schemes=("committed", "trajectory"))
 def deviation(
     situation: Situation, metres: Annotated[float, Meta(ge=0), DefaultKey("deviation_m")]
 ) -> Verdict:
@@ -332,28 +330,12 @@ def deviation(
     return above(situation, Compared.DEVIATION_M, metres)
 
 
-@trigger(schemes=("dead_reckoning",))
-def tolerance(
-    situation: Situation, metres: Annotated[float, Meta(ge=0), DefaultKey("tolerance_m")]
-) -> Verdict:
-    """Sends where the target has left where both ends expect it by more than so many metres."""
-    return above(situation, Compared.LEFT_M, metres)
-
-
-@trigger(schemes=("dead_reckoning",))
-def delta(
-    situation: Situation, metres: Annotated[float, Meta(ge=0), DefaultKey("tolerance_m")]
-) -> Verdict:
-    """Sends where the target has moved by more than so many metres since it was sent."""
-    return above(situation, Compared.MOVED_M, metres)
-
-
 @trigger(name="silence")
 class Silence(Periodic):
     """Sends after so many seconds without a packet, or half a horizon where that is shorter.
 
     It sends at most at every step. A horizon of which half is left is replaced in time even if the
-    first that follows is lost. With dead reckoning no horizon is planned that could end.
+    first that follows is lost. A trajectory has no inputs that could end.
     """
 
     def __init__(
@@ -365,7 +347,7 @@ class Silence(Periodic):
         steps = int(
             seconds / control.dt + 1e-9
         )  # as much as floating point may take from 0.35 / 0.05
-        if control.scheme != "dead_reckoning":
+        if control.scheme != "trajectory":
             steps = min(steps, control.horizon // 2)
         super().__init__(control, capacity, steps)
 

@@ -127,7 +127,7 @@ FIGURES: Mapping[str, tuple[Compared, ...]] = MappingProxyType(
         ),
         "predictive": (Compared.STATE_GAP,),
         "none": (Compared.STATE_GAP,),
-        "dead_reckoning": (Compared.LEFT_M, Compared.MOVED_M),
+        "trajectory": (Compared.COST_GAP, Compared.EXPECTED_GAP, Compared.DEVIATION_M),
     }
 )
 """Figures of plans that each scheme computes."""
@@ -153,8 +153,8 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
             ("input", "<f8", (axes,)),  # û(k), or the committed input of k
             ("observed_step", "<i8"),  # of the observation behind x̂
-            # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m], left_m [m],
-            # moved_m [m]; NaN where there is no plan, or no trigger that asks for expected_gap
+            # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without
+            # a plan, or without a trigger that asks for expected_gap
             *((str(figure), "<f8") for figure in FIGURES[scheme]),
             (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, else NaN
             ("threshold", "<f8"),  # what is compared, in its unit; 0 where nothing is
@@ -190,8 +190,8 @@ def compared(rows: Rows) -> Array:
 def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
     """Columns of the server's plans: one row for each horizon that it sends.
 
-    With dead reckoning there is no plan: the state is where the target is told to be, and the one
-    input the velocity at which it goes on from there.
+    With the scheme "trajectory" there is no plan: the state is the first knot, and the one input
+    that which holds its velocity.
 
     Args:
         planned: number of its inputs on each axis, see `shared.law.terms.Terms.planned`.

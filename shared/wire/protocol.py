@@ -1,4 +1,4 @@
-"""The wire: six messages, each one msgpack array in one UDP datagram, sealed or plain.
+"""The wire: seven messages, each one msgpack array in one UDP datagram, sealed or plain.
 
     [version, type, vehicle, ...]
 
@@ -12,6 +12,9 @@
 | 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback    |
 | 5    | HEARTBEAT   | server  | session, server_ns, idle, degraded                         |
 | 6    | CLOSE       | both    | session                                                    |
+| 7    | TRAJECTORY  | server  | session, step, server_ns, age, spacing, knots              |
+
+With the scheme "trajectory" TRAJECTORY stands in place of HORIZON.
 
 `docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
 Those that control uses are the client's; `server_ns` is the server's own, which the client only
@@ -31,7 +34,7 @@ from numpy.typing import NDArray
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 
-VERSION = 5
+VERSION = 6
 PAYLOAD_BYTES_MAX = 1200
 """So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
 
@@ -40,6 +43,8 @@ TEXT_MAX = 32
 """Characters of a text in the terms."""
 INPUTS_MAX = 270
 """Inputs of all axes in one horizon: what fits beside the other fields."""
+KNOTS_MAX = 16
+"""Knots in one trajectory."""
 
 LED_P = 0
 """Column of `Horizon.feedback`: position x̄ at the horizon's step [m]."""
@@ -232,11 +237,26 @@ class Horizon(NamedTuple):
     observed_ns: int
     """Stamp of the observation it was computed from, echoed [client clock]."""
     inputs: NDArray[np.float32]
-    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`; or
-    (axes, 1) with dead reckoning, the velocity at which the vehicle goes on."""
+    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """What feedback aboard takes, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
     (axes, 0) where the inputs are to be flown as they are."""
+
+
+class Trajectory(NamedTuple):
+    """The desired trajectory from a step on, as a spline, see `shared.law.spline`."""
+
+    vehicle: int
+    session: int
+    step: int
+    """Step k of the first knot, on the vehicle's grid."""
+    server_ns: int
+    age: int
+    """Steps from the newest observation that the server had to `step`."""
+    spacing: int
+    """Steps from one knot to the next."""
+    knots: NDArray[np.float32]
+    """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
 
 
 class Idle(IntEnum):
@@ -285,7 +305,7 @@ class Close(NamedTuple):
 CLOSES = 3
 """Number of times that CLOSE is said, for some of them may be lost."""
 
-Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close
+Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory
 
 _Check = range | Callable[[object, Terms], object]
 """The integers a field may be, or what makes the field of what was sent, or refuses it."""
@@ -344,8 +364,10 @@ def _input(value: object, ours: Terms) -> Array:
 
 
 def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
-    most = ours.planned + (0 if ours.reckons else committed_max(ours))
-    inputs = _array(value, _FLOAT32, ours.axes, (ours.planned, most))
+    if ours.splines:
+        raise ProtocolError(Drop.TYPE)
+    most = ours.horizon + committed_max(ours)
+    inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, most))
     largest = np.abs(inputs).max(axis=1).tolist()  # NaN where there is one
     if not all(map(math.isfinite, largest)):
         raise ProtocolError(Drop.NOT_FINITE)
@@ -362,6 +384,17 @@ def _feedback(value: object, ours: Terms) -> NDArray[np.float32]:
     if not all(map(math.isfinite, feedback.ravel().tolist())):
         raise ProtocolError(Drop.NOT_FINITE)
     return feedback
+
+
+def _knots(value: object, ours: Terms) -> NDArray[np.float32]:
+    if not ours.splines:
+        raise ProtocolError(Drop.TYPE)
+    numbers = _array(value, _FLOAT32, ours.axes, (2, 2 * KNOTS_MAX))
+    if numbers.shape[1] % 2:
+        raise ProtocolError(Drop.SHAPE)
+    if not all(map(math.isfinite, numbers.ravel().tolist())):
+        raise ProtocolError(Drop.NOT_FINITE)
+    return numbers.reshape(ours.axes, -1, 2)
 
 
 def committed_max(terms: Terms) -> int:
@@ -387,6 +420,8 @@ _U32 = range(2**32)
 _U64 = range(2**64)
 _STAMP = range(2**63)
 _STEP = range(2**40 + 1)
+_AGE = range(-(2**15), 2**32)
+_SPACING = range(1, 2**16)
 _STEP_OR_NONE = range(NO_HORIZON, 2**40 + 1)
 
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
@@ -402,6 +437,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback)),
     (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG)),
     (Close, (_U16, _U32)),
+    (Trajectory, (_U16, _U32, _STEP, _STAMP, _AGE, _SPACING, _knots)),
 )
 """Message of each type number (from 1) and the check of each of its fields."""
 

@@ -120,13 +120,13 @@ WEIGHTS = (
 """Weights that are searched for; only ratios matter, so the position's keeps its value."""
 REGULATOR = (WEIGHTS[0], WEIGHTS[3])
 """Those of them that make the gain aboard, where nothing is planned."""
+SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
+"""Key of a trajectory that is seen ahead."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (Free("control.epsilon", 1e-4, 1e8), Free("control.decay_rate", 1e-2, 1e2)),
     "cost_gap": (Free("control.cost_gap", 1e-6, 1e6),),
     "expected_gap": (Free("control.cost_gap", 1e-6, 1e6),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
-    "tolerance": (Free("control.tolerance_m", 1e-4, 1e1),),
-    "delta": (Free("control.tolerance_m", 1e-4, 1e1),),
 }
 """Keys of each policy that looks at the flight, so that weights decide what it sends, too."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
@@ -173,9 +173,11 @@ class Rmse:
     def free(self) -> Sequence[Free]:
         """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
         control, table = self.scenario.control, plain(self.scenario)
-        weights = REGULATOR if control.scheme == "dead_reckoning" else WEIGHTS
+        weights = REGULATOR if control.scheme == "trajectory" else WEIGHTS
         observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
-        keys = [*weights, *trigger_keys(control.trigger), *observer]
+        ahead = control.scheme == "trajectory" and self.scenario.reference.preview != "none"
+        spline = SPLINE_KEYS if ahead else ()
+        keys = [*weights, *trigger_keys(control.trigger), *observer, *spline]
         return [key for key in keys if key.of(table) > 0.0]
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:

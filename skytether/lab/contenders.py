@@ -85,29 +85,29 @@ BLIND = {"scheme": "committed", "feedback": False, "observer_s": 0.0, "horizon":
 COMMITTED = BLIND | {"observer_s": 4.0}
 """Committed inputs; the observer's time constant is searched for and may come out very long."""
 FEEDBACK = COMMITTED | {"feedback": True}
-RECKONING = {
-    "scheme": "dead_reckoning",
+TRAJECTORY = {
+    "scheme": "trajectory",
     "feedback": True,
     "state_weight": [7.1, 1.0],
-    "input_weight": 0.3,
+    "input_weight": 1.0,
 }
-"""No plan is sent, but the target's state, towards which the vehicle regulates itself."""
+"""No plan is sent, but the desired trajectory, along which the vehicle regulates itself."""
 
 ALWAYS = {"trigger": "always"}
 PERIODIC = {"trigger": "periodic", "period": 10}
 STATE_GAP = {"trigger": "state_gap", "epsilon": 5e4}
 COST_GAP = {"trigger": "cost_gap", "cost_gap": 300.0}
 EXPECTED_GAP = {"trigger": "expected_gap", "cost_gap": 300.0}
+OF_NOW = {"cost_gap": 3.0}
+"""Gap of a trajectory, which is the cost of a moment, and not that of a horizon."""
 DEVIATION = {"trigger": "deviation", "deviation_m": 1.0}
-TOLERANCE = {"trigger": "tolerance", "tolerance_m": 0.05}
-DELTA = {"trigger": "delta", "tolerance_m": 0.4}
 
 
 def _contenders() -> tuple[Contender, ...]:
     """All contenders, family by family."""
     every, periodic, event = "every step", "periodic", "eq. (16)"
     paper, observed, led = "paper", "paper with observer", "paper with feedback"
-    committed, aboard, state = "committed", "committed with feedback", "target's state"
+    committed, aboard, spline = "committed", "committed with feedback", "desired trajectory"
     return (
         Contender("paper-every-step", paper, every, PAPER | ALWAYS),
         Contender("paper-event", paper, event, PAPER | STATE_GAP, "epsilon"),
@@ -133,10 +133,16 @@ def _contenders() -> tuple[Contender, ...]:
         Contender("feedback-periodic", aboard, periodic, FEEDBACK | PERIODIC, "period"),
         Contender("feedback-gap", aboard, "cost gap", FEEDBACK | COST_GAP, "cost_gap"),
         Contender("feedback-expected", aboard, "expected gap", FEEDBACK | EXPECTED_GAP, "cost_gap"),
-        Contender("reckoning-every-step", state, every, RECKONING | ALWAYS),
-        Contender("reckoning-periodic", state, periodic, RECKONING | PERIODIC, "period"),
-        Contender("reckoning-tolerance", state, "tolerance", RECKONING | TOLERANCE, "tolerance_m"),
-        Contender("reckoning-delta", state, "send on delta", RECKONING | DELTA, "tolerance_m"),
+        Contender("trajectory-every-step", spline, every, TRAJECTORY | ALWAYS),
+        Contender("trajectory-periodic", spline, periodic, TRAJECTORY | PERIODIC, "period"),
+        Contender("trajectory-gap", spline, "cost gap", TRAJECTORY | COST_GAP | OF_NOW, "cost_gap"),
+        Contender(
+            "trajectory-expected",
+            spline,
+            "expected gap",
+            TRAJECTORY | EXPECTED_GAP | OF_NOW,
+            "cost_gap",
+        ),
     )
 
 
@@ -174,8 +180,8 @@ TARGET = {"link.heartbeat_s": 1.0, "link.timeout_s": 5.0, "duration": 35.0}
 packet is sent but by a trigger."""
 CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap")
 """Contenders on a trajectory that is known for ever, for which no network is needed."""
-AHEAD = ("paper-every-step", "feedback-gap", "reckoning-tolerance")
-"""Contenders where a plan may say more than a target's state."""
+AHEAD = ("paper-every-step", "feedback-gap", "trajectory-expected")
+"""Contenders where more is known than a target's state."""
 TURNING = (
     "paper-every-step",
     "paper-event",
@@ -183,8 +189,9 @@ TURNING = (
     "feedback-periodic",
     "feedback-gap",
     "feedback-expected",
-    "reckoning-periodic",
-    "reckoning-tolerance",
+    "trajectory-periodic",
+    "trajectory-gap",
+    "trajectory-expected",
 )
 """Contenders where a trigger may earn its packets."""
 
@@ -311,7 +318,7 @@ class ComparisonSize:
         ]
 
 
-LOOKED_AT = ("paper-every-step", "paper-event", "feedback-gap", "reckoning-tolerance")
+LOOKED_AT = ("paper-every-step", "paper-event", "feedback-gap", "trajectory-expected")
 """Contenders of a first look."""
 
 

@@ -22,8 +22,8 @@ import numpy as np
 from skytether.client.clamp import clamped
 from skytether.client.navigation import Navigation
 from skytether.client.simulated.vehicle import simulated
-from skytether.server.control.gain import stationary_gain
 from skytether.shared.law.model import Array, white_acceleration
+from skytether.shared.scenario.gain import stationary_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Reason, Rows, client_columns
 from skytether.shared.telemetry.summary import Summary, summarise

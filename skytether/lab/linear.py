@@ -15,27 +15,29 @@ from skytether.client.filter import Kalman
 from skytether.client.navigation import filters, sensing
 from skytether.client.simulated.sensor import Sensor
 from skytether.server.control.committed import HOVERS, UNKNOWN
-from skytether.server.control.gain import feedback_gain
 from skytether.server.control.law import advance, lasting, lead_to
 from skytether.server.control.law import step as fly
 from skytether.server.control.mpc import LATER, MPC, make_mpc, pose
 from skytether.server.control.observer import decay_of, learned
 from skytether.server.control.predictive import APART_NS
+from skytether.server.control.trajectory import follow
 from skytether.shared.base.chance import stream
 from skytether.shared.base.kernel import B1, F1, F2, F3, I1, inline, kernel, part
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.dead_time import dead_time
 from skytether.shared.law.model import Array, Axis, Indices, Model, discretise, white_acceleration
 from skytether.shared.law.rule import Held
+from skytether.shared.law.spline import Guide
 from skytether.shared.scenario import policies
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import committed_max
 
 WIND, NOISE = 2, 2
 """Columns of a step's wind on an axis, and of its measurement."""
-COMMITTED, PREDICTIVE, NONE, DEAD_RECKONING = range(4)
-SCHEMES = ("committed", "predictive", "none", "dead_reckoning")
+COMMITTED, PREDICTIVE, NONE, TRAJECTORY = range(4)
+SCHEMES = ("committed", "predictive", "none", "trajectory")
 """The schemes, as kernels take them."""
 
 
@@ -82,7 +84,7 @@ class Loop(NamedTuple):
     predicts: bool
     """Whether the filter moves its state on by the model between measurements."""
     scheme: int
-    """COMMITTED, PREDICTIVE, NONE or DEAD_RECKONING."""
+    """COMMITTED, PREDICTIVE, NONE or TRAJECTORY."""
     plan: F2
     """Inputs of a plan for position and velocity where it begins, and for ŵ; shape (H, 3)."""
     before: F2
@@ -225,12 +227,13 @@ def _go_on(loop: Loop, last: F1, stage: int, holds: bool, u: F1) -> None:
 
 
 @part
-def _reckon(loop: Loop, x: F2, u: F1) -> None:
-    """Fill in what is flown with dead reckoning, where the target rests at the origin."""
-    back, rests = loop.back, (0.0,)
-    held = Held(loop.model, rests, 1, True, 0.0, 0.0, np.inf, True, back[0], back[1], 0.0)
+def _follow(loop: Loop, past: Past, x: F2, u: F1) -> None:
+    """Fill in what is flown along a trajectory that rests at the origin."""
+    rests = (0.0, 0.0)
+    gain_p, gain_v = loop.back[0], loop.back[1]
+    guide = Guide(loop.model, rests, 1, 1.0, 1, 0.0, 0.0, 0.0, np.inf, gain_p, gain_v)
     for c in range(len(u)):
-        u[c], _, _, _ = fly(held, 0, 0.0, 0.0, x[0, c], x[1, c])
+        u[c], _ = follow(guide, 0, 0.0, 0.0, x[0, c], x[1, c], past.filtered[2, c])
 
 
 @part
@@ -404,8 +407,8 @@ def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
     """Do what the compensator aboard does at step `s`."""
     reach = len(past.flown)
     u, x = past.flown[s % reach], past.reported[s % reach]
-    if loop.scheme == DEAD_RECKONING:
-        _reckon(loop, x, u)
+    if loop.scheme == TRAJECTORY:
+        _follow(loop, past, x, u)
         return
     made = timing.in_force[s]
     number = _number(past, made)
@@ -548,7 +551,7 @@ def make_loops(scenario: Scenario, steps: int) -> list[Loop]:
     known_late = terms.dead_times
     nowhere = discretise([1.0], 0.0).axes()[0]
     plans, before = np.zeros((terms.axes, 1, 3)), np.zeros((terms.axes, 0, 0))
-    if not terms.reckons:
+    if not terms.splines:
         plans, before = _plans(terms.model, make_mpc(terms, control))
     back = feedback_gain(scenario).astype("f4").astype("f8")
     delay, corrections = _corrections(scenario, steps)

@@ -117,8 +117,8 @@ VEHICLES: dict[str, Differing] = {
 
 def looks_at_state(scenario: Scenario) -> bool:
     """Whether the trigger looks at the state, so that the loop is not linear."""
-    trigger, reckons = policies.parse(scenario.control.trigger), scenario.terms().reckons
-    return not reckons and any(each.name not in CLOCK_ONLY for each in policies.policies(trigger))
+    trigger, splines = policies.parse(scenario.control.trigger), scenario.terms().splines
+    return not splines and any(each.name not in CLOCK_ONLY for each in policies.policies(trigger))
 
 
 def equivalent_period(
@@ -163,7 +163,7 @@ def timings(
 ) -> list[Timing]:
     """Timings of so many flights, with seeds that count up from the scenario's."""
     flown = calm(scenario)
-    if flown.terms().reckons:  # it flies by itself, whatever arrives
+    if flown.terms().splines:  # it flies by itself, whatever arrives
         return [no_packets(flown.steps)] * runs
     seeds = range(flown.seed, flown.seed + runs)
     return [timing_of(flight) for flight in fly_batch(flown, seeds, stopped=stopped)]

@@ -127,13 +127,6 @@ THRESHOLDS = (
         1,
         0.01,
     ),
-    _compared(
-        "Tolerance [m]",
-        "Distance of the target from where it was expected, above which it is sent",
-        "tolerance_m",
-        1,
-        0.01,
-    ),
     Knob(
         "Rate: steps from packet to packet",
         "One packet every so many steps",
@@ -155,8 +148,6 @@ TRIGGERS = (
     "expected_gap | silence(1)",
     "deviation | silence(1)",
     "state_gap",
-    "tolerance | silence(1)",
-    "delta | silence(1)",
 )
 """Triggers that are offered, where the scheme has what they compare."""
 

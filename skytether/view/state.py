@@ -489,7 +489,7 @@ class State:
             self.name = opened.name
             self.scenario = scenario
             terms = self.scenario.control
-            planned = 1 if terms.scheme == "dead_reckoning" else terms.horizon
+            planned = 1 if terms.scheme == "trajectory" else terms.horizon
             self.network = Network(4 * self.scenario.model.axes * planned)
         columns: dict[str, np.dtype[np.void]] = {}
         for part, described in opened.parts.items():

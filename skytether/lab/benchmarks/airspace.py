@@ -153,7 +153,7 @@ class Airspace:
         if sent:
             assert sent == len(self._sessions), "a vehicle was sent no horizon"
             planner = self.server.controller.planner
-            assert isinstance(planner, Planner), "dead reckoning plans nothing"
+            assert isinstance(planner, Planner), "a trajectory is no plan"
             planned = planner.inputs
             self._vehicles.fly(planned[:sent, :, 0])
             self._past.append(self._vehicles.x)

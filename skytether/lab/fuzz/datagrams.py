@@ -34,8 +34,10 @@ SCENARIOS = (
         },
         "fuzz",
     ),
+    reading.check({"control": {"scheme": "trajectory", "trigger": "expected_gap"}}, "fuzz"),
 )
-"""A flight in the plane with committed inputs, and one in space with feedback aboard."""
+"""A flight in the plane with committed inputs, one in space with feedback aboard, and one along
+trajectories."""
 
 KNOWN = (*corpus().values(), *(seed for each in SCENARIOS for seed in seeds(each.terms())))
 """Odd payloads, and a message of each type."""

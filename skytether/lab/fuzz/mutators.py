@@ -15,7 +15,9 @@ from skytether.shared.wire.protocol import (
     Heartbeat,
     Hello,
     Horizon,
+    Message,
     Observation,
+    Trajectory,
     Welcome,
     encode,
 )
@@ -71,14 +73,19 @@ def seeds(terms: Terms) -> list[bytes]:
     inputs = np.zeros((axes, n), np.float32)
     feedback = np.ones((axes, FEEDBACK), np.float32)
     state, flown = np.zeros((axes, 2)), np.zeros(axes)
+    plans: list[Message] = [
+        Horizon(1, 7, 5, 10, 9, inputs),
+        Horizon(1, 7, 5, 10, 9, inputs, feedback),
+    ]
+    if terms.splines:
+        plans = [Trajectory(1, 7, 5, 10, 1, 4, np.zeros((axes, 3, 2), np.float32))]
     return [
         encode(message)
         for message in (
             Hello(1, 2**50, terms),
             Welcome(1, 7, 5, 3, 10, 0, terms),
             Observation(1, 7, 5, 10, 4, 4, 8, 9, 3, 1, state, flown),
-            Horizon(1, 7, 5, 10, 9, inputs),
-            Horizon(1, 7, 5, 10, 9, inputs, feedback),
+            *plans,
             Heartbeat(1, 7, 10, 0, 0),
             Close(1, 7),
         )
