@@ -271,6 +271,14 @@ def asked(served: Metrics, request: bytes) -> tuple[bytes, bytes]:
     return head.split(b"\r\n")[0], body
 
 
+def test_a_thread_that_ends_by_itself_is_closed_in_order(served: Metrics) -> None:
+    """One that was awake anyway sees that it is to end before it is told so."""
+    served._closed = True
+    calling(served).close()
+    served._thread.join(30.0)
+    assert not served._thread.is_alive()  # the fixture closes it
+
+
 def test_metrics_and_health_are_served(served: Metrics) -> None:
     """As Prometheus and Docker ask for them."""
     request = b"GET %s HTTP/1.1\r\nHost: netem:9464\r\nAccept: */*\r\n\r\n"

@@ -155,8 +155,10 @@ class Metrics:
     def close(self) -> None:
         """Answer nobody any more."""
         self._closed = True
-        self._waker.send(b"\0")
+        with suppress(BrokenPipeError):  # it has ended already
+            self._waker.send(b"\0")
         self._thread.join()
+        self._waker.close()
 
     def _work(self) -> None:
         try:
@@ -166,8 +168,8 @@ class Metrics:
             for connection in self._connections.values():
                 connection.socket.close()
             self._selector.close()
-            for sock in (self._socket, self._ours, self._waker):
-                sock.close()
+            self._socket.close()
+            self._ours.close()
 
     def _turn(self) -> None:
         oldest = next(iter(self._connections.values()), None)
