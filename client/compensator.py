@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 
 from skytether.shared.law import rule
-from skytether.shared.law.model import Array
+from skytether.shared.law.model import Array, advance
 from skytether.shared.law.rule import Held, bounded, lasting, late_max
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import (
@@ -47,6 +47,8 @@ class Compensator:
         """State x̄ that the horizon leads to, of each axis at stage `_lead_stage` [m, m/s]."""
         self._lead_stage = 0
         self._hold([[0.0]] * terms.axes, 1)
+        self._chosen = 0
+        """Step chosen for last."""
         self.told = [0.0] * terms.axes
         """What is flown at the step chosen for last but for the feedback, of each axis [m/s]."""
         self.in_force = NO_HORIZON
@@ -171,6 +173,7 @@ class Compensator:
         """
         if self._new:
             self.since, self._new = step, False
+        self._chosen = step
         stage = step - self._begins
         self.covered = self.in_force != NO_HORIZON and stage < self._held[0].length
         if self.feeds_back:
@@ -179,6 +182,22 @@ class Compensator:
         flown = [rule.step(held, stage, *lead, *x) for held, lead, x in axes]
         self.told = [told for _, told, _, _ in flown]
         return [u for u, _, _, _ in flown]
+
+    def foresee(
+        self, states: Sequence[tuple[float, float]], flown: Sequence[float] | None = None
+    ) -> list[tuple[float, float]]:
+        """State of each axis a step after the one chosen for last, as the server foresees it.
+
+        Args:
+            states: position [m] and velocity [m/s] of each axis at that step.
+            flown: input flown there [m/s]; None for what the rule of flight makes of the states.
+        """
+        stage = self._chosen - self._begins
+        if flown is None:
+            axes = zip(self._held, self._lead, states, strict=True)
+            flown = [rule.step(held, stage, *lead, *x)[0] for held, lead, x in axes]
+        along = zip(self._held, states, flown, strict=True)
+        return [advance(held.model, p, v, u + held.disturbance) for held, (p, v), u in along]
 
     @property
     def feeds_back(self) -> bool:

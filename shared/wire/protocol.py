@@ -8,9 +8,10 @@
 | 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, refusal,      |
 |      |             |         | terms                                                      |
 | 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
-|      |             |         | received_ns, mode, takes, state, input                     |
-| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback    |
-| 5    | HEARTBEAT   | server  | session, server_ns, idle, degraded                         |
+|      |             |         | received_ns, mode, takes, state, input, number, silence_ms |
+| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback,   |
+|      |             |         | number, silence_ms                                         |
+| 5    | HEARTBEAT   | server  | session, server_ns, idle, degraded, number, silence_ms     |
 | 6    | CLOSE       | both    | session                                                    |
 
 `docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 
-VERSION = 5
+VERSION = 6
 PAYLOAD_BYTES_MAX = 1200
 """So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
 
@@ -219,6 +220,10 @@ class Observation(NamedTuple):
     """Position [m] and velocity [m/s]; shape (axes, 2)."""
     input: Array
     """Desired velocity that is flown from `step` on [m/s]; shape (axes,)."""
+    number: int = 0
+    """Number of packets that the vehicle has sent in the session before."""
+    silence_ms: int = 0
+    """Longest silence that the vehicle asks of the server [ms]; 0 where it asks for none."""
 
 
 class Horizon(NamedTuple):
@@ -237,6 +242,10 @@ class Horizon(NamedTuple):
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """What feedback aboard takes, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
     (axes, 0) where the inputs are to be flown as they are."""
+    number: int = 0
+    """Number of packets that the server has sent in the session before."""
+    silence_ms: int = 0
+    """Longest silence that the server asks of the vehicle [ms]; 0 where it asks for none."""
 
 
 class Idle(IntEnum):
@@ -273,6 +282,10 @@ class Heartbeat(NamedTuple):
     """Why no plan is made for the vehicle, one of `Idle`."""
     degraded: int
     """1 if the server sleeps through more of its ticks than it may, else 0."""
+    number: int = 0
+    """Number of packets that the server has sent in the session before."""
+    silence_ms: int = 0
+    """Longest silence that the server asks of the vehicle [ms]; 0 where it asks for none."""
 
 
 class Close(NamedTuple):
@@ -396,11 +409,11 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
         Observation,
         (
             *(_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP),
-            *(range(len(Mode)), _FLAG, _state, _input),
+            *(range(len(Mode)), _FLAG, _state, _input, _U32, _U16),
         ),
     ),
-    (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback)),
-    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG)),
+    (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback, _U32, _U16)),
+    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG, _U32, _U16)),
     (Close, (_U16, _U32)),
 )
 """Message of each type number (from 1) and the check of each of its fields."""
@@ -424,10 +437,12 @@ def encode_horizon(
     observed_ns: int,
     inputs: memoryview,
     feedback: memoryview,
+    number: int,
+    silence_ms: int,
 ) -> bytes:
     """Datagram of a `Horizon` whose arrays are bytes already, for a server that sends many."""
-    fields = (vehicle, session, step, server_ns, observed_ns, inputs, feedback)
-    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *fields))
+    told = (vehicle, session, step, server_ns, observed_ns, inputs, feedback, number, silence_ms)
+    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *told))
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
 
