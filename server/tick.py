@@ -193,7 +193,7 @@ class Ticker:
             self._out += session.sealed(payload)
 
     def _send_heartbeats(self, now_ns: int) -> None:
-        """Let vehicles that were sent nothing for as long as they ask know that the server lives."""
+        """Say that the server lives to vehicles that it sent nothing for as long as they ask."""
         for session in self._sessions:
             if 0 < session.asked_ns <= now_ns - session.sent_ns:
                 idle = int(self._sessions.idle[session.row])

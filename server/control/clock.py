@@ -176,7 +176,7 @@ def _drop_stepped(seen: Seen, row: int) -> None:
     recent, old, newest, recently = 0, 0, seen.vehicles[row]["newest"], RECENT
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]
-        if age < RECENT or age < OLD and recent < STEP_SAMPLES:
+        if age < RECENT or (age < OLD and recent < STEP_SAMPLES):
             recent, recently = recent + count, age + 1
         elif age >= OLD:
             old += count

@@ -44,7 +44,7 @@ def periodic(now: Unreported, N: Annotated[int, Meta(ge=1, le=PERIOD_MAX)]) -> b
     return now.steps >= N
 
 
-@REPORTS(schemes=("committed", "dead_reckoning"))
+@REPORTS
 def deviation(now: Unreported, metres: Annotated[float, Meta(ge=0, le=1e9)]) -> bool:
     """Sends where the vehicle has left where the server believes it by more than so many metres,
     where another horizon has come into force, and where its mode has changed.

@@ -47,37 +47,51 @@ class Kept(NamedTuple):
     """Mean and largest time from when it was cut to when that was noticed [s]."""
 
 
+class Listener:
+    """One end that hears nothing but heartbeats."""
+
+    def __init__(self, timeout_ns: int, fixed_ns: int | None) -> None:
+        self._timeout_ns = timeout_ns
+        self.hearing = Hearing(timeout_ns, STEP_NS, fixed_ns)
+        """What silence it asks for."""
+        self._under_way: list[tuple[int, int]] = []
+        """When each packet comes [ns], and its number; a heap."""
+        self.heard_ns: int | None = None
+        """When it heard something last [ns]."""
+        self.false = 0
+        """Number of times that it took the link for lost, and heard something later."""
+
+    def send(self, at_ns: int, number: int) -> None:
+        """Let a packet be under way that comes at a time."""
+        heappush(self._under_way, (at_ns, number))
+
+    def hear(self, until_ns: int) -> None:
+        """Take what comes until a time."""
+        while self._under_way and self._under_way[0][0] <= until_ns:
+            at_ns, number = heappop(self._under_way)
+            self.false += self.heard_ns is not None and at_ns - self.heard_ns > self._timeout_ns
+            self.heard_ns = at_ns
+            self.hearing.hear(number)
+
+
 def keep(network: DirectionConfig, timeout_s: float, heartbeat_s: float | None, lives: int) -> Kept:
     """Keep a link at rest alive for so many sessions of LIFE_S, and cut it at the end of each."""
     timeout_ns, end_ns = seconds_to_ns(timeout_s), LIFE_S * SECOND_NS
     fixed_ns = None if heartbeat_s is None else seconds_to_ns(heartbeat_s)
     false, sent, noticed_s = 0, 0, []
     for seed in range(1, lives + 1):
-        hearing, fates = Hearing(timeout_ns, STEP_NS, fixed_ns), Fates(network, seed, "uplink", 0)
-        under_way: list[tuple[int, int]] = []
-        heard_ns, now_ns, number = None, 0, 0
-
-        def hear(until_ns: int) -> int:
-            """Take what comes until a time; the number of times that it came too late."""
-            nonlocal heard_ns
-            late = 0
-            while under_way and under_way[0][0] <= until_ns:
-                at_ns, came = heappop(under_way)
-                late += heard_ns is not None and at_ns - heard_ns > timeout_ns
-                heard_ns = at_ns
-                hearing.hear(came)
-            return late
-
+        listener, fates = Listener(timeout_ns, fixed_ns), Fates(network, seed, "uplink", 0)
+        now_ns, number = 0, 0
         while now_ns < end_ns:
-            false += hear(now_ns)
+            listener.hear(now_ns)
             fate = fates.at(now_ns // SLOT_NS)
             if not fate.lost:
-                heappush(under_way, (now_ns + fate.delay_ns, number))
+                listener.send(now_ns + fate.delay_ns, number)
             number += 1
-            now_ns += -(-hearing.silence_ns // STEP_NS) * STEP_NS
-        false += hear(2 * end_ns)
-        sent += number
-        noticed_s.append(((heard_ns or 0) + timeout_ns - end_ns) / SECOND_NS)
+            now_ns += -(-listener.hearing.silence_ns // STEP_NS) * STEP_NS
+        listener.hear(2 * end_ns)
+        false, sent = false + listener.false, sent + number
+        noticed_s.append(((listener.heard_ns or 0) + timeout_ns - end_ns) / SECOND_NS)
     hours = lives * LIFE_S / 3600.0
     mean_s = sum(noticed_s) / lives
     return Kept(false / hours, sent / lives / LIFE_S, (mean_s, max(noticed_s)))
