@@ -159,7 +159,7 @@ def test_documented_sizes_are_the_real_ones() -> None:
     inputs = np.zeros((2, 40), np.float32)
     state = np.zeros((2, 2))
     stamp_ns, session = 3 * 10**14, 2**31
-    asked = {"number": 500, "silence_ms": 300}
+    asked: dict[str, Any] = {"number": 500, "silence_ms": 300}
     none = NO_FEEDBACK
     assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs, none, **asked))) == 361
     committed = np.zeros((2, 51), np.float32)

@@ -231,12 +231,12 @@ def test_both_ends_expect_the_target_in_the_same_place(
 
 def horizon(step: int, inputs: Floats, feedback: Floats) -> Horizon:
     """What the server sends at a step."""
-    return Horizon(1, 2**32 - 1, step, 2**47, 2**47, inputs, feedback)
+    return Horizon(1, 2**32 - 1, step, 2**47, 2**47, inputs, feedback, 2**15, 300)
 
 
 def wire(count: int) -> bytes:
     """The datagram of a HORIZON with so many inputs on each of two axes."""
-    datagram: bytes = msgpack.packb([VERSION, 4, 1, 2, 5, 9, 9, bytes(8 * count), bytes(40)])
+    datagram: bytes = msgpack.packb([VERSION, 4, 1, 2, 5, 9, 9, bytes(8 * count), bytes(40), 3, 9])
     return datagram
 
 
@@ -258,10 +258,10 @@ def test_a_single_input_is_refused_by_a_vehicle_that_flies_plans() -> None:
 
 
 def test_a_packet_is_small() -> None:
-    """At most 84 bytes in the plane, where a plan of 40 inputs has 397."""
+    """At most 90 bytes in the plane, where a plan of 40 inputs has 403."""
     told = horizon(2**20, np.zeros((2, 1), np.float32), np.zeros((2, FEEDBACK), np.float32))
-    assert len(encode(told)) == 84
-    assert len(encode(told._replace(inputs=np.zeros((2, 40), np.float32)))) == 397
+    assert len(encode(told)) == 90
+    assert len(encode(told._replace(inputs=np.zeros((2, 40), np.float32)))) == 403
 
 
 # -- flights ---------------------------------------------------------------------------------

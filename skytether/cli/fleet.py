@@ -329,8 +329,9 @@ def _show(summary: FleetSummary, title: str) -> None:
         ("link", "sealed" if s.secure else "plaintext"),
         ("event ratio", f"{s.event_ratio:.3f}"),
         (
-            "uplink, downlink packets/s",
-            f"{s.uplink_packets_per_s:.0f}, {s.downlink_packets_per_s:.0f}",
+            "packets/s up, down, both",
+            f"{s.uplink_packets_per_s:.0f}, {s.downlink_packets_per_s:.0f}, "
+            f"{s.uplink_packets_per_s + s.downlink_packets_per_s:.0f}",
         ),
         ("lost packets, dropped by accident", f"{s.lost}, {s.dropped}"),
         ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
