@@ -112,7 +112,7 @@ def test_a_cut_link_is_a_gap_in_all_that_nobody_knows_meanwhile() -> None:
     for direction in (UPLINK, DOWNLINK):
         delays_s = plots._delays(direction)(look)
         assert np.isnan(delays_s[-40:]).all()
-        assert not np.isnan(delays_s[-160:-130]).any()
+        assert not np.isnan(delays_s[-200:-170]).any()
 
 
 def test_the_error_is_that_of_the_record() -> None:

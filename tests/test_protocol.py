@@ -159,7 +159,7 @@ def test_documented_sizes_are_the_real_ones() -> None:
     inputs = np.zeros((2, 40), np.float32)
     state = np.zeros((2, 2))
     stamp_ns, session = 3 * 10**14, 2**31
-    asked: dict[str, Any] = {"number": 500, "silence_ms": 300}
+    asked = {"number": 500, "silence_ms": 300}
     none = NO_FEEDBACK
     assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs, none, **asked))) == 361
     committed = np.zeros((2, 51), np.float32)
@@ -168,7 +168,7 @@ def test_documented_sizes_are_the_real_ones() -> None:
     aboard = np.zeros((2, FEEDBACK), np.float32)
     assert len(encode(committing._replace(feedback=aboard))) == 361 + 11 * 8 + 40
     told = 480, 490, stamp_ns, stamp_ns, Mode.TRACK, 1, state, np.zeros(2)
-    assert len(encode(Observation(1, session, 500, stamp_ns, *told, **asked))) == 105
+    assert len(encode(Observation(1, session, 500, stamp_ns, *told, **asked))) == 107
     assert len(encode(Heartbeat(1, session, stamp_ns, Idle.DELAY, 0, **asked))) == 26
     assert len(encode(Close(1, session))) == 9
 

@@ -447,6 +447,19 @@ def encode_horizon(
     return payload
 
 
+def kind_of(payload: bytes) -> int | None:
+    """Type number of a message, from its first bytes; None of one that is none of ours.
+
+    Array, version and type must be in msgpack's shortest form, so that it is what it looks like.
+    """
+    array = payload[0] if payload else 0
+    begin = 1 if array & 0xF0 == 0x90 else 3 if array == 0xDC else len(payload)
+    head = payload[begin : begin + 2]
+    if len(head) < 2 or max(head) >= 0x80 or (begin == 3 and payload[1:3] < b"\0\x10"):
+        return None
+    return head[1]
+
+
 def decode(payload: bytes, terms: Terms) -> Message:
     """The message in a datagram, every field checked against our own terms.
 

@@ -1,4 +1,4 @@
-"""`skytether triggers`, `reports`, `references` and `vehicles`: what a scenario can name, a sentence each."""
+"""`skytether triggers`, `reports` and so on: what a scenario can name, a sentence each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,7 +5,7 @@ on its grid of steps, netem's fates of packets, and the listener's `Hearing` and
 nothing, and so an hour takes well under a second. What the listener asks for reaches the sender
 without loss or delay.
 
-    python -m skytether.lab.heartbeats --hours 100
+    python -m skytether.lab.benchmarks.heartbeats --hours 100
 """
 
 import sys
