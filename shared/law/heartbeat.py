@@ -27,7 +27,7 @@ ROOM = 0.95
 """Share of the time-out within which n heartbeats are counted."""
 WINDOW = 128
 """Newest packets of the other end of which it is known whether they came."""
-ASSUMED, WEIGHT = 0.3, 6
+ASSUMED, WEIGHT = 0.3, 4
 """Share lost that is assumed at first, and for how many packets that counts, always."""
 SILENCE_MS_MAX = 2**16 - 1
 """Longest silence that can be asked for [ms]."""
