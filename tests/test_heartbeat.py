@@ -67,7 +67,7 @@ def test_a_lossier_link_is_asked_for_more(loss: float, period_s: float) -> None:
 
 
 def test_a_new_session_assumes_a_loss_of_three_in_ten() -> None:
-    """And unlearns that with what comes; late, doubled and missing packets count as they are."""
+    """It unlearns that with what comes; late, doubled and missing packets count as they are."""
     hearing = ear()
     assert hearing.loss == ASSUMED
     assert hearing.silence_ns == 150 * MILLISECOND_NS - DT_NS // 2
