@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skytether.shared.law import rule, spline
-from skytether.shared.law.model import Array
+from skytether.shared.law.model import Array, advance
 from skytether.shared.law.rule import Held, bounded, lasting, late_max
 from skytether.shared.law.spline import Guide, along
 from skytether.shared.law.terms import Terms
@@ -68,6 +68,8 @@ class Compensator:
         self._length = 0
         """Number of stages for which the horizon is flown."""
         self._hold([[0.0]] * terms.axes, 1)
+        self._chosen = 0
+        """Step chosen for last."""
         self.told = [0.0] * terms.axes
         """What is flown at the step chosen for last but for the feedback, of each axis [m/s]."""
         self.in_force = NO_HORIZON
@@ -236,6 +238,7 @@ class Compensator:
         """
         if self._new:
             self.since, self._new = step, False
+        self._chosen = step
         stage = step - self._begins
         self.covered = self.in_force != NO_HORIZON and stage < self._length
         if self._guides:
@@ -259,6 +262,26 @@ class Compensator:
         self._lead_stage = stage
         self.told = [told for _, told in flown]
         return [u for u, _ in flown]
+
+    def foresee(
+        self, states: Sequence[tuple[float, float]], flown: Sequence[float] | None = None
+    ) -> list[tuple[float, float]]:
+        """State of each axis a step after the one chosen for last, as the server foresees it.
+
+        Args:
+            states: position [m] and velocity [m/s] of each axis at that step.
+            flown: input flown there [m/s]; None for what the rule of flight makes of the states.
+        """
+        stage = self._chosen - self._begins
+        if self._guides:  # what the wind does is flown off
+            led = zip(self._guides, self._lead, states, strict=True)
+            told = [spline.follow(guide, stage, *lead, *x, 0.0)[0] for guide, lead, x in led]
+            return [advance(m, *x, u) for m, x, u in zip(self._model, states, told, strict=True)]
+        if flown is None:
+            axes = zip(self._held, self._lead, states, strict=True)
+            flown = [rule.step(held, stage, *lead, *x)[0] for held, lead, x in axes]
+        flying = zip(self._held, states, flown, strict=True)
+        return [advance(held.model, p, v, u + held.disturbance) for held, (p, v), u in flying]
 
     @property
     def feeds_back(self) -> bool:

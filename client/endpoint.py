@@ -82,6 +82,7 @@ class Client(Endpoint):
             server=server,
             connect_s=scenario.link.connect_s,
             link=link or PlainLink(),
+            hearing=scenario.link.hearing(terms.dt_ns),
             failsafe=self._failsafe,
             out=self._out,
             events=self._events,
@@ -195,9 +196,10 @@ class Client(Endpoint):
         if pilot.step >= pilot.steps:
             self._end(now_ns)
         assert session.number is not None
-        observation = pilot.observation(session.number, session.echo)
+        observation = pilot.observation(session.number, session.echo, session.asked_ms)
         if observation is not None:
-            session.send(observation)
+            silence_ms = session.hearing.silence_ms
+            session.send(observation._replace(number=session.said, silence_ms=silence_ms))
 
     def _end(self, now_ns: int) -> None:
         """Say how the flight ended, and see the vehicle down."""

@@ -16,6 +16,7 @@ from skytether.client.compensator import Compensator
 from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe
 from skytether.client.fence import Fence
 from skytether.client.navigation import Navigation
+from skytether.client.reporting import Reporter
 from skytether.client.vehicle import Vehicle
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.gain import feedback_gain
@@ -71,6 +72,7 @@ class Pilot:
         gain = feedback_gain(scenario) if self._terms.splines else None
         self.compensator = Compensator(self._terms, gain)
         """What chooses the input."""
+        self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
         self._fence = Fence(scenario) if scenario.fence.is_there else None
         self._change_max = (
             math.inf
@@ -255,15 +257,21 @@ class Pilot:
 
     # -- what is told of a step --------------------------------------------------------------
 
-    def observation(self, session: int, echo: tuple[int, int]) -> Observation | None:
-        """Observation of the step that has just begun; None where the state is none.
+    def observation(
+        self, session: int, echo: tuple[int, int], silence_ms: int
+    ) -> Observation | None:
+        """Observation of the step that has just begun; None where none is due, or no state known.
 
         Args:
             session: number of the session.
             echo: newest stamp of the server [server's clock], and when it came.
+            silence_ms: longest silence that the server asks for [ms]; 0 for none.
         """
         failsafe, compensator = self._failsafe, self.compensator
-        if not self._navigation.is_known:
+        states, flown = self._navigation.predicted, self._input.tolist()
+        if not self._navigation.is_known or not self._reporter.is_due(
+            session, self.flown, failsafe.mode, states, flown, silence_ms
+        ):
             return None
         server_ns, received_ns = echo
         return Observation(

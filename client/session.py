@@ -14,6 +14,7 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused
 from skytether.shared.core.steady import JUMP_NS
+from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
@@ -59,6 +60,7 @@ class ServerSession:
         server: address of the server, or of the netem before it.
         connect_s: time after which a vehicle that was never answered gives up [s].
         link: how messages become datagrams.
+        hearing: finds what silence to ask of the server.
         failsafe: is told what is heard.
         out: takes what is sent.
         events: takes what the operator is told.
@@ -73,6 +75,7 @@ class ServerSession:
         server: Address,
         connect_s: float,
         link: ClientLink,
+        hearing: Hearing,
         failsafe: Failsafe,
         out: list[Datagram],
         events: Events,
@@ -84,6 +87,12 @@ class ServerSession:
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         """How messages become datagrams."""
+        self.hearing = hearing
+        """What silence is asked of the server."""
+        self.asked_ms = hearing.silence_ms
+        """Longest silence that the server asks of us [ms]; 0 for none."""
+        self.said = 0
+        """Number of packets said in the session."""
         self._failsafe = failsafe
         self._out = out
         self._events = events
@@ -168,6 +177,9 @@ class ServerSession:
         restarted = self._server_boot_id not in (None, welcome.server_boot_id)
         if restarted:
             self.echo = NEVER
+        if self.number != welcome.session:
+            self.said = 0
+            self.hearing.begin()
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
@@ -204,6 +216,9 @@ class ServerSession:
             self._failsafe.meet(Reason.STALLED, now_ns=now_ns)
         self._failsafe.heard(now_ns=now_ns)
         self.echo = (message.server_ns, now_ns)
+        if not isinstance(message, Welcome):
+            self.asked_ms = message.silence_ms
+            self.hearing.hear(message.number)
 
     # -- what is said ------------------------------------------------------------------------
 
@@ -223,6 +238,7 @@ class ServerSession:
 
     def send(self, message: Observation | Close) -> None:
         """Say something in the session."""
+        self.said += 1
         self._out.append(Datagram(self.link.seal(encode(message)), self._server))
 
     def close(self) -> None:

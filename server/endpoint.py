@@ -6,6 +6,7 @@ with `control`. Here they are put together.
 
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,12 @@ class Server(Endpoint):
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, terms.dt_ns)
         self.controller = Controller(scenario, terms, room, self._clock, self.stopwatch, references)
-        self.sessions = Sessions(room, entropy, seconds_to_ns(scenario.link.timeout_s))
+        self.sessions = Sessions(
+            room,
+            entropy,
+            seconds_to_ns(scenario.link.timeout_s),
+            partial(scenario.link.hearing, terms.dt_ns),
+        )
         """Who flies."""
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(

@@ -12,7 +12,7 @@ from skytether.server.gate import Call, Gate
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
     Event,
@@ -204,7 +204,8 @@ class Reception:
         session.doubted = False
         if verdict == ANEW:
             self._anew(row)
-        session.heard_ns = now_ns
+        session.heard_ns, session.asked_ns = now_ns, observation.silence_ms * MILLISECOND_NS
+        session.hearing.hear(observation.number)
         self.observations += 1
         self._clock.observe(row, forward_ns, backward_ns, echo_ns=echo_ns, now_ns=now_ns)
         if not self._controller.observe(row, observation):

@@ -18,6 +18,7 @@ import numpy as np
 from skytether.server.gate import Line
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.model import Indices
 from skytether.shared.wire.protocol import Drop, Hello, Observation, ProtocolError
 
@@ -43,6 +44,8 @@ class Session:
     """Where its newest observation came from."""
     line: Line
     """Way to answer it."""
+    hearing: Hearing
+    """What silence is asked of it."""
     row: int = -1
     """Where its numbers lie in every array; -1 until its first observation."""
     observed_ns: int = -1
@@ -55,6 +58,10 @@ class Session:
     """Whether its newest observation was not believed."""
     stale: int = 0
     """Number of observations that came after a newer one."""
+    asked_ns: int = 0
+    """Longest silence that it asks of us [ns]; 0 for none."""
+    said: int = 0
+    """Number of packets said in the session."""
 
     def sealed(self, payload: bytes) -> Sequence[Datagram]:
         """Datagram that brings the vehicle a message; one each where it may be in two places.
@@ -75,9 +82,17 @@ class Sessions:
         room: vehicles at once.
         entropy: makes so many random bytes, of which the numbers of sessions are made.
         silence_ns: time after which a vehicle that is not heard may be taken for gone [ns].
+        hearing: makes an ear for each session.
     """
 
-    def __init__(self, room: int, entropy: Callable[[int], bytes], silence_ns: int) -> None:
+    def __init__(
+        self,
+        room: int,
+        entropy: Callable[[int], bytes],
+        silence_ns: int,
+        hearing: Callable[[], Hearing],
+    ) -> None:
+        self._hearing = hearing
         self._entropy = entropy
         self._silence_ns = silence_ns
         self._live: dict[int, Session] = {}
@@ -146,7 +161,8 @@ class Sessions:
         waiting = self._waiting(hello.vehicle)
         session = waiting.pop(hello.vehicle, None)
         if session is None or session.boot_id != hello.boot_id:
-            session = Session(hello.vehicle, self._number(), hello.boot_id, address, address, line)
+            number, hearing = self._number(), self._hearing()
+            session = Session(hello.vehicle, number, hello.boot_id, address, address, line, hearing)
         session.home, session.heard_ns = address, now_ns
         if waiting is self.coming and len(waiting) == len(self._free_rows):
             self.coming.popitem(last=False)

@@ -12,7 +12,7 @@ from skytether.server.control.clock import ClockMap
 from skytether.server.control.controller import BLOCK, Controller, Decisions
 from skytether.server.control.scheme import in_a_row
 from skytether.server.sessions import Sessions
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
 from skytether.shared.core.events import Degraded, Fault, PlanningResumed, PlanningStopped
 from skytether.shared.core.stopwatch import Stopwatch
@@ -119,7 +119,6 @@ class Ticker:
         plans: Recorder | None,
     ) -> None:
         self._terms = terms
-        self._heartbeat_ns = seconds_to_ns(terms.heartbeat_s)
         self._sessions = sessions
         self._clock = clock
         self._controller = controller
@@ -196,8 +195,11 @@ class Ticker:
                 session.observed_ns,
                 inputs[begin:end],
                 feedback[i * told : (i + 1) * told],
+                session.said,
+                session.hearing.silence_ms,
             )
             session.sent_ns, begin = now_ns, end
+            session.said += 1
             self._out += session.sealed(payload)
 
     def _send_trajectories(self, decisions: Decisions, now_ns: int) -> None:
@@ -207,18 +209,37 @@ class Ticker:
         columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
         for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
             session, knots = self._sessions.at(row), told.knots[i, :, : 2 * n].reshape(axes, n, 2)
-            message = Trajectory(session.vehicle, session.number, k, now_ns, o, spacing, knots)
+            message = Trajectory(
+                session.vehicle,
+                session.number,
+                k,
+                now_ns,
+                o,
+                spacing,
+                knots,
+                session.said,
+                session.hearing.silence_ms,
+            )
             session.sent_ns = now_ns
+            session.said += 1
             self._out += session.sealed(encode(message))
 
     def _send_heartbeats(self, now_ns: int) -> None:
-        """Let vehicles that were sent nothing for a while know that the server lives."""
+        """Say that the server lives to vehicles that it sent nothing for as long as they ask."""
         for session in self._sessions:
-            if now_ns - session.sent_ns >= self._heartbeat_ns:
-                session.sent_ns = now_ns
+            if 0 < session.asked_ns <= now_ns - session.sent_ns:
                 idle = int(self._sessions.idle[session.row])
-                degraded = int(self._grid.degraded)
-                beat = Heartbeat(session.vehicle, session.number, now_ns, idle, degraded)
+                beat = Heartbeat(
+                    session.vehicle,
+                    session.number,
+                    now_ns,
+                    idle,
+                    int(self._grid.degraded),
+                    session.said,
+                    session.hearing.silence_ms,
+                )
+                session.sent_ns = now_ns
+                session.said += 1
                 self._out += session.sealed(encode(beat))
 
     def _record(self, decisions: Decisions) -> None:

@@ -31,6 +31,7 @@ reorders and loses their packets.
   set PATH KEY=VALUE    change something while it flies, at a process with --control
   scenarios             what can be flown
   triggers              policies for control.trigger, a sentence each
+  reports               policies for vehicle.report, a sentence each
   references            shapes for reference.shape, a sentence each
   vehicles              what may fly, for vehicle.kind, a sentence each
   keygen FILE           keys for vehicles, so that nobody else can fly them
@@ -82,6 +83,7 @@ COMMANDS = {
     "set": "skytether.cli.set:set_keys",
     "scenarios": "skytether.__main__:list_scenarios",
     "triggers": "skytether.cli.names:triggers",
+    "reports": "skytether.cli.names:reports",
     "references": "skytether.cli.names:references",
     "vehicles": "skytether.cli.names:vehicles",
     "keygen": "skytether.cli.keygen:keygen",

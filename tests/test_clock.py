@@ -198,6 +198,16 @@ def test_change_that_differs_between_directions_is_no_stepped_clock() -> None:
     assert after_change(100 * MS, 750 * MS, before=before, since=20) == 425 * MS
 
 
+@pytest.mark.parametrize("every", [7, 10])
+def test_the_step_of_a_clock_is_found_of_a_quiet_vehicle(every: int) -> None:
+    """Two or three packets a second: what is recent reaches back to hold five, and no further."""
+    clock = ClockMap(1, DT_NS)
+    quiet = list(times(0, 10))[::every]
+    listen(clock, quiet, lambda _: 0)
+    errors = listen(clock, list(times(10, 20))[::every], lambda _: HOUR)
+    assert set(errors[30 * 2 // every * 2 :]) == {0}
+
+
 @pytest.mark.parametrize("before_s", [10, 30])
 def test_four_packets_are_too_few_to_tell_a_stepped_clock(before_s: int) -> None:
     """Five are enough, also where the ring has come round."""

@@ -302,7 +302,7 @@ def test_the_protocols_table_states_the_limits() -> None:
     text = (ROOT / "docs" / "protocol.md").read_text()
     assert f"at most {PAYLOAD_BYTES_MAX} bytes" in text
     assert (
-        "has 355 bytes and\n8 more for each committed step, an OBSERVATION 99, a HEARTBEAT 20"
+        "has 361 bytes and\n8 more for each committed step, an OBSERVATION 107, a HEARTBEAT 26"
         in text
     )
     assert "rmse_xy" in Summary.__struct_fields__

@@ -177,7 +177,8 @@ def scenario(**sections: Any) -> Scenario:
     """A long flight of the demo at 50 Hz in calm air; sections are laid over."""
     table = reading.to_table(reading.load("demo")) | {"duration": 100.0}
     table["control"] |= {"dt": 0.02, "horizon": H, "feedback": False}
-    table["vehicle"] |= {"wind": 0.0, "land_after_s": 10.0}
+    table["vehicle"] |= {"wind": 0.0, "land_after_s": 10.0, "report": "always"}
+    table["link"] |= {"heartbeat_s": 0.1, "timeout_s": 1.0}
     for section, values in sections.items():
         table[section] |= values
     return reading.check(table, "test")

@@ -22,6 +22,7 @@ def scenario(**sections: Any) -> Scenario:
     table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
     quick = {"delay": "constant", "minimum_s": 0.2, "loss": 0.0}
     table["network"] = {"uplink": quick, "downlink": quick}
+    table["link"] |= {"heartbeat_s": 0.1, "timeout_s": 1.0}
     for section, values in sections.items():
         table[section] |= values
     return reading.check(table, "test")

@@ -435,7 +435,8 @@ def steps_of(flown: Scenario, awake: Iterable[int]) -> tuple[Rows, list[Observat
 
 def test_the_filter_goes_on_through_a_sleep() -> None:
     """Each step that was slept through is gone through afterwards, with its input."""
-    flown = scenario(sensor=POSITIONS, vehicle={"wind": 0.0, "exhausted": "hold"})
+    vehicle = {"wind": 0.0, "exhausted": "hold", "report": "always"}
+    flown = scenario(sensor=POSITIONS, vehicle=vehicle)
     awake, _ = steps_of(flown, range(2, 16))
     asleep, told = steps_of(flown, (2, 14, 15))
     assert asleep["step"].tolist() == [0, 1, 2, 14, 15]

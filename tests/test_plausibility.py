@@ -300,8 +300,11 @@ def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit:
 
 
 def scenario(**changes: Any) -> Scenario:
-    """The demo, with some keys changed."""
-    return reading.check(reading.to_table(reading.load("demo")) | changes, "test")
+    """The demo, told of at every step, with some keys changed."""
+    table = reading.to_table(reading.load("demo"))
+    table["vehicle"]["report"] = "always"
+    table["link"] |= {"heartbeat_s": 0.1, "timeout_s": 1.0}
+    return reading.check(table | changes, "test")
 
 
 def flipped(share: float) -> list[Record]:

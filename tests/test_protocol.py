@@ -16,6 +16,7 @@ from skytether.shared.wire import protocol
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     INPUTS_MAX,
+    NO_FEEDBACK,
     NO_HORIZON,
     PAYLOAD_BYTES_MAX,
     TEXT_MAX,
@@ -64,7 +65,6 @@ terms = st.builds(
     scheme=text,
     exhausted=text,
     brake_mps2=positive,
-    heartbeat_s=positive,
     age_max_s=positive,
     shape=text,
     radius_m=positive,
@@ -95,6 +95,8 @@ messages: st.SearchStrategy[Message] = st.one_of(
         st.integers(0, 1),
         arrays("<f8", (2, 2), elements=st.floats(allow_nan=False, allow_infinity=False)),
         arrays("<f8", 2, elements=st.floats(-1.8, 1.8)),
+        u32,
+        u16,
     ),
     st.builds(
         Horizon,
@@ -113,8 +115,10 @@ messages: st.SearchStrategy[Message] = st.one_of(
             st.tuples(st.just(2), st.sampled_from([0, FEEDBACK])),
             elements=st.floats(allow_nan=False, allow_infinity=False, width=32),
         ),
+        u32,
+        u16,
     ),
-    st.builds(Heartbeat, u16, u32, stamp, st.sampled_from(Idle), st.integers(0, 1)),
+    st.builds(Heartbeat, u16, u32, stamp, st.sampled_from(Idle), st.integers(0, 1), u32, u16),
     st.builds(Close, u16, u32),
 )
 trajectories = st.builds(
@@ -130,6 +134,8 @@ trajectories = st.builds(
         st.tuples(st.just(2), st.integers(1, 16), st.just(2)),
         elements=st.floats(allow_nan=False, allow_infinity=False, width=32),
     ),
+    u32,
+    u16,
 )
 
 
@@ -165,6 +171,8 @@ def test_the_longest_horizon_fits_one_datagram(axes: int) -> None:
         2**63 - 1,
         np.ones((axes, longest), np.float32),
         np.ones((axes, FEEDBACK), np.float32),
+        2**32 - 1,
+        2**16 - 1,
     )
     assert len(encode(horizon)) <= PAYLOAD_BYTES_MAX
 
@@ -174,15 +182,17 @@ def test_documented_sizes_are_the_real_ones() -> None:
     inputs = np.zeros((2, 40), np.float32)
     state = np.zeros((2, 2))
     stamp_ns, session = 3 * 10**14, 2**31
-    assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs))) == 355
+    asked = {"number": 500, "silence_ms": 300}
+    none = NO_FEEDBACK
+    assert len(encode(Horizon(1, session, 500, stamp_ns, stamp_ns, inputs, none, **asked))) == 361
     committed = np.zeros((2, 51), np.float32)
-    committing = Horizon(1, session, 500, stamp_ns, stamp_ns, committed)
-    assert len(encode(committing)) == 355 + 11 * 8
+    committing = Horizon(1, session, 500, stamp_ns, stamp_ns, committed, none, **asked)
+    assert len(encode(committing)) == 361 + 11 * 8
     aboard = np.zeros((2, FEEDBACK), np.float32)
-    assert len(encode(committing._replace(feedback=aboard))) == 355 + 11 * 8 + 40
+    assert len(encode(committing._replace(feedback=aboard))) == 361 + 11 * 8 + 40
     told = 480, 490, stamp_ns, stamp_ns, Mode.TRACK, 1, state, np.zeros(2)
-    assert len(encode(Observation(1, session, 500, stamp_ns, *told))) == 99
-    assert len(encode(Heartbeat(1, session, stamp_ns, Idle.DELAY, 0))) == 20
+    assert len(encode(Observation(1, session, 500, stamp_ns, *told, **asked))) == 107
+    assert len(encode(Heartbeat(1, session, stamp_ns, Idle.DELAY, 0, **asked))) == 26
     assert len(encode(Close(1, session))) == 9
 
 
@@ -191,10 +201,10 @@ def test_a_horizon_made_of_bytes_is_the_message() -> None:
     inputs = np.arange(84, dtype=np.float32).reshape(2, 42) / 84
     for count in (0, FEEDBACK):
         feedback = np.ones((2, count), np.float32)
-        horizon = Horizon(1, 2**31, 500, 10**15, 10**14, inputs, feedback)
-        *fields, _, _ = horizon
+        horizon = Horizon(1, 2**31, 500, 10**15, 10**14, inputs, feedback, 7, 300)
+        *fields, _, _, number, silence_ms = horizon
         bytes_of = (array.ravel().data.cast("B") for array in (inputs, feedback))
-        assert encode_horizon(*fields, *bytes_of) == encode(horizon)
+        assert encode_horizon(*fields, *bytes_of, number, silence_ms) == encode(horizon)
 
 
 def body(message: Message) -> list[object]:

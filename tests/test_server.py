@@ -2,6 +2,7 @@
 
 import io
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from skytether.shared.core.events import (
     SessionRefused,
     Unauthenticated,
 )
+from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -129,6 +131,8 @@ class Vehicles:
             takes=1,
             state=np.array(state),
             input=np.zeros(2),
+            number=step,
+            silence_ms=1000,
         )
         assert self.say(observation, sender) == []
 
@@ -455,7 +459,7 @@ def test_a_silent_server_sends_heartbeats() -> None:
         sent += [message for message, _ in vehicles.tick()]
     assert isinstance(sent[0], Horizon)
     heartbeats = sent[1:]
-    # The paper's scenario asks for one a second, and a step is 50 ms.
+    # The vehicle asks for one a second, and a step is 50 ms.
     assert [type(message) for message in heartbeats] == [Heartbeat] * 3
     assert {message.session for message in heartbeats} == {welcome.session}
 
@@ -545,7 +549,8 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
     moves: list[tuple[str, int, int]],
 ) -> None:
     """Any vehicles, lives and waits: never more than there is room for, and never a crash."""
-    sessions, now_ns = Sessions(3, stream(1, "entropy").bytes, SILENCE_NS), DAY_NS
+    ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
+    sessions, now_ns = Sessions(3, stream(1, "entropy").bytes, SILENCE_NS, ear), DAY_NS
     terms = scenario().terms()
     numbers: dict[tuple[int, int], int] = {}
     due: dict[int, tuple[int, int]] = {}

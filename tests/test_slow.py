@@ -47,7 +47,7 @@ def scenario(
     """A figure eight in calm air at TIGHT weights over constant delays; sections are laid over."""
     table = reading.to_table(reading.load("demo")) | {"duration": duration}
     table["control"] |= TIGHT
-    table["vehicle"]["wind"] = 0.0
+    table["vehicle"] |= {"wind": 0.0, "report": "always"}
     for direction, delay_s in (("uplink", uplink_s), ("downlink", downlink_s)):
         table["network"][direction] |= {"delay": "constant", "minimum_s": delay_s}
     for section, values in sections.items():

@@ -49,6 +49,8 @@ OTHER: dict[str, Any] = {
     "reference.points_m": [[0.0, 0.0], [2.0, 0.0]],
     "reference.loop": True,
     "vehicle.kind": "quadrotor",
+    "vehicle.report": "deviation(0.1)",
+    "link.heartbeat_s": 0.2,
     "vehicle.address": "tcp:127.0.0.1:5760",
     "vehicle.frame": "crazyflie",
     "vehicle.battery": 0.5,

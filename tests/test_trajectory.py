@@ -418,12 +418,13 @@ def message(step: int, knots: Floats, *, age: int = 9, spacing: int = 5) -> Traj
 @pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("count", [1, 9, KNOTS_MAX])
 def test_a_packet_is_small(axes: int, count: int) -> None:
-    """At most 40 bytes, and 8 for each knot and axis."""
+    """34 bytes as a rule, 48 at most, and 8 for each knot and axis."""
     knots = np.zeros((axes, count, 2), np.float32)
     longest = message(2**40, knots, age=2**32 - 1, spacing=2**16 - 1)
-    assert len(encode(longest)) <= 40 + 8 * axes * count
-    usual = Trajectory(1, 2**32 - 1, 1200, 2**47, 12, 8, knots)
-    assert len(encode(usual)) <= 28 + 8 * axes * count
+    longest = longest._replace(number=2**32 - 1, silence_ms=2**16 - 1)
+    assert len(encode(longest)) <= 48 + 8 * axes * count
+    usual = Trajectory(1, 2**32 - 1, 1200, 2**47, 12, 8, knots, 300, 300)
+    assert len(encode(usual)) <= 34 + 8 * axes * count
 
 
 def test_what_is_sent_is_what_is_read() -> None:
@@ -439,7 +440,8 @@ def test_what_is_sent_is_what_is_read() -> None:
 def wire(**fields: Any) -> bytes:
     """The datagram of a TRAJECTORY of two knots with other fields."""
     usual = {"spacing": 5, "age": 3, "knots": np.ones(8, np.float32)} | fields
-    packed = [VERSION, 7, 1, 2, 5, 9, usual["age"], usual["spacing"], bytes(usual["knots"].data)]
+    knots = bytes(usual["knots"].data)
+    packed = [VERSION, 7, 1, 2, 5, 9, usual["age"], usual["spacing"], knots, 4, 300]
     datagram: bytes = msgpack.packb(packed)
     return datagram
 
@@ -472,7 +474,7 @@ def test_each_scheme_takes_its_own_messages_alone() -> None:
     """A plan is no trajectory, and a trajectory no plan."""
     splines, plans = scenario().terms(), scenario().terms()._replace(scheme="committed")
     inputs = bytes(8 * plans.horizon)
-    plan = msgpack.packb([VERSION, 4, 1, 2, 5, 9, 9, inputs, b""])
+    plan = msgpack.packb([VERSION, 4, 1, 2, 5, 9, 9, inputs, b"", 4, 300])
     decode(plan, plans)
     for datagram, terms in ((plan, splines), (wire(), plans)):
         with pytest.raises(ProtocolError, match=r"^type$"):

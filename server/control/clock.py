@@ -23,7 +23,8 @@ BUCKET_NS = SECOND_NS // 2
 BUCKETS = 40
 """Half seconds for which minima are kept: 20 s."""
 RECENT = 3
-"""Half seconds that are recent, where a step of a clock is looked for."""
+"""Half seconds that are recent, where a step of a clock is looked for; more, up to OLD, of a
+vehicle that says so little that they would hold fewer than STEP_SAMPLES."""
 OLD = 8
 """Half seconds after which minima are old enough to compare the recent ones with."""
 STEP_SAMPLES = 5
@@ -157,12 +158,12 @@ def _observe(seen: Seen, row: int, forward: int, backward: int, echo: int, bucke
 
 
 @part
-def _change(minimum: I1, newest: int) -> int:
-    """Smallest delay of the last 1.5 s, less that of what is older than 4 s [ns]."""
+def _change(minimum: I1, newest: int, recently: int) -> int:
+    """Smallest delay of what is recent, less that of what is older than 4 s [ns]."""
     recent, old = UNSEEN, UNSEEN
     for age in range(BUCKETS):
         value = minimum[(newest - age) % BUCKETS]
-        if age < RECENT:
+        if age < recently:
             recent = min(recent, value)
         elif age >= OLD:
             old = min(old, value)
@@ -172,20 +173,20 @@ def _change(minimum: I1, newest: int) -> int:
 @part
 def _drop_stepped(seen: Seen, row: int) -> None:
     """Keep only what came since, where one of a vehicle's two clocks has stepped."""
-    recent, old, newest = 0, 0, seen.vehicles[row]["newest"]
+    recent, old, newest, recently = 0, 0, seen.vehicles[row]["newest"], RECENT
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]
-        if age < RECENT:
-            recent += count
+        if age < RECENT or (age < OLD and recent < STEP_SAMPLES):
+            recent, recently = recent + count, age + 1
         elif age >= OLD:
             old += count
     if min(recent, old) < STEP_SAMPLES:
         return
-    forward = _change(seen.minimum[row, 0], newest)
-    backward = _change(seen.minimum[row, 1], newest)
+    forward = _change(seen.minimum[row, 0], newest, recently)
+    backward = _change(seen.minimum[row, 1], newest, recently)
     large = min(abs(forward), abs(backward)) > STEP_NS
     if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
-        for age in range(RECENT, BUCKETS):
+        for age in range(recently, BUCKETS):
             slot = (newest - age) % BUCKETS
             seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
             seen.samples[row, slot] = 0

@@ -50,8 +50,6 @@ class Terms(NamedTuple):
     """What the vehicle does after a horizon's last input, "hold" or "brake"."""
     brake_mps2: float
     """How fast braking takes the desired velocity to zero [m/s²]."""
-    heartbeat_s: float
-    """Longest silence of the server [s]."""
     age_max_s: float
     """Largest age of the observation behind an input [s]."""
     shape: str

@@ -9,7 +9,7 @@ import numpy as np
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, margins
-from skytether.shared.scenario.registry import REFERENCES, TRIGGERS
+from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.triggers import make_trigger
 from skytether.shared.wire.protocol import INPUTS_MAX
@@ -60,7 +60,7 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
         fit = f"at most {INPUTS_MAX // axes} with {axes} axes, to fit one datagram"
         yield "control.horizon", control.horizon, fit
     link = scenario.link
-    if link.timeout_s <= link.heartbeat_s:
+    if link.heartbeat_s != "auto" and link.timeout_s <= link.heartbeat_s:
         yield "link.timeout_s", link.timeout_s, f"more than link.heartbeat_s = {link.heartbeat_s:g}"
     if vehicle.exhausted == "brake" and vehicle.slew_mps2 < vehicle.brake_mps2:
         least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, for it to brake"
@@ -79,6 +79,7 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
     yield from _no_trigger(control)
+    yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
     if known is None or scenario.reference != known.reference or axes != known.model.axes:
         yield from _no_shape(scenario) or _no_reference(scenario)
     if scenario.fence.is_there:
@@ -131,20 +132,30 @@ def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
 def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
     """Why there can be no such trigger."""
     try:
-        trigger = policies.parse(control.trigger)
-    except policies.PolicyError as error:
-        yield "control.trigger", repr(error.given), error.expected
-        return
-    try:
+        policies.parse(control.trigger)
         make_trigger(control, 1)
+    except policies.PolicyError:
+        pass
     except Exception as error:
         expected = f"a trigger that can be made ({type(error).__name__}: {error})"
         yield "control.trigger", repr(control.trigger), expected
-    for name in (part.name for part in policies.policies(trigger)):
-        schemes = TRIGGERS[name].schemes
+    yield from _no_policies("control.trigger", control.trigger, TRIGGERS, control)
+
+
+def _no_policies(
+    key: str, text: str, table: PluginTable, control: ControlConfig
+) -> Iterator[Contradiction]:
+    """Why a text is no combination of a table's policies, or none for the scheme."""
+    try:
+        expression = policies.parse(text, table)
+    except policies.PolicyError as error:
+        yield key, repr(error.given), error.expected
+        return
+    for name in (part.name for part in policies.policies(expression)):
+        schemes = table[name].schemes
         if schemes and control.scheme not in schemes:
-            expected = " or ".join(map(repr, schemes))
-            yield "control.scheme", repr(control.scheme), f"{expected} with the trigger {name}"
+            expected = f"{' or '.join(map(repr, schemes))} with the {key.split('.')[1]} {name}"
+            yield "control.scheme", repr(control.scheme), expected
 
 
 def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:

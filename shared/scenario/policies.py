@@ -1,4 +1,4 @@
-"""Triggers as a scenario writes them: `cost_gap & budget(5, 2) | silence(1)`.
+"""Triggers and reports as a scenario writes them: `cost_gap & budget(5, 2) | silence(1)`.
 
     trigger := policy | trigger & trigger | trigger "|" trigger | ( trigger )
     policy  := name | name(number, …)
@@ -63,13 +63,13 @@ class Combination:
 Expression = Policy | Combination
 
 
-def parse(text: str) -> Expression:
-    """The trigger that a text describes.
+def parse(text: str, table: PluginTable = TRIGGERS) -> Expression:
+    """The trigger that a text describes, or another combination of a table's policies.
 
     Raises:
         PolicyError: with the part of it that is wrong.
     """
-    return _expression(_tree(text, TRIGGERS), TRIGGERS)
+    return _expression(_tree(text, table), table)
 
 
 def shape(text: str, table: PluginTable) -> Policy:

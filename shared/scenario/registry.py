@@ -216,6 +216,9 @@ TRIGGERS = PluginTable(
 )
 """Policies of `control.trigger`. A function is given a `triggers.Situation` at each step; a class
 the control section and the largest number of vehicles, once. See `shared.scenario.triggers`."""
+REPORTS = PluginTable("report", "reports such as 'deviation(0.05) | silence(1)'", given=1, class_=1)
+"""Policies of `vehicle.report`, given an `observing.Unreported` at each step. See
+`shared.scenario.observing`; no plug-in adds to them."""
 REFERENCES = PluginTable("shape", "a shape such as 'circle', or 'name(1.5)'", given=1, class_=1)
 """Shapes of `reference.shape`, given the `Scenario`. See `shared.scenario.trajectories`."""
 VEHICLES = PluginTable(
@@ -224,4 +227,4 @@ VEHICLES = PluginTable(
 """Vehicles of `vehicle.kind`, given the `Scenario` and the vehicle's number. See
 `client.vehicles`."""
 TABLES = (TRIGGERS, REFERENCES, VEHICLES)
-"""All tables."""
+"""All tables that plug-ins add to."""

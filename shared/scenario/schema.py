@@ -19,6 +19,7 @@ import numpy as np
 from msgspec import Meta
 
 from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import policies
@@ -188,6 +189,8 @@ class VehicleConfig(Section, frozen=True):
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
     """Line to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
     serial:PATH:BAUD."""
+    report: OfVehicle[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "always"
+    """Rule for sending an observation: policies combined with & and |, see `skytether reports`."""
     exhausted: Term[Literal["hold", "brake"]] = "brake"
     """Action at the end of a horizon: hold its last input (the paper), or brake and hover."""
     brake_mps2: Term[Factor] = 2.0
@@ -349,16 +352,22 @@ class NetworkConfig(Section, frozen=True):
 class LinkConfig(Section, frozen=True):
     """Time limits of a session."""
 
-    heartbeat_s: Term[Interval] = 0.1
-    """Longest time between two packets of the server [s]."""
+    heartbeat_s: OfEach[Interval | Literal["auto"]] = "auto"
+    """Longest time between two packets that this end asks of the other [s]; auto: from its
+    `timeout_s` and the share of packets that are lost on the way to it."""
     age_max_s: Term[Annotated[float, Meta(gt=0, le=60)]] = 5.0
     """Largest age of the observation behind an input [s]; beyond it the vehicle brakes and hovers,
     or holds its last input where `vehicle.exhausted` says so."""
-    timeout_s: OfEach[Interval] = 1.0
+    timeout_s: OfEach[Interval] = 2.0
     """Time of silence after which the other end is taken for gone [s]: the vehicle brakes and says
     HELLO again; the server lets another client have the vehicle's number."""
     connect_s: OfVehicle[Interval] = 15.0
     """Time for which the vehicle waits for its first session before it gives up [s]."""
+
+    def hearing(self, dt_ns: int) -> Hearing:
+        """Ear of one end, with steps of dt_ns [ns]."""
+        fixed_ns = None if self.heartbeat_s == "auto" else seconds_to_ns(self.heartbeat_s)
+        return Hearing(seconds_to_ns(self.timeout_s), dt_ns, fixed_ns)
 
 
 class SimulationConfig(Section, frozen=True):
@@ -457,7 +466,6 @@ class Scenario(Section, frozen=True):
             feedback=control.feedback,
             exhausted=vehicle.exhausted,
             brake_mps2=vehicle.brake_mps2,
-            heartbeat_s=self.link.heartbeat_s,
             age_max_s=self.link.age_max_s,
             shape=self._shape(),
             radius_m=reference.radius_m,

@@ -14,6 +14,10 @@ AT_BOUND = 1.0 - 1e-6
 """Share of the bound from which an input is at it: inputs are rounded on the wire."""
 
 
+HEADER_BYTES = 28
+"""Headers of IPv4 and UDP on each packet [B]."""
+
+
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """One vehicle's flight; None is what was not measured or whose part of the record is absent."""
 
@@ -50,6 +54,18 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """UDP payload of all uplink packets [B]."""
     downlink_packets: int | None
     downlink_bytes: int | None
+    uplink_packets_per_s: float | None = None
+    """Packets from the server a second of flight, heartbeats and lost ones among them [1/s]."""
+    uplink_bytes_per_s: float | None = None
+    """Bytes on the line that they take a second, with HEADER_BYTES a packet [B/s]."""
+    downlink_packets_per_s: float | None = None
+    """Packets from the vehicle a second of flight [1/s]."""
+    downlink_bytes_per_s: float | None = None
+    """Bytes on the line that they take a second, with HEADER_BYTES a packet [B/s]."""
+    packets_per_s: float | None = None
+    """Packets both ways a second of flight [1/s]."""
+    bytes_per_s: float | None = None
+    """Bytes on the line both ways a second, with HEADER_BYTES a packet [B/s]."""
     lost: int | None
     """Number of packets that the network lost, both ways."""
     reordered: int | None
@@ -122,10 +138,11 @@ def summarise(
         event_ratio = float(rows["event"].mean()) if len(rows) else None
         solve_ms = rows["solve_ns"][rows["solve_ns"] >= 0] / 1e6
         stale, missed = stale + _last(rows, "stale"), missed + _last(rows, "missed")
+    duration_s = (_last(client, "step") + 1) * scenario.control.dt if len(client) else 0.0
     return Summary(
         scenario=name,
         seed=scenario.seed,
-        duration_s=(_last(client, "step") + 1) * scenario.control.dt if len(client) else 0.0,
+        duration_s=duration_s,
         steps=len(client),
         rmse_x=rmse[0] if rmse else None,
         rmse_y=rmse[1] if rmse else None,
@@ -146,6 +163,7 @@ def summarise(
         uplink_bytes=_bytes(netem, UPLINK),
         downlink_packets=_count(netem, DOWNLINK),
         downlink_bytes=_bytes(netem, DOWNLINK),
+        **_rates(netem, duration_s),
         lost=None if netem is None else int(netem["lost"].sum()),
         reordered=None if netem is None else int(netem["overtaken"].sum()),
         stale=stale,
@@ -224,6 +242,21 @@ def _count(netem: Rows | None, direction: int) -> int | None:
 
 def _bytes(netem: Rows | None, direction: int) -> int | None:
     return None if netem is None else int(netem["bytes"][netem["direction"] == direction].sum())
+
+
+def _rates(netem: Rows | None, duration_s: float) -> dict[str, float]:
+    """Packets and bytes on the line a second, up, down and both ways; none where not measured."""
+    if netem is None or duration_s == 0.0:
+        return {}
+    packets, sizes = {}, {}
+    for name, direction in (("uplink_", UPLINK), ("downlink_", DOWNLINK)):
+        rows = netem[netem["direction"] == direction]
+        packets[name] = len(rows) / duration_s
+        sizes[name] = (int(rows["bytes"].sum()) + HEADER_BYTES * len(rows)) / duration_s
+    packets[""], sizes[""] = sum(packets.values()), sum(sizes.values())
+    return {f"{name}packets_per_s": rate for name, rate in packets.items()} | {
+        f"{name}bytes_per_s": rate for name, rate in sizes.items()
+    }
 
 
 def _mean(values: Array) -> float | None:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 from skytether.shared.wire.channel import VERSION
 from skytether.shared.wire.keys import VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import MESSAGE_BYTES
-from skytether.shared.wire.protocol import Drop, ProtocolError
+from skytether.shared.wire.protocol import Drop, ProtocolError, kind_of
 
 INITIATION, CHALLENGE, RESPONSE = 1, 2, 3
 """Types of the packets."""
@@ -72,14 +72,13 @@ def check_place(message: bytes, *, in_handshake: bool) -> None:
     """Refuse a HELLO or WELCOME in a channel, and any other message in a handshake.
 
     A packet of the handshake may be repeated by others, and what is agreed upon in a channel is no
-    handshake. Each message must begin in msgpack's shortest form, so that it is what it looks like.
+    handshake.
 
     Raises:
         ProtocolError: even the holder of the key must not send it there.
     """
-    array, version, type_ = message[:3] if len(message) >= 3 else bytes(3)
-    is_short = array & 0xF0 == 0x90 and version < 0x80 and type_ < 0x80
-    if not is_short or (type_ in _GREETINGS) != in_handshake:
+    kind = kind_of(message)
+    if kind is None or (kind in _GREETINGS) != in_handshake:
         raise ProtocolError(Drop.OUT_OF_PLACE)
 
 

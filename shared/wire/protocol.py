@@ -8,11 +8,13 @@
 | 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, refusal,      |
 |      |             |         | terms                                                      |
 | 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
-|      |             |         | received_ns, mode, takes, state, input                     |
-| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback    |
-| 5    | HEARTBEAT   | server  | session, server_ns, idle, degraded                         |
+|      |             |         | received_ns, mode, takes, state, input, number, silence_ms |
+| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback,   |
+|      |             |         | number, silence_ms                                         |
+| 5    | HEARTBEAT   | server  | session, server_ns, idle, degraded, number, silence_ms     |
 | 6    | CLOSE       | both    | session                                                    |
-| 7    | TRAJECTORY  | server  | session, step, server_ns, age, spacing, knots              |
+| 7    | TRAJECTORY  | server  | session, step, server_ns, age, spacing, knots, number,     |
+|      |             |         | silence_ms                                                 |
 
 With the scheme "trajectory" TRAJECTORY stands in place of HORIZON.
 
@@ -224,6 +226,10 @@ class Observation(NamedTuple):
     """Position [m] and velocity [m/s]; shape (axes, 2)."""
     input: Array
     """Desired velocity that is flown from `step` on [m/s]; shape (axes,)."""
+    number: int = 0
+    """Number of packets that the vehicle has sent in the session before."""
+    silence_ms: int = 0
+    """Longest silence that the vehicle asks of the server [ms]; 0 where it asks for none."""
 
 
 class Horizon(NamedTuple):
@@ -241,6 +247,10 @@ class Horizon(NamedTuple):
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """What feedback aboard takes, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
     (axes, 0) where the inputs are to be flown as they are."""
+    number: int = 0
+    """Number of packets that the server has sent in the session before."""
+    silence_ms: int = 0
+    """Longest silence that the server asks of the vehicle [ms]; 0 where it asks for none."""
 
 
 class Trajectory(NamedTuple):
@@ -257,6 +267,10 @@ class Trajectory(NamedTuple):
     """Steps from one knot to the next."""
     knots: NDArray[np.float32]
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
+    number: int = 0
+    """Number of packets that the server has sent in the session before."""
+    silence_ms: int = 0
+    """Longest silence that the server asks of the vehicle [ms]; 0 where it asks for none."""
 
 
 class Idle(IntEnum):
@@ -293,6 +307,10 @@ class Heartbeat(NamedTuple):
     """Why no plan is made for the vehicle, one of `Idle`."""
     degraded: int
     """1 if the server sleeps through more of its ticks than it may, else 0."""
+    number: int = 0
+    """Number of packets that the server has sent in the session before."""
+    silence_ms: int = 0
+    """Longest silence that the server asks of the vehicle [ms]; 0 where it asks for none."""
 
 
 class Close(NamedTuple):
@@ -431,13 +449,13 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
         Observation,
         (
             *(_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP),
-            *(range(len(Mode)), _FLAG, _state, _input),
+            *(range(len(Mode)), _FLAG, _state, _input, _U32, _U16),
         ),
     ),
-    (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback)),
-    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG)),
+    (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback, _U32, _U16)),
+    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG, _U32, _U16)),
     (Close, (_U16, _U32)),
-    (Trajectory, (_U16, _U32, _STEP, _STAMP, _AGE, _SPACING, _knots)),
+    (Trajectory, (_U16, _U32, _STEP, _STAMP, _AGE, _SPACING, _knots, _U32, _U16)),
 )
 """Message of each type number (from 1) and the check of each of its fields."""
 
@@ -460,12 +478,27 @@ def encode_horizon(
     observed_ns: int,
     inputs: memoryview,
     feedback: memoryview,
+    number: int,
+    silence_ms: int,
 ) -> bytes:
     """Datagram of a `Horizon` whose arrays are bytes already, for a server that sends many."""
-    fields = (vehicle, session, step, server_ns, observed_ns, inputs, feedback)
-    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *fields))
+    told = (vehicle, session, step, server_ns, observed_ns, inputs, feedback, number, silence_ms)
+    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *told))
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
+
+
+def kind_of(payload: bytes) -> int | None:
+    """Type number of a message, from its first bytes; None of one that is none of ours.
+
+    Array, version and type must be in msgpack's shortest form, so that it is what it looks like.
+    """
+    array = payload[0] if payload else 0
+    begin = 1 if array & 0xF0 == 0x90 else 3 if array == 0xDC else len(payload)
+    head = payload[begin : begin + 2]
+    if len(head) < 2 or max(head) >= 0x80 or (begin == 3 and payload[1:3] < b"\0\x10"):
+        return None
+    return head[1]
 
 
 def decode(payload: bytes, terms: Terms) -> Message:

@@ -322,6 +322,7 @@ def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
 
 def _show(summary: FleetSummary, title: str) -> None:
     s = summary
+    up, down = s.uplink_packets_per_s, s.downlink_packets_per_s
     rows = [
         ("vehicles, server's workers", f"{s.vehicles}, {s.workers}"),
         ("steps flown, planned for", f"{s.steps}, {s.server_steps} in {s.duration_s:g} s"),
@@ -329,8 +330,8 @@ def _show(summary: FleetSummary, title: str) -> None:
         ("link", "sealed" if s.secure else "plaintext"),
         ("event ratio", f"{s.event_ratio:.3f}"),
         (
-            "uplink, downlink packets/s",
-            f"{s.uplink_packets_per_s:.0f}, {s.downlink_packets_per_s:.0f}",
+            "packets/s up, down, both",
+            ", ".join(f"{rate:.0f}" for rate in (up, down, up + down)),
         ),
         ("lost packets, dropped by accident", f"{s.lost}, {s.dropped}"),
         ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),

@@ -1,4 +1,4 @@
-"""`skytether triggers`, `references` and `vehicles`: what a scenario can name, a sentence each."""
+"""`skytether triggers`, `reports` and so on: what a scenario can name, a sentence each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +26,9 @@ def names(title: str, table: registry.PluginTable, about: str, argv: Sequence[st
 
 triggers = partial(
     names, "triggers", registry.TRIGGERS, "List what control.trigger is made of, a sentence each."
+)
+reports = partial(
+    names, "reports", registry.REPORTS, "List what vehicle.report is made of, a sentence each."
 )
 references = partial(
     names, "references", registry.REFERENCES, "List what reference.shape may be, a sentence each."

@@ -38,6 +38,7 @@ from skytether.shared.wire.protocol import (
     Mode,
     Observation,
     decode,
+    kind_of,
 )
 
 WELCOME, OBSERVATION, HORIZON = 2, 3, 4
@@ -81,7 +82,7 @@ class Ledger:
         if len(self._sealed) > REMEMBERED:
             self._sealed.popitem(last=False)
 
-    def believe(self, vehicle: int, payload: bytes, kind: int) -> None:
+    def believe(self, vehicle: int, payload: bytes, kind: int | None) -> None:
         """Note a message that is believed.
 
         Raises:
@@ -120,7 +121,7 @@ class Gatekeeper:
         if call is None:
             return None
         assert call.vehicle is not None
-        self._down.believe(call.vehicle, call.payload, call.payload[2])
+        self._down.believe(call.vehicle, call.payload, kind_of(call.payload))
         return call._replace(line=_Noted(call.line, call.vehicle, self._life, self._up))
 
     def admit(self, call: Call, *, now_ns: int) -> None:
@@ -291,7 +292,7 @@ class WatchedLife(Recorder):
         payload = self._link.open(datagram, now_ns=now_ns)
         if payload is None:
             return None
-        kind = payload[2]
+        kind = kind_of(payload)
         self._up.believe(self.vehicle, payload, kind)
         life, session = self._up.life(self.vehicle, payload), _session(payload)
         if kind == WELCOME:

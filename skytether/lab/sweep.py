@@ -262,6 +262,8 @@ FIGURES = (
     "uplink_bytes",
     "downlink_packets",
     "downlink_bytes",
+    "packets_per_s",
+    "bytes_per_s",
     "lost",
     "reordered",
     "stale",

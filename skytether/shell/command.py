@@ -647,6 +647,14 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
         ("uplink horizons, other packets", _values("d", *_uplink(s))),
         ("uplink packets, bytes", _values("d", s.uplink_packets, s.uplink_bytes)),
         ("downlink packets, bytes", _values("d", s.downlink_packets, s.downlink_bytes)),
+        (
+            "packets/s up, down, both",
+            _values(".2f", s.uplink_packets_per_s, s.downlink_packets_per_s, s.packets_per_s),
+        ),
+        (
+            "bytes/s with headers up, down, both",
+            _values(".0f", s.uplink_bytes_per_s, s.downlink_bytes_per_s, s.bytes_per_s),
+        ),
         ("lost, reordered packets", _values("d", s.lost, s.reordered)),
         ("stale packets", _values("d", s.stale)),
         ("link", "sealed" if s.secure else "plaintext"),

@@ -348,7 +348,8 @@ class Subscriber:
     def close(self) -> None:
         """Read no more; returns when nothing is called any more."""
         self._closed = True
-        self._waker.send(b"\0")
+        with suppress(OSError):  # the thread has ended by itself
+            self._waker.send(b"\0")
         if threading.current_thread() is not self._thread:
             self._thread.join()
 

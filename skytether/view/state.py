@@ -142,6 +142,8 @@ class VehicleTrack:
         self.sent = 0
         """Number of horizons that it has sent at them."""
         self._plan: np.void | None = None
+        self._seen: np.void | None = None
+        """Newest row of the server's part; None without any."""
 
     # -- what comes in -----------------------------------------------------------------------
 
@@ -169,6 +171,8 @@ class VehicleTrack:
         )
         self.planned += len(rows)
         self.sent += int(rows["event"].sum())
+        if len(rows):
+            self._seen = rows[-1].copy()
 
     def lead(self, rows: Table) -> None:
         """Take rows of the part "plan", of which the newest is shown."""
@@ -215,6 +219,14 @@ class VehicleTrack:
         if self.row is None or self.row["age_ns"] < 0:
             return np.nan
         return float(self.row["age_ns"]) / SECOND_NS
+
+    @property
+    def known_s(self) -> float:
+        """Age of what the server knew of the vehicle when it planned last [s]; NaN for none."""
+        if self._seen is None or self._seen["observed_step"] < 0:
+            return np.nan
+        behind = int(self._seen["step"] - self._seen["observed_step"])
+        return behind * self._scenario.control.dt
 
     def trail(self, seconds: float = SPAN_S) -> Array:
         """True positions of the last seconds, oldest first [m]; NaN in gaps; shape (n, axes)."""

@@ -157,13 +157,14 @@ class RestartVerdict:
 
 
 def scenario() -> Scenario:
-    """The demonstration in still air, on a network of our own, for as long as it takes."""
+    """The demonstration in still air, on a network of our own, with a time-out of 1 s."""
     way = {"delay": "poisson", "minimum_s": 0.03, "slot_s": 0.005, "slots_mean": 1.0, "loss": 0.05}
     return derive(
         "demo",
         duration=7200.0,
-        vehicle={"wind": 0.0},
+        vehicle={"wind": 0.0, "report": "always"},
         network={"uplink": way, "downlink": way},
+        link={"heartbeat_s": 0.1, "timeout_s": 1.0},
     )
 
 

@@ -24,7 +24,7 @@ DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
 SHOWN = {
     "rmse_xy": ("RMSE xy [m]", ".4f"),
     "event_ratio": ("event ratio", ".4f"),
-    "uplink_packets": ("packets up", ".1f"),
+    "packets_per_s": ("packets/s both ways", ".2f"),
 }
 """Figures in the printed table, with their headings and formats."""
 

@@ -22,7 +22,7 @@ from skytether.shared.core.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire import protocol
-from skytether.shared.wire.protocol import ProtocolError, decode, encode
+from skytether.shared.wire.protocol import ProtocolError, decode, encode, kind_of
 from skytether.sim.flight import make_keys
 
 SCENARIOS = (
@@ -155,7 +155,7 @@ class EndpointInFlight(Datagrams):
 
     def _note(self, sender: str, payload: bytes) -> None:  # noqa: ARG002 - see `Strangers`
         if self._keyring is None:
-            self.newest[payload[2]] = payload
+            self.newest[kind_of(payload)] = payload
 
     def _seal(self, end: Endpoint, payload: bytes) -> bytes:
         """Datagram that brings a payload to an end, from the other one where they have keys."""

@@ -1,0 +1,108 @@
+"""When the vehicle reports its state: what the server believes of it, and the rule for saying more.
+
+The server rolls the newest observation on by the rule of flight (`shared.law.rule`). So does the
+vehicle, from the observation that it sent last and by the horizon that it holds. While the two lead
+to about the same, the server knows what it needs, and the vehicle may be silent.
+"""
+
+from collections.abc import Sequence
+from math import hypot
+
+from skytether.client.compensator import Compensator
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.observing import Unreported, make_report
+from skytether.shared.wire.protocol import Mode
+
+States = Sequence[tuple[float, float]]
+"""Position [m] and velocity [m/s] of each axis."""
+
+
+class Belief:
+    """State that the server must take the vehicle to be in, as long as nothing is lost.
+
+    Args:
+        terms: the rule of flight.
+        compensator: holds the horizon.
+    """
+
+    def __init__(self, terms: Terms, compensator: Compensator) -> None:
+        self._tau_s, self._compensator = terms.tau_s, compensator
+        self._states: States = ()
+
+    def off_m(self, states: States) -> float:
+        """How far the vehicle has left it [m].
+
+        A velocity that is off by Δv counts for the τ Δv by which it would lead astray.
+        """
+        axes = zip(self._tau_s, self._states, states, strict=True)
+        return hypot(*((p - q) + tau * (v - w) for tau, (p, v), (q, w) in axes))
+
+    def told(self, states: States, flown: Sequence[float]) -> None:
+        """Go on from an observation to the next step.
+
+        Args:
+            states: what it says.
+            flown: input that is flown from there on, of each axis [m/s].
+        """
+        self._states = self._compensator.foresee(states, flown)
+
+    def silent(self) -> None:
+        """Go on to the next step, at which nothing was said."""
+        self._states = self._compensator.foresee(self._states)
+
+
+class Reporter:
+    """Says at each step whether an observation is sent.
+
+    Args:
+        terms: the rule of flight.
+        report: `vehicle.report`.
+        compensator: holds the horizon; at each step the input has been chosen from it.
+    """
+
+    def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:
+        self._dt_ns, self._dt_s = terms.dt_ns, terms.dt_s
+        self._compensator = compensator
+        self._wants = make_report(report)
+        self._belief = Belief(terms, compensator)
+        self._session: int | None = None
+        """Session in which an observation was sent last; None before the first."""
+        self._known: tuple[int, Mode] | None = None
+        """Horizon in force, and mode, as they were told last."""
+        self._told, self._step = 0, 0
+        """Step that was told last, and the one that was asked about last."""
+
+    def is_due(
+        self,
+        session: int,
+        step: int,
+        mode: Mode,
+        states: States,
+        flown: Sequence[float],
+        silence_ms: int,
+    ) -> bool:
+        """Whether an observation of this step is sent; asked once, and taken for sent where it is.
+
+        Args:
+            session: number of the session.
+            step: k; it has just begun.
+            mode: what the vehicle does.
+            states: what is known of its state.
+            flown: input that is flown from here on, of each axis [m/s].
+            silence_ms: longest silence that the server asks for [ms]; 0 for none.
+        """
+        known, slept = (self._compensator.in_force, mode), step > self._step + 1
+        due = session != self._session
+        if not due:
+            is_news, steps = slept or known != self._known, step - self._told
+            off_m = self._belief.off_m(states)
+            due = 0 < silence_ms * MILLISECOND_NS <= steps * self._dt_ns
+            due |= self._wants(Unreported(off_m, is_news, steps, self._dt_s))
+        self._step = step
+        if due:
+            self._session, self._known, self._told = session, known, step
+            self._belief.told(states, flown)
+        else:
+            self._belief.silent()
+        return due

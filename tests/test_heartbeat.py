@@ -1,0 +1,143 @@
+"""Heartbeats: how long an end may be silent, and what that costs."""
+
+from functools import partial
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import skytether
+from skytether.lab.benchmarks.heartbeats import computed, keep, main
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.law.heartbeat import (
+    ASSUMED,
+    FALSE_PER_H,
+    WEIGHT,
+    WINDOW,
+    Hearing,
+    false_per_h,
+    silences,
+)
+from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.sim.flight import fly
+
+DT_NS = 50 * MILLISECOND_NS
+ear = partial(Hearing, 2 * SECOND_NS, DT_NS, None)
+
+
+@pytest.mark.parametrize(
+    ("timeout_s", "period_s", "loss", "per_h"),
+    [(1.0, 0.1, 0.1, 3.24e-5), (2.0, 0.2, 0.3, 0.248), (2.0, 0.5, 0.1, 6.48), (2.0, 0.3, 0.0, 0)],
+)
+def test_false_losses_are_runs_of_lost_heartbeats(
+    timeout_s: float, period_s: float, loss: float, per_h: float
+) -> None:
+    """3600/T pⁿ (1 - p): n = 9, 9 and 3 fit into 0.95 of the time-out."""
+    found = false_per_h(round(period_s * SECOND_NS), round(timeout_s * SECOND_NS), loss)
+    assert found == pytest.approx(per_h, rel=2e-3)
+
+
+@given(st.integers(200, 10_000), st.integers(5, 200), st.floats(0.0, 1.0))
+def test_what_is_asked_for_meets_the_goal_or_is_the_shortest(
+    timeout_ms: int, step_ms: int, loss: float
+) -> None:
+    """A whole number of steps, from a fifteenth to a third of the time-out where steps allow."""
+    timeout_ns, step_ns = timeout_ms * MILLISECOND_NS, step_ms * MILLISECOND_NS
+    table = silences(timeout_ns, step_ns)
+    times_ns = [ns for _, ns in table]
+    assert times_ns == sorted(set(times_ns), reverse=True)
+    assert all(ns % step_ns == 0 for ns in times_ns)
+    assert times_ns[0] <= max(step_ns, timeout_ns // 3)
+    assert times_ns[-1] >= min(step_ns, timeout_ns // 15)
+    for up_to, silence_ns in table:
+        if loss <= up_to:
+            assert false_per_h(silence_ns, timeout_ns, loss) <= FALSE_PER_H * 1.01
+            break
+
+
+@pytest.mark.parametrize(
+    ("loss", "period_s"), [(0.0, 0.6), (0.05, 0.45), (0.1, 0.35), (0.2, 0.2), (0.3, 0.15)]
+)
+def test_a_lossier_link_is_asked_for_more(loss: float, period_s: float) -> None:
+    """With a time-out of 2 s and steps of 50 ms, once much has been heard."""
+    table = silences(2 * SECOND_NS, DT_NS)
+    found = next(ns for up_to, ns in table if loss + 0.005 * (loss == 0.0) <= up_to)
+    assert found == round(period_s * SECOND_NS)
+
+
+def test_a_new_session_assumes_a_loss_of_three_in_ten() -> None:
+    """It unlearns that with what comes; late, doubled and missing packets count as they are."""
+    hearing = ear()
+    assert hearing.loss == ASSUMED
+    assert hearing.silence_ns == 150 * MILLISECOND_NS - DT_NS // 2
+    for number in (0, 2, 1, 1, 4):
+        hearing.hear(number)
+    assert hearing.loss == pytest.approx((1 + WEIGHT * ASSUMED) / (5 + WEIGHT))
+    for number in range(5, 3 * WINDOW):
+        hearing.hear(number)
+    assert hearing.loss == pytest.approx(WEIGHT * ASSUMED / (WINDOW + WEIGHT))
+    hearing.hear(10 * WINDOW)
+    assert hearing.loss > 0.9
+    hearing.hear(0)
+    assert hearing.loss > 0.9
+    hearing.begin()
+    assert hearing.loss == ASSUMED
+
+
+@given(st.lists(st.integers(0, 500), max_size=60))
+def test_the_share_lost_does_not_depend_on_the_order(numbers: list[int]) -> None:
+    """Within the window, whoever comes first and however often."""
+    heard, sorted_ = ear(), ear()
+    near = [number for number in numbers if number > max(numbers) - WINDOW]
+    for number in near:
+        heard.hear(number)
+    for number in sorted(set(near)):
+        sorted_.hear(number)
+    assert heard.loss == sorted_.loss
+
+
+def test_a_number_that_is_asked_for_is_asked_for_whatever_the_loss() -> None:
+    """`link.heartbeat_s` as a number."""
+    hearing = Hearing(2 * SECOND_NS, DT_NS, SECOND_NS // 4)
+    assert hearing.silence_ms == 250
+    hearing.hear(100)
+    assert hearing.silence_ms == 250
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.3])
+def test_a_link_at_rest_is_rarely_taken_for_lost(loss: float) -> None:
+    """In three hours; where heartbeats do not follow the loss, far more often."""
+    network = DirectionConfig(loss=loss)
+    kept = keep(network, 2.0, None, 18)
+    assert kept.false_per_h <= 0.34
+    assert kept.noticed_s[1] < 2.0 + 0.6
+    assert computed(loss, 2.0, None) <= FALSE_PER_H
+    if loss == 0.3:
+        assert keep(network, 2.0, 0.5, 18).false_per_h > 30.0
+        assert (
+            kept.packets_per_s > 1.5 * keep(DirectionConfig(loss=0.1), 2.0, None, 6).packets_per_s
+        )
+
+
+def test_the_table_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    """A row for each link and network."""
+    main(["--hours", "0.1"])
+    rows = capsys.readouterr().out.splitlines()
+    assert len(rows) == 2 + 4 * 5
+    assert all(row.count("|") == 7 for row in rows)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+def test_a_hover_in_still_air_costs_the_heartbeats_and_no_more(loss: float) -> None:
+    """Both ends settle at what the loss asks for: 1.7 to 4 packets a second each."""
+    calm = {"vehicle.wind": 0.0, "reference.shape": "hover", "reference.points_m": [[0.0, 0.0]]}
+    way = {"network.uplink.loss": loss, "network.downlink.loss": loss}
+    scenario = skytether.load("demo", duration=60, settle=5, **calm, **way)
+    flown = fly(scenario)
+    late = flown.netem[flown.netem["arrived_ns"] > flown.netem["arrived_ns"].max() - 25 * SECOND_NS]
+    most = 2.2 if loss == 0.0 else 4.2
+    for direction in (UPLINK, DOWNLINK):
+        rate = (late["direction"] == direction).sum() / 25.0
+        assert 1.3 < rate < most
+    assert flown.client["covered"][200:].all()
