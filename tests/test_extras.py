@@ -33,6 +33,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "keygen": (),
     "scenarios": (),
     "triggers": (),
+    "reports": (),
     "references": (),
     "vehicles": (),
     "set": (),
@@ -128,7 +129,7 @@ def test_a_command_runs_with_what_it_needs_and_names_what_it_misses(command: str
 
     One command of the laboratory stands for all: their package asks for the extra.
     """
-    lists = command in ("scenarios", "triggers", "references", "vehicles")
+    lists = command in ("scenarios", "triggers", "reports", "references", "vehicles")
     shown = run([command] if lists else [command, "--help"], NEEDS[command])
     assert (shown.returncode, shown.stderr) == (0, "")
     if not NEEDS[command]:
