@@ -129,7 +129,7 @@ def _work(
 
     # Each worker knows sessions of its own.
     gate = SecureGate(keyring, entropy=secrets.token_bytes) if keyring else PlainGate()
-    axes, planned = options.config.model.axes, options.config.terms().planned
+    axes, planned = options.config.model.axes, options.config.control.horizon
     record, columns = own(options.record), server_columns(axes, options.config.control.scheme)
     part = command.part_of(record)
     stopwatch = Stopwatch(time.perf_counter_ns)

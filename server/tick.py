@@ -5,18 +5,22 @@ never caught up with.
 """
 
 from collections import deque
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.controller import BLOCK, Controller, Decisions
-from skytether.server.control.scheme import in_a_row
+from skytether.server.control.scheme import Splines, in_a_row
 from skytether.server.sessions import Sessions
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
 from skytether.shared.core.events import Degraded, Fault, PlanningResumed, PlanningStopped
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
+from skytether.shared.law.rule import bounded
+from skytether.shared.law.spline import along
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
@@ -118,7 +122,7 @@ class Ticker:
         recorder: Recorder | None,
         plans: Recorder | None,
     ) -> None:
-        self._terms = terms
+        self._terms, self._axes = terms, terms.model.axes()
         self._sessions = sessions
         self._clock = clock
         self._controller = controller
@@ -282,20 +286,35 @@ class Ticker:
         told[OWN] = verdict.figure if verdict.compared is Compared.OWN else nothing
         return told
 
+    def _along(self, told: Splines, i: int) -> list[list[float]]:
+        """Inputs ū along the spline of a vehicle of a block, for H stages [m/s]; (axes, H)."""
+        dt_s, spacing = self._terms.dt_s, int(told.spacing[i])
+        knots = told.knots[i, :, : 2 * told.number[i]].tolist()
+        return [
+            [
+                bounded(along(model, each, spacing, dt_s, stage), bound)
+                for stage in range(self._terms.horizon)
+            ]
+            for model, each, bound in zip(self._axes, knots, self._terms.u_max, strict=True)
+        ]
+
     def _record_plans(self, plans: Recorder, decisions: Decisions) -> None:
         sent, found = decisions.sent, decisions.found
         step, ahead = decisions.step[sent], found.ahead[sent]
-        # Behind d committed inputs, another d of each vehicle.
-        stages = ahead[:, None] + np.arange(self._terms.planned)
-        state: Array = found.start[sent]
         if self._terms.splines:
-            state = found.told.knots[sent, :, :2].astype(np.float64)
+            state: Array = found.told.knots[sent, :, :2].astype(np.float64)
+            inputs: NDArray[Any] = np.array([self._along(found.told, i) for i in sent.tolist()])
+        else:
+            # Behind d committed inputs, another d of each vehicle.
+            stages = ahead[:, None] + np.arange(self._terms.planned)
+            state = found.start[sent]
+            inputs = np.take_along_axis(found.horizons[sent], stages[:, None], axis=2)
         plans.append(
             len(sent),
             vehicle=self._sessions.vehicle[decisions.rows[sent]],
             step=step,
             begins=step + ahead,
             state=state,
-            inputs=np.take_along_axis(found.horizons[sent], stages[:, None], axis=2),
+            inputs=inputs,
             disturbance=found.disturbance[sent],
         )

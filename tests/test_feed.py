@@ -26,6 +26,7 @@ from skytether.netem.proxy import Proxy
 from skytether.server import tick
 from skytether.shared.core.change import Running
 from skytether.shared.core.events import Changed, Degraded, Event, Finished
+from skytether.shared.law.spline import along
 from skytether.shared.scenario import reading, schema
 from skytether.shared.telemetry.feed import (
     FRAME_BYTES_MAX,
@@ -662,8 +663,12 @@ def test_the_plans_told_are_those_that_are_sent(
 
     def watched(message: Message) -> bytes:
         if isinstance(message, Trajectory):
-            inputs = message.knots[:, :1, 1].copy()
-            sent.append((message.vehicle, message.step, inputs))
+            dt_s, u_max, each = terms.dt_s, terms.u_max[0], message.knots.reshape(2, -1)
+            inputs = [
+                [along(model, knots, message.spacing, dt_s, i) for i in range(terms.horizon)]
+                for model, knots in zip(terms.model.axes(), each, strict=True)
+            ]
+            sent.append((message.vehicle, message.step, np.clip(inputs, -u_max, u_max)))
         return bytes(encode(message))
 
     monkeypatch.setattr(tick, "encode_horizon", spied)
@@ -676,12 +681,12 @@ def test_the_plans_told_are_those_that_are_sent(
     terms = flown.terms()
     flight_ = flight.fly(flown, vehicles=2)
     plans = flight_.plan
-    assert plans.dtype == plan_columns(2, terms.planned)
+    assert plans.dtype == plan_columns(2, terms.horizon)
     assert len(plans) == len(sent) > 80
     for plan, (vehicle, step, inputs) in zip(plans, sent, strict=True):
-        d = inputs.shape[1] - terms.planned
+        d = inputs.shape[1] - terms.horizon
         assert (plan["vehicle"], plan["step"], plan["begins"]) == (vehicle, step, step + d)
-        np.testing.assert_array_equal(plan["inputs"], inputs[:, d:])
+        np.testing.assert_array_equal(plan["inputs"], inputs[:, d:].astype(np.float32))
     ahead = plans["begins"] - plans["step"]
     assert (ahead.max() > 0) == terms.commits
     assert not plans["disturbance"].any()

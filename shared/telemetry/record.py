@@ -190,11 +190,10 @@ def compared(rows: Rows) -> Array:
 def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
     """Columns of the server's plans: one row for each horizon that it sends.
 
-    With the scheme "trajectory" there is no plan: the state is the first knot, and the one input
-    that which holds its velocity.
+    With the scheme "trajectory" the state is the first knot, and the inputs lead along the spline.
 
     Args:
-        planned: number of its inputs on each axis, see `shared.law.terms.Terms.planned`.
+        planned: number of its inputs on each axis, H.
     """
     return np.dtype(
         [

@@ -325,7 +325,7 @@ def record_of(
             FlightEvent(each.time_ns - zero_ns, each.process, each.event) for each in said
         ),
         incomplete=tuple(each for each in shortfalls if not isinstance(each, NotFlown)),
-        plan=np.empty(0, plan_columns(axes, scenario.terms().planned)),
+        plan=np.empty(0, plan_columns(axes, scenario.control.horizon)),
     )
 
 

@@ -242,7 +242,7 @@ def _no_rows(scenario: Scenario) -> dict[str, Table]:
         "client": np.empty(0, client_columns(axes)),
         "server": np.empty(0, server_columns(axes, scenario.control.scheme)),
         "netem": np.empty(0, PACKET_COLUMNS),
-        "plan": np.empty(0, plan_columns(axes, scenario.terms().planned)),
+        "plan": np.empty(0, plan_columns(axes, scenario.control.horizon)),
     }
 
 

@@ -94,7 +94,7 @@ def fly(
         stopped: asked often; once it says so, the flight is broken off.
     """
     keyring = make_keys(scenario.seed, vehicles) if secure else None
-    columns, sink = plan_columns(scenario.model.axes, scenario.terms().planned), io.BytesIO()
+    columns, sink = plan_columns(scenario.model.axes, scenario.control.horizon), io.BytesIO()
     plans = Recorder(columns, sink)
     (flight,) = _fly(
         scenario,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.law.model import Array, discretise
+from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.record import (
@@ -277,5 +277,4 @@ def planned(scenario: Scenario, row: np.void) -> Array:
         row: row of the part "plan".
     """
     inputs = row["inputs"] + row["disturbance"][:, np.newaxis]
-    model = discretise(scenario.tau_s, scenario.control.dt)
-    return model.roll(row["state"], inputs)[:, :, 0]
+    return scenario.terms().model.roll(row["state"], inputs)[:, :, 0]

@@ -252,7 +252,7 @@ def measure(
 
 def _server(scenario: Scenario, vehicles: int, feed: Feed) -> Server:
     """A server as its process makes it, which records for the feed alone."""
-    axes, planned = scenario.model.axes, scenario.terms().planned
+    axes, planned = scenario.model.axes, scenario.control.horizon
     recorders = {}
     for part, columns in (
         ("server", server_columns(axes, scenario.control.scheme)),
