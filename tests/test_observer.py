@@ -142,6 +142,7 @@ async def test_an_observer_who_can_send_changes_nothing(monkeypatch: pytest.Monk
     monkeypatch.setattr(skytether.shared.wire.channel, "FRESH_NS", 15 * SECOND_NS)
     monkeypatch.setattr(skytether.client.failsafe, "STALL_NS", 60 * SECOND_NS)  # busy machines
     table = reading.to_table(reading.load("demo")) | {"duration": 60.0}
+    table["vehicle"]["report"] = "always"  # much to copy
     flown = reading.check(table, "test")
     alone, attacked = await asyncio.gather(
         fly(flown, attacked=False, restart_s=25.0), fly(flown, attacked=True, restart_s=25.0)

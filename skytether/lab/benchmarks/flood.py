@@ -291,7 +291,9 @@ class _State:
 
 def _fly(kind: str, counts: FloodCounts, lateness: Lateness) -> Flood:
     """One flight, with one kind of flood or none."""
-    flown = derive("demo", duration=counts.lead_s + counts.seconds + AFTER_S, settle=0.0)
+    duration_s = counts.lead_s + counts.seconds + AFTER_S
+    # A report at each step: what is missing has been lost.
+    flown = derive("demo", duration=duration_s, settle=0.0, vehicle={"report": "always"})
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-")))
         lab = Lab(stack, folder, flown, range(1, NEWCOMER + 1))
