@@ -196,10 +196,11 @@ class Client(Endpoint):
         if pilot.step >= pilot.steps:
             self._end(now_ns)
         assert session.number is not None
-        observation = pilot.observation(session.number, session.echo, session.asked_ms)
+        number, echo, said = session.number, session.echo, session.said
+        asks_ms = session.hearing.silence_ms
+        observation = pilot.observation(number, echo, session.asked_ms, said, asks_ms)
         if observation is not None:
-            silence_ms = session.hearing.silence_ms
-            session.send(observation._replace(number=session.said, silence_ms=silence_ms))
+            session.send(observation)
 
     def _end(self, now_ns: int) -> None:
         """Say how the flight ended, and see the vehicle down."""

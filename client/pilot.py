@@ -258,19 +258,21 @@ class Pilot:
     # -- what is told of a step --------------------------------------------------------------
 
     def observation(
-        self, session: int, echo: tuple[int, int], silence_ms: int
+        self, session: int, echo: tuple[int, int], asked_ms: int, number: int, asks_ms: int
     ) -> Observation | None:
         """Observation of the step that has just begun; None where none is due, or no state known.
 
         Args:
             session: number of the session.
             echo: newest stamp of the server [server's clock], and when it came.
-            silence_ms: longest silence that the server asks for [ms]; 0 for none.
+            asked_ms: longest silence that the server asks for [ms]; 0 for none.
+            number: number of packets sent in the session before.
+            asks_ms: longest silence that is asked of the server [ms].
         """
         failsafe, compensator = self._failsafe, self.compensator
         states, flown = self._navigation.predicted, self._input.tolist()
         if not self._navigation.is_known or not self._reporter.is_due(
-            session, self.flown, failsafe.mode, states, flown, silence_ms
+            session, self.flown, failsafe.mode, states, flown, asked_ms
         ):
             return None
         server_ns, received_ns = echo
@@ -285,8 +287,10 @@ class Pilot:
             received_ns,
             failsafe.mode,
             int(failsafe.takes),
-            np.array(self._navigation.predicted),
+            np.array(states),
             self._input,
+            number,
+            asks_ms,
         )
 
     def _record(self) -> None:

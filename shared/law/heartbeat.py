@@ -84,10 +84,12 @@ class Hearing:
         """Which of the newest WINDOW packets came, the newest in the lowest bit."""
         self.newest = -1
         """Largest number of a packet that came; -1 before the first."""
+        self._told_ms = 0
+        """`silence_ms`, once it has been asked for; 0 where it may be another by now."""
 
     def begin(self) -> None:
         """Begin anew with another session."""
-        self._came, self.newest = 0, -1
+        self._came, self.newest, self._told_ms = 0, -1, 0
 
     def hear(self, number: int) -> None:
         """Take the number of a packet that came, in whatever order and however often."""
@@ -97,6 +99,8 @@ class Hearing:
             self.newest = number
         elif -ahead < WINDOW:
             self._came |= 1 << -ahead
+        if self._fixed_ns is None:
+            self._told_ms = 0
 
     @property
     def loss(self) -> float:
@@ -120,4 +124,6 @@ class Hearing:
     @property
     def silence_ms(self) -> int:
         """Longest silence that is asked of the other end, as it is told [ms]."""
-        return min(max(self.silence_ns // MILLISECOND_NS, 1), SILENCE_MS_MAX)
+        if self._told_ms == 0:
+            self._told_ms = min(max(self.silence_ns // MILLISECOND_NS, 1), SILENCE_MS_MAX)
+        return self._told_ms

@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 
 from msgspec import Meta
 
-from skytether.shared.scenario.policies import PERIOD_MAX, Combination, Expression, parse
+from skytether.shared.scenario.policies import PERIOD_MAX, Combination, Expression, Policy, parse
 from skytether.shared.scenario.registry import REPORTS
 
 
@@ -56,6 +56,11 @@ def deviation(now: Unreported, metres: Annotated[float, Meta(ge=0, le=1e9)]) -> 
 def silence(now: Unreported, seconds: Annotated[float, Meta(ge=0.001, le=3600)]) -> bool:
     """Sends after so many seconds without an observation."""
     return now.steps * now.dt_s > seconds - now.dt_s / 2.0
+
+
+def is_always(text: str) -> bool:
+    """Whether a report is at every step, and that is all there is to it."""
+    return parse(text, REPORTS) == Policy("always", ())
 
 
 def make_report(text: str) -> Report:
