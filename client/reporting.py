@@ -18,7 +18,7 @@ States = Sequence[tuple[float, float]]
 """Position [m] and velocity [m/s] of each axis."""
 
 
-class Belief:
+class BelievedState:
     """State that the server must take the vehicle to be in, as long as nothing is lost.
 
     Args:
@@ -66,7 +66,7 @@ class Reporter:
         self._compensator = compensator
         self._always = is_always(report)
         self._wants = make_report(report)
-        self._belief = Belief(terms, compensator)
+        self._belief = BelievedState(terms, compensator)
         self._session: int | None = None
         """Session in which an observation was sent last; None before the first."""
         self._known: tuple[int, Mode] | None = None

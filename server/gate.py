@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from skytether.shared.core.endpoint import Datagram
 
 
-class Line(Protocol):
+class WayBack(Protocol):
     """Way to answer one peer."""
 
     def seal(self, payload: bytes) -> bytes:
@@ -22,7 +22,7 @@ class Call(NamedTuple):
     """The message."""
     vehicle: int | None
     """Number of the vehicle whose key it was sealed with; None where there are no keys."""
-    line: Line
+    line: WayBack
     """Way to answer it."""
     moves: bool
     """Whether nothing newer has come from the vehicle, so that it may have a new address."""
@@ -69,7 +69,7 @@ class _Open:
     """Line without keys."""
 
     def seal(self, payload: bytes) -> bytes:
-        """See `Line`."""
+        """See `WayBack`."""
         return payload
 
 

@@ -15,7 +15,7 @@ from itertools import islice
 
 import numpy as np
 
-from skytether.server.gate import Line
+from skytether.server.gate import WayBack
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import Hearing
@@ -42,7 +42,7 @@ class Session:
     """Where its newest HELLO came from, which has heard from us there."""
     address: Address
     """Where its newest observation came from."""
-    line: Line
+    line: WayBack
     """Way to answer it."""
     hearing: Hearing
     """What silence is asked of it."""
@@ -149,7 +149,7 @@ class Sessions:
         oldest = next(iter(self.coming.values()), None)
         return oldest is None or _is_expected(oldest, now_ns)
 
-    def welcome(self, hello: Hello, address: Address, line: Line, now_ns: int) -> Session:
+    def welcome(self, hello: Hello, address: Address, line: WayBack, now_ns: int) -> Session:
         """The session of the life that says HELLO, a new one or the one it has.
 
         There must be room for it, if only that of a vehicle that was welcomed and did not come.

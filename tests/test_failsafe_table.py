@@ -6,7 +6,7 @@ import pytest
 
 from skytether.autopilot.flavours import FlavourName
 from skytether.lab.benchmarks import failsafe
-from skytether.lab.benchmarks.failsafe import CaseName, Ending, Outcome
+from skytether.lab.benchmarks.failsafe import CaseName, Ending, FaultOutcome
 
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 SILENCE_S = (1.0, 1.6)
@@ -27,7 +27,7 @@ STANDS_S: dict[FlavourName, float] = {"ardupilot": 4.0, "px4": 10.0}
 """Time after which a vehicle stands, unless it flies on [s]."""
 
 
-def flown(case: CaseName, flavour: FlavourName) -> Outcome:
+def flown(case: CaseName, flavour: FlavourName) -> FaultOutcome:
     """One flight with a fault, which is held to what is promised of all of them."""
     outcome = failsafe.fly(case, flavour, 1)
     names, (least_s, most_s), ending = STARTS[case]
@@ -76,7 +76,7 @@ def test_a_row_has_the_spread_of_its_flights() -> None:
     """Times from least to most, largest distances, and both where they went different ways."""
     common = {"autopilot": (), "moved_m": 1.0, "off_path_m": 0.1, "off_reference_m": 2.0}
     outcomes = [
-        Outcome(
+        FaultOutcome(
             "pilot takes over",
             "px4",
             seed,

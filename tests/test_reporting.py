@@ -8,7 +8,7 @@ import pytest
 
 import skytether
 from skytether.client.compensator import Compensator
-from skytether.client.reporting import Belief, Reporter
+from skytether.client.reporting import BelievedState, Reporter
 from skytether.shared.scenario import policies
 from skytether.shared.scenario.observing import Unreported, make_report
 from skytether.shared.scenario.reading import load
@@ -98,7 +98,7 @@ def test_the_belief_is_the_rule_of_flight() -> None:
     compensator = Compensator(terms)
     feedback = np.array([[0.2, 0.1, 0.05, 1.5, 0.5]] * 2, np.float32)
     compensator.offer(horizon(3)._replace(feedback=feedback), 4, 2)
-    belief, x = Belief(terms, compensator), [(0.5, -0.3), (-0.2, 0.4)]
+    belief, x = BelievedState(terms, compensator), [(0.5, -0.3), (-0.2, 0.4)]
     for step in range(4, 40):
         u = np.array(compensator.choose(step, x))
         belief.told(x, u.tolist()) if step == 4 else belief.silent()

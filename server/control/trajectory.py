@@ -80,7 +80,7 @@ follow = shared(spline.follow)
 """The rule of flight along a spline, compiled for kernels."""
 
 
-class Vehicle:
+class Followed:
     """Record: what is known of one vehicle."""
 
     in_force: int
@@ -114,7 +114,7 @@ class Sent:
     """Number of its knots."""
 
 
-VEHICLE, SENT = record(Vehicle), record(Sent)
+VEHICLE, SENT = record(Followed), record(Sent)
 
 
 class Settings(NamedTuple):

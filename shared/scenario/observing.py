@@ -19,7 +19,7 @@ class Unreported(NamedTuple):
 
     off_m: float
     """How far the vehicle has left where the server must believe it, see
-    `client.reporting.Belief` [m]."""
+    `client.reporting.BelievedState` [m]."""
     is_news: bool
     """Whether another horizon has come into force since the newest observation, or another mode."""
     steps: int

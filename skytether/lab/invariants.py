@@ -20,7 +20,7 @@ import numpy as np
 from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
 from skytether.client.link import ClientLink
 from skytether.client.pilot import ALTITUDE, LAND_MPS
-from skytether.server.gate import Call, Gate, Line
+from skytether.server.gate import Call, Gate, WayBack
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram
 from skytether.shared.law.model import Array
@@ -135,16 +135,16 @@ class Gatekeeper:
 
 
 class _Noted:
-    """Line that notes what is sealed."""
+    """Way back that notes what is sealed."""
 
     __slots__ = ("_life", "_up", "_vehicle", "inner")
 
-    def __init__(self, line: Line, vehicle: int, life: int, up: Ledger) -> None:
+    def __init__(self, line: WayBack, vehicle: int, life: int, up: Ledger) -> None:
         self.inner = line
         self._vehicle, self._life, self._up = vehicle, life, up
 
     def seal(self, payload: bytes) -> bytes:
-        """See `Line`."""
+        """See `WayBack`."""
         self._up.seal(self._vehicle, payload, self._life)
         return self.inner.seal(payload)
 

@@ -79,7 +79,7 @@ Changes = tuple[tuple[str, float], ...]
 """Modes in order, and the time at which each began, from the fault on [s]."""
 
 
-class Outcome(NamedTuple):
+class FaultOutcome(NamedTuple):
     """A vehicle after a fault."""
 
     case: CaseName
@@ -199,7 +199,7 @@ class Watched:
         plan_changes(self.world, self.scenario, {"netem": self.netem}, changes)
 
 
-def fly(case: CaseName, flavour: FlavourName, seed: int) -> Outcome:
+def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
     """Fly with a fault, and say what came of it."""
     scenario = scenario_of(flavour, seed)
     watched = Watched(scenario, flavour)
@@ -224,7 +224,7 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> Outcome:
     speeds = np.linalg.norm(rows["state"][seen, :2, 1], axis=1)
     positions = rows["state"][seen, :2, 0]
     still = np.flatnonzero(speeds < STILL_MPS)
-    return Outcome(
+    return FaultOutcome(
         case,
         flavour,
         seed,
@@ -286,7 +286,7 @@ HEADINGS = [
 ]
 
 
-def tables(outcomes: Sequence[Outcome]) -> dict[str, TextTable]:
+def tables(outcomes: Sequence[FaultOutcome]) -> dict[str, TextTable]:
     """A table for each flavour, by its name."""
     made = {}
     for flavour in get_args(FlavourName):
@@ -300,7 +300,7 @@ def tables(outcomes: Sequence[Outcome]) -> dict[str, TextTable]:
     return made
 
 
-def _row(case: CaseName, outcomes: Sequence[Outcome]) -> list[str]:
+def _row(case: CaseName, outcomes: Sequence[FaultOutcome]) -> list[str]:
     """Row of a fault: times from the least to the most of its flights, and largest distances."""
     return [
         case,

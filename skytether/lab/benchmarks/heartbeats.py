@@ -36,7 +36,7 @@ LINKS = ((1.0, 0.1), (2.0, 0.5), (2.0, None), (4.0, None))
 """Time-out [s], and time from one heartbeat to the next [s]; None where it follows the loss."""
 
 
-class Kept(NamedTuple):
+class KeptAlive(NamedTuple):
     """What a link at rest has come to."""
 
     false_per_h: float
@@ -47,7 +47,7 @@ class Kept(NamedTuple):
     """Mean and largest time from when it was cut to when that was noticed [s]."""
 
 
-class Listener:
+class WaitingEnd:
     """One end that hears nothing but heartbeats."""
 
     def __init__(self, timeout_ns: int, fixed_ns: int | None) -> None:
@@ -74,13 +74,15 @@ class Listener:
             self.hearing.hear(number)
 
 
-def keep(network: DirectionConfig, timeout_s: float, heartbeat_s: float | None, lives: int) -> Kept:
+def keep(
+    network: DirectionConfig, timeout_s: float, heartbeat_s: float | None, lives: int
+) -> KeptAlive:
     """Keep a link at rest alive for so many sessions of LIFE_S, and cut it at the end of each."""
     timeout_ns, end_ns = seconds_to_ns(timeout_s), LIFE_S * SECOND_NS
     fixed_ns = None if heartbeat_s is None else seconds_to_ns(heartbeat_s)
     false, sent, noticed_s = 0, 0, []
     for seed in range(1, lives + 1):
-        listener, fates = Listener(timeout_ns, fixed_ns), Fates(network, seed, "uplink", 0)
+        listener, fates = WaitingEnd(timeout_ns, fixed_ns), Fates(network, seed, "uplink", 0)
         now_ns, number = 0, 0
         while now_ns < end_ns:
             listener.hear(now_ns)
@@ -94,7 +96,7 @@ def keep(network: DirectionConfig, timeout_s: float, heartbeat_s: float | None, 
         noticed_s.append(((listener.heard_ns or 0) + timeout_ns - end_ns) / SECOND_NS)
     hours = lives * LIFE_S / 3600.0
     mean_s = sum(noticed_s) / lives
-    return Kept(false / hours, sent / lives / LIFE_S, (mean_s, max(noticed_s)))
+    return KeptAlive(false / hours, sent / lives / LIFE_S, (mean_s, max(noticed_s)))
 
 
 def computed(loss: float, timeout_s: float, heartbeat_s: float | None) -> float:
