@@ -264,7 +264,8 @@ def row(name: str, flights: Sequence[Flown]) -> list[str]:
             np.mean([getattr(each.whole, key) / each.whole.duration_s for each in flights])
         )
 
-    on = sum(each.cut.mode == str(Mode.TRACK) for each in flights)
+    flying = {str(Mode.TRACK), str(Mode.COAST)}
+    on = sum(each.cut.mode in flying for each in flights)
     return [
         name,
         f"{np.mean(errors):.3f}",
