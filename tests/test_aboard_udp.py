@@ -127,13 +127,19 @@ async def test_a_figure_eight_over_the_papers_network(flavour: FlavourName, tmp_
     assert np.sqrt(np.mean(error**2)) < 1.5
 
 
-def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
-    """Those of docs/fly-a-real-one.md, with its scenario, each line in a process of its own."""
+def field_in(folder: Path) -> list[str]:
+    """Commands of docs/fly-a-real-one.md, whose scenario is `field.toml` in the folder now."""
     document = (Path(__file__).parent.parent / "docs" / "fly-a-real-one.md").read_text()
     (table,) = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
-    blocks = re.findall(r"```sh\n(.*?)```", document, re.DOTALL)
+    (folder / "field.toml").write_text(table)
+    commands: list[str] = re.findall(r"```sh\n(.*?)```", document, re.DOTALL)
+    return commands
+
+
+def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
+    """Those of docs/fly-a-real-one.md, with its scenario, each line in a process of its own."""
+    blocks = field_in(tmp_path)
     (block,) = (each for each in blocks if "skytether client field.toml" in each)
-    (tmp_path / "field.toml").write_text(table)
     lines = [[sys.executable, "-P", "-m", *shlex.split(line)] for line in block.splitlines()]
     *others, client = lines
     with contextlib.ExitStack() as stack:
@@ -149,9 +155,7 @@ def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
 
 def test_fly_has_everything_but_the_autopilot(tmp_path: Path) -> None:
     """It sets the parameters where it is told to, and is refused where it is not."""
-    document = (Path(__file__).parent.parent / "docs" / "fly-a-real-one.md").read_text()
-    (table,) = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
-    (tmp_path / "field.toml").write_text(table)
+    field_in(tmp_path)
     skytether = [sys.executable, "-P", "-m", "skytether"]
     fly = [*skytether, "fly", "field.toml", "--duration", "4", "--settle", "0"]
     autopilot = [*skytether, "autopilot", "field.toml", "--flavour", "ardupilot", "--ready", "2"]

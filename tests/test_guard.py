@@ -125,7 +125,7 @@ def test_the_page_itself_reads_the_flight_under_any_number(page: Page, host: str
 
 
 def test_who_has_the_token_in_the_address_is_asked_nothing_else(flown: PageFlight) -> None:
-    """By any name, behind any proxy; a wrong token is none."""
+    """The right token lets a browser in by any host name; a wrong one counts as none."""
     with closing(Page("127.0.0.1", 0, [flown], token="secret")) as page:
         with joined(page, "https://fleet.example", "fleet.example", "/?token=secret") as browser:
             assert browser.recv(timeout=PATIENCE_S)

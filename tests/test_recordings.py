@@ -1076,7 +1076,7 @@ def test_a_chunk_that_is_far_larger_inside_is_not_opened(
 def test_more_messages_than_there_is_an_index_for_are_not_made(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A message of two bytes becomes an object of hundreds, and compresses to nothing."""
+    """Two bytes of a message take hundreds in memory, so the number of messages is bounded."""
     content, builder = recording.read_bytes(), RecordBuilder()
     first, second = places(recording)["chunk"][:2]
     Message(1, 0, b"{}", 0, 0).write(builder)
