@@ -693,3 +693,23 @@ def test_steady_wind_is_taken_off_by_the_vehicle_itself(
         sensor={"position_noise_m": 0.01, "velocity_noise_mps": 0.02},
     )
     assert (rmse_m(flown, fly(flown)) < 0.1) == known_aboard
+
+
+def test_a_vehicle_along_a_spline_reports_where_it_leaves_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In still air the server foresees it, and hears little; ablation: foreseen to stand still."""
+    silent = {"wind": 0.0, "report": "deviation(0.01) | silence(1)"}
+    table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
+    table["control"]["scheme"] = "trajectory"
+    table["vehicle"] |= silent
+    flown = reading.check(table, "test")
+
+    def reports_per_s() -> float:
+        packets = fly(flown).netem
+        return float((packets["direction"] != UPLINK).sum()) / flown.duration
+
+    seldom = reports_per_s()
+    monkeypatch.setattr(Compensator, "foresee", lambda _, states, __=None: list(states))
+    assert seldom < 6.0
+    assert reports_per_s() > 2.0 * seldom
