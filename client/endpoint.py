@@ -115,6 +115,11 @@ class Client(Endpoint):
         """Steps slept through."""
         return self._pilot.missed
 
+    @property
+    def disturbance(self) -> Sequence[float]:
+        """Disturbance ŵ that its filter has found on each axis [m/s]; 0 without a filter."""
+        return self._pilot.disturbance
+
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Take what is said in this session; drop and count anything else.
 
@@ -197,8 +202,8 @@ class Client(Endpoint):
             self._end(now_ns)
         assert session.number is not None
         number, echo, said = session.number, session.echo, session.said
-        asks_ms = session.hearing.silence_ms
-        observation = pilot.observation(number, echo, session.asked_ms, said, asks_ms)
+        asks = session.hearing.silence
+        observation = pilot.observation(number, echo, session.asked, said, asks)
         if observation is not None:
             session.send(observation)
 

@@ -18,6 +18,7 @@ from skytether.shared.law.dead_time import OnTheirWay
 from skytether.shared.law.leap import NOISE_M, NOISE_MPS, position_leaps, velocity_leaps
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.protocol import FLOAT_MAX
 
 CARRIED_NS = SECOND_NS // 2
 """Longest time for which a measurement is carried on [ns]; an older one is as if from then."""
@@ -84,7 +85,7 @@ class Navigation:
         """State in which the next input will meet the vehicle, which is flown by and reported;
         without a dead time the estimate."""
         self.is_known = False
-        """Whether the estimate is finite, and can be flown by."""
+        """Whether the estimate is finite, also when it is told, and can be flown by."""
 
     def advance(self, measurements: Sequence[Measurement], command: Array, *, now_ns: int) -> None:
         """Go on to a step; before the first the vehicle stands.
@@ -115,7 +116,8 @@ class Navigation:
             self.estimate = self.predicted = self._filter.estimate()
             if self._inputs is not None:
                 self.predicted = self._inputs.predict(self.estimate, self._filter.disturbance())
-            self.is_known = all(map(math.isfinite, chain.from_iterable(self.predicted)))
+            numbers = chain.from_iterable(self.predicted)
+            self.is_known = all(-FLOAT_MAX <= number <= FLOAT_MAX for number in numbers)
 
     @property
     def disturbance(self) -> Sequence[float]:

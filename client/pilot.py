@@ -7,6 +7,7 @@ at epoch + k Δt, and every stamp that control uses is read here. What the vehic
 """
 
 import math
+from collections.abc import Sequence
 from itertools import chain
 
 import numpy as np
@@ -17,19 +18,23 @@ from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe
 from skytether.client.fence import Fence
 from skytether.client.navigation import Navigation
 from skytether.client.reporting import Reporter
+from skytether.client.session import Echo
 from skytether.client.vehicle import Vehicle
+from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
+    NO_INPUT,
     Drop,
     Horizon,
     Mode,
     Observation,
     ProtocolError,
     Trajectory,
+    stamp_us,
 )
 
 LAND_MPS = 0.5
@@ -108,6 +113,11 @@ class Pilot:
         """Time for which there has been no input planned [ns]."""
         return (self.step - self._covered_last) * self._dt_ns
 
+    @property
+    def disturbance(self) -> Sequence[float]:
+        """Disturbance ŵ that its filter has found on each axis [m/s]; 0 without a filter."""
+        return self._navigation.disturbance
+
     def starts_ns(self, step: int) -> int:
         """Time at which a step begins; the flight must have begun."""
         assert self._epoch_ns is not None
@@ -135,10 +145,7 @@ class Pilot:
             if isinstance(horizon, Horizon):
                 passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
-        if isinstance(horizon, Trajectory):
-            observed = horizon.step - horizon.age
-        else:
-            observed = self._step_at(horizon.observed_ns)
+        observed = horizon.step - horizon.age
         if self._takes_from is None or 0 <= observed < self._takes_from:
             raise ProtocolError(Drop.NOT_TAKEN)
         try:
@@ -149,11 +156,6 @@ class Pilot:
             raise
         if is_held:
             self._failsafe.horizon_taken(now_ns=now_ns)
-
-    def _step_at(self, stamp_ns: int) -> int:
-        """Step of one of the vehicle's own stamps, or -1 where it is none."""
-        step, off_ns = divmod(stamp_ns - self.starts_ns(0), self._dt_ns)
-        return -1 if off_ns else step
 
     def mode_changed(self, cause: Reason) -> None:
         """Do what goes with another mode, or another reason for it."""
@@ -258,39 +260,38 @@ class Pilot:
     # -- what is told of a step --------------------------------------------------------------
 
     def observation(
-        self, session: int, echo: tuple[int, int], asked_ms: int, number: int, asks_ms: int
+        self, session: int, echo: Echo, asked: int, number: int, asks: int
     ) -> Observation | None:
         """Observation of the step that has just begun; None where none is due, or no state known.
 
         Args:
             session: number of the session.
-            echo: newest stamp of the server [server's clock], and when it came.
-            asked_ms: longest silence that the server asks for [ms]; 0 for none.
-            number: number of packets sent in the session before.
-            asks_ms: longest silence that is asked of the server [ms].
+            echo: newest packet of the server.
+            asked: longest silence that the server asks for [half steps]; 0 for none.
+            number: number of packets sent in the session before, modulo NUMBERS.
+            asks: longest silence that is asked of the server [half steps].
         """
         failsafe, compensator = self._failsafe, self.compensator
         states, flown = self._navigation.predicted, self._input.tolist()
         if not self._navigation.is_known or not self._reporter.is_due(
-            session, self.flown, failsafe.mode, states, flown, asked_ms
+            session, self.flown, failsafe.mode, states, flown, asked
         ):
             return None
-        server_ns, received_ns = echo
+        backward_ns = echo.received_ns - self.starts_ns(0) - echo.server_ns
         return Observation(
             self._number,
             session,
             self.flown,
-            self._flown_ns,
             compensator.in_force,
             compensator.since,
-            server_ns,
-            received_ns,
+            stamp_us(backward_ns + MICROSECOND_NS - 1),  # a delay is told no shorter than it is
+            echo.heard,
             failsafe.mode,
             int(failsafe.takes),
             np.array(states),
-            self._input,
+            NO_INPUT if self._terms.splines else self._input,
             number,
-            asks_ms,
+            asks,
         )
 
     def _record(self) -> None:

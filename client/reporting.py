@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from math import hypot
 
 from skytether.client.compensator import Compensator
-from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.observing import Unreported, is_always, make_report
 from skytether.shared.wire.protocol import Mode
@@ -62,7 +61,7 @@ class Reporter:
     """
 
     def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:
-        self._dt_ns, self._dt_s = terms.dt_ns, terms.dt_s
+        self._dt_s = terms.dt_s
         self._compensator = compensator
         self._always = is_always(report)
         self._wants = make_report(report)
@@ -81,7 +80,7 @@ class Reporter:
         mode: Mode,
         states: States,
         flown: Sequence[float],
-        silence_ms: int,
+        silence: int,
     ) -> bool:
         """Whether an observation of this step is sent; asked once, and taken for sent where it is.
 
@@ -91,7 +90,7 @@ class Reporter:
             mode: what the vehicle does.
             states: what is known of its state.
             flown: input that is flown from here on, of each axis [m/s].
-            silence_ms: longest silence that the server asks for [ms]; 0 for none.
+            silence: longest silence that the server asks for [half steps]; 0 for none.
         """
         if self._always:  # nothing need be known of what the server believes
             return True
@@ -100,7 +99,7 @@ class Reporter:
         if not due:
             is_news, steps = slept or known != self._known, step - self._told
             off_m = self._belief.off_m(states)
-            due = 0 < silence_ms * MILLISECOND_NS <= steps * self._dt_ns
+            due = 0 < silence <= 2 * steps
             due |= self._wants(Unreported(off_m, is_news, steps, self._dt_s))
         self._step = step
         if due:

@@ -6,7 +6,7 @@ Every packet of the session is echoed by its stamp, so that the server learns of
 follows for the vehicle from what is heard, and from silence, `client.failsafe` decides.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from skytether.client.failsafe import Failsafe
 from skytether.client.link import AGAIN_NS, ClientLink
@@ -14,7 +14,7 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused
 from skytether.shared.core.steady import JUMP_NS
-from skytether.shared.law.heartbeat import Hearing
+from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
@@ -33,10 +33,9 @@ from skytether.shared.wire.protocol import (
     Welcome,
     decode,
     encode,
+    stamped_ns,
 )
 
-NEVER = (0, 0)
-"""Echo of a server that was not heard yet."""
 SLEPT_NS = JUMP_NS // 2
 """Time by which the server's clock goes on further than ours while we sleep [ns]; far more than
 what delays that change make of it."""
@@ -48,6 +47,21 @@ REFUSED = {
 """Why a WELCOME is dropped that refuses the vehicle."""
 DEGRADED = "the server misses its deadlines"
 """Why no newer horizon comes, as it seems, of a server that plans and says that it is degraded."""
+
+
+class Echo(NamedTuple):
+    """The newest packet of the server, as the vehicle tells of it."""
+
+    server_ns: int
+    """The server's clock when it was sent [ns]."""
+    received_ns: int
+    """When it came [ns; our clock]."""
+    heard: int
+    """Number of packets that have come with it, modulo NUMBERS."""
+
+
+NEVER = Echo(0, 0, 0)
+"""Echo of a server that was not heard yet."""
 
 
 class ServerSession:
@@ -89,10 +103,10 @@ class ServerSession:
         """How messages become datagrams."""
         self.hearing = hearing
         """What silence is asked of the server."""
-        self.asked_ms = hearing.silence_ms
-        """Longest silence that the server asks of us [ms]; 0 for none."""
+        self.asked = hearing.silence
+        """Longest silence that the server asks of us [half steps]; 0 for none."""
         self.said = 0
-        """Number of packets said in the session."""
+        """Number of packets said in the session, modulo NUMBERS."""
         self._failsafe = failsafe
         self._out = out
         self._events = events
@@ -105,7 +119,7 @@ class ServerSession:
         """Whether that session may go on; else nothing but a WELCOME is heard."""
         self._server_boot_id: int | None = None
         self.echo = NEVER
-        """Newest `server_ns` [server's clock], and the time it came."""
+        """Newest packet of the server."""
         self.idle = str(Idle.PLANS)
         """Why no newer horizon comes, as far as the server has said."""
         self._refusal: NoSession | None = None
@@ -207,18 +221,22 @@ class ServerSession:
         """Note a packet of the session, and a sleep that our own clock has not told of.
 
         A leap of it may be a clock that was set, or real time that was slept through
-        (`shared.core.steady`): the server's clock has gone on as well then.
+        (`shared.core.steady`): the server's clock has gone on as well then. Who sleeps for longer
+        than stamps are good for is forgotten by the server, whose WELCOME tells the whole time.
         """
         self._check(message)
-        server_ns, received_ns = self.echo
-        ahead_ns = (message.server_ns - server_ns) - (now_ns - received_ns)
-        if ahead_ns > SLEPT_NS and self.echo != NEVER:
+        expected_ns = self.echo.server_ns + now_ns - self.echo.received_ns
+        if isinstance(message, Welcome):
+            server_ns = message.server_ns
+        else:
+            server_ns = stamped_ns(message.server_us, expected_ns)
+        if server_ns - expected_ns > SLEPT_NS and self.echo != NEVER:
             self._failsafe.meet(Reason.STALLED, now_ns=now_ns)
         self._failsafe.heard(now_ns=now_ns)
-        self.echo = (message.server_ns, now_ns)
+        self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)
         if not isinstance(message, Welcome):
-            self.asked_ms = message.silence_ms
-            self.hearing.hear(message.number)
+            self.asked = message.silence
+            self.hearing.hear(message.number, server_ns)
 
     # -- what is said ------------------------------------------------------------------------
 
@@ -238,7 +256,7 @@ class ServerSession:
 
     def send(self, message: Observation | Close) -> None:
         """Say something in the session."""
-        self.said += 1
+        self.said = (self.said + 1) % NUMBERS
         self._out.append(Datagram(self.link.seal(encode(message)), self._server))
 
     def close(self) -> None:

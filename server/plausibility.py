@@ -2,7 +2,6 @@
 
 Each is held against the one of its vehicle that was believed last:
 
-    epoch     its stamp is the beginning of its step, on the vehicle's one grid
     clock     with the delay of the other direction it makes no round trip of less than nothing
     horizon   the horizon in force, and since when, go on with time and not beyond it
     jump      position and velocity have changed by no more than a vehicle can fly
@@ -33,8 +32,6 @@ SLACK_NS = 50 * MILLISECOND_NS
 class Statement:
     """Record: an observation, but for its state."""
 
-    epoch: int
-    """Begin of step 0 [ns; vehicle's clock]."""
     step: int
     """Its step, or -1 where there is no observation."""
     in_force: int
@@ -59,10 +56,9 @@ class Belief(IntEnum):
     ANEW = -1
     """Believed, unlike all that was believed before."""
     BELIEVED = 0
-    EPOCH = 1
-    CLOCK = 2
-    HORIZON = 3
-    JUMP = 4
+    CLOCK = 1
+    HORIZON = 2
+    JUMP = 3
 
 
 LAST, DOUBTED, NEW = 0, 1, 2
@@ -96,26 +92,22 @@ class Plausibility:
         """Begin anew with a vehicle, or with a new life of it."""
         self._said.numbers["step"][:, row] = -1
 
-    def judge(self, row: int, observation: Observation, epoch: int, F: int, G: int) -> int:
+    def judge(self, row: int, observation: Observation, F: int, G: int) -> int:
         """What becomes of an observation of a vehicle.
 
         Args:
             row: the vehicle.
             observation: what it says.
-            epoch: begin of step 0, by its stamp and its step [ns; vehicle's clock].
             F, G: of the observation and its echo, see `server.control.clock` [ns].
 
         Returns:
             a `Belief`.
         """
-        if epoch < 0:  # before its clock began, and maybe more than an int64 holds
-            return Belief.EPOCH
         told = observation
         return _judge(
             self._said,
             row,
             told.state,
-            epoch,
             told.step,
             told.in_force,
             told.since,
@@ -127,7 +119,7 @@ class Plausibility:
         )
 
 
-ANEW, BELIEVED, EPOCH, CLOCK, HORIZON, JUMP = map(int, Belief)
+ANEW, BELIEVED, CLOCK, HORIZON, JUMP = map(int, Belief)
 """As kernels take them."""
 
 
@@ -140,9 +132,7 @@ def _against(said: HeardNumbers, row: int, which: int, H: int, dt: float, noise_
         verdict = HORIZON
     elif before.step >= 0:
         trip = min(new.forward + before.backward, new.backward + before.forward)
-        if new.epoch != before.epoch:
-            verdict = EPOCH
-        elif min(trip, new.forward + new.backward) < -SLACK_NS:
+        if min(trip, new.forward + new.backward) < -SLACK_NS:
             verdict = CLOCK
         elif new.step > before.step:  # an older one tells of the clocks alone
             back = new.in_force < before.in_force or new.since < before.since
@@ -175,7 +165,6 @@ def _judge(
     said: HeardNumbers,
     row: int,
     state: R2,
-    epoch: int,
     step: int,
     in_force: int,
     since: int,
@@ -188,7 +177,7 @@ def _judge(
     """The verdict on a new observation, which takes its place among those of its vehicle."""
     numbers, place = said.numbers, LAST
     new = numbers[NEW, row]
-    new.epoch, new.step, new.in_force, new.since = epoch, step, in_force, since
+    new.step, new.in_force, new.since = step, in_force, since
     new.forward, new.backward, new.count = F, G, 0
     said.states[NEW, row] = state
     verdict = _against(said, row, LAST, H, dt, noise_m)

@@ -12,7 +12,7 @@ from skytether.server.gate import Call, Gate
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
     Event,
@@ -39,6 +39,7 @@ from skytether.shared.wire.protocol import (
     Welcome,
     decode,
     encode,
+    stamped_ns,
 )
 
 REFUSALS_TOLD_MAX = 64
@@ -46,7 +47,6 @@ REFUSALS_TOLD_MAX = 64
 TELL_NS = 10 * SECOND_NS
 """Time from one word about datagrams of strangers to the next [ns]."""
 IMPLAUSIBLE: dict[int, Drop] = {
-    Belief.EPOCH: Drop.IMPLAUSIBLE_EPOCH,
     Belief.CLOCK: Drop.IMPLAUSIBLE_CLOCK,
     Belief.HORIZON: Drop.IMPLAUSIBLE_HORIZON,
     Belief.JUMP: Drop.IMPLAUSIBLE_JUMP,
@@ -192,10 +192,10 @@ class Reception:
 
     def _observe(self, observation: Observation, call: Call, address: Address, now_ns: int) -> None:
         session = self._sessions.find(observation) or self._begin(observation, call, now_ns)
-        row, stamp_ns, echo_ns = session.row, observation.stamp_ns, observation.server_ns
-        epoch_ns = stamp_ns - observation.step * self._terms.dt_ns
-        forward_ns, backward_ns = now_ns - stamp_ns, observation.received_ns - echo_ns
-        verdict = self._plausibility.judge(row, observation, epoch_ns, forward_ns, backward_ns)
+        row, forward_ns = session.row, now_ns - observation.step * self._terms.dt_ns
+        # A round trip of half an hour or more is none: less than nothing is made of it.
+        backward_ns = stamped_ns(observation.backward_us, near_ns=-forward_ns)
+        verdict = self._plausibility.judge(row, observation, forward_ns, backward_ns)
         if verdict > BELIEVED:
             if verdict == Belief.JUMP and not session.doubted:
                 self._events.append(StateDoubted(vehicle=session.vehicle))
@@ -204,17 +204,18 @@ class Reception:
         session.doubted = False
         if verdict == ANEW:
             self._anew(row)
-        session.heard_ns, session.asked_ns = now_ns, observation.silence_ms * MILLISECOND_NS
-        session.hearing.hear(observation.number)
+            session.hearing.begin()
+        session.heard_ns = now_ns
+        session.asked_ns = observation.silence * self._terms.dt_ns // 2
+        session.hearing.hear(observation.number, observation.step)
         self.observations += 1
-        self._clock.observe(row, forward_ns, backward_ns, echo_ns=echo_ns, now_ns=now_ns)
+        heard = observation.heard
+        self._clock.observe(row, forward_ns, backward_ns, heard=heard, now_ns=now_ns)
         if not self._controller.observe(row, observation):
             session.stale += 1
             return
         if call.moves:
             session.address, session.line = address, call.line
-        session.observed_ns = stamp_ns
-        self._clock.epoch_ns[row] = epoch_ns
         self._grid.arm(now_ns)
 
     def _anew(self, row: int) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from skytether.server.gate import WayBack
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.law.heartbeat import Hearing
+from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.law.model import Indices
 from skytether.shared.wire.protocol import Drop, Hello, Observation, ProtocolError
 
@@ -48,8 +48,6 @@ class Session:
     """What silence is asked of it."""
     row: int = -1
     """Where its numbers lie in every array; -1 until its first observation."""
-    observed_ns: int = -1
-    """Stamp of its newest observation [vehicle's clock]."""
     heard_ns: int = 0
     """When something was heard of it last."""
     sent_ns: int = 0
@@ -61,7 +59,17 @@ class Session:
     asked_ns: int = 0
     """Longest silence that it asks of us [ns]; 0 for none."""
     said: int = 0
-    """Number of packets said in the session."""
+    """Number of packets said in the session, modulo NUMBERS."""
+
+    def number_next(self, now_ns: int) -> int:
+        """Number of a packet that is said now."""
+        number = self.said
+        self.said, self.sent_ns = (number + 1) % NUMBERS, now_ns
+        return number
+
+    def is_owed(self, now_ns: int) -> bool:
+        """Whether nothing was sent for as long as the vehicle asks."""
+        return 0 < self.asked_ns <= now_ns - self.sent_ns
 
     def sealed(self, payload: bytes) -> Sequence[Datagram]:
         """Datagram that brings the vehicle a message; one each where it may be in two places.

@@ -5,6 +5,7 @@ never caught up with.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,15 @@ from numpy.typing import NDArray
 
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.controller import BLOCK, Controller, Decisions
-from skytether.server.control.scheme import Splines, in_a_row
-from skytether.server.sessions import Sessions
+from skytether.server.control.knots import inputs_along
+from skytether.server.control.law import axes_of
+from skytether.server.control.scheme import in_a_row
+from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
 from skytether.shared.core.events import Degraded, Fault, PlanningResumed, PlanningStopped
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
-from skytether.shared.law.rule import bounded
-from skytether.shared.law.spline import along
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
@@ -32,6 +33,7 @@ from skytether.shared.wire.protocol import (
     Trajectory,
     encode,
     encode_horizon,
+    stamp_us,
 )
 
 MISSES_MAX = 5
@@ -122,7 +124,8 @@ class Ticker:
         recorder: Recorder | None,
         plans: Recorder | None,
     ) -> None:
-        self._terms, self._axes = terms, terms.model.axes()
+        self._terms = terms
+        self._model, self._bounds = axes_of(terms.model), np.array(terms.u_max)
         self._sessions = sessions
         self._clock = clock
         self._controller = controller
@@ -148,6 +151,9 @@ class Ticker:
         rows = self._sessions.rows
         step = self._clock.steps(rows, tick_ns)
         self._controller.desired.tick(tick_ns)
+        owed = [each for each in self._sessions if each.is_owed(now_ns)]
+        self._controller.owed[:] = False
+        self._controller.owed[[each.row for each in owed]] = True
         able = self._controller.able(rows, step)
         if not able.all():
             rows, step = rows[able], step[able]
@@ -160,7 +166,7 @@ class Ticker:
         self._tell_idle()
         self._events += [Fault(traceback=said) for said in self._controller.faults]
         self._controller.faults.clear()
-        self._send_heartbeats(now_ns)
+        self._send_heartbeats(owed, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.spent_ns.total() - before_ns)
 
@@ -188,22 +194,23 @@ class Ticker:
         if self._terms.feedback:
             told = width * FEEDBACK
         inputs, begin = in_a_row(found, sent), 0
-        columns = (sent, decisions.rows[sent], decisions.step[sent], found.ahead[sent])
-        for i, row, step, d in zip(*(column.tolist() for column in columns), strict=True):
+        rows, step = decisions.rows[sent], decisions.step[sent]
+        age = step - self._controller.observed_step[rows]
+        columns, server_us = (sent, rows, step, age, found.ahead[sent]), stamp_us(now_ns)
+        for i, row, k, o, d in zip(*(each.tolist() for each in columns), strict=True):
             session, end = self._sessions.at(row), begin + width * (d + self._terms.planned)
             payload = encode_horizon(
                 session.vehicle,
                 session.number,
-                step,
-                now_ns,
-                session.observed_ns,
+                k,
+                server_us,
+                o,
                 inputs[begin:end],
                 feedback[i * told : (i + 1) * told],
-                session.said,
-                session.hearing.silence_ms,
+                session.number_next(now_ns),
+                session.hearing.silence,
             )
-            session.sent_ns, begin = now_ns, end
-            session.said += 1
+            begin = end
             self._out += session.sealed(payload)
 
     def _send_trajectories(self, decisions: Decisions, now_ns: int) -> None:
@@ -211,39 +218,36 @@ class Ticker:
         rows, step = decisions.rows[sent], decisions.step[sent]
         age = step - self._controller.observed_step[rows]
         columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
+        server_us = stamp_us(now_ns)
         for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
             session, knots = self._sessions.at(row), told.knots[i, :, : 2 * n].reshape(axes, n, 2)
             message = Trajectory(
                 session.vehicle,
                 session.number,
                 k,
-                now_ns,
+                server_us,
                 o,
                 spacing,
                 knots,
-                session.said,
-                session.hearing.silence_ms,
+                session.number_next(now_ns),
+                session.hearing.silence,
             )
-            session.sent_ns = now_ns
-            session.said += 1
             self._out += session.sealed(encode(message))
 
-    def _send_heartbeats(self, now_ns: int) -> None:
-        """Say that the server lives to vehicles that it sent nothing for as long as they ask."""
-        for session in self._sessions:
-            if 0 < session.asked_ns <= now_ns - session.sent_ns:
+    def _send_heartbeats(self, owed: Sequence[Session], now_ns: int) -> None:
+        """Say that the server lives to vehicles that nothing else was sent to at this tick."""
+        for session in owed:
+            if session.is_owed(now_ns):
                 idle = int(self._sessions.idle[session.row])
                 beat = Heartbeat(
                     session.vehicle,
                     session.number,
-                    now_ns,
+                    stamp_us(now_ns),
                     idle,
                     int(self._grid.degraded),
-                    session.said,
-                    session.hearing.silence_ms,
+                    session.number_next(now_ns),
+                    session.hearing.silence,
                 )
-                session.sent_ns = now_ns
-                session.said += 1
                 self._out += session.sealed(encode(beat))
 
     def _record(self, decisions: Decisions) -> None:
@@ -286,24 +290,22 @@ class Ticker:
         told[OWN] = verdict.figure if verdict.compared is Compared.OWN else nothing
         return told
 
-    def _along(self, told: Splines, i: int) -> list[list[float]]:
-        """Inputs ū along the spline of a vehicle of a block, for H stages [m/s]; (axes, H)."""
-        dt_s, spacing = self._terms.dt_s, int(told.spacing[i])
-        knots = told.knots[i, :, : 2 * told.number[i]].tolist()
-        return [
-            [
-                bounded(along(model, each, spacing, dt_s, stage), bound)
-                for stage in range(self._terms.horizon)
-            ]
-            for model, each, bound in zip(self._axes, knots, self._terms.u_max, strict=True)
-        ]
-
     def _record_plans(self, plans: Recorder, decisions: Decisions) -> None:
         sent, found = decisions.sent, decisions.found
         step, ahead = decisions.step[sent], found.ahead[sent]
         if self._terms.splines:
-            state: Array = found.told.knots[sent, :, :2].astype(np.float64)
-            inputs: NDArray[Any] = np.array([self._along(found.told, i) for i in sent.tolist()])
+            knots = found.told.knots[sent].astype(np.float64)
+            state: Array = knots[:, :, :2]
+            inputs: NDArray[Any] = np.empty((len(sent), *self._bounds.shape, self._terms.horizon))
+            inputs_along(
+                self._model,
+                self._bounds,
+                self._terms.dt_s,
+                knots,
+                found.told.number[sent],
+                found.told.spacing[sent],
+                inputs,
+            )
         else:
             # Behind d committed inputs, another d of each vehicle.
             stages = ahead[:, None] + np.arange(self._terms.planned)

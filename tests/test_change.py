@@ -218,7 +218,7 @@ def make(kind: type[Endpoint]) -> Endpoint:
 
 def scenario(**changes: Any) -> Scenario:
     """Ten seconds of the demonstration."""
-    table = reading.to_table(DEMO) | {"duration": 10.0, "settle": 0.0}
+    table = reading.to_table(reading.load("demo-committed")) | {"duration": 10.0, "settle": 0.0}
     for key, value in changes.items():
         table[key] = table[key] | value if isinstance(value, dict) else value
     return reading.check(table, "test")

@@ -37,6 +37,7 @@ from skytether.shared.wire.protocol import (
     Welcome,
     decode,
     encode,
+    stamp_us,
 )
 
 SERVER: Address = ("server", 0)
@@ -68,7 +69,6 @@ class Server:
             recorder=Recorder(client_columns(flown.model.axes), self.sink),
         )
         self.now_ns = 5 * SECOND_NS
-        self.epoch_ns = 0
         self.session = 7
 
     def wake(self) -> list[Message]:
@@ -94,15 +94,14 @@ class Server:
         terms: Terms | None = None,
     ) -> None:
         """Open a session, or refuse it."""
-        self.epoch_ns = self.epoch_ns or self.now_ns
         session, terms = self.session if refusal == Refusal.ACCEPTED else 0, terms or self.terms
         self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
 
     def horizon(self, step: int, value: float, *, observed: int | None = None) -> None:
         """A horizon of one constant input, planned from a step that is its own unless told."""
-        observed_ns = self.epoch_ns + (step if observed is None else observed) * self.dt_ns
+        age = 0 if observed is None else step - observed
         inputs = np.full((self.terms.axes, self.terms.horizon), value, np.float32)
-        self.say(Horizon(4, self.session, step, 5678, observed_ns, inputs))
+        self.say(Horizon(4, self.session, step, 5678, age, inputs))
 
     def rows(self) -> Rows:
         """The record so far."""
@@ -218,7 +217,7 @@ def test_a_refusal_in_flight_is_told_and_flown_through() -> None:
 
 
 def test_the_epoch_is_the_moment_the_session_opens() -> None:
-    """Step k is observed at epoch + k Δt exactly, however late the timer is."""
+    """Step k begins at epoch + k Δt exactly, however late the timer is."""
     server = flying()
     epoch_ns = server.now_ns
     (first,) = server.wake()
@@ -226,24 +225,27 @@ def test_the_epoch_is_the_moment_the_session_opens() -> None:
     (second,) = server.wake()
     assert isinstance(first, Observation)
     assert isinstance(second, Observation)
-    assert (first.step, first.stamp_ns, first.in_force) == (0, epoch_ns, NO_HORIZON)
-    assert (second.step, second.stamp_ns) == (1, epoch_ns + server.dt_ns)
+    assert (first.step, first.in_force) == (0, NO_HORIZON)
+    assert second.step == 1
     assert server.client.next_wake_ns() == epoch_ns + 2 * server.dt_ns
 
 
-def test_every_observation_echoes_the_newest_word_of_the_server() -> None:
-    """The stamp and when it came are the server's only way to know the vehicle's clock."""
+def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> None:
+    """By the time since step 0, less its stamp: all the server knows of the vehicle's clock."""
     server = flying()
-    welcomed_ns = server.now_ns
+    epoch_ns = server.now_ns
     (first,) = server.wake()
     server.now_ns += 7_000_000
     server.say(Heartbeat(4, 7, 4321, 0, 0))
     heard_ns = server.now_ns
     (second,) = server.wake()
+    (third,) = server.wake()
     assert isinstance(first, Observation)
     assert isinstance(second, Observation)
-    assert (first.server_ns, first.received_ns) == (1234, welcomed_ns)
-    assert (second.server_ns, second.received_ns) == (4321, heard_ns)
+    assert isinstance(third, Observation)
+    assert first.backward_us == stamp_us(-1000)  # of 1234 ns, rounded up
+    assert second.backward_us == stamp_us(heard_ns - epoch_ns - 4_321_000) == third.backward_us
+    assert (first.heard, second.heard, third.heard) == (1, 2, 2)
 
 
 def test_the_vehicle_hovers_until_its_first_horizon() -> None:
@@ -299,7 +301,7 @@ def test_a_vehicle_that_does_not_know_its_true_state_records_its_estimate(
     assert rows["step"].tolist() == [0, 1, 2]
     for row, message in zip(rows, said, strict=True):
         assert isinstance(message, Observation)
-        np.testing.assert_array_equal(row["estimate"], message.state)
+        np.testing.assert_array_equal(row["estimate"].astype(np.float32), message.state)
 
 
 def test_steps_slept_through_are_flown_with_the_old_input_and_counted() -> None:
@@ -314,7 +316,7 @@ def test_steps_slept_through_are_flown_with_the_old_input_and_counted() -> None:
     assert late.step == 5
     assert server.client.missed == 3
     tau, held_s = 0.84, 4 * 0.05
-    assert late.state[0, 1] == pytest.approx(1 - np.exp(-held_s / tau), abs=1e-12)
+    assert late.state[0, 1] == pytest.approx(1 - np.exp(-held_s / tau), rel=1e-7)
 
 
 def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
@@ -328,7 +330,8 @@ def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
     server.say(Heartbeat(4, 7, 1, 0, 0))
     (only,) = server.wake()
     assert isinstance(only, Observation)
-    assert only.stamp_ns == epoch_ns + 65 * server.dt_ns
+    assert only.step == 65
+    assert server.client.next_wake_ns() == epoch_ns + 66 * server.dt_ns
 
 
 def test_a_restarted_server_is_flown_with_in_its_new_session() -> None:

@@ -123,11 +123,12 @@ def start() -> Iterator[Callable[..., Process]]:
             "fly: demo and the command line: control.dt: got 0.0, expected a number >= 0.001",
         ),
         (
-            ["fly", "demo", "--control.horizon", "5"],
+            ["fly", "demo-committed", "--control.horizon", "5"],
             2,
             (
-                "fly: demo and the command line: control.horizon: got 5, expected horizon · dt "
-                "(now 0.25 s) to be at least 0.4 s, half of what braking from u_max takes"
+                "fly: demo-committed and the command line: control.horizon: got 5, expected "
+                "horizon · dt (now 0.25 s) to be at least 0.4 s, half of what braking from u_max "
+                "takes"
             ),
         ),
         (
@@ -317,7 +318,7 @@ def test_a_flag_may_be_a_number_or_a_word(given: str, bound: float | str, tmp_pa
 def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
     """Three processes on loopback; every figure of the summary is there."""
     file = tmp_path / "real.json"
-    run = skytether("fly", "demo", *QUICK, "--duration", "3", "--json", str(file))
+    run = skytether("fly", "demo-committed", *QUICK, "--duration", "3", "--json", str(file))
     assert run.returncode == 0, run.stderr
     summary = json.loads(file.read_text())
     assert summary["steps"] + summary["deadline_misses"] >= 60

@@ -11,6 +11,7 @@ import time
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,32 +19,36 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+import skytether
 from skytether.__main__ import main
 from skytether.lab import contenders
 from skytether.lab.calibration import Rmse, SearchLimits
 from skytether.lab.commands import pool
 from skytether.lab.comparison import (
-    BYTES_UP,
     CLAIMS,
-    SHARE,
     Claim,
     ComparedCase,
     ContenderRuns,
+    budgets_table,
     judge,
-    measure,
-    ranks_table,
+    leaders_table,
     ratio,
 )
 from skytether.lab.contenders import (
     ABOARD,
     BESIDE,
+    BUDGETS,
     CASES,
     CONTENDERS,
     LOOKED_AT,
+    REPORTS,
+    Case,
     Contender,
     FlownContender,
     Found,
+    Plan,
 )
+from skytether.lab.sweep import Done
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.reading import COMPARED
@@ -136,35 +141,66 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
     assert reading.names(str(file)) == [f"{file}/committed-gap-gusts"]
 
 
-def thresholds(
-    contender: Contender, scenario: Scenario, case: str = "gusts"
-) -> dict[float | None, bool]:
-    """Those of its curve, and which is tuned."""
-    points = contenders.flying(contender, BY_CASE[case], scenario, SCALE)
-    return {point.threshold: point.tuned for point in points}
+def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, bool]:
+    """Those at which it flies, each with every way of reporting, and which is tuned."""
+    points = contenders.flying(contender, BY_CASE["gusts"], scenario, SCALE)
+    found = {point.threshold: point.tuned for point in points}
+    assert [(point.threshold, point.report) for point in points] == [
+        (threshold, report) for threshold in found for report in REPORTS
+    ]
+    return found
 
 
 def test_a_curve_goes_through_what_was_found_and_rises() -> None:
     """Thresholds around it; whole steps of a period, none of them twice; one point of `always`."""
     gap = replace(PAPER, control=replace(PAPER.control, cost_gap=0.8))
     found = thresholds(BY_NAME["committed-gap"], gap)
-    assert list(found) == pytest.approx([0.32, 0.64, 0.8, 1.0, 2.0])
+    assert list(found) == pytest.approx([0.08, 0.24, 0.48, 0.8, 1.6, 3.2, 8.0])
     assert [value for value, tuned in found.items() if tuned] == [0.8]
-    assert list(thresholds(BY_NAME["paper-periodic"], PAPER)) == [2, 5, 10, 15, 30]
+    assert list(thresholds(BY_NAME["paper-periodic"], PAPER)) == [1, 2, 5, 10, 20, 40, 80]
     often = replace(PAPER, control=replace(PAPER.control, period=2))
-    assert list(thresholds(BY_NAME["paper-periodic"], often)) == [1, 2, 3, 6]
+    assert list(thresholds(BY_NAME["paper-periodic"], often)) == [1, 2, 4, 8, 16]
     assert thresholds(BY_NAME["paper-every-step"], PAPER) == {None: True}
 
 
 def test_where_nobody_has_searched_the_weights_of_another_case_meet_what_is_met_there() -> None:
-    """One threshold; the network is the case's own, whatever the weights were found with."""
+    """The network is the case's own, whatever the weights were found with."""
     contender, case = BY_NAME["committed-gap"], BY_CASE["loss-0.5"]
     tuned = contenders.search_start(contender, TARGET, SCALE)
-    assert thresholds(contender, tuned, "loss-0.5") == {tuned.control.cost_gap: True}
     lossy = replace(tuned.network.uplink, loss=0.2)
     tuned = replace(tuned, network=replace(tuned.network, uplink=lossy))
-    (flying,) = contenders.flying(contender, case, tuned, SCALE)
-    assert not flying.control.keys() & case.keys.keys()
+    for flying in contenders.flying(contender, case, tuned, SCALE):
+        assert flying.keys.keys() & case.keys.keys() <= {
+            key for changes in REPORTS.values() for key in changes
+        }
+
+
+def test_within_a_budget_the_nearest_is_chosen() -> None:
+    """It spends no more packets than that, nor much more effort than its case allows."""
+    scale = contenders.ComparisonSize(
+        runs=4, generations=1, scouts=1, contenders=[BY_NAME["committed-gap"]], every=3
+    )
+    plan = Plan(BY_CASE["gusts"], COMPARED, scale)
+    spent = {"rmse_xy": 1.0, "packets_per_s": 50.0, "effort_mps": 0.1}
+    done = {
+        (cell, 0): Done(cell, 0, (replace(SUMMARY, **spent),)) for cell in range(len(plan.points))
+    }
+
+    def chosen(*flown: dict[str, Any]) -> list[int | None]:
+        """Number of what is chosen within each budget, where the first points fly like this."""
+        for cell, values in enumerate(flown):
+            done[cell, 0] = Done(cell, 0, (replace(SUMMARY, **{**spent, **values}),))
+        found = plan.choose(done)
+        points = (found.get(("committed-gap", budget)) for budget in BUDGETS)
+        return [None if point is None else plan.points.index(point) for point in points]
+
+    assert chosen() == [None] * 6
+    cheap, near = {"packets_per_s": 1.5}, {"packets_per_s": 9.0, "rmse_xy": 0.5}
+    wild = {"packets_per_s": 1.5, "rmse_xy": 0.1, "effort_mps": 0.106}
+    assert chosen(cheap, near, wild, {"packets_per_s": 0.2, "rmse_xy": None}) == [
+        *(None, 0, 0),
+        *(1, 1, 1),
+    ]
 
 
 # -- what is said of it --------------------------------------------------------------------------
@@ -176,28 +212,20 @@ def flew(
     name: str,
     errors: Sequence[float | None],
     *,
-    share: float = 0.1,
-    threshold: float | None = None,
-    tuned: bool = True,
+    packets_per_s: float = 2.0,
+    bytes_per_s: float = 1000.0,
 ) -> ContenderRuns:
-    """A contender with these errors, that sent a share of its 20 packets/s."""
-    counts = {"uplink_packets": round(1200 * share), "uplink_bytes": 60_000}
-    counts |= {"downlink_packets": 1200, "downlink_bytes": 120_000}
-    runs = [
-        replace(SUMMARY, rmse_xy=error, event_ratio=share, duration_s=60.0, **counts)
-        for error in errors
-    ]
-    return ContenderRuns(FlownContender(BY_NAME[name], threshold, tuned, {}), runs)
+    """A contender with these errors, that spent this."""
+    spent = {"packets_per_s": packets_per_s, "bytes_per_s": bytes_per_s}
+    runs = [replace(SUMMARY, rmse_xy=error, **spent) for error in errors]
+    return ContenderRuns(FlownContender(BY_NAME[name], packets_per_s, "every step", True, {}), runs)
 
 
-def test_packets_and_bytes_are_of_a_second_of_flight() -> None:
-    """Bytes both ways; what has not flown counts in nothing."""
+def test_what_has_not_flown_counts_in_nothing() -> None:
+    """Neither in its error, nor in what it spent."""
     one = flew("paper-event", [0.1, None, 0.3])
     assert one.estimate("rmse_xy")[0] == pytest.approx(0.2)
-    assert one.estimate("uplink_packets_per_s")[0] == pytest.approx(2.0)
-    assert one.estimate("total_bytes_per_s")[0] == pytest.approx(3000.0)
-    assert one.estimate(BYTES_UP)[0] == pytest.approx(1000.0)
-    assert measure(one.runs[1], "uplink_packets_per_s") is None
+    assert len(one.values("packets_per_s")) == 2
     assert math.isnan(flew("paper-event", [None]).mean("rmse_xy"))
 
 
@@ -254,91 +282,84 @@ def test_seeds_that_did_not_fly_in_both_are_left_out() -> None:
     assert ratio(flew("paper-event", [1.0, None]), flew("paper-periodic", [2.0, 2.0])) is None
 
 
-CLAIM = Claim("committed-gap", "committed-periodic", at_most={"target": 0.9})
-PERIODIC = flew("committed-periodic", [1.0, 1.1, 1.2])
+CLAIM = Claim("committed-gap", "paper-periodic", 0.25, {"target": 0.9})
 
 
-def curve(*points: tuple[float, float, float]) -> list[ContenderRuns]:
-    """Curve of the cost gap: threshold, share of packets, error; the first of them is tuned."""
-    return [
-        flew(
-            "committed-gap",
-            [error, 1.1 * error, 1.2 * error],
-            share=share,
-            threshold=threshold,
-            tuned=threshold == points[0][0],
-        )
-        for threshold, share, error in points
-    ]
+def within(case: Case, *points: tuple[float, ContenderRuns]) -> ComparedCase:
+    """A case in which these fly within these budgets."""
+    bought = {(runs.what.contender.name, budget): runs for budget, runs in points}
+    return ComparedCase(case, bought)
 
 
-def test_what_sends_too_much_is_judged_at_the_next_threshold_that_does_not() -> None:
-    """The best of the curve is not taken: it would be chosen on the seeds that are reported."""
-    judged = judge(
-        CLAIM, TARGET, [*curve((1, 0.11, 0.5), (2, 0.09, 0.8), (8, 0.05, 0.7)), PERIODIC]
-    )
-    assert judged.ours.what.threshold == 2
+THEIRS = (
+    (10.0, flew("paper-periodic", [2.0, 2.1, 2.2], packets_per_s=9.0)),
+    (40.0, flew("paper-periodic", [1.0, 1.1, 1.2], packets_per_s=20.0)),
+)
+OURS = (
+    (2.0, flew("committed-gap", [0.8, 0.88, 0.96], packets_per_s=1.5)),
+    (5.0, flew("committed-gap", [0.7, 0.77, 0.84], packets_per_s=4.9)),
+    (10.0, flew("committed-gap", [0.5, 0.55, 0.6], packets_per_s=5.1)),
+)
+
+
+def test_ours_is_judged_with_the_most_that_it_may_spend() -> None:
+    """Theirs is what flies within the largest budget: its share is theirs."""
+    judged = judge(CLAIM, within(TARGET, *THEIRS, *OURS))
+    assert judged is not None
+    assert judged.theirs is THEIRS[1][1]
+    assert judged.ours is OURS[1][1]
     assert judged.ratio is not None
-    assert judged.ratio[0] == pytest.approx(0.8)
+    assert judged.ratio[0] == pytest.approx(0.7)
     assert judged.holds
-    never = judge(CLAIM, TARGET, [*curve((1, 0.3, 0.5), (2, 0.2, 0.5)), PERIODIC])
+    never = judge(CLAIM, within(TARGET, *THEIRS, OURS[2]))
+    assert never is not None
     assert never.holds is False
-    sparse = judge(CLAIM, TARGET, [*curve((1, 0.1, 0.5), (2, 0.09, 0.8)), PERIODIC])
-    assert sparse.ours.what.threshold == 1
+    assert judge(CLAIM, within(TARGET, *OURS)) is None
 
 
 def test_a_claim_holds_with_all_of_its_interval_or_not_at_all() -> None:
     """Where nothing is asked for, a claim neither holds nor fails."""
-    assert not judge(CLAIM, TARGET, [*curve((1, 0.1, 0.95)), PERIODIC]).holds
-    wide = flew("committed-gap", [0.1, 0.1, 1.9], threshold=1)
-    judged = judge(CLAIM, TARGET, [wide, PERIODIC])
+    wide = (2.0, flew("committed-gap", [0.1, 0.1, 1.9], packets_per_s=1.5))
+    judged = judge(CLAIM, within(TARGET, *THEIRS, wide))
+    assert judged is not None
     assert judged.ratio is not None
     assert judged.ratio[0] < 0.9 < judged.ratio[2]
     assert judged.holds is False
-    assert judge(CLAIM, CASES[-1], [*curve((1, 0.1, 0.5)), PERIODIC]).holds is None
-
-
-def test_a_share_of_the_steps_may_be_the_limit() -> None:
-    """Against one that sends at every step, the same packets would be no limit."""
-    claim = Claim("committed-gap", "paper-every-step", SHARE, {"target": 0.75})
-    every = flew("paper-every-step", [1.0, 1.1, 1.2], share=1.0)
-    assert judge(claim, TARGET, [*curve((1, 0.09, 0.5)), every]).holds
-    assert not judge(claim, TARGET, [*curve((1, 0.11, 0.5)), every]).holds
-
-
-def test_what_is_equal_may_be_bytes() -> None:
-    """Packets of one may be longer than those of another that sends as often."""
-    claim = Claim("committed-gap", "committed-periodic", BYTES_UP, {"target": 0.9})
-    few = [replace(run, uplink_bytes=50_000) for run in PERIODIC.runs]
-    assert judge(claim, TARGET, [*curve((1, 0.1, 0.5)), PERIODIC]).holds
-    assert not judge(
-        claim, TARGET, [*curve((1, 0.1, 0.5)), ContenderRuns(PERIODIC.what, few)]
-    ).holds
+    unasked = judge(CLAIM, within(CASES[-1], *THEIRS, *OURS))
+    assert unasked is not None
+    assert unasked.holds is None
 
 
 def test_a_run_that_went_astray_moves_the_mean_and_not_the_median() -> None:
     """Both are told, of a contender and of a ratio."""
-    astray = flew("committed-gap", [0.5, 0.6, 0.7, 50.0, 0.6], threshold=1)
-    steady = flew("committed-periodic", [1.2, 1.2, 1.2, 1.2, 1.2])
-    assert astray.median() == pytest.approx(0.6)
-    judged = judge(CLAIM, TARGET, [astray, steady])
+    astray = (2.0, flew("committed-gap", [0.5, 0.6, 0.7, 50.0, 0.6], packets_per_s=1.5))
+    steady = (40.0, flew("paper-periodic", [1.2, 1.2, 1.2, 1.2, 1.2], packets_per_s=20.0))
+    assert astray[1].median() == pytest.approx(0.6)
+    judged = judge(CLAIM, within(TARGET, astray, steady))
+    assert judged is not None
     assert judged.medians == pytest.approx(0.5)
     assert judged.ratio is not None
     assert judged.ratio[0] > 8.0
     assert flew("committed-gap", [None]).median() is None
 
 
-def test_nobodys_rank_is_hidden() -> None:
-    """By mean error in each case; who has not flown comes last."""
-    here = [flew("paper-event", [0.3]), flew("committed-gap", [0.2]), flew("feedback-gap", [None])]
-    there = [flew("paper-event", [0.3]), flew("committed-gap", [0.4]), flew("feedback-gap", [0.1])]
-    table = ranks_table([ComparedCase(TARGET, here), ComparedCase(BY_CASE["loss-0.5"], there)])
-    assert [row[1:] for row in table.rows] == [
-        ("2: 0.300 @ 10%", "2: 0.300 @ 10%"),
-        ("1: 0.200 @ 10%", "3: 0.400 @ 10%"),
-        ("3: – @ –", "1: 0.100 @ 10%"),
-    ]
-    assert len(table.csv.splitlines()) == 1 + 2 * 3
+def test_the_best_within_a_budget_is_marked_and_ours_is_measured_against_it() -> None:
+    """What does not fly within a budget has a dash there; what failed comes last."""
+    ours = flew("trajectory-expected", [0.3, 0.31], packets_per_s=3.0)
+    best = flew("feedback-gap", [0.2, 0.21], packets_per_s=4.0)
+    failed = flew("paper-event", [None, None], packets_per_s=1.0)
+    compared = within(TARGET, (5.0, ours), (5.0, best), (10.0, best), (5.0, failed))
+    lines = {row[1]: row[2:] for row in budgets_table([compared]).rows}
+    dash = "–"
+    assert lines["committed with feedback, cost gap"] == (
+        *(dash, dash, "0.2050 @ 4.0 *", "0.2050 @ 4.0 *"),
+        *(dash, dash),
+    )
+    assert lines["trajectory, expected gap"] == (dash, dash, "0.3050 @ 3.0", dash, dash, dash)
+    ((_, budget, error, other, their_error, value, _),) = leaders_table([compared]).rows
+    assert (budget, error, their_error) == ("≤ 5/s", "0.3050", "0.2050")
+    assert other == "committed with feedback, cost gap"
+    assert float(value) == pytest.approx(0.305 / 0.205, abs=1e-3)
 
 
 def test_what_is_claimed_is_what_was_asked_for() -> None:
@@ -351,9 +372,6 @@ def test_what_is_claimed_is_what_was_asked_for() -> None:
 # -- the command ---------------------------------------------------------------------------------
 
 TUNE = ["compare", "--quick", "--tune", "--generations", "1"]
-FLOWN = 38
-"""Runs of a quick comparison: one contender at one threshold, three at three, three times; and in
-a case that nobody has searched all at one, twice."""
 
 
 @pytest.fixture(scope="module")
@@ -384,7 +402,7 @@ def test_every_contender_gets_the_same_search(tuned: Path) -> None:
         effort = (head["runs"], head["population"], head["sigma"], len(generation))
         assert effort == (2, 4, 0.1, 4)
         limits = (head["packets"], head["effort_mps"], head["saturated"])
-        assert limits == (0.1, TARGET.effort_mps, contenders.SATURATED)
+        assert limits == (0.1, TARGET.effort_mps, 1.0)
         best = min(generation, key=lambda point: point["score"])
         found = reading.load(f"{weights}/{folder.name}")
         assert found.control.input_weight == best["keys"]["control.input_weight"]
@@ -408,39 +426,34 @@ def rows(file: Path) -> list[dict[str, str]]:
 
 def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None:
     """Means over the seeds from 1 on, of the scenario in the file of weights."""
-    table = rows(out / "contenders.csv")
-    assert [row["contender"] for row in table] == [*LOOKED_AT] * 2
-    (row,) = [row for row in table if (row["case"], row["contender"]) == ("target", "feedback-gap")]
-    found = reading.load(f"{tuned / 'weights.toml'}/feedback-gap-target")
-    scenario = replace(found, duration=12.0)
-    runs = [
-        summarise(replace(scenario, seed=seed), "", each.client, each.server, each.netem)
-        for seed, each in enumerate(flight.fly_batch(scenario, [1, 2, 3]), start=1)
-    ]
-    errors = [run.rmse_xy for run in runs]
-    packets = [run.uplink_packets for run in runs]
-    assert float(row["rmse_xy"]) == pytest.approx(np.mean(errors))
-    assert float(row["rmse_xy_median"]) == pytest.approx(np.median(errors))
-    assert float(row["uplink_packets_per_s"]) == pytest.approx(np.mean(packets) / 12.0)
-    assert float(row["effort_mps"]) == pytest.approx(np.mean([run.effort_mps for run in runs]))
-    assert float(row["threshold"]) == scenario.control.cost_gap
-    (weights,) = [row for row in rows(out / "weights.csv") if row["contender"] == "feedback-gap"]
-    assert float(weights["control.cost_gap"]) == pytest.approx(scenario.control.cost_gap, rel=1e-3)
-    ranks = [row["rank"] for row in rows(out / "ranks.csv") if row["case"] == "loss-0.5"]
-    assert sorted(ranks) == ["1", "2", "3", "4"]
+    table = rows(out / "budgets.csv")
+    assert {row["case"] for row in table} == {"target", "loss-0.5"}
+    row = next(
+        row for row in table if (row["case"], row["contender"]) == ("target", "trajectory-expected")
+    )
+    found = reading.load(f"{tuned / 'weights.toml'}/trajectory-expected-target")
+    keys = {**REPORTS[row["report"]], "control.cost_gap": float(row["threshold"])}
+    runs = [each.summary for each in skytether.fly_batch(found, [1, 2, 3], duration=12.0, **keys)]
+    for figure in ("rmse_xy", "packets_per_s", "bytes_per_s", "effort_mps"):
+        assert float(row[figure]) == pytest.approx(np.mean([getattr(run, figure) for run in runs]))
+    assert float(row["packets_per_s"]) <= 1.3 * float(row["budget"])
+    assert float(row["rmse_xy_median"]) == pytest.approx(np.median([run.rmse_xy for run in runs]))
+    weights = {row["contender"]: row for row in rows(out / "weights.csv")}
+    assert list(weights) == [*LOOKED_AT]
+    here = float(weights["trajectory-expected"]["control.cost_gap"])
+    assert here == pytest.approx(found.control.cost_gap, rel=1e-3)
 
 
 def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
-    """A row for each point, one of each contender tuned, and PNG and PDF beside it."""
+    """A row for each budget of each contender, and PNG and PDF beside it."""
     assert (out / "trade-target.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "trade-target.pdf").read_bytes().startswith(b"%PDF")
     points = rows(out / "trade-target.csv")
-    assert len(points) == 10
-    assert [row["contender"] for row in points if row["tuned"] == "true"] == [*LOOKED_AT]
+    assert {row["contender"] for row in points} <= {*LOOKED_AT}
     assert all(row["flown"] == row["runs"] == "3" for row in points)
     page = (out / "report.html").read_text()
-    for name in LOOKED_AT:
-        assert BY_NAME[name].title.replace("'", "&#39;") in page
+    for name in {row["contender"] for row in points}:
+        assert BY_NAME[name].title in page
     assert "http" not in page
     assert "floor" in page
 
@@ -454,9 +467,8 @@ def test_where_the_reference_is_known_it_is_flown_without_packets(
     argv = ["compare", "--quick", "--cases", "wind-0.3", "--out", str(tmp_path)]
     assert main([*argv, "--tune", "--generations", "1"]) == 0
     assert main([*argv, "--weights", str(tmp_path / "weights.toml")]) == 0
-    table = {row["contender"]: row for row in rows(tmp_path / "contenders.csv")}
-    assert list(table) == [*(each.name for each in known), ABOARD.name]
-    assert float(table[ABOARD.name]["uplink_packets_per_s"]) == 0.0
+    table = {row["contender"]: row for row in rows(tmp_path / "budgets.csv")}
+    assert float(table[ABOARD.name]["packets_per_s"]) == 0.0
     errors = {name: float(row["rmse_xy"]) for name, row in table.items()}
     assert errors[ABOARD.name] < 1.1 * errors[BESIDE]
     assert errors[ABOARD.name] < 0.5 * errors["paper-every-step"]
@@ -470,12 +482,13 @@ def test_the_second_time_it_only_draws(
     weights = str(tuned / "weights.toml")
     assert main(["compare", "--quick", "--weights", weights, "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "1 figures; 0 runs flown" in said
+    assert "2 figures; 0 runs flown" in said
     assert "ratios that are asked for hold" in said
     changed = {path.name for path, content in kept.items() if path.read_bytes() != content}
     assert changed == {"report.html", "calls.jsonl"}
     calls = [json.loads(line)["runs"] for line in (out / "calls.jsonl").read_text().splitlines()]
-    assert calls[:2] == [FLOWN, 0]
+    assert calls[0] > 0
+    assert calls[1] == 0
 
 
 def test_other_weights_are_another_comparison(
@@ -487,7 +500,7 @@ def test_other_weights_are_another_comparison(
     file.write_text(weights.replace("input_weight = ", "input_weight = 77", 1))
     assert main(["compare", "--quick", "--weights", str(file), "--out", str(out)]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"compare: {out / 'sweeps' / 'target'}: grid: got [")
+    assert said.startswith(f"compare: {out / 'scouts' / 'target'}: grid: got [")
     assert said.endswith("], to go on there; or another --out\n")
 
 

@@ -41,9 +41,9 @@ def terms(*, scheme: str = "predictive", exhausted: str = "hold", feedback: bool
     ).terms()
 
 
-def horizon(step: int, inputs: Array = INPUTS, *, observed_ns: int = 0) -> Horizon:
+def horizon(step: int, inputs: Array = INPUTS) -> Horizon:
     """What the server made for `step`."""
-    return Horizon(1, 1, step, 0, observed_ns, inputs.astype(np.float32))
+    return Horizon(1, 1, step, 0, 0, inputs.astype(np.float32))
 
 
 def holding(step: int, inputs: Array = INPUTS, **keys: str) -> Compensator:
@@ -123,7 +123,7 @@ def test_stale_horizon_is_ignored_after_reordering() -> None:
     """E11: the newest generation wins; what comes after it is counted."""
     compensator = Compensator(terms())
     for made in (10, 12, 11, 12, 10):
-        new = horizon(made, INPUTS + 0.01 * (made - 10), observed_ns=made)
+        new = horizon(made, INPUTS + 0.01 * (made - 10))
         compensator.offer(new, 14, made - 1)
     assert (compensator.in_force, compensator.observed, compensator.stale) == (12, 11, 3)
     np.testing.assert_allclose(chosen(compensator, 14, HERE), INPUTS[:, 2] + 0.02, rtol=1e-6)

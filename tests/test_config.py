@@ -160,8 +160,8 @@ WRONG = {
     "a trigger nobody knows": (
         'control.trigger = "often"',
         (
-            "control.trigger: got 'often', expected a policy; there are always, periodic, "
-            "state_gap, cost_gap, expected_gap, deviation, silence, budget"
+            "control.trigger: got 'often', expected a policy; there are always, heartbeat, "
+            "periodic, state_gap, cost_gap, expected_gap, deviation, silence, budget"
         ),
     ),
     "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),

@@ -33,7 +33,7 @@ BRISK = {"shape": "figure-eight", "radius_m": 3.0, "period_s": 15.0}
 
 def scenario(**sections: Any) -> Scenario:
     """The demo in calm air, some 15 s; sections are laid over."""
-    table = reading.to_table(reading.load("demo")) | {"duration": 15.0, "settle": 5.0}
+    table = reading.to_table(reading.load("demo-committed")) | {"duration": 15.0, "settle": 5.0}
     table["vehicle"]["wind"] = 0.0
     for section, values in sections.items():
         table[section] |= values

@@ -237,7 +237,7 @@ def turning(scale: float) -> Reference:
 
 def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> list[Record]:
     """Two flights of one seed, after targets that differ from TURN on."""
-    flown = replaced("target", {"duration": 6.0, "settle": 0.0}, preview=preview)
+    flown = replaced("target-committed", {"duration": 6.0, "settle": 0.0}, preview=preview)
     flights = []
     for scale in (0.5, -0.5):
         monkeypatch.setattr(Scenario, "make_reference", lambda _, scale=scale: turning(scale))
@@ -455,7 +455,7 @@ def test_a_live_flight_is_judged_by_where_the_server_knew_the_point() -> None:
     """A point that goes straight on is followed closely; without the server nobody can tell."""
     changes = {"duration": 12.0, "settle": 8.0}
     flown = replaced(
-        "target", changes, shape="live", points_m=[[0.0, 0.0]], velocity_mps=[0.3, -0.2]
+        "target-committed", changes, shape="live", points_m=[[0.0, 0.0]], velocity_mps=[0.3, -0.2]
     )
     flight = fly(flown)
     rows = flight.server
@@ -485,7 +485,7 @@ def test_the_desired_position_of_a_live_flight_is_held_where_the_server_has_no_r
 def test_the_record_tells_what_was_known_of_the_reference() -> None:
     """The desired state at the step, whatever the preview."""
     for preview in ("all", "none"):
-        flown = replaced("target", {"duration": 6.0, "settle": 0.0}, preview=preview)
+        flown = replaced("target-committed", {"duration": 6.0, "settle": 0.0}, preview=preview)
         rows = fly(flown).server
         known = flown.make_reference()(rows["step"] * DT_S)
         np.testing.assert_array_equal(rows["reference"], known)

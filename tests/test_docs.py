@@ -301,8 +301,7 @@ def test_the_protocols_table_states_the_limits() -> None:
     """The numbers in prose are the numbers in code."""
     text = (ROOT / "docs" / "protocol.md").read_text()
     assert f"at most {PAYLOAD_BYTES_MAX} bytes" in text
-    assert (
-        "has 361 bytes and\n8 more for each committed step, an OBSERVATION 107, a HEARTBEAT 26"
-        in text
-    )
+    assert '| OBSERVATION, scheme "trajectory" | 107 | 129 | 41 | 55 | 139 | 73 |' in text
+    assert "| HORIZON, d = 0 and no feedback | 361 | 371 | 345 | 355 | 393 | 377 |" in text
+    assert "| HEARTBEAT | 26 | 30 | 18 | 22 | 58 | 50 |" in text
     assert "rmse_xy" in Summary.__struct_fields__

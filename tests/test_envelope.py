@@ -36,12 +36,12 @@ from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.shell import command
 from skytether.sim import flight
 
-DEMO = Envelope("demo", reading.load("demo"))
+DEMO = Envelope("demo-committed", reading.load("demo-committed"))
 
 
 def changed(**keys: Any) -> Scenario:
     """The demo with some keys changed."""
-    table = reading.to_table(reading.load("demo"))
+    table = reading.to_table(reading.load("demo-committed"))
     lay({key.replace("__", "."): value for key, value in keys.items()}, table)
     return reading.check(table, "test")
 
@@ -85,9 +85,9 @@ def test_a_point_is_the_same_whatever_else_is_flown() -> None:
 
 def test_the_command_line_of_a_point_flies_that_point() -> None:
     """All its keys, and those that the user has changed; what is the scenario's own is left out."""
-    plan = Envelope("demo", changed(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2]))
+    plan = Envelope("demo-committed", changed(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2]))
     line = plan.command(1).split()
-    assert line[:4] == ["skytether", "fly", "demo", "--virtual"]
+    assert line[:4] == ["skytether", "fly", "demo-committed", "--virtual"]
     options = command.parse(fly.FlyOptions(), line[2:], "skytether fly", "")
     assert options.config == plan.scenario_of(1)
     assert "--reference.radius-m" not in line
@@ -357,7 +357,7 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
     monkeypatch.setattr(
         "skytether.client.compensator.Compensator._comes_too_late", lambda *_: False
     )
-    table = reading.to_table(reading.load("demo"))
+    table = reading.to_table(reading.load("demo-committed"))
     for direction, delay_s in (("uplink", 0.05), ("downlink", 1.4)):
         network = f"network.{direction}"
         lay({f"{network}.delay": "constant", f"{network}.minimum_s": delay_s}, table)
@@ -388,7 +388,9 @@ def test_a_refused_point_has_the_line_that_a_user_would_read() -> None:
     """The scenario, the key, what was given and what was expected."""
     point = DEMO.fly(0)
     assert point.outcome == "refused"
-    assert point.line.startswith("demo: control.dt: got 0.005685, expected more, for the delay of ")
+    assert point.line.startswith(
+        "demo-committed: control.dt: got 0.005685, expected more, for the delay of "
+    )
 
 
 def test_a_point_that_raises_has_crashed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -416,7 +418,7 @@ def test_the_worst_come_first() -> None:
 
 # -- the command ---------------------------------------------------------------------------------
 
-SHORT = ["envelope", "demo", "--duration", "4", "--settle", "0", "--workers", "1"]
+SHORT = ["envelope", "demo-committed", "--duration", "4", "--settle", "0", "--workers", "1"]
 
 
 @pytest.mark.usefixtures("here")
@@ -447,7 +449,7 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Which flies that point again; what went astray is told, too, and is no failure."""
-    plan = Envelope("demo", changed(duration=4.0, settle=0.0))
+    plan = Envelope("demo-committed", changed(duration=4.0, settle=0.0))
     lost = EnvelopePoint(0, "flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
     with closing(Journal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
         journal.append(EnvelopePoint(1, "astray", 1.25, 1.0, 0.0))
@@ -463,7 +465,10 @@ def test_another_seed_does_not_go_on_in_the_folder(
 ) -> None:
     """Its points are others."""
     Journal(tmp_path, DEMO.settings(), EnvelopePoint).close()
-    assert main(["envelope", "demo", "--seed", "2", "--points", "1", "--out", str(tmp_path)]) == 2
+    assert (
+        main(["envelope", "demo-committed", "--seed", "2", "--points", "1", "--out", str(tmp_path)])
+        == 2
+    )
     said = f"envelope: {tmp_path}: seed: got 2, expected 1, to go on there; or another --out\n"
     assert capsys.readouterr().err == said
 
@@ -479,6 +484,17 @@ def test_an_impossible_envelope_is_refused(
     argv: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In one line, before anything is written."""
-    assert main(["envelope", "demo", "--out", str(tmp_path / "out"), *argv]) == 2
+    assert main(["envelope", "demo-committed", "--out", str(tmp_path / "out"), *argv]) == 2
     assert capsys.readouterr().err == f"envelope: {line}\n"
     assert not (tmp_path / "out").exists()
+
+
+def test_points_with_trajectories_are_flown_with_feedback() -> None:
+    """At the same points, where committed inputs are drawn with it and without."""
+    along = changed(
+        control__scheme="trajectory", control__trigger="expected_gap(0.05) | silence(1)"
+    )
+    plan = Envelope("demo", along)
+    for number in range(20):
+        assert plan.keys(number) == DEMO.keys(number) | {"control.feedback": True}
+    assert plan.fly(0).outcome != "refused"

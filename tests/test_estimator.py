@@ -32,7 +32,7 @@ SENT = np.array([True])
 
 def seen(step: int, state: Array) -> Observation:
     """Observation of the one vehicle."""
-    return Observation(1, 1, step, 0, NO_HORIZON, 0, 0, 0, Mode.TRACK, 1, state, np.zeros(2))
+    return Observation(1, 1, step, NO_HORIZON, 0, 0, 0, Mode.TRACK, 1, state, np.zeros(2))
 
 
 def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:

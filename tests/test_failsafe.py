@@ -48,6 +48,7 @@ from skytether.shared.wire.protocol import (
     Welcome,
     decode,
     encode,
+    stamp_us,
 )
 
 SERVER: Address = ("server", 0)
@@ -83,7 +84,7 @@ class Hand:
             link=Sealed() if secure else PlainLink(),
             recorder=Recorder(client_columns(self.terms.axes), self.sink),
         )
-        self.now_ns = self.epoch_ns = 5 * SECOND_NS
+        self.now_ns = 5 * SECOND_NS
         self.session = 7
         self.events: list[Event] = []
         self.client.wake(now_ns=self.now_ns)
@@ -114,14 +115,14 @@ class Hand:
         It leads on from where the vehicle said that it was.
         """
         step = self.step if made_for is None else made_for
-        observed_ns = self.epoch_ns + (self.step if observed is None else observed) * 20_000_000
+        age = step - (self.step if observed is None else observed)
         inputs = np.zeros((self.terms.axes, D + self.terms.horizon), np.float32)
         inputs[0] = SPEED
         feedback = NO_FEEDBACK
         if gain is not None:
             aboard = [[p, v, 0.0, *gain] for p, v in self.said[-1].state.tolist()]
             feedback = np.array(aboard, np.float32)
-        self.say(Horizon(4, self.session, step, 1, observed_ns, inputs, feedback))
+        self.say(Horizon(4, self.session, step, 1, age, inputs, feedback))
 
     @property
     def step(self) -> int:
@@ -175,7 +176,7 @@ class Hand:
 
 def scenario(**sections: Any) -> Scenario:
     """A long flight of the demo at 50 Hz in calm air; sections are laid over."""
-    table = reading.to_table(reading.load("demo")) | {"duration": 100.0}
+    table = reading.to_table(reading.load("demo-committed")) | {"duration": 100.0}
     table["control"] |= {"dt": 0.02, "horizon": H, "feedback": False}
     table["vehicle"] |= {"wind": 0.0, "land_after_s": 10.0, "report": "always"}
     table["link"] |= {"heartbeat_s": 0.1, "timeout_s": 1.0}
@@ -444,7 +445,7 @@ def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
 def with_input_out_of_range(hand: Hand) -> Horizon:
     """A horizon that asks for more than u_max."""
     inputs = np.full((2, H), 1.01 * hand.terms.u_max[0], np.float32)
-    return Horizon(4, hand.session, hand.step, 1, hand.epoch_ns, inputs)
+    return Horizon(4, hand.session, hand.step, 1, hand.step, inputs)
 
 
 def test_in_plaintext_a_stranger_cannot_make_it_brake_by_malformed_messages() -> None:
@@ -592,10 +593,10 @@ def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
 ) -> None:
     """Seen through `Steady` no time has passed; the server's clock has gone on by half a minute."""
     hand = tracking()
-    hand.say(Heartbeat(4, hand.session, SECOND_NS, Idle.PLANS, 0))
+    hand.say(Heartbeat(4, hand.session, stamp_us(SECOND_NS), Idle.PLANS, 0))
     hand.fly(0.1, beats=False)
     passed_ns = 100 * MILLISECOND_NS + slept_s * SECOND_NS
-    hand.say(Heartbeat(4, hand.session, SECOND_NS + passed_ns, Idle.PLANS, 0))
+    hand.say(Heartbeat(4, hand.session, stamp_us(SECOND_NS + passed_ns), Idle.PLANS, 0))
     hand.fly(0.1, beats=False)
     assert hand.mode is mode
 

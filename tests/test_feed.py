@@ -696,7 +696,7 @@ def test_the_plans_told_are_those_that_are_sent(
     if scheme in ("predictive", "none"):
         np.testing.assert_array_equal(one["state"], made["estimate"])
     elif scheme == "trajectory":
-        np.testing.assert_allclose(one["state"], made["reference"], atol=1e-5)
+        np.testing.assert_allclose(one["state"], made["planned"], atol=1e-5)
     else:  # where it was to be, it has come to be, but for what it never heard of
         steps = flight_.client[flight_.client["vehicle"] == 1]
         late = one[(one["step"] > 60) & (one["begins"] < len(steps))]

@@ -11,6 +11,7 @@ from skytether.client.fence import Fence
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.events import FenceHolds
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
 from skytether.sim.flight import fly
 
 
@@ -49,13 +50,32 @@ def test_a_flight_that_stays_inside_is_the_same_with_a_fence() -> None:
     assert fly(scenario(fence={"radius_m": 50.0, "speed_mps": 5.0})).trace_hash() == free
 
 
-def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so() -> None:
-    """The circle of the demo is 3.1 m wide; the fence aboard ends it at x = 1 m."""
-    bounds = {"low_m": (-9.0, -9.0), "high_m": (1.0, 9.0), "wind_mps": 0.2}
-    fenced = msgspec.structs.replace(
-        scenario(), fence=msgspec.convert(bounds, type(scenario().fence))
+def held_back(scheme: str, seed: int) -> Record:
+    """A flight in wind, with a gain and a dead time that are wrong, out of a fence at x = 1 m.
+
+    The circle of the demo is 3.1 m wide. The scenario is made, and not read: nobody has held the
+    trajectory against the fence.
+    """
+    rng = np.random.default_rng(seed)
+    trigger = "expected_gap(0.05)" if scheme == "trajectory" else "cost_gap(3)"
+    wind = rng.uniform(-0.14, 0.14, 2).tolist()
+    gain, late_s = rng.uniform(0.8, 1.2, 2).tolist(), rng.uniform(0.0, 0.1)
+    unlike = {"gain": gain, "dead_time_s": [late_s], "steady_wind_mps": wind, "wind": 0.0}
+    free = scenario(
+        control={"scheme": scheme, "trigger": f"{trigger} | silence(1)"}, vehicle=unlike
     )
-    record = fly(fenced)  # made, and not read: nobody has held the trajectory against it
+    bounds = {"low_m": (-9.0, -9.0), "high_m": (1.0, 9.0), "wind_mps": 0.2}
+    fence = msgspec.convert(bounds, type(free.fence))
+    return fly(msgspec.structs.replace(free, fence=fence, seed=seed))
+
+
+@pytest.mark.parametrize("scheme", ["committed", "trajectory"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so(
+    scheme: str, seed: int
+) -> None:
+    """Whatever the scheme: also a regulator aboard, that would take off what holds it back."""
+    record = held_back(scheme, seed)
     assert record.client["state"][:, 0, 0].max() <= 1.0
     assert record.client["state"][:, 0, 0].min() < -1.0
     assert any(isinstance(each.event, FenceHolds) for each in record.events)

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import skytether.sim.flight
+from skytether.server import reception
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Finished, FlowOpened, Flying, ModeChanged, SessionOpened
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -85,12 +88,13 @@ def test_the_event_trigger_saves_four_packets_in_five() -> None:
 
 
 def test_without_network_the_estimate_is_the_state() -> None:
-    """Zero delay, no loss: x̂(k) = x(k) to the last bit, at every step."""
+    """Zero delay, no loss: x̂(k) = x(k) to the last bit of float32, at every step."""
     flown = scenario("paper-every-step", duration=10.0, network=QUIET)
     flight = fly(flown)
     # The flight is over with step 199, before the server has ticked for it.
     assert flight.server["step"].tolist() == list(range(199))
-    np.testing.assert_array_equal(flight.server["estimate"], flight.client["state"][:199])
+    state = flight.client["state"][:199].astype(np.float32)
+    np.testing.assert_array_equal(flight.server["estimate"], state)
 
 
 def test_a_flight_that_is_over_before_it_has_settled_has_an_error() -> None:
@@ -297,8 +301,31 @@ def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
 def test_what_is_never_flown_costs_no_packets() -> None:
     """Over a round trip of 1.6 s the last 1.3 s of a plan are too old before their turn comes."""
     slow = {"minimum_s": 0.76}
-    long = scenario("demo", duration=30.0, network={"uplink": slow, "downlink": slow})
+    long = scenario("demo-committed", duration=30.0, network={"uplink": slow, "downlink": slow})
     assert long.link.age_max_s == 5.0
     found = [summary(long, flight) for flight in fly_batch(long, range(1, 7))]
     assert max(each.event_ratio or 1.0 for each in found) < 0.08  # 0.6 where all of it is compared
     assert np.median([each.rmse_xy or 1.0 for each in found]) < 0.035
+
+
+@pytest.mark.parametrize("midnight_s", [0, 4280, 4294, 2 * 10**9])
+@pytest.mark.parametrize("name", ["demo", "paper"])
+def test_a_flight_is_the_same_whenever_stamps_begin_anew(
+    name: str, midnight_s: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every 71 minutes of the server's clock: 15 s after its begin, and where the clocks differ."""
+    flown = scenario(name, duration=25.0)
+    usual = fly(flown)
+    monkeypatch.setattr(skytether.sim.flight, "MIDNIGHT_NS", midnight_s * SECOND_NS)
+    other = fly(flown)
+    assert other.client.tobytes() == usual.client.tobytes()
+    assert other.server.tobytes() == usual.server.tobytes()
+
+
+def test_a_server_that_takes_stamps_as_they_are_plans_for_nobody(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ablation: a day after its begin no round trip is one."""
+    monkeypatch.setattr(reception, "stamped_ns", lambda stamp, near_ns: stamp * 1000)  # noqa: ARG005
+    flight = fly(scenario("demo", duration=10.0))
+    assert not flight.client["covered"].any()

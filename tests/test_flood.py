@@ -65,7 +65,7 @@ def test_forgeries_get_as_far_as_they_are_meant_to(linked: Linked) -> None:
     packets = flood.forgeries(linked.observation)
     assert {len(packet) for packet in packets} == {len(linked.observation)}
     assert refusals(linked.gate, packets[::2]) == {"forged"}
-    early = {"not sealed", "not for a server", "unknown channel"}
+    early = {"not sealed", "not for a server", "unknown channel", "length"}
     assert refusals(linked.gate, packets[1::2]) <= early
     assert refusals(linked.gate, [linked.observation]) == {""}
     assert not linked.gate.outbox()

@@ -69,7 +69,7 @@ def test_noise_of_the_measurements_asks_for_no_other_gain() -> None:
 
 def scenario(**sections: Any) -> Scenario:
     """The demo at firm weights in calm air, its inputs 0.3 s late; sections are laid over."""
-    table = reading.to_table(reading.load("demo")) | {"duration": 20.0, "settle": 5.0}
+    table = reading.to_table(reading.load("demo-committed")) | {"duration": 20.0, "settle": 5.0}
     table["control"] |= {"input_weight": 0.01, "input_reference": False}
     table["vehicle"] |= {"wind": 0.0, "dead_time_s": 0.3}
     for section, values in sections.items():

@@ -7,11 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import skytether
+from skytether.lab.benchmarks import liveness
 from skytether.lab.benchmarks.heartbeats import computed, keep, main
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.heartbeat import (
     ASSUMED,
     FALSE_PER_H,
+    NUMBERS,
     WEIGHT,
     WINDOW,
     Hearing,
@@ -24,6 +26,11 @@ from skytether.sim.flight import fly
 
 DT_NS = 50 * MILLISECOND_NS
 ear = partial(Hearing, 2 * SECOND_NS, DT_NS, None)
+
+
+def hear(hearing: Hearing, number: int) -> None:
+    """Hear a packet by its number in the session; one is sent a millisecond."""
+    hearing.hear(number % NUMBERS, number * MILLISECOND_NS)
 
 
 @pytest.mark.parametrize(
@@ -72,37 +79,49 @@ def test_a_new_session_assumes_a_loss_of_three_in_ten() -> None:
     assert hearing.loss == ASSUMED
     assert hearing.silence_ns == 150 * MILLISECOND_NS - DT_NS // 2
     for number in (0, 2, 1, 1, 4):
-        hearing.hear(number)
+        hear(hearing, number)
     assert hearing.loss == pytest.approx((1 + WEIGHT * ASSUMED) / (5 + WEIGHT))
     for number in range(5, 3 * WINDOW):
-        hearing.hear(number)
+        hear(hearing, number)
     assert hearing.loss == pytest.approx(WEIGHT * ASSUMED / (WINDOW + WEIGHT))
-    hearing.hear(10 * WINDOW)
+    hear(hearing, 4 * WINDOW - 2)
     assert hearing.loss > 0.9
-    hearing.hear(0)
+    hear(hearing, 0)
     assert hearing.loss > 0.9
     hearing.begin()
     assert hearing.loss == ASSUMED
 
 
-@given(st.lists(st.integers(0, 500), max_size=60))
-def test_the_share_lost_does_not_depend_on_the_order(numbers: list[int]) -> None:
+@given(st.lists(st.integers(0, NUMBERS - 2), max_size=60), st.sampled_from([0, 2 * WINDOW]))
+def test_the_share_lost_does_not_depend_on_the_order(numbers: list[int], before: int) -> None:
     """Within the window, whoever comes first and however often."""
     heard, sorted_ = ear(), ear()
-    near = [number for number in numbers if number > max(numbers) - WINDOW]
-    for number in near:
-        heard.hear(number)
-    for number in sorted(set(near)):
-        sorted_.hear(number)
+    for number in range(before):
+        hear(heard, number)
+        hear(sorted_, number)
+    for number in numbers:
+        hear(heard, before + number)
+    for number in sorted(set(numbers)):
+        hear(sorted_, before + number)
     assert heard.loss == sorted_.loss
+
+
+@given(st.integers(0, 4 * NUMBERS))
+def test_of_a_burst_no_more_than_its_rest_by_the_modulus_is_seen(burst: int) -> None:
+    """All of it where it is shorter than NUMBERS."""
+    hearing = ear()
+    for number in range(2 * WINDOW):
+        hear(hearing, number)
+    hear(hearing, 2 * WINDOW + burst)
+    assert hearing.loss == pytest.approx((burst % NUMBERS + WEIGHT * ASSUMED) / (WINDOW + WEIGHT))
 
 
 def test_a_number_that_is_asked_for_is_asked_for_whatever_the_loss() -> None:
     """`link.heartbeat_s` as a number."""
     hearing = Hearing(2 * SECOND_NS, DT_NS, SECOND_NS // 4)
-    assert hearing.silence_ms == 250
-    hearing.hear(100)
-    assert hearing.silence_ms == 250
+    assert hearing.silence == 10  # of half a step of 50 ms
+    hear(hearing, 100)
+    assert hearing.silence == 10
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.3])
@@ -141,3 +160,33 @@ def test_a_hover_in_still_air_costs_the_heartbeats_and_no_more(loss: float) -> N
         rate = (late["direction"] == direction).sum() / 25.0
         assert 1.3 < rate < most
     assert flown.client["covered"][200:].all()
+
+
+def test_both_ends_keep_a_link_alive_and_notice_its_end() -> None:
+    """What each asks for comes over the same network; half of the packets are too many to lose."""
+    kept = liveness.keep(DirectionConfig(loss=0.1), 6)
+    assert kept.hours == 1.0
+    assert kept.false <= 1
+    assert len(kept.noticed_s) == 6
+    assert 1.9 < min(kept.noticed_s) <= max(kept.noticed_s) < 2.6
+    assert liveness.keep(DirectionConfig(loss=0.5), 12).false > 0
+    assert liveness.keep(DirectionConfig(loss=0.0), 1) == (1 / 6, 0, pytest.approx([2.0], abs=0.5))
+
+
+def test_bursts_are_longer_than_any_heartbeat_helps_against() -> None:
+    """Bursts of 2 s make a link be taken for lost dozens of times an hour."""
+    burst = DirectionConfig(loss=0.1, burst_s=2.0)
+    assert liveness.keep(burst, 6).false > 20
+
+
+def test_a_flight_notices_that_it_is_cut() -> None:
+    """At the step after the time-out, counted from the packet that came last."""
+    assert 1.9 < liveness.noticed_s(0.1, 1) < 2.6
+
+
+def test_liveness_is_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    """A row for each network."""
+    liveness.main(["--hours", "0.17"])
+    printed = capsys.readouterr().out
+    assert all(f"{loss:g}" in printed for loss in liveness.LOSSES)
+    assert "in bursts of 2 s" in printed

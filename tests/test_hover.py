@@ -19,7 +19,7 @@ from skytether.sim.flight import MIDNIGHT_NS, fly
 
 def scenario(**sections: Any) -> Scenario:
     """Twenty seconds of the demo over 0.2 s each way without loss; sections are laid over."""
-    table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
+    table = reading.to_table(reading.load("demo-committed")) | {"duration": 20.0}
     quick = {"delay": "constant", "minimum_s": 0.2, "loss": 0.0}
     table["network"] = {"uplink": quick, "downlink": quick}
     table["link"] |= {"heartbeat_s": 0.1, "timeout_s": 1.0}
@@ -60,8 +60,8 @@ class Interrupted(Server):
         message = decode(payload, self._terms)
         if not isinstance(message, Horizon):
             return payload
-        vehicle, session, _, server_ns, *_ = message
-        return encode(Heartbeat(vehicle, session, server_ns, Idle.PLANS, 0))
+        vehicle, session, _, server_us, *_ = message
+        return encode(Heartbeat(vehicle, session, server_us, Idle.PLANS, 0))
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Endpoint`."""

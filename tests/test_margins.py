@@ -31,7 +31,7 @@ from skytether.sim.flight import fly_batch
 
 def changed(**keys: Any) -> Scenario:
     """The demo with some keys changed."""
-    table = reading.to_table(reading.load("demo"))
+    table = reading.to_table(reading.load("demo-committed"))
     lay({key.replace("__", "."): value for key, value in keys.items()}, table)
     return reading.check(table, "test")
 
@@ -188,6 +188,20 @@ def test_the_worst_corners_of_the_box_are_stable_at_weights_that_bear_them() -> 
         assert margin(corner.of(scenario), "corner", given).growth < 0.99
     tight = changed(control__input_weight=0.05, control__trigger="periodic(12)")
     assert margin(corners[0].of(tight), "corner", given).growth > 1.05
+
+
+@pytest.mark.parametrize(("input_weight", "stable"), [(1.0, False), (1.2, True)])
+def test_along_trajectories_the_worst_corner_asks_for_a_fifth_more(
+    input_weight: float, stable: bool
+) -> None:
+    """The disturbance that the filter aboard has found is taken off at once, and so is firm."""
+    scenario = changed(
+        control__scheme="trajectory",
+        control__trigger="expected_gap(0.05) | silence(1)",
+        control__input_weight=input_weight,
+    )
+    corner = Differing(0.5, 1.3, 0.3).of(scenario)
+    assert (margin(corner, "corner", timings(scenario, 1)).growth < 0.995) == stable
 
 
 def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:

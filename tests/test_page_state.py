@@ -45,9 +45,9 @@ class Shown:
 
 
 @cache
-def demo(cut_s: float = 0.0, vehicles: int = 1) -> Shown:
-    """Twelve seconds of the demonstration, the link of which may be cut."""
-    scenario = msgspec.structs.replace(reading.load("demo"), duration=12.0)
+def demo(cut_s: float = 0.0, vehicles: int = 1, name: str = "demo-committed") -> Shown:
+    """Twelve seconds of the demonstration, with plans of inputs, the link of which may be cut."""
+    scenario = msgspec.structs.replace(reading.load(name), duration=12.0)
     lost = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
     changes = [(cut_s, lost)] if cut_s else []
     flown = flight.fly(scenario, vehicles=vehicles, changes=changes)
@@ -144,9 +144,10 @@ def test_the_plan_leads_on_from_where_the_vehicle_is() -> None:
     np.testing.assert_array_equal(ahead, planned(shown.scenario, newest)[-len(ahead) :])
 
 
-def test_loss_and_rates_are_those_of_the_packets() -> None:
-    """Counted in bins, they are what netem recorded."""
-    shown = demo()
+@pytest.mark.parametrize(("name", "least"), [("demo-committed", 320), ("demo", 50)])
+def test_loss_and_rates_are_those_of_the_packets(name: str, least: int) -> None:
+    """Counted in bins, they are what netem recorded; packets with a plan are the long ones."""
+    shown = demo(name=name)
     packets, network = shown.flown.netem, shown.state.network
     for direction in (UPLINK, DOWNLINK):
         own = packets[packets["direction"] == direction]
@@ -163,7 +164,7 @@ def test_loss_and_rates_are_those_of_the_packets() -> None:
         assert network.traffic(direction, 60.0, shown.now_ns).delay_ms_p50 == pytest.approx(
             float(np.median(through_ms)), abs=20.0
         )
-    up = packets[(packets["direction"] == UPLINK) & (packets["bytes"] >= 320)]
+    up = packets[(packets["direction"] == UPLINK) & (packets["bytes"] >= least)]
     assert network.horizon_bytes(shown.now_ns) == pytest.approx(up["bytes"].mean())
     assert shown.state.every_step == 20.0
 

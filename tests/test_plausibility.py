@@ -18,25 +18,26 @@ from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import ModeChanged, StateDoubted
+from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
-from skytether.shared.wire.protocol import Drop, Mode, Observation
+from skytether.shared.wire.protocol import Drop, Mode, Observation, stamp_us, stamped_ns
 from skytether.sim.flight import fly, fly_batch
 from skytether.sim.world import Clock
 
 quick = settings(max_examples=60, deadline=None)
 
-TERMS = reading.load("demo").terms()
+TERMS = reading.load("demo-committed").terms()
 DT_NS, H = TERMS.dt_ns, TERMS.horizon
 HOUR = 3600 * S
 DELAY_NS = 440 * MS
-BEGAN_NS = 10 * HOUR
-"""Begin of step 0, by the vehicle's clock."""
-CLOCK_NS = 7 * HOUR
-"""Vehicle's clock minus server's."""
+BEGAN_NS = 3 * HOUR
+"""Begin of step 0, by the server's clock."""
+BACKWARD_NS = DELAY_NS - BEGAN_NS
+"""G of a packet that comes to the vehicle after its delay."""
 
 
 def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
@@ -44,16 +45,14 @@ def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
     angle, pace = 0.25 * step * TERMS.dt_s, 0.5
     x = 2.0 * np.array([[np.cos(angle), 0.0], [np.sin(angle), 0.0]])
     x[:, 1] = -pace * np.sin(angle), pace * np.cos(angle)
-    stamp_ns = BEGAN_NS + step * DT_NS
     told = Observation(
         1,
         1,
         step,
-        stamp_ns,
         in_force=step - 12,
         since=step - 2,
-        server_ns=stamp_ns - CLOCK_NS - DELAY_NS,
-        received_ns=stamp_ns,
+        backward_us=stamp_us(BACKWARD_NS),
+        heard=step % NUMBERS,
         mode=Mode.TRACK,
         takes=1,
         state=x,
@@ -64,10 +63,10 @@ def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
 
 def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: int = -1) -> Belief:
     """The verdict on an observation that arrives after its delay, or when that of `step` would."""
-    now_ns = BEGAN_NS + (told.step if step < 0 else step) * DT_NS - CLOCK_NS + DELAY_NS
-    forward_ns, backward_ns = now_ns - told.stamp_ns, told.received_ns - told.server_ns
-    epoch_ns = told.stamp_ns - told.step * DT_NS
-    return plausibility.judge(row, told, epoch_ns, forward_ns, backward_ns)
+    now_ns = BEGAN_NS + (told.step if step < 0 else step) * DT_NS + DELAY_NS
+    forward_ns = now_ns - told.step * DT_NS
+    backward_ns = stamped_ns(told.backward_us, near_ns=-forward_ns)
+    return plausibility.judge(row, told, forward_ns, backward_ns)
 
 
 def after(count: int = 5) -> Plausibility:
@@ -94,15 +93,16 @@ def test_a_predicted_position_may_be_off_by_what_the_velocity_may_over_the_dead_
 
 
 ODD: dict[str, tuple[dict[str, Any], Belief]] = {
-    "step 2^36": ({"step": 2**36}, Belief.EPOCH),
-    "a step ahead": ({"step": 106}, Belief.EPOCH),
-    "a stamp an hour ahead": ({"stamp_ns": BEGAN_NS + 105 * DT_NS + HOUR}, Belief.EPOCH),
-    "a stamp a nanosecond ahead": ({"stamp_ns": BEGAN_NS + 105 * DT_NS + 1}, Belief.EPOCH),
-    "an echo an hour ahead": (
-        {"server_ns": BEGAN_NS + 105 * DT_NS - CLOCK_NS + HOUR},
+    "step 2^31": ({"step": 2**31}, Belief.CLOCK),
+    "a step from a second and more ahead": ({"step": 124}, Belief.CLOCK),
+    "an echo from half an hour ahead": (
+        {"backward_us": stamp_us(BACKWARD_NS - HOUR // 2)},
         Belief.CLOCK,
     ),
-    "an echo that came before it was sent": ({"received_ns": 0}, Belief.CLOCK),
+    "an echo that came before it was sent": (
+        {"backward_us": stamp_us(-BEGAN_NS - S)},
+        Belief.CLOCK,
+    ),
     "a horizon from far ahead": ({"in_force": 105 + H + 1}, Belief.HORIZON),
     "a horizon of before": ({"in_force": 91}, Belief.HORIZON),
     "in force since a later step": ({"since": 106}, Belief.HORIZON),
@@ -129,18 +129,14 @@ def test_an_odd_observation_is_not_believed_and_changes_nothing(
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
     """What is odd for one may be the first that is heard of another."""
-    expected = Belief.EPOCH if row == 0 else Belief.BELIEVED
-    assert judge(after(), seen(105, {"stamp_ns": 90 * HOUR}), row=row) == expected
+    expected = Belief.JUMP if row == 0 else Belief.BELIEVED
+    assert judge(after(), elsewhere(105), row=row) == expected
 
 
-def elsewhere(step: int) -> Observation:
-    """What the vehicle says once its clock has stepped, and it has been carried away."""
+def elsewhere(step: int, metres: float = 100.0) -> Observation:
+    """What the vehicle says once it has been carried away."""
     told = seen(step)
-    return told._replace(
-        stamp_ns=told.stamp_ns + HOUR,
-        received_ns=told.received_ns + HOUR,
-        state=told.state + np.array([[100.0, 0.0], [0.0, 0.0]]),
-    )
+    return told._replace(state=told.state + np.array([[metres, 0.0], [0.0, 0.0]]))
 
 
 def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
@@ -148,20 +144,19 @@ def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
     plausibility = after()
     verdicts = [judge(plausibility, elsewhere(step)) for step in range(105, 110)]
     assert verdicts == [
-        *[Belief.EPOCH] * (REPEATS - 1),
+        *[Belief.JUMP] * (REPEATS - 1),
         Belief.ANEW,
         Belief.BELIEVED,
         Belief.BELIEVED,
     ]
-    assert judge(plausibility, seen(110)) == Belief.EPOCH
+    assert judge(plausibility, seen(110)) == Belief.JUMP
 
 
 def test_three_that_do_not_agree_are_not_believed() -> None:
     """Each contradicts the one before it."""
     plausibility = after()
     for n, step in enumerate(range(105, 125)):
-        odd = seen(step, {"stamp_ns": BEGAN_NS + step * DT_NS + (n + 1) * S})
-        assert judge(plausibility, odd, step=step) == Belief.EPOCH
+        assert judge(plausibility, elsewhere(step, 100.0 * (n + 1))) == Belief.JUMP
     assert judge(plausibility, seen(125)) == Belief.BELIEVED
 
 
@@ -169,8 +164,8 @@ def test_two_among_believed_ones_are_not_in_a_row() -> None:
     """However many there are of them."""
     plausibility = after()
     for step in range(105, 205, 3):
-        assert judge(plausibility, elsewhere(step)) == Belief.EPOCH
-        assert judge(plausibility, elsewhere(step + 1)) == Belief.EPOCH
+        assert judge(plausibility, elsewhere(step)) == Belief.JUMP
+        assert judge(plausibility, elsewhere(step + 1)) == Belief.JUMP
         assert judge(plausibility, seen(step + 2)) == Belief.BELIEVED
 
 
@@ -180,7 +175,7 @@ def test_an_odd_one_among_those_that_agree_begins_the_row_anew() -> None:
     told = [
         elsewhere(105),
         elsewhere(106),
-        seen(107, {"stamp_ns": 90 * HOUR}),
+        elsewhere(107, -100.0),
         elsewhere(108),
         elsewhere(109),
     ]
@@ -193,7 +188,8 @@ def test_a_late_observation_tells_of_the_clocks_alone() -> None:
     plausibility = after()
     assert judge(plausibility, seen(90)) == Belief.BELIEVED
     assert judge(plausibility, seen(105)) == Belief.BELIEVED
-    assert judge(plausibility, seen(90, {"stamp_ns": 90 * HOUR})) == Belief.EPOCH
+    early = seen(90, {"backward_us": stamp_us(BACKWARD_NS - S)})
+    assert judge(plausibility, early) == Belief.CLOCK
     assert judge(plausibility, seen(104, {"in_force": -1, "state": moved(50.0)})) == Belief.BELIEVED
     assert judge(plausibility, seen(106)) == Belief.BELIEVED
 
@@ -204,15 +200,15 @@ def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
     assert judge(plausibility, seen(100), row=1) == Belief.BELIEVED
     plausibility.forget(0)
     assert judge(plausibility, elsewhere(3)) == Belief.BELIEVED
-    assert judge(plausibility, elsewhere(101), row=1) == Belief.EPOCH
+    assert judge(plausibility, elsewhere(101), row=1) == Belief.JUMP
 
 
 def test_an_odd_first_observation_is_forgotten_after_three() -> None:
     """Nothing is known that would speak against it."""
     plausibility = Plausibility(TERMS, 1)
-    assert judge(plausibility, seen(100, {"stamp_ns": 90 * HOUR})) == Belief.BELIEVED
+    assert judge(plausibility, elsewhere(100)) == Belief.BELIEVED
     verdicts = [judge(plausibility, seen(step)) for step in range(101, 105)]
-    assert verdicts == [Belief.EPOCH, Belief.EPOCH, Belief.ANEW, Belief.BELIEVED]
+    assert verdicts == [Belief.JUMP, Belief.JUMP, Belief.ANEW, Belief.BELIEVED]
 
 
 @quick
@@ -234,35 +230,20 @@ def test_whatever_a_vehicle_may_say_is_believed(
         up_ns, down_ns = (int(rng.integers(jitter_ms * MS + 1)) for _ in range(2))
         # The server's clock drifts away from the vehicle's.
         drift_ns = (step - 100) * DT_NS * drift_ppm // 1_000_000
-        now_ns = told.stamp_ns - CLOCK_NS + drift_ns + down_ns
-        backward_ns = CLOCK_NS - drift_ns + up_ns
-        epoch_ns = told.stamp_ns - step * DT_NS
-        verdict = plausibility.judge(0, told, epoch_ns, now_ns - told.stamp_ns, backward_ns)
-        assert verdict == Belief.BELIEVED
-
-
-@quick
-@given(st.sampled_from(["step", "stamp_ns"]), st.integers(0, 39), st.sampled_from([105, 2**20 - 1]))
-def test_no_flipped_bit_of_a_step_or_a_stamp_is_believed(field: str, bit: int, step: int) -> None:
-    """Neither comes without the other."""
-    plausibility = Plausibility(TERMS, 1)
-    assert judge(plausibility, seen(step - 1)) == Belief.BELIEVED
-    told = seen(step)
-    odd = told._replace(**{field: getattr(told, field) ^ 1 << bit})
-    assert judge(plausibility, odd, step=step) > Belief.BELIEVED
+        forward_ns = BEGAN_NS + drift_ns + down_ns
+        backward_us = stamp_us(up_ns - BEGAN_NS - drift_ns)
+        backward_ns = stamped_ns(backward_us, near_ns=-forward_ns)
+        assert plausibility.judge(0, told, forward_ns, backward_ns) == Belief.BELIEVED
 
 
 @pytest.mark.parametrize("first", [True, False])
-@pytest.mark.parametrize(("step", "stamp_ns"), [(2**40, 0), (2**40, 2**63 - 1), (0, 2**63 - 1)])
-def test_the_largest_numbers_on_the_wire_overflow_nothing(
-    step: int, stamp_ns: int, *, first: bool
-) -> None:
-    """A grid that began before the vehicle's clock did is none, be it the first that is heard."""
+@pytest.mark.parametrize("backward_us", [0, 2**31, 2**32 - 1])
+def test_the_largest_step_on_the_wire_overflows_nothing(backward_us: int, *, first: bool) -> None:
+    """First in its session, it is believed: nothing is known that would speak against it."""
     plausibility = Plausibility(TERMS, 1) if first else after()
-    odd = seen(105)._replace(step=step, stamp_ns=stamp_ns, in_force=-1, since=0)
-    impossible = stamp_ns < step * DT_NS
-    expected = Belief.EPOCH if impossible or not first else Belief.BELIEVED
-    assert judge(plausibility, odd, step=105) == expected
+    last = seen(105)._replace(step=2**32 - 1, in_force=-1, since=0, backward_us=backward_us)
+    verdict = judge(plausibility, last, step=105)
+    assert verdict == Belief.CLOCK or (first and verdict == Belief.BELIEVED)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +282,7 @@ def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit:
 
 def scenario(**changes: Any) -> Scenario:
     """The demo, told of at every step, with some keys changed."""
-    table = reading.to_table(reading.load("demo"))
+    table = reading.to_table(reading.load("demo-committed"))
     table["vehicle"]["report"] = "always"
     table["link"] |= {"heartbeat_s": 0.1, "timeout_s": 1.0}
     return reading.check(table | changes, "test")
@@ -353,7 +334,7 @@ def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
     good, bad = rmse(flipped(0.0)), flipped(0.01)
     assert rmse(bad) == pytest.approx(good, rel=0.1)
     dropped = bad[0].figures["server"]["dropped"]  # of all of them
-    assert dropped.get(Drop.IMPLAUSIBLE_EPOCH, 0) > 0
+    assert dropped.get(Drop.IMPLAUSIBLE_HORIZON, 0) > 0
     assert all(flight.failure is None for flight in bad)
     monkeypatch.setattr(Plausibility, "judge", believe)
     assert rmse(flipped(0.01)) > 2.0 * good
@@ -371,7 +352,7 @@ def oddly(
         send(self, message)
 
     monkeypatch.setattr(ServerSession, "send", lie)
-    control = reading.to_table(reading.load("demo"))["control"] | {"feedback": feedback}
+    control = reading.to_table(reading.load("demo-committed"))["control"] | {"feedback": feedback}
     network = {"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}
     return fly(scenario(control=control, network=network))
 
@@ -379,7 +360,13 @@ def oddly(
 @pytest.mark.parametrize("number", [0, 300])
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("step", 2**36), ("stamp_ns", HOUR), ("server_ns", HOUR), ("since", -1), ("in_force", 2**30)],
+    [
+        ("step", 16),
+        ("step", 2**20),
+        ("backward_us", -10_000_000),
+        ("since", -1),
+        ("in_force", 2**30),
+    ],
 )
 def test_one_odd_observation_costs_a_few_steps_at_most(
     number: int, field: str, value: int, monkeypatch: pytest.MonkeyPatch
@@ -388,24 +375,23 @@ def test_one_odd_observation_costs_a_few_steps_at_most(
     flight = oddly(monkeypatch, number, field, value)
     assert flight.failure is None
     steps = flight.server["step"]
+    steps = steps[steps < 2**19]
     assert steps[0] <= 12 + REPEATS + 1
-    assert np.diff(steps).max() <= 2
+    assert np.diff(steps).max() <= 9  # one within the round trip, of 0.88 s, is believed
     error = summarise(scenario(), "test", flight.client).error_max
     assert error is not None
     assert error < 0.5
 
 
-@pytest.mark.parametrize("field", ["step", "stamp_ns"])
 def test_believed_one_odd_observation_leaves_the_vehicle_alone(
-    field: str, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: no observation is newer than step 2^36, no horizon is for a step of now.
+    """Ablation: no observation is newer than step 2^20, no horizon is for a step of now.
 
-    Without feedback: with it the server would go 2^36 steps along where its plan leads.
+    Without feedback: with it the server would go 2^20 steps along where its plan leads.
     """
     monkeypatch.setattr(Plausibility, "judge", believe)
-    value = 2**36 if field == "step" else HOUR
-    flight = oddly(monkeypatch, 300, field, value, feedback=False)
+    flight = oddly(monkeypatch, 300, "step", 2**20, feedback=False)
     error = summarise(scenario(), "test", flight.client).error_max
     assert flight.failure is not None or (error or 0.0) > 0.5
 
@@ -464,7 +450,9 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
             self.x = [(p + 300.0, v) for p, v in self.x]
 
     monkeypatch.setattr(FirstOrderPlant, "advance", leaping)
-    flight = fly(reading.check(reading.to_table(reading.load("demo")) | {"duration": 40.0}, "test"))
+    flight = fly(
+        reading.check(reading.to_table(reading.load("demo-committed")) | {"duration": 40.0}, "test")
+    )
     said = [event for _, _, event in flight.events]
     assert StateDoubted(vehicle=1) in said
     changes = [(each.after, each.reason) for each in said if isinstance(each, ModeChanged)]

@@ -73,8 +73,8 @@ def plug(folder: Path, code: str, name: str = "mine.py") -> str:
 
 
 def scenario(**sections: Any) -> Scenario:
-    """The scenario demo for ten seconds, with other keys in its sections."""
-    table = reading.to_table(reading.load("demo")) | {"duration": 10.0}
+    """The scenario demo-committed for ten seconds, with other keys in its sections."""
+    table = reading.to_table(reading.load("demo-committed")) | {"duration": 10.0}
     for section, values in sections.items():
         table[section] = table[section] | values
     return reading.check(table, "test")

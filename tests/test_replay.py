@@ -36,6 +36,10 @@ def scenario(name: str = "paper", **changes: Any) -> Scenario:
     return reading.check(table, "test")
 
 
+TOLD_M = 2e-7
+"""How exactly float32 tells a position of some metres [m]."""
+
+
 def lossy(loss: float, down: float = 0.1) -> dict[str, Any]:
     """The paper's network, with other losses."""
     return {"uplink": {"loss": loss}, "downlink": {"loss": down}}
@@ -73,7 +77,7 @@ def see(
     """An observation comes, of a vehicle that flies by the rule unless it is told what it flies."""
     u = by_rule(replay, step, in_force) if flown is None else flown
     told = Mode.TRACK, takes, state, u
-    return replay.observe(0, Observation(1, 1, step, 0, in_force, since, 0, 0, *told))
+    return replay.observe(0, Observation(1, 1, step, in_force, since, 0, 0, *told))
 
 
 def by_rule(replay: Replay, step: int, in_force: int) -> Array:
@@ -308,12 +312,12 @@ def sparse() -> tuple[Scenario, Record]:
 def test_the_estimate_is_exact_once_every_horizon_has_arrived_or_is_known_lost(
     sparse: tuple[Scenario, Record], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without noise, to 1e-9; without acknowledgements it is not."""
+    """Without noise, as exact as a state is told; without acknowledgements it is not."""
     flown, flight = sparse
     certain = settled(flight, 16)
     assert certain.sum() > 300
     assert flight.figures["server"]["counts"]["horizons_lost"] > 3
-    assert estimate_error(flight)[certain].max() <= 1e-9
+    assert estimate_error(flight)[certain].max() <= TOLD_M
     assert estimate_error(flight).max() > 1e-3  # of others it cannot be
 
     sent: list[int] = []
@@ -341,7 +345,7 @@ def test_a_packet_at_every_step_hides_what_is_lost() -> None:
     flown = scenario(control={"trigger": "always", "delay_bound": 0.8}, duration=20.0)
     flight = fly(flown)
     assert flight.netem["lost"].sum() > 50
-    assert estimate_error(flight)[40:].max() <= 1e-9
+    assert estimate_error(flight)[40:].max() <= TOLD_M
 
 
 def test_every_lost_horizon_is_counted(sparse: tuple[Scenario, Record]) -> None:
@@ -458,7 +462,7 @@ def test_feedback_aboard_flies_in_wind_with_a_packet_a_second() -> None:
 
 
 def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
-    """Without noise, to 1e-9, once every horizon has arrived or is known to be lost."""
+    """Without noise, as exact as a state is told, once each horizon has come or is lost."""
     control = {
         "scheme": "committed",
         "feedback": True,
@@ -469,7 +473,7 @@ def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
     flown = scenario(control=control, network=lossy(0.33), duration=60.0)
     flight = fly(flown)
     assert flight.figures["server"]["counts"]["horizons_lost"] > 3
-    assert estimate_error(flight)[settled(flight, 16)].max() <= 1e-9
+    assert estimate_error(flight)[settled(flight, 16)].max() <= TOLD_M
 
 
 def test_the_observer_sees_past_feedback_aboard() -> None:

@@ -291,7 +291,7 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
     arriving = {begin: (make_horizon(rng, FIRST, first, x, gain), begin - observed)}
     replay.observe(
         0,
-        Observation(1, 1, begin - observed, 0, NO_HORIZON, 0, 0, 0, Mode.READY, 1, x, np.zeros(2)),
+        Observation(1, 1, begin - observed, NO_HORIZON, 0, 0, 0, Mode.READY, 1, x, np.zeros(2)),
     )
     send(replay, arriving[begin][0])
     for step in range(begin, now + BOUND + H):
@@ -307,7 +307,7 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
         inputs.append(np.array(vehicle.choose(step, x.tolist())))
         if step in {begin, seen}:
             told = Mode.TRACK, 1, x, inputs[-1]
-            replay.observe(0, Observation(1, 1, step, 0, FIRST, begin, 0, 0, *told))
+            replay.observe(0, Observation(1, 1, step, FIRST, begin, 0, 0, *told))
             foresee(replay, step)
         x = terms.model.step(x, inputs[-1])
 

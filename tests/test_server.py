@@ -29,7 +29,7 @@ from skytether.shared.core.events import (
     SessionRefused,
     Unauthenticated,
 )
-from skytether.shared.law.heartbeat import Hearing
+from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -51,6 +51,7 @@ from skytether.shared.wire.protocol import (
     Welcome,
     decode,
     encode,
+    stamp_us,
 )
 
 HERE: Address = ("vehicle", 1)
@@ -58,7 +59,7 @@ LINE = PlainGate().open(Datagram(b"", ("", 0)), now_ns=0).line
 SILENCE_NS = 1500 * MILLISECOND_NS
 """Time after which another life of a vehicle may take its number, in all of these tests."""
 DAY_NS = 86_400 * SECOND_NS
-"""What the vehicle's clock is ahead of the server's, in all of these tests."""
+"""A day [ns]."""
 
 
 def scenario(**control: Any) -> Scenario:
@@ -83,7 +84,7 @@ class Vehicles:
         # Ticks lie on multiples of 50 ms: the first comes 30 ms after what is said first.
         self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
         self.epochs_ns: dict[int, int] = {}
-        """Begin of step 0 of each session, by the vehicle's clock."""
+        """Begin of step 0 of each session."""
 
     def say(self, message: Message, sender: Address = HERE) -> list[tuple[Message, Address]]:
         """One datagram, and the answers to it."""
@@ -114,27 +115,31 @@ class Vehicles:
         state: object = ((1.0, 0.0), (0.0, 0.0)),
         sender: Address = HERE,
     ) -> None:
-        """An observation that took no time, unless it is an old one; the clocks are a day apart."""
-        epoch_ns = self.now_ns + DAY_NS - step * self.dt_ns
-        stamp_ns = self.epochs_ns.setdefault(welcome.session, epoch_ns) + step * self.dt_ns
-        self.now_ns = max(self.now_ns, stamp_ns - DAY_NS)
-        observation = Observation(
+        """An observation that took no time, unless it is an old one."""
+        epoch_ns = self.epochs_ns.setdefault(welcome.session, self.now_ns - step * self.dt_ns)
+        self.now_ns = max(self.now_ns, epoch_ns + step * self.dt_ns)
+        assert self.say(self.told(welcome, step, state), sender) == []
+
+    def told(
+        self, welcome: Welcome, step: int, state: object = ((1.0, 0.0), (0.0, 0.0))
+    ) -> Observation:
+        """Observation of a step of a session that has an epoch."""
+        epoch_ns = self.epochs_ns[welcome.session]
+        return Observation(
             welcome.vehicle,
             welcome.session,
             step,
-            stamp_ns,
             in_force=NO_HORIZON,
             since=0,
-            server_ns=stamp_ns - DAY_NS,
-            received_ns=stamp_ns,
+            backward_us=stamp_us(-epoch_ns),
+            heard=step % NUMBERS,
             mode=Mode.TRACK,
             takes=1,
             state=np.array(state),
             input=np.zeros(2),
-            number=step,
-            silence_ms=1000,
+            number=step % NUMBERS,
+            silence=40,
         )
-        assert self.say(observation, sender) == []
 
     def tick(self) -> list[tuple[Message, Address]]:
         """Time passes until the next tick; what is sent at it."""
@@ -238,17 +243,46 @@ def test_the_first_tick_sends_a_horizon_for_the_step_it_is_aboard() -> None:
     vehicles = Vehicles(scenario())
     welcome = vehicles.open()
     vehicles.observe(welcome, 100)
-    observed_ns = vehicles.now_ns + DAY_NS
     ((horizon, peer),) = vehicles.tick()
     assert isinstance(horizon, Horizon)
     assert peer == HERE
     assert (horizon.vehicle, horizon.session) == (1, welcome.session)
     # 30 ms have passed since the start of step 100, a step is 50 ms.
     assert horizon.step == 100
-    assert horizon.observed_ns == observed_ns
+    assert horizon.age == 0
     ((later, _),) = vehicles.tick()
     assert isinstance(later, Horizon)
-    assert later.step == 101
+    assert (later.step, later.age) == (101, 1)
+
+
+@pytest.mark.parametrize("minutes", [36, 71, 71.6, 72, 143.2, 1000])
+def test_an_observation_that_was_held_back_is_no_new_one(minutes: float) -> None:
+    """However often stamps have begun anew since: it makes a round trip of less than nothing."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    vehicles.observe(welcome, 1)
+    later = round(minutes * 60 * SECOND_NS) // vehicles.dt_ns
+    vehicles.observe(welcome, later)
+    assert vehicles.server.dropped == {}
+    vehicles.say(vehicles.told(welcome, 1))
+    assert vehicles.server.dropped == {Drop.IMPLAUSIBLE_CLOCK: 1}
+    vehicles.observe(welcome, later + 1)
+    assert vehicles.server.dropped == {Drop.IMPLAUSIBLE_CLOCK: 1}
+
+
+def test_a_vehicle_that_is_begun_anew_has_its_packets_counted_anew() -> None:
+    """Else all were late after one that told of a step 71 minutes ahead, and none counted."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.epochs_ns[welcome.session] = vehicles.now_ns
+    vehicles.say(vehicles.told(welcome, 71 * 60 * 20))
+    for step in range(4):
+        vehicles.say(vehicles.told(welcome, step))
+        vehicles.now_ns += vehicles.dt_ns
+    (session,) = vehicles.server.sessions
+    assert vehicles.server.dropped == {Drop.IMPLAUSIBLE_CLOCK: 2}
+    assert session.hearing.newest == 3
 
 
 def test_the_newest_observation_wins_after_reordering() -> None:
@@ -564,7 +598,7 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
                     numbers[vehicle, boot_id] = session.number
                     due[vehicle] = (boot_id, now_ns + WELCOME_NS)
             case "observe" if (vehicle, boot_id) in numbers:
-                told = 0, 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
+                told = 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
                 said = Observation(vehicle, numbers[vehicle, boot_id], *told)
                 granted, refused = due.get(vehicle, (-1, 0)), ""
                 try:
@@ -636,12 +670,13 @@ def test_a_row_that_was_left_is_used_again_as_if_it_were_new() -> None:
 
 
 def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
-    """One vehicle reports a position at which its QP overflows; the other flies on."""
+    """One vehicle is at a position at which its QP overflows; the other flies on."""
     vehicles = Vehicles(scenario())
     good = vehicles.open(vehicle=1, sender=("v", 1))
     bad = vehicles.open(vehicle=2, sender=("v", 2))
     vehicles.observe(good, 0, sender=("v", 1))
-    vehicles.observe(bad, 0, state=((1e308, 1e308), (0.0, 0.0)), sender=("v", 2))
+    vehicles.observe(bad, 0, sender=("v", 2))
+    vehicles.server.controller._scheme._memory.state[1, 0] = 1e308  # no float32 is as large
     with np.errstate(all="ignore"):
         sent = vehicles.tick()
     assert [peer for _, peer in sent] == [("v", 1)]

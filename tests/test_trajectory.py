@@ -1,5 +1,6 @@
 """The scheme "trajectory": what is sent in place of a plan, when, and how it is flown."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -11,15 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+import skytether
 from skytether.client.compensator import Compensator
 from skytether.client.navigation import Navigation
 from skytether.server.control import trajectory
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.desired import Desired, Window
+from skytether.server.control.knots import fewest_knots
+from skytether.server.control.nominal import make_nominal, plan_nominal
 from skytether.server.control.scheme import Foresight, foresight
 from skytether.server.control.trajectory import Guidance
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.law.model import Array, Indices
+from skytether.shared.base.kernel import plain
+from skytether.shared.law.model import Array, Indices, advance
 from skytether.shared.law.spline import Guide, along, follow, guided_to, spline_at
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import feedback_gain
@@ -222,7 +227,7 @@ class Server:
         self, step: int, *, in_force: int = NO_HORIZON, since: int = 0, takes: int = 1
     ) -> None:
         """An observation of a vehicle at rest at the origin."""
-        at = (step, 0, in_force, since, 0, 0, Mode.TRACK, takes)
+        at = (step, in_force, since, 0, 0, Mode.TRACK, takes)
         self.scheme.observe(0, Observation(1, 1, *at, np.zeros((2, 2)), np.zeros(2)))
 
     def at(self, step: int, *states: Sequence[float], send: bool = False) -> Any:
@@ -371,31 +376,21 @@ def test_a_new_life_forgets_what_the_old_one_was_sent() -> None:
     assert server.at(1)["fresh"]
 
 
-def fitted(flown: Scenario, path: Any) -> tuple[int, int, Array]:
+def fitted(path: Any, error_m: float) -> tuple[int, int, float]:
     """Number of knots, spacing, and largest distance of the spline of a path of the time."""
-    server = Server(flown)
-    scheme, H = server.scheme, flown.control.horizon
-    scheme._settings = scheme._settings._replace(seen=H)
-    times = np.arange(H + 1) * 0.1
+    times = np.arange(61) * 0.1
     states = np.stack([path(times), np.gradient(path(times), 0.1)], axis=-1)
-    server.desired.moved = np.stack([states, states])[None]
-    server.observe(0)
-    server.at(1, send=True)
-    told = server.found.told
-    count, spacing = int(told.number[0]), int(told.spacing[0])
-    knots = told.knots[0, 0, : 2 * count]
-    found = [spline_at(knots, spacing, 0.1, stage)[0] for stage in range(H + 1)]
-    return count, spacing, np.abs(np.array(found) - states[:, 0]).max()
+    knots = np.zeros((2, 2 * KNOTS_MAX), dtype=np.float32)
+    count, spacing = plain(fewest_knots)(np.stack([states, states]), 0.1, error_m, knots)
+    some = knots[0, : 2 * count]
+    found = np.array([spline_at(some, spacing, 0.1, stage)[0] for stage in range(61)])
+    return count, spacing, float(np.abs(found - states[:, 0]).max())
 
 
 def test_as_few_knots_are_sent_as_keep_near_enough() -> None:
     """A line has one; a wave has more, the more the nearer it is to be followed."""
-    flown = scenario(control={"horizon": 60})
-    assert fitted(flown, lambda t: 0.5 * t)[0] == 1
-    few, many = (
-        fitted(scenario(control={"horizon": 60, "spline_error_m": error}), np.sin)
-        for error in (0.03, 0.003)
-    )
+    assert fitted(lambda t: 0.5 * t, 0.02)[0] == 1
+    few, many = (fitted(np.sin, error) for error in (0.03, 0.003))
     assert 1 < few[0] < many[0] < KNOTS_MAX
     assert few[2] <= 0.03
     assert many[2] <= 0.003
@@ -403,8 +398,67 @@ def test_as_few_knots_are_sent_as_keep_near_enough() -> None:
 
 def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
     """A square wave."""
-    count, spacing, _ = fitted(scenario(control={"horizon": 60}), lambda t: np.sign(np.sin(9 * t)))
+    count, spacing, _ = fitted(lambda t: np.sign(np.sin(9 * t)), 0.02)
     assert (count, spacing) == (KNOTS_MAX, 4)
+
+
+# -- what is seen ahead --------------------------------------------------------------------------
+
+
+@given(
+    st.tuples(st.floats(-5, 5), st.floats(-1, 1)),
+    st.lists(st.floats(-9, 9), min_size=41, max_size=41),
+)
+@settings(max_examples=40)
+def test_what_a_vehicle_is_told_can_be_flown(
+    start: tuple[float, float], places: list[float]
+) -> None:
+    """Whatever is desired: its motion goes on from where it is led, by inputs within bounds."""
+    flown = scenario(control={"horizon": 40}, reference={"preview": "all"})
+    terms = flown.terms()
+    nominal = make_nominal(terms, flown.control, capacity=1)
+    desired = np.zeros((2, 41, 2))
+    desired[:, :, 0] = places
+    states = np.zeros((2, 41, 2))
+    states[:, 0] = start
+    assert plain(plan_nominal)(nominal, 0, 7, desired, states)
+    assert states[:, 0].tolist() == [list(start)] * 2
+    for axis, model in enumerate(terms.model.axes()):
+        for (p, v), (q, w) in itertools.pairwise(states[axis].tolist()):
+            u = (w - model.a11 * v) / model.b1
+            assert abs(u) <= terms.u_max[axis] * (1 + 1e-9)
+            assert advance(model, p, v, u) == pytest.approx((q, w), abs=1e-9)
+
+
+FAST = {
+    "duration": 30.0,
+    "reference.preview": 4.0,
+    "reference.agility": 0.6,
+    "reference.speed_mps": 1.5,
+    "vehicle.report": "always",
+    "control.state_weight": [7.1, 0.07],
+    "control.input_weight": 0.05,
+}
+"""A target nearly as fast as the vehicle, which the server sees for 4 s."""
+
+
+def test_bounds_shape_what_is_told() -> None:
+    """A trajectory flies as near as plans of inputs that know of the bounds do, with fewer packets.
+
+    If it told what is desired, without regard to the bounds, its error would be twice as large.
+    """
+    plans, told = (
+        [
+            flight.summary
+            for flight in skytether.fly_batch(
+                "target", range(3), **FAST, **{"control.scheme": scheme, "control.trigger": trigger}
+            )
+        ]
+        for scheme, trigger in (("committed", "cost_gap(2)"), ("trajectory", "expected_gap(0.05)"))
+    )
+    error, error_told = (np.mean([run.rmse_xy for run in runs]) for runs in (plans, told))
+    assert error_told < 1.1 * error
+    assert sum(run.uplink_packets for run in told) < sum(run.uplink_packets for run in plans)
 
 
 # -- the wire --------------------------------------------------------------------------------
@@ -412,19 +466,19 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
 
 def message(step: int, knots: Floats, *, age: int = 9, spacing: int = 5) -> Trajectory:
     """What the server sends at a step."""
-    return Trajectory(65535, 2**32 - 1, step, 2**62, age, spacing, knots)
+    return Trajectory(65535, 2**32 - 1, step, 2**32 - 1, age, spacing, knots)
 
 
 @pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("count", [1, 9, KNOTS_MAX])
 def test_a_packet_is_small(axes: int, count: int) -> None:
-    """34 bytes as a rule, 48 at most, and 8 for each knot and axis."""
+    """23 bytes as a rule, 36 at most, and 8 for each knot and axis."""
     knots = np.zeros((axes, count, 2), np.float32)
-    longest = message(2**40, knots, age=2**32 - 1, spacing=2**16 - 1)
-    longest = longest._replace(number=2**32 - 1, silence_ms=2**16 - 1)
-    assert len(encode(longest)) <= 48 + 8 * axes * count
-    usual = Trajectory(1, 2**32 - 1, 1200, 2**47, 12, 8, knots, 300, 300)
-    assert len(encode(usual)) <= 34 + 8 * axes * count
+    longest = message(2**32 - 1, knots, age=2**32 - 1, spacing=2**16 - 1)
+    longest = longest._replace(number=127, silence=2**16 - 1)
+    assert len(encode(longest)) <= 36 + 8 * axes * count
+    usual = Trajectory(1, 2**32 - 1, 1200, 2**32 - 1, 12, 8, knots, 100, 25)
+    assert len(encode(usual)) == 23 + 8 * axes * count + (axes * count >= 32)
 
 
 def test_what_is_sent_is_what_is_read() -> None:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import skytether
 from skytether.server.control.planner import FIGURES, Figures
 from skytether.shared.law.model import Flags, Indices, discretise
 from skytether.shared.scenario.registry import TRIGGERS
@@ -56,6 +57,7 @@ KNOWN = Known(
     horizons=np.arange(20, dtype=np.float32).reshape(2, 2, 5),
     held=np.arange(12.0).reshape(2, 2, 3),
     sent_step=np.array([40, -1]),
+    owed=np.array([False, True]),
     desired=lambda rows, *_: np.zeros((len(rows), 2, 4, 2)),
 )
 """What is known of two vehicles at most."""
@@ -249,6 +251,35 @@ def test_silence_ends_in_time() -> None:
     for seconds, steps in ((0.35, 7), (0.33, 6), (0.01, 1)):
         trigger = trigger_of(f"silence({seconds})", dt=0.05)
         assert events(trigger, 3, 40) == list(range(3, 41, steps))
+
+
+def test_heartbeat_sends_where_one_is_due() -> None:
+    """To the second vehicle here, which is owed one; and to one that has nothing to fly on with."""
+    sent = trigger_of("heartbeat")
+    both = np.array([0, 1])
+    known = KNOWN._replace(sent_step=np.array([40, 40]))
+    for fresh, events in ((False, [False, True]), (True, [True, True])):
+        asked = facing(both, figures_of(2, step=41, fresh=fresh))._replace(known=known)
+        assert sent.test(asked).event.tolist() == events
+
+
+def test_a_horizon_takes_the_place_of_a_heartbeat() -> None:
+    """The server says no more often that it lives, and the target is followed closer."""
+    few, owed = (
+        skytether.fly(
+            "target",
+            **{
+                "duration": 20.0,
+                "seed": 3,
+                "control.scheme": "trajectory",
+                "control.trigger": trigger,
+            },
+        ).summary
+        for trigger in ("expected_gap(50)", "expected_gap(50) | heartbeat")
+    )
+    assert few.event_ratio < 0.5 * owed.event_ratio
+    assert owed.uplink_packets <= 1.1 * few.uplink_packets
+    assert owed.rmse_xy < 0.9 * few.rmse_xy
 
 
 @pytest.mark.parametrize(("horizon", "steps"), [(40, 20), (41, 20), (3, 1), (2, 1), (1, 1)])

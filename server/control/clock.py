@@ -1,12 +1,13 @@
 """Which step it is aboard each vehicle: the server's clock mapped to the vehicle's.
 
-Neither clock is set. Every observation gives F = t2 - t1 (sent by the vehicle, received here) and,
-by its echo of our own stamp, G = t4 - t3 (sent here, received aboard). Over the last 20 s
+Neither clock is set; the vehicle's is the time since its step 0. Every observation gives
+F = t2 - t1 (sent by the vehicle, received here) and tells G = t4 - t3 (sent here, received aboard)
+of the newest packet from here. Over the last 20 s
 
     offset = (min G - min F) / 2,    bound = (min F + min G) / 2,
 
 vehicle's clock minus server's. Half of any asymmetry of the two smallest delays stays unknown: the
-offset is right to within the bound and no better. Step k begins at epoch + k Δt of the vehicle.
+offset is right to within the bound and no better. Step k begins at k Δt of the vehicle.
 """
 
 from typing import Annotated, NamedTuple
@@ -44,14 +45,12 @@ class VehicleClock:
 
     newest: int
     """Half second of its newest sample, since our clock's zero."""
-    echo: int
-    """Stamp of ours that its newest echo is of [ns]."""
     heard: int
-    """Number of echoes so far."""
+    """`Observation.heard` of its newest observation; -1 before the first."""
+    echoes: int
+    """Number of packets of ours that it has told G of."""
     adopted: int
     """Offset that is reckoned with, the vehicle's clock minus ours [ns], or UNSEEN."""
-    epoch: int
-    """Begin of step 0 [ns; vehicle's clock]."""
 
 
 VEHICLE_CLOCK = record(VehicleClock)
@@ -85,8 +84,6 @@ class ClockMap:
             samples=np.empty((capacity, BUCKETS), dtype=np.int64),
             echoes=np.empty((capacity, ECHOES), dtype=np.int64),
         )
-        self.epoch_ns = self.seen.vehicles["epoch"]
-        """Begin of step 0 [vehicle's clock]; shape (capacity,)."""
         for row in range(capacity):
             self.forget(row)
 
@@ -94,17 +91,17 @@ class ClockMap:
         """Begin anew with a vehicle, or with a new life of it."""
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN
-        self.seen.vehicles[row] = (0, 0, 0, UNSEEN, 0)
+        self.seen.vehicles[row] = (0, -1, 0, UNSEEN)
 
     def observe(
-        self, row: int, forward_ns: int, backward_ns: int, *, echo_ns: int, now_ns: int
+        self, row: int, forward_ns: int, backward_ns: int, *, heard: int, now_ns: int
     ) -> None:
         """Take one F and one G of a vehicle, received at `now_ns`.
 
         Args:
-            echo_ns: our own stamp that G is of.
+            heard: another number for each packet of ours that G is of.
         """
-        _observe(self.seen, row, forward_ns, backward_ns, echo_ns, now_ns // BUCKET_NS)
+        _observe(self.seen, row, forward_ns, backward_ns, heard, now_ns // BUCKET_NS)
 
     def steps(self, rows: Indices, now_ns: int) -> Indices:
         """Step k of each vehicle at a time of the server's clock; shape (n,)."""
@@ -139,13 +136,13 @@ def shortest_ns(seen: Seen, row: int) -> int:
 
 
 @kernel
-def _observe(seen: Seen, row: int, forward: int, backward: int, echo: int, bucket: int) -> None:
+def _observe(seen: Seen, row: int, forward: int, backward: int, heard: int, bucket: int) -> None:
     """Take F and G [ns] of a vehicle into the half second `bucket`."""
     vehicle = seen.vehicles[row]
-    if echo != vehicle.echo:
-        vehicle.echo = echo
-        seen.echoes[row, vehicle.heard % ECHOES] = backward
-        vehicle.heard += 1
+    if heard != vehicle.heard:
+        vehicle.heard = heard
+        seen.echoes[row, vehicle.echoes % ECHOES] = backward
+        vehicle.echoes += 1
     for passed in range(max(vehicle.newest + 1, bucket - BUCKETS + 1), bucket + 1):
         slot = passed % BUCKETS
         seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
@@ -202,4 +199,4 @@ def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
         vehicle = seen.vehicles[row]
         if vehicle["adopted"] == UNSEEN or abs(estimate - vehicle["adopted"]) > dt // 2:
             vehicle["adopted"] = estimate
-        steps[i] = (now + vehicle["adopted"] - vehicle["epoch"]) // dt
+        steps[i] = (now + vehicle["adopted"]) // dt

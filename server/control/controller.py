@@ -113,6 +113,8 @@ class Controller:
         """Tracebacks of mistakes in plug-ins' policies, one for each policy, to be told."""
         self._sent_step = np.full(room, -1, dtype=np.int64)
         """Step at which each vehicle was sent a horizon last, or -1; shape (room,)."""
+        self.owed: Flags = np.zeros(room, dtype=np.bool_)
+        """Whether each vehicle is sent a heartbeat at this tick if nothing else; shape (room,)."""
         self.change_trigger(control)
         self._stopwatch = stopwatch
         self.last_step = np.full(room, -1, dtype=np.int64)
@@ -151,6 +153,7 @@ class Controller:
             horizons=found.horizons,
             held=found.held if terms.commits else None,
             sent_step=self._sent_step,
+            owed=self.owed,
             desired=self.desired.states,
         )
 

@@ -1,11 +1,10 @@
 """Trajectories: the vehicle is told the desired trajectory, and which one it holds is estimated.
 
-No plan is made. What is sent at step k is the desired trajectory from there on, as far as the
-server sees ahead, as a spline with as few uniform knots as keep within `control.spline_error_m` of
-it (`shared.law.spline`); where the server sees nothing ahead that is one knot, the state of the
-target at k. An inner knot has the mean velocity about it: that of the knot alone would make the
-input of a target that moves at random swing. The vehicle regulates itself along the spline, so all
-that is known of the vehicle is its newest observation.
+What is sent at step k is the trajectory to be followed from there on: where the server sees ahead,
+the nominal motion of the vehicle along what it sees (`server.control.nominal`), and else the state
+of the target at k. It is sent as a spline with as few uniform knots as keep within
+`control.spline_error_m` of it (`shared.law.spline`); of a state that is one. The vehicle regulates
+itself along the spline, so all that is known of the vehicle is its newest observation.
 
 Which trajectory it follows is not certain: every observation acknowledges the one in force, and
 those sent since may be on their way, or lost. With the share ℓ of losses and the share S(t) of
@@ -40,6 +39,8 @@ from skytether.server.control.clock import ClockMap, Seen, half_trip_ns, shortes
 from skytether.server.control.committed import LEARNED, LOSS, MARGIN
 from skytether.server.control.delay import SAMPLES, DelayBound, acknowledge, at_least, begin
 from skytether.server.control.desired import Desired, Window
+from skytether.server.control.knots import fewest_knots, spline_at
+from skytether.server.control.nominal import Nominal, make_nominal, plan_nominal
 from skytether.server.control.planner import FIGURES, Figures
 from skytether.server.control.scheme import Foresight, Splines
 from skytether.shared.base.kernel import (
@@ -49,7 +50,6 @@ from skytether.shared.base.kernel import (
     F3,
     F4,
     I1,
-    S2,
     inline,
     kernel,
     part,
@@ -71,11 +71,9 @@ SURE = 1e-3
 """Probability below which what is left of the cases is not looked at."""
 TINY = 1e-9
 """Smallest K_p, for weights that ask for none [1/s]."""
-INTERVALS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, KNOTS_MAX - 1])
-"""Numbers of intervals between knots that are tried, fewest first."""
 
-spline_at, along = shared(spline.spline_at), shared(spline.along)
-shared(spline.guided), shared(spline.guided_to)
+along, guided_to = shared(spline.along), shared(spline.guided_to)
+shared(spline.guided)
 follow = shared(spline.follow)
 """The rule of flight along a spline, compiled for kernels."""
 
@@ -207,9 +205,10 @@ class Guidance:
         """What flying on would cost; those of a block come first."""
         self.planned = np.zeros((block, axes, 2))
         """States at k of the trajectories sent last [m, m/s]; shape (block, axes, 2)."""
-        self._now = np.zeros((block, axes, 2))
-        """Desired states at k, with velocities within the bounds [m, m/s]."""
-        self._window: Window | None = None
+        self._nominal = make_nominal(terms, control, capacity if desired.seen else 0)
+        self._intended = np.zeros((block, axes, desired.seen + 1, 2))
+        """Trajectories that would be sent now, from k on [m, m/s]; shape (block, axes, seen + 1,
+        2)."""
         for row in range(capacity):
             self.forget(row)
 
@@ -237,48 +236,49 @@ class Guidance:
         found.estimate[:n] = found.start[:n] = self._memory.state[rows]
 
     def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Fill in `figures` and `planned`, and the desired state of now in place of a plan.
+        """Fill in `figures` and `planned`, and the velocity of now in place of a plan.
 
         Args:
             rows: the vehicles; shape (n,).
             step: k of each; shape (n,).
             found: what is filled in.
         """
-        self._window = self._desired.window(rows, step, found.ahead)
-        lost = _appraise(
+        lost, unsolved = _appraise(
             self._settings,
             self._memory,
             self.delay_bound,
             self._clock.seen,
-            self._window,
+            self._nominal,
+            self._desired.window(rows, step, found.ahead),
             rows,
             step,
             self.figures,
             self.planned,
-            self._now,
+            self._intended,
         )
         if lost:
             self.counts["horizons_lost"] += lost
+        if unsolved:
+            self.counts["unsolved"] += unsolved
         n = len(rows)
-        found.horizons[:n, :, 0] = self._now[:n, :, 1] / self._loop_gain
+        found.horizons[:n, :, 0] = self._intended[:n, :, 0, 1] / self._loop_gain
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; only what is sent is made, and counts."""
-        window, bound = self._window, self.delay_bound
-        assert window is not None
-        _remember(self._settings, self._memory, bound, window, rows, step, event, found.told)
+        bound, intended = self.delay_bound, self._intended
+        _remember(self._settings, self._memory, bound, intended, rows, step, event, found.told)
 
 
 @inline
-def _known(settings: Settings, desired: F2, stage: int, axis: int) -> tuple[float, float]:
-    """Desired state at a stage on one axis as it would be told, position [m] and velocity [m/s].
+def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
+    """State of a trajectory at a stage on one axis, position [m] and velocity [m/s].
 
     Args:
-        desired: states from k on [m, m/s]; shape (stages, 2).
+        intended: states from k on [m, m/s]; shape (seen + 1, 2).
     """
-    last, bound = min(stage, settings.seen), settings.bounds[axis]
-    v = max(-bound, min(desired[last, 1], bound))
-    return desired[last, 0] + (stage - last) * settings.dt_s * v, v
+    last = min(stage, settings.seen)
+    v = intended[last, 1]
+    return intended[last, 0] + (stage - last) * settings.dt_s * v, v
 
 
 @inline
@@ -350,18 +350,18 @@ def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
 
 @part
 def _gap(
-    settings: Settings, memory: Memory, desired: F3, row: int, number: int, k: int, d: int
+    settings: Settings, memory: Memory, intended: F3, row: int, number: int, k: int, d: int
 ) -> tuple[float, float]:
     """Mean of Q_p Σ (Δp + h Δv)² of a trajectory that may be followed, and |Δp| at k + d [m].
 
     Args:
-        desired: what is known now, from k on [m, m/s]; shape (axes, stages, 2).
+        intended: what would be sent now, from k on [m, m/s]; shape (axes, seen + 1, 2).
         number: of the trajectory; negative for none.
     """
     gap, away = 0.0, 0.0
     for stage in range(d, CHANCES * d + 1, d):
         for axis in range(len(settings.bounds)):
-            p, v = _known(settings, desired[axis], stage, axis)
+            p, v = _ahead(settings, intended[axis], stage)
             led_p, led_v = _followed(settings, memory, row, number, axis, k + stage)
             off = led_p - p + settings.lead_s[axis] * (led_v - v)
             gap += off * off / CHANCES
@@ -370,93 +370,91 @@ def _gap(
     return settings.weight * gap, np.sqrt(away)
 
 
+@part
+def _intend(
+    settings: Settings, nominal: Nominal, row: int, k: int, desired: F3, intended: F3
+) -> bool:
+    """Fill in the trajectory that would be sent now; False where no plan is found.
+
+    Args:
+        desired: states from k on [m, m/s]; shape (axes, seen + 1 or more, 2).
+        intended: what is filled in; where the server sees ahead, its first stage is where the
+            vehicle is led at k [m, m/s]; shape (axes, seen + 1, 2).
+    """
+    if settings.seen > 0 and plan_nominal(nominal, row, k, desired, intended):
+        return True
+    for axis in range(len(intended)):
+        bound = settings.bounds[axis]
+        for stage in range(settings.seen + 1):
+            v = desired[axis, stage, 1]
+            intended[axis, stage, 0] = desired[axis, stage, 0]
+            intended[axis, stage, 1] = max(-bound, min(v, bound))
+    return settings.seen == 0
+
+
 @kernel
 def _appraise(
     settings: Settings,
     memory: Memory,
     bound: DelayBound,
     clock: Seen,
+    nominal: Nominal,
     window: Window,
     rows: I1,
     steps: I1,
     figures: Figures,
     planned: F3,
-    now: F3,
-) -> int:
-    """Fill in figures, see `Guidance.plan`; the number of trajectories newly known to be lost."""
-    lost, axes = 0, len(settings.bounds)
+    intended: F4,
+) -> tuple[int, int]:
+    """Fill in what `Guidance.plan` says.
+
+    Returns:
+        how many trajectories are newly known to be lost, and how many plans were not found.
+    """
+    lost, unsolved, axes = 0, 0, len(settings.bounds)
     for i in range(len(rows)):
         row, k, plan = rows[i], steps[i], figures[i]
         flown, newly = _listen(settings, memory, bound, clock, row)
         lost += newly
         known, d, observed = memory.vehicles[row], bound.steps[row], memory.observed[row]
-        place, first = window.place[i], window.first[i]
-        desired = window.states[place, :axes, first : first + settings.seen + 1]
-        newest, share, expected, ends = flown, 1.0, 0.0, -1
+        newest, ends = flown, -1
         if flown >= 0:
             ends = memory.sent[row, flown % ROOM].ends
         oldest = max(known.first, known.sent - ROOM, flown + 1)
-        for number in range(known.sent - 1, oldest - 1, -1):
+        for number in range(oldest, known.sent):
             sent = memory.sent[row, number % ROOM]
-            if sent.step <= known.in_force or sent.due <= observed:
+            if sent.step > known.in_force and sent.due > observed:
+                newest, ends = number, max(ends, sent.ends)
+        plan.fresh = ends <= k + d
+        for axis in range(axes):
+            p, v = memory.state[row, axis, 0], memory.state[row, axis, 1]
+            if not plan.fresh:
+                p, v = _followed(settings, memory, row, newest, axis, k)
+            intended[i, axis, 0, 0], intended[i, axis, 0, 1] = p, v
+            planned[i, axis, 0], planned[i, axis, 1] = p, v
+        place, first = window.place[i], window.first[i]
+        desired = window.states[place, :axes, first:]
+        if not _intend(settings, nominal, row, k, desired, intended[i]):
+            unsolved += 1
+        share, expected = 1.0, 0.0
+        for number in range(newest, flown, -1):
+            sent = memory.sent[row, number % ROOM]
+            if number < oldest or sent.due <= observed or share <= SURE:
                 break
-            newest, ends = max(newest, number), max(ends, sent.ends)
-            if share > SURE:
-                comes = _arrives(bound, row, known.loss, observed - sent.step)
-                gap, _ = _gap(settings, memory, desired, row, number, k, d)
-                expected += share * comes * gap
-                share *= 1.0 - comes
+            comes = _arrives(bound, row, known.loss, observed - sent.step)
+            gap, _ = _gap(settings, memory, intended[i], row, number, k, d)
+            expected += share * comes * gap
+            share *= 1.0 - comes
         if share > SURE:
-            gap, _ = _gap(settings, memory, desired, row, flown, k, d)
+            gap, _ = _gap(settings, memory, intended[i], row, flown, k, d)
             expected += share * gap
         plan.row, plan.step, plan.start, plan.gap = row, k, k, 1
-        plan.fresh, plan.solved = ends <= k + d, True
+        plan.solved = True
         plan.state_gap, plan.expected_gap = 0.0, expected
         plan.cost_gap, plan.deviation_m = 0.0, 0.0
         if not plan.fresh:
-            plan.cost_gap, plan.deviation_m = _gap(settings, memory, desired, row, newest, k, d)
-        for axis in range(axes):
-            p, v = _known(settings, desired[axis], 0, axis)
-            now[i, axis, 0], now[i, axis, 1] = p, v
-            if newest >= 0:
-                p, v = _followed(settings, memory, row, newest, axis, k)
-            planned[i, axis, 0], planned[i, axis, 1] = p, v
-    return lost
-
-
-@part
-def _fit(settings: Settings, desired: F3, knots: S2) -> tuple[int, int]:
-    """Fill in the fewest knots that keep near enough to what is seen, or else as many as fit.
-
-    Args:
-        desired: states from k on [m, m/s]; shape (axes, stages, 2).
-        knots: what is filled in [m, m/s]; shape (axes, 2 KNOTS_MAX).
-
-    Returns:
-        number of knots, and steps from one to the next.
-    """
-    count, spacing, seen = 1, 1, settings.seen
-    for intervals in INTERVALS:
-        if intervals > seen:
-            break
-        count, spacing, away = intervals + 1, max(seen // max(intervals, 1), 1), 0.0
-        for axis in range(len(knots)):
-            bound = settings.bounds[axis]
-            for knot in range(count):
-                at, near = knot * spacing, spacing // 2
-                p, v = desired[axis, at, 0], desired[axis, at, 1]
-                if near > 0 and 0 < knot < count - 1:
-                    way = desired[axis, at + near, 0] - desired[axis, at - near, 0]
-                    v = way / (2 * near * settings.dt_s)
-                knots[axis, 2 * knot] = p
-                knots[axis, 2 * knot + 1] = max(-bound, min(v, bound))
-            some = knots[axis, : 2 * count]
-            for stage in range(seen + 1):
-                p, _ = spline_at(some, spacing, settings.dt_s, stage)
-                away = max(away, abs(p - desired[axis, stage, 0]))
-        if away <= settings.error_m:
-            break
-    return count, spacing
+            plan.cost_gap, plan.deviation_m = _gap(settings, memory, intended[i], row, newest, k, d)
+    return lost, unsolved
 
 
 @kernel
@@ -464,7 +462,7 @@ def _remember(
     settings: Settings,
     memory: Memory,
     bound: DelayBound,
-    window: Window,
+    intended: F4,
     rows: I1,
     steps: I1,
     event: B1,
@@ -474,10 +472,8 @@ def _remember(
     for i in range(len(rows)):
         if not event[i]:
             continue
-        row, place, first = rows[i], window.place[i], window.first[i]
-        axes = len(settings.bounds)
-        desired = window.states[place, :axes, first : first + settings.seen + 1]
-        count, spacing = _fit(settings, desired, told.knots[i])
+        row, dt_s = rows[i], settings.dt_s
+        count, spacing = fewest_knots(intended[i], dt_s, settings.error_m, told.knots[i])
         told.number[i], told.spacing[i] = count, spacing
         slot = memory.vehicles[row].sent % ROOM
         memory.vehicles[row].sent += 1
@@ -485,6 +481,4 @@ def _remember(
         sent.step, sent.due = steps[i], steps[i] + bound.steps[row]
         sent.ends = memory.observed[row] + settings.age_max + 1
         sent.spacing, sent.count = spacing, count
-        for axis in range(axes):
-            for n in range(2 * count):
-                memory.knots[row, slot, axis, n] = told.knots[i, axis, n]
+        memory.knots[row, slot, :, : 2 * count] = told.knots[i, :, : 2 * count]

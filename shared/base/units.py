@@ -2,6 +2,7 @@
 
 SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000
+MICROSECOND_NS = 1_000
 
 
 def seconds_to_ns(seconds: float) -> int:

@@ -17,7 +17,7 @@ from bisect import bisect_left
 from functools import lru_cache
 from itertools import pairwise
 
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import SECOND_NS
 
 FALSE_PER_H = 0.1
 """False losses of the link that are put up with [1/h]."""
@@ -29,8 +29,12 @@ WINDOW = 128
 """Newest packets of the other end of which it is known whether they came."""
 ASSUMED, WEIGHT = 0.3, 4
 """Share lost that is assumed at first, and for how many packets that counts, always."""
-SILENCE_MS_MAX = 2**16 - 1
-"""Longest silence that can be asked for [ms]."""
+NUMBERS = 128
+"""Modulus of the numbers of packets as they are told."""
+BEFORE = -(2**64)
+"""Time or step before all others."""
+SILENCE_MAX = 2**16 - 1
+"""Longest silence that can be asked for [half steps]."""
 
 
 def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:
@@ -77,30 +81,40 @@ class Hearing:
     """
 
     def __init__(self, timeout_ns: int, step_ns: int, fixed_ns: int | None) -> None:
-        self._fixed_ns, self._early_ns = fixed_ns, step_ns // 2
+        self._fixed_ns, self._half_step_ns = fixed_ns, step_ns // 2
         table = silences(timeout_ns, step_ns)
         self._losses, self._silences = [loss for loss, _ in table], [ns for _, ns in table]
         self._came = 0
         """Which of the newest WINDOW packets came, the newest in the lowest bit."""
         self.newest = -1
         """Largest number of a packet that came; -1 before the first."""
-        self._told_ms = 0
-        """`silence_ms`, once it has been asked for; 0 where it may be another by now."""
+        self._newest_at = BEFORE
+        """What tells when that packet was sent."""
+        self._told = 0
+        """`silence`, once it has been asked for; 0 where it may be another by now."""
 
     def begin(self) -> None:
         """Begin anew with another session."""
-        self._came, self.newest, self._told_ms = 0, -1, 0
+        self._came, self.newest, self._newest_at, self._told = 0, -1, BEFORE, 0
 
-    def hear(self, number: int) -> None:
-        """Take the number of a packet that came, in whatever order and however often."""
-        ahead = number - self.newest
-        if ahead > 0:
-            self._came = (self._came << min(ahead, WINDOW) | 1) & (1 << WINDOW) - 1
-            self.newest = number
-        elif -ahead < WINDOW:
-            self._came |= 1 << -ahead
+    def hear(self, number: int, at: int) -> None:
+        """Take a packet that came, in whatever order and however often.
+
+        Of a burst of NUMBERS losses or more so many are not seen to be lost.
+
+        Args:
+            number: its number, modulo NUMBERS.
+            at: step or time at which it was sent; larger for a later one.
+        """
+        if at > self._newest_at:
+            ahead = (number - self.newest - 1) % NUMBERS + 1
+            self._came = (self._came << ahead | 1) & (1 << WINDOW) - 1
+            self.newest += ahead
+            self._newest_at = at
+        else:
+            self._came |= 1 << (self.newest - number) % NUMBERS
         if self._fixed_ns is None:
-            self._told_ms = 0
+            self._told = 0
 
     @property
     def loss(self) -> float:
@@ -119,11 +133,11 @@ class Hearing:
         if self._fixed_ns is not None:
             return self._fixed_ns
         index = bisect_left(self._losses, self.loss)
-        return self._silences[min(index, len(self._silences) - 1)] - self._early_ns
+        return self._silences[min(index, len(self._silences) - 1)] - self._half_step_ns
 
     @property
-    def silence_ms(self) -> int:
-        """Longest silence that is asked of the other end, as it is told [ms]."""
-        if self._told_ms == 0:
-            self._told_ms = min(max(self.silence_ns // MILLISECOND_NS, 1), SILENCE_MS_MAX)
-        return self._told_ms
+    def silence(self) -> int:
+        """Longest silence that is asked of the other end, as it is told [half steps]."""
+        if self._told == 0:
+            self._told = min(max(self.silence_ns // self._half_step_ns, 1), SILENCE_MAX)
+        return self._told

@@ -51,6 +51,8 @@ class Known(NamedTuple):
     inputs, where they are not known."""
     sent_step: Indices
     """Step at which each vehicle was sent a horizon last, or -1; shape (capacity,)."""
+    owed: Flags
+    """Whether each vehicle is sent a heartbeat at this step if nothing else; shape (capacity,)."""
     desired: Callable[[Indices, Indices, Indices], Array]
     """Desired states of some rows, at their steps k, from k+d on; see `Situation.desired`."""
 
@@ -107,6 +109,11 @@ class Situation(NamedTuple):
         sent = self.known.sent_step[self.rows]
         since: Array = np.where(sent < 0, np.inf, (self.figures["step"] - sent) * self.known.dt_s)
         return since
+
+    @property
+    def owed(self) -> Flags:
+        """Whether a heartbeat is due, which a horizon would take the place of; shape (n,)."""
+        return self.known.owed[self.rows]
 
     @property
     def model(self) -> Model:
@@ -222,6 +229,12 @@ class _Stateless(Trigger):
 def always(situation: Situation) -> Verdict:
     """Sends at every step."""
     return _timed(np.ones(len(situation.rows), dtype=np.bool_), situation.figures)
+
+
+@trigger
+def heartbeat(situation: Situation) -> Flags:
+    """Sends where a heartbeat is due, in its place: as many packets, and each says something."""
+    return situation.owed
 
 
 @trigger(name="periodic")

@@ -7,36 +7,40 @@
 | 1    | HELLO       | client  | boot_id, terms                                             |
 | 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, refusal,      |
 |      |             |         | terms                                                      |
-| 3    | OBSERVATION | client  | session, step, stamp_ns, in_force, since, server_ns,       |
-|      |             |         | received_ns, mode, takes, state, input, number, silence_ms |
-| 4    | HORIZON     | server  | session, step, server_ns, observed_ns, inputs, feedback,   |
-|      |             |         | number, silence_ms                                         |
-| 5    | HEARTBEAT   | server  | session, server_ns, idle, degraded, number, silence_ms     |
+| 3    | OBSERVATION | client  | session, step, flown, delay, backward_us, heard, mode,     |
+|      |             |         | motion, number, silence                                    |
+| 4    | HORIZON     | server  | session, step, server_us, age, inputs, feedback, number,   |
+|      |             |         | silence                                                    |
+| 5    | HEARTBEAT   | server  | session, server_us, idle, degraded, number, silence        |
 | 6    | CLOSE       | both    | session                                                    |
-| 7    | TRAJECTORY  | server  | session, step, server_ns, age, spacing, knots, number,     |
-|      |             |         | silence_ms                                                 |
+| 7    | TRAJECTORY  | server  | session, step, server_us, age, spacing, knots, number,     |
+|      |             |         | silence                                                    |
 
 With the scheme "trajectory" TRAJECTORY stands in place of HORIZON.
 
-`docs/protocol.md` has the bytes. Stamps are integer nanoseconds of one host's monotonic clock.
-Those that control uses are the client's; `server_ns` is the server's own, which the client only
-echoes. A datagram that is not exactly one of these messages is a `ProtocolError`: the peer's
-mistake, to be dropped and counted by its reason, never answered.
+`docs/protocol.md` has the bytes. What the receiver knows is not sent: a state is sampled at the
+begin of its step, so that the vehicle's clock is its step; a stamp is told in microseconds modulo
+2^32 (71 minutes), and is the one of these times that lies nearest to what the receiver expects. A
+datagram that is not exactly one of these messages is a `ProtocolError`: the peer's mistake, to be
+dropped and counted by its reason, never answered.
 """
 
 import math
 from collections.abc import Callable
 from enum import IntEnum, StrEnum
+from struct import Struct
 from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.shared.base.units import MICROSECOND_NS
+from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 
-VERSION = 6
+VERSION = 7
 PAYLOAD_BYTES_MAX = 1200
 """So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
 
@@ -47,6 +51,8 @@ INPUTS_MAX = 270
 """Inputs of all axes in one horizon: what fits beside the other fields."""
 KNOTS_MAX = 16
 """Knots in one trajectory."""
+STAMPS = 2**32
+"""Number of microseconds that stamps are told apart of: 71 minutes."""
 
 LED_P = 0
 """Column of `Horizon.feedback`: position x̄ at the horizon's step [m]."""
@@ -64,6 +70,10 @@ FEEDBACK = 5
 """Number of columns of `Horizon.feedback`."""
 
 NO_FEEDBACK = np.empty((0, 0), np.float32)
+FLOAT_MAX = float(np.finfo(np.float32).max)
+"""Largest number of a state that can be told [m, m/s]."""
+NO_INPUT = np.empty(0)
+"""`Observation.input` with the scheme "trajectory", where nobody reads it."""
 
 INPUT_TOLERANCE = 1.001
 """How far over its bound an input may be (float32 rounds) before the packet is refused."""
@@ -129,7 +139,6 @@ class Drop(StrEnum):
     TOO_MANY_HANDSHAKES = "too many handshakes"
 
     # It is an observation that is impossible, see `server.plausibility`.
-    IMPLAUSIBLE_EPOCH = "implausible: epoch"
     IMPLAUSIBLE_CLOCK = "implausible: clock"
     IMPLAUSIBLE_HORIZON = "implausible: horizon"
     IMPLAUSIBLE_JUMP = "implausible: jump"
@@ -208,28 +217,29 @@ class Observation(NamedTuple):
     vehicle: int
     session: int
     step: int
-    stamp_ns: int
-    """When the state was sampled [client clock]."""
+    """Step k at whose begin the state was sampled, on the vehicle's grid."""
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
     """First step that was flown with that horizon."""
-    server_ns: int
-    """Newest `server_ns` seen, echoed [server clock]."""
-    received_ns: int
-    """When that stamp came [client clock]."""
+    backward_us: int
+    """Stamp: when the newest packet of the server came, by the time since the vehicle's step 0,
+    less the server's clock when it was sent."""
+    heard: int
+    """Number of packets of the server that have come, modulo NUMBERS."""
     mode: int
     """What the vehicle does, one of `Mode`."""
     takes: int
     """1 if a horizon that comes now would be flown, else 0."""
     state: Array
-    """Position [m] and velocity [m/s]; shape (axes, 2)."""
+    """Position [m] and velocity [m/s]; shape (axes, 2). It is told as float32."""
     input: Array
-    """Desired velocity that is flown from `step` on [m/s]; shape (axes,)."""
+    """Desired velocity that is flown from `step` on [m/s]; shape (axes,), or NO_INPUT with the
+    scheme "trajectory". It is told as float32."""
     number: int = 0
-    """Number of packets that the vehicle has sent in the session before."""
-    silence_ms: int = 0
-    """Longest silence that the vehicle asks of the server [ms]; 0 where it asks for none."""
+    """Number of packets that the vehicle has sent in the session before, modulo NUMBERS."""
+    silence: int = 0
+    """Longest silence that the vehicle asks of the server [half steps]; 0 for none."""
 
 
 class Horizon(NamedTuple):
@@ -239,18 +249,19 @@ class Horizon(NamedTuple):
     session: int
     step: int
     """Step k of the first input, on the vehicle's grid."""
-    server_ns: int
-    observed_ns: int
-    """Stamp of the observation it was computed from, echoed [client clock]."""
+    server_us: int
+    """Stamp: the server's clock when it was sent."""
+    age: int
+    """Steps from the newest observation that the server had to `step`."""
     inputs: NDArray[np.float32]
     """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """What feedback aboard takes, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
     (axes, 0) where the inputs are to be flown as they are."""
     number: int = 0
-    """Number of packets that the server has sent in the session before."""
-    silence_ms: int = 0
-    """Longest silence that the server asks of the vehicle [ms]; 0 where it asks for none."""
+    """Number of packets that the server has sent in the session before, modulo NUMBERS."""
+    silence: int = 0
+    """Longest silence that the server asks of the vehicle [half steps]; 0 for none."""
 
 
 class Trajectory(NamedTuple):
@@ -260,7 +271,8 @@ class Trajectory(NamedTuple):
     session: int
     step: int
     """Step k of the first knot, on the vehicle's grid."""
-    server_ns: int
+    server_us: int
+    """Stamp: the server's clock when it was sent."""
     age: int
     """Steps from the newest observation that the server had to `step`."""
     spacing: int
@@ -268,9 +280,9 @@ class Trajectory(NamedTuple):
     knots: NDArray[np.float32]
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
     number: int = 0
-    """Number of packets that the server has sent in the session before."""
-    silence_ms: int = 0
-    """Longest silence that the server asks of the vehicle [ms]; 0 where it asks for none."""
+    """Number of packets that the server has sent in the session before, modulo NUMBERS."""
+    silence: int = 0
+    """Longest silence that the server asks of the vehicle [half steps]; 0 for none."""
 
 
 class Idle(IntEnum):
@@ -302,15 +314,16 @@ class Heartbeat(NamedTuple):
 
     vehicle: int
     session: int
-    server_ns: int
+    server_us: int
+    """Stamp: the server's clock when it was sent."""
     idle: int
     """Why no plan is made for the vehicle, one of `Idle`."""
     degraded: int
     """1 if the server sleeps through more of its ticks than it may, else 0."""
     number: int = 0
-    """Number of packets that the server has sent in the session before."""
-    silence_ms: int = 0
-    """Longest silence that the server asks of the vehicle [ms]; 0 where it asks for none."""
+    """Number of packets that the server has sent in the session before, modulo NUMBERS."""
+    silence: int = 0
+    """Longest silence that the server asks of the vehicle [half steps]; 0 for none."""
 
 
 class Close(NamedTuple):
@@ -322,6 +335,22 @@ class Close(NamedTuple):
 
 CLOSES = 3
 """Number of times that CLOSE is said, for some of them may be lost."""
+
+
+def stamp_us(time_ns: int) -> int:
+    """Stamp of a time, or of a difference of two clocks: whole microseconds modulo STAMPS."""
+    return time_ns // MICROSECOND_NS % STAMPS
+
+
+def stamped_ns(stamp: int, near_ns: int) -> int:
+    """Time that a stamp tells [ns]: of all that have the stamp the one nearest to `near_ns`.
+
+    It is the right one, but for its part of a microsecond, where that is known to half an hour.
+    """
+    near = near_ns // MICROSECOND_NS
+    half = STAMPS // 2
+    return (near + (stamp - near + half) % STAMPS - half) * MICROSECOND_NS
+
 
 Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory
 
@@ -364,21 +393,28 @@ def _is_plain(value: object) -> bool:
     return True
 
 
-def _state(value: object, ours: Terms) -> Array:
-    state = _array(value, _FLOAT64, ours.axes, (2, 2))
-    if not all(map(math.isfinite, state.ravel().tolist())):
+def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
+    """State and input of an observation; the input is NO_INPUT where nobody reads it."""
+    axes = ours.axes
+    told = _FLOATS[axes * (2 if ours.splines else 3)]
+    if type(value) is not bytes or len(value) != told.size:
+        raise ProtocolError(Drop.SHAPE)
+    numbers = told.unpack(value)
+    if not all(map(math.isfinite, numbers)):
         raise ProtocolError(Drop.NOT_FINITE)
-    return state
-
-
-def _input(value: object, ours: Terms) -> Array:
-    flown = _array(value, _FLOAT64, ours.axes, (1, 1))[:, 0]
-    for u, bound in zip(flown.tolist(), ours.u_max, strict=True):
-        if not math.isfinite(u):
-            raise ProtocolError(Drop.NOT_FINITE)
+    # Without inputs there is nothing left to be held against a bound.
+    for u, bound in zip(numbers[2 * axes :], ours.u_max, strict=False):
         if abs(u) > bound * INPUT_TOLERANCE:
             raise ProtocolError(Drop.INPUT_OUT_OF_RANGE)
-    return flown
+    motion = np.array(numbers)
+    return motion[: 2 * axes].reshape(axes, 2), motion[2 * axes :]
+
+
+def _delay(value: object, ours: Terms) -> int | None:  # noqa: ARG001 - see `_Check`
+    """Steps from the one that a horizon was made for to the first flown with it; None for none."""
+    if value is not None and (type(value) is not int or value not in _AGE):
+        raise ProtocolError(Drop.FIELD)
+    return value
 
 
 def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
@@ -431,41 +467,91 @@ def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, in
 
 
 _FLOAT32 = np.dtype("<f4")
-_FLOAT64 = np.dtype("<f8")
+_FLOATS = {count: Struct(f"<{count}f") for count in range(1, 3 * AXES_MAX + 1)}
 _FLAG = range(2)
 _U16 = range(2**16)
 _U32 = range(2**32)
 _U64 = range(2**64)
-_STAMP = range(2**63)
-_STEP = range(2**40 + 1)
+_CLOCK = range(2**63)
+_STAMP = range(STAMPS)
+_NUMBER = range(NUMBERS)
 _AGE = range(-(2**15), 2**32)
 _SPACING = range(1, 2**16)
-_STEP_OR_NONE = range(NO_HORIZON, 2**40 + 1)
 
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),
-    (Welcome, (_U16, _U32, _U64, _U64, _STAMP, range(len(Refusal)), _terms)),
+    (Welcome, (_U16, _U32, _U64, _U64, _CLOCK, range(len(Refusal)), _terms)),
     (
         Observation,
         (
-            *(_U16, _U32, _STEP, _STAMP, _STEP_OR_NONE, _STEP, _STAMP, _STAMP),
-            *(range(len(Mode)), _FLAG, _state, _input, _U32, _U16),
+            *(_U16, _U32, _U32, _AGE, _delay, _STAMP, _NUMBER),
+            *(range(2 * len(Mode)), _motion, _NUMBER, _U16),
         ),
     ),
-    (Horizon, (_U16, _U32, _STEP, _STAMP, _STAMP, _inputs, _feedback, _U32, _U16)),
-    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG, _U32, _U16)),
+    (Horizon, (_U16, _U32, _U32, _STAMP, _AGE, _inputs, _feedback, _NUMBER, _U16)),
+    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG, _NUMBER, _U16)),
     (Close, (_U16, _U32)),
-    (Trajectory, (_U16, _U32, _STEP, _STAMP, _AGE, _SPACING, _knots, _U32, _U16)),
+    (Trajectory, (_U16, _U32, _U32, _STAMP, _AGE, _SPACING, _knots, _NUMBER, _U16)),
 )
-"""Message of each type number (from 1) and the check of each of its fields."""
+"""Message of each type number (from 1) and the check of each of its fields on the wire."""
 
 _NUMBERS = {message: number for number, (message, _) in enumerate(_TYPES, start=1)}
 _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
+def _told(said: Observation) -> list[object]:
+    """Fields of an observation on the wire."""
+    made_for, since = said.in_force, said.since
+    numbers = said.state.ravel().tolist() + said.input.tolist()
+    return [
+        VERSION,
+        _NUMBERS[Observation],
+        said.vehicle,
+        said.session,
+        said.step,
+        said.step - since,
+        None if made_for == NO_HORIZON else since - made_for,
+        said.backward_us,
+        said.heard,
+        2 * said.mode + said.takes,
+        _FLOATS[len(numbers)].pack(*numbers),
+        said.number,
+        said.silence,
+    ]
+
+
+def _observation(told: list[Any]) -> Observation:
+    """Observation of its fields on the wire, each of which has been checked."""
+    vehicle, session, step, flown, delay, backward_us, heard, does, motion, number, silence = told
+    since = step - flown
+    in_force = NO_HORIZON if delay is None else since - delay
+    if since < 0 or (delay is not None and in_force < 0):
+        raise ProtocolError(Drop.FIELD)
+    mode, takes = divmod(does, 2)
+    state, flown_on = motion
+    return Observation(
+        vehicle,
+        session,
+        step,
+        in_force,
+        since,
+        backward_us,
+        heard,
+        mode,
+        takes,
+        state,
+        flown_on,
+        number,
+        silence,
+    )
+
+
 def encode(message: Message) -> bytes:
     """The datagram of a message; arrays travel as little-endian bytes."""
-    payload: bytes = _PACKER.pack([VERSION, _NUMBERS[type(message)], *message])
+    if type(message) is Observation:
+        payload: bytes = _PACKER.pack(_told(message))
+    else:
+        payload = _PACKER.pack([VERSION, _NUMBERS[type(message)], *message])
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
 
@@ -474,15 +560,15 @@ def encode_horizon(
     vehicle: int,
     session: int,
     step: int,
-    server_ns: int,
-    observed_ns: int,
+    server_us: int,
+    age: int,
     inputs: memoryview,
     feedback: memoryview,
     number: int,
-    silence_ms: int,
+    silence: int,
 ) -> bytes:
     """Datagram of a `Horizon` whose arrays are bytes already, for a server that sends many."""
-    told = (vehicle, session, step, server_ns, observed_ns, inputs, feedback, number, silence_ms)
+    told = (vehicle, session, step, server_us, age, inputs, feedback, number, silence)
     payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *told))
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
@@ -493,12 +579,10 @@ def kind_of(payload: bytes) -> int | None:
 
     Array, version and type must be in msgpack's shortest form, so that it is what it looks like.
     """
-    array = payload[0] if payload else 0
-    begin = 1 if array & 0xF0 == 0x90 else 3 if array == 0xDC else len(payload)
-    head = payload[begin : begin + 2]
-    if len(head) < 2 or max(head) >= 0x80 or (begin == 3 and payload[1:3] < b"\0\x10"):
+    head = payload[:3]
+    if len(head) < 3 or head[0] & 0xF0 != 0x90 or max(head[1:]) >= 0x80:
         return None
-    return head[1]
+    return head[2]
 
 
 def decode(payload: bytes, terms: Terms) -> Message:
@@ -523,4 +607,5 @@ def decode(payload: bytes, terms: Terms) -> Message:
     message, checks = _TYPES[number - 1]
     if len(body) != len(checks):
         raise ProtocolError(Drop.NOT_A_MESSAGE)
-    return message._make(_checked(body, checks, terms))
+    fields = _checked(body, checks, terms)
+    return _observation(fields) if message is Observation else message._make(fields)

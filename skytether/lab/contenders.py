@@ -1,20 +1,24 @@
 """The contenders and cases of `skytether compare`, and the file of the weights that each flies at.
 
 The best weights of a contender in a case are a table of that file, found by a search
-(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. Around them
-the contender's threshold is moved, which gives a curve of what a packet buys. Other cases are flown
-at the weights of one that was searched: they show what weights are worth where they were not meant
-to be.
+(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. With them
+the contender flies at several thresholds and with several ways of reporting, on the seeds of the
+search; of those within a budget of packets, both ways, the best flies in the comparison. Other
+cases are flown at the weights of one that was searched: they show what weights are worth where they
+were not meant to be.
 """
 
 import json
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from skytether.lab.sweep import GridAxis, Sweep
+import numpy as np
+from msgspec.structs import replace
+
+from skytether.lab.sweep import GridAxis, Results, Sweep
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import reading
@@ -25,13 +29,31 @@ SEARCH_SEED = 1001
 """First seed of a search; the seeds that are compared begin at the plant's own."""
 PACKETS = 0.1
 """Largest share of steps that may send, for a contender whose trigger looks at the flight."""
-SATURATED = 0.1
-"""Largest share of steps with an input at its bound, in a search."""
 
-NEAR = (0.4, 0.8, 1, 1.25, 2.5)
+BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
+"""Budgets: largest numbers of packets per second, both ways and with heartbeats."""
+SCOUTS = 8
+"""Number of flights, with seeds of the search, by which points are chosen for the budgets."""
+EFFORT_ROOM = 1.05
+"""How many times the effort of a case a point that is chosen may take."""
+NEAR = (0.1, 0.3, 0.6, 1, 2, 4, 10)
 """Factors of a threshold with which what is seen of a flight is compared."""
-PERIODS = (0.2, 0.5, 1, 1.5, 3)
+PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
 """Factors of a period of ten steps."""
+REPORTS: Mapping[str, Mapping[str, Any]] = {
+    "every step": {"vehicle.report": "always"},
+    "by event": {"vehicle.report": "deviation(0.05) | silence(1)"},
+    "each second": {"vehicle.report": "silence(1)"},
+    "every 4 s": {
+        "vehicle.report": "silence(4)",
+        "link.heartbeat_s": 4.0,
+        "link.timeout_s": 20.0,
+        "link.age_max_s": 10.0,
+    },
+}
+"""Ways of reporting to the server: keys of the scenario that each changes."""
+EVERY = "every step"
+"""The way of reporting with which weights are searched for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,70 +101,54 @@ TIGHT = {
 
 PAPER = {"scheme": "predictive", "feedback": False, "observer_s": 0.0, "horizon": 40} | LOOSE
 """The paper's scheme, with the horizon that reproduces its table."""
-OBSERVED = PAPER | {"observer_s": 4.0}
-LED = OBSERVED | {"feedback": True}
-BLIND = {"scheme": "committed", "feedback": False, "observer_s": 0.0, "horizon": 60} | TIGHT
-COMMITTED = BLIND | {"observer_s": 4.0}
+COMMITTED = {
+    "scheme": "committed",
+    "feedback": False,
+    "observer_s": 4.0,
+    "horizon": 60,
+} | TIGHT
 """Committed inputs; the observer's time constant is searched for and may come out very long."""
 FEEDBACK = COMMITTED | {"feedback": True}
 TRAJECTORY = {
     "scheme": "trajectory",
     "feedback": True,
-    "state_weight": [7.1, 1.0],
+    "horizon": 80,
+    "state_weight": [7.1, 0.1],
+    "terminal_weight": [50.0, 20.0],
     "input_weight": 1.0,
+    "change_weight": 0.0,
 }
-"""No plan is sent, but the desired trajectory, along which the vehicle regulates itself."""
+"""No inputs are sent, but a trajectory, along which the vehicle regulates itself."""
 
 ALWAYS = {"trigger": "always"}
 PERIODIC = {"trigger": "periodic", "period": 10}
 STATE_GAP = {"trigger": "state_gap", "epsilon": 5e4}
 COST_GAP = {"trigger": "cost_gap", "cost_gap": 300.0}
 EXPECTED_GAP = {"trigger": "expected_gap", "cost_gap": 300.0}
-OF_NOW = {"cost_gap": 3.0}
-"""Gap of a trajectory, which is the cost of a moment, and not that of a horizon."""
-DEVIATION = {"trigger": "deviation", "deviation_m": 1.0}
+SILENT = {"trigger": "cost_gap | silence(1)", "cost_gap": 3.0}
+ACKNOWLEDGED = {"trigger": "expected_gap | heartbeat", "cost_gap": 3.0}
+"""Triggers of a trajectory, whose gap is the cost of a moment, and not that of a horizon."""
 
 
 def _contenders() -> tuple[Contender, ...]:
     """All contenders, family by family."""
-    every, periodic, event = "every step", "periodic", "eq. (16)"
-    paper, observed, led = "paper", "paper with observer", "paper with feedback"
-    committed, aboard, spline = "committed", "committed with feedback", "desired trajectory"
+    every, periodic, gap, expected = "every step", "periodic", "cost gap", "expected gap"
+    committed, aboard, spline = "committed", "committed with feedback", "trajectory"
     return (
-        Contender("paper-every-step", paper, every, PAPER | ALWAYS),
-        Contender("paper-event", paper, event, PAPER | STATE_GAP, "epsilon"),
-        Contender("paper-periodic", paper, periodic, PAPER | PERIODIC, "period"),
-        Contender("paper-observer-every-step", observed, every, OBSERVED | ALWAYS),
-        Contender("paper-observer-event", observed, event, OBSERVED | STATE_GAP, "epsilon"),
-        Contender("paper-feedback-every-step", led, every, LED | ALWAYS),
-        Contender("paper-feedback-event", led, event, LED | STATE_GAP, "epsilon"),
-        Contender("committed-every-step", committed, every, COMMITTED | ALWAYS),
-        Contender("committed-periodic", committed, periodic, COMMITTED | PERIODIC, "period"),
-        Contender("committed-gap", committed, "cost gap", COMMITTED | COST_GAP, "cost_gap"),
-        Contender(
-            "committed-deviation", committed, "deviation", COMMITTED | DEVIATION, "deviation_m"
-        ),
-        Contender(
-            "committed-blind-gap",
-            "committed without observer",
-            "cost gap",
-            BLIND | COST_GAP,
-            "cost_gap",
-        ),
+        Contender("paper-every-step", "paper", every, PAPER | ALWAYS),
+        Contender("paper-event", "paper", "eq. (16)", PAPER | STATE_GAP, "epsilon"),
+        Contender("paper-periodic", "paper", periodic, PAPER | PERIODIC, "period"),
+        Contender("committed-gap", committed, gap, COMMITTED | COST_GAP, "cost_gap"),
         Contender("feedback-every-step", aboard, every, FEEDBACK | ALWAYS),
         Contender("feedback-periodic", aboard, periodic, FEEDBACK | PERIODIC, "period"),
-        Contender("feedback-gap", aboard, "cost gap", FEEDBACK | COST_GAP, "cost_gap"),
-        Contender("feedback-expected", aboard, "expected gap", FEEDBACK | EXPECTED_GAP, "cost_gap"),
+        Contender("feedback-gap", aboard, gap, FEEDBACK | COST_GAP, "cost_gap"),
+        Contender("feedback-expected", aboard, expected, FEEDBACK | EXPECTED_GAP, "cost_gap"),
         Contender("trajectory-every-step", spline, every, TRAJECTORY | ALWAYS),
         Contender("trajectory-periodic", spline, periodic, TRAJECTORY | PERIODIC, "period"),
-        Contender("trajectory-gap", spline, "cost gap", TRAJECTORY | COST_GAP | OF_NOW, "cost_gap"),
         Contender(
-            "trajectory-expected",
-            spline,
-            "expected gap",
-            TRAJECTORY | EXPECTED_GAP | OF_NOW,
-            "cost_gap",
+            "trajectory-gap", spline, "cost gap or a second", TRAJECTORY | SILENT, "cost_gap"
         ),
+        Contender("trajectory-expected", spline, expected, TRAJECTORY | ACKNOWLEDGED, "cost_gap"),
     )
 
 
@@ -176,29 +182,16 @@ class Case:
 
 
 TARGET = {
+    "control.input_reference": True,
     "link.heartbeat_s": 1.0,
     "link.timeout_s": 5.0,
     "vehicle.report": "always",
     "duration": 35.0,
 }
-"""Keys of every case with a target: as few heartbeats as in the paper's scenario, so that hardly a
-packet is sent up but by a trigger, and a report at every step, which every scheme can use."""
-CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap")
+"""Keys of every case with a target: as few heartbeats as in the paper's scenario, and plans weighed
+about the target's velocity (`control.input_reference`)."""
+CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap", "trajectory-expected")
 """Contenders on a trajectory that is known for ever, for which no network is needed."""
-AHEAD = ("paper-every-step", "feedback-gap", "trajectory-expected")
-"""Contenders where more is known than a target's state."""
-TURNING = (
-    "paper-every-step",
-    "paper-event",
-    "feedback-every-step",
-    "feedback-periodic",
-    "feedback-gap",
-    "feedback-expected",
-    "trajectory-periodic",
-    "trajectory-gap",
-    "trajectory-expected",
-)
-"""Contenders where a trigger may earn its packets."""
 
 
 def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
@@ -228,6 +221,7 @@ def _noise(position_m: float) -> Mapping[str, Any]:
 
 
 GUSTS = {"vehicle.gust_mps2": 1.0, "vehicle.gust_every_s": 10.0, "vehicle.gust_s": 1.0}
+WINDY = {"vehicle.wind": 0.3, "vehicle.gain": 0.8}
 CASES = (
     Case("target", "a target that only the server sees", "target", TARGET, 0.3),
     Case(
@@ -236,15 +230,12 @@ CASES = (
         "target",
         {**TARGET, "reference.turn_every_s": 4.0},
         0.3,
-        contenders=TURNING,
     ),
     _unsearched("loss-0.3", "loss of 0.3 each way", _network(loss=0.3)),
     _unsearched("loss-0.5", "loss of 0.5 each way", _network(loss=0.5)),
+    _unsearched("wind-gain", "wind of 0.3 m/s per √s, and a gain of 0.8", WINDY),
     _unsearched("jitter", "jitter doubled", _network(minimum_s=0.36, slot_s=0.04, slots_mean=2.0)),
-    _unsearched("burst-0.5", "bursts of 0.5 s", _network(burst_s=0.5)),
     _unsearched("burst-2", "bursts of 2 s", _network(burst_s=2.0)),
-    _unsearched("noise-1", "noise of 1 cm", _noise(0.01)),
-    _unsearched("noise-5", "noise of 5 cm", _noise(0.05)),
     _unsearched("noise-10", "noise of 10 cm", _noise(0.1)),
     Case(
         "route",
@@ -252,7 +243,6 @@ CASES = (
         "target",
         {**TARGET, "reference.preview": 4.0},
         0.3,
-        contenders=AHEAD,
     ),
     Case(
         "bounds",
@@ -260,7 +250,6 @@ CASES = (
         "target",
         {**TARGET, "reference.speed_mps": 1.5, "reference.agility": 0.6},
         0.6,
-        contenders=AHEAD,
     ),
     _circle("wind-0.1", "circle, wind of 0.1 m/s per √s", {"vehicle.wind": 0.1}, 0.1),
     _circle("wind-0.3", "circle, wind of 0.3 m/s per √s", {"vehicle.wind": 0.3}, 0.35),
@@ -287,8 +276,8 @@ class ComparisonSize:
     """How much a comparison flies; what is not given is as in those that are reported."""
 
     runs: int
-    """Number of flights of each contender in each case at each threshold; half as many where the
-    case has no weights of its own."""
+    """Number of flights of each point that is chosen; half as many where the case has no weights of
+    its own."""
     generations: int
     """Number of generations of a search."""
     population: int = 8
@@ -301,6 +290,8 @@ class ComparisonSize:
     """Cases that are flown."""
     contenders: Sequence[Contender] = CONTENDERS
     """Contenders that fly, in those cases that they are in."""
+    scouts: int = SCOUTS
+    """Number of flights of each point by which it is chosen."""
     every: int = 1
     """Stride over a contender's factors; it meets the middle one, a factor of 1."""
     duration: float = math.inf
@@ -338,7 +329,8 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
         search_duration=12.0,
         cases=few or scale.cases[:1],
         contenders=[each for each in CONTENDERS if each.name in LOOKED_AT],
-        every=2,
+        scouts=2,
+        every=3,
         duration=12.0,
     )
 
@@ -383,16 +375,16 @@ def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
         "Scenarios of each contender of `skytether compare` in each case, with the weights and "
         f"thresholds that `skytether compare --tune` has found for it in {scale.generations} "
         f"generations of {scale.population} points, each flown with {scale.search_runs} seeds from "
-        f"{SEARCH_SEED} on for {scale.search_duration:g} s. At most {SATURATED:.0%} of the steps "
-        f"may have an input at its bound, and at most {PACKETS:.0%} may send, where the trigger "
-        "has a say in that. The largest effort, the RMS change of the command from step to step, is"
+        f"{SEARCH_SEED} on for {scale.search_duration:g} s. At most {PACKETS:.0%} of the steps may "
+        "send, where the trigger has a say in that. The largest effort, the RMS change of the "
+        "command from step to step, is"
     )
     efforts = {each.case.name: each.case.effort_mps for each in found}
     lines = [f"# {line}" for line in textwrap.wrap(says, 98)]
     lines += [f"# - {effort:g} m/s in the case {name}" for name, effort in efforts.items()]
     for each in found:
         sections: dict[str, Any] = {}
-        lay(differences(each.scenario, each.case.plant), sections)
+        lay(_told(each), sections)
         lines += [
             "",
             f"# {each.says}",
@@ -402,6 +394,13 @@ def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
             *(f"{section} = {_inline(keys)}" for section, keys in sections.items()),
         ]
     return "\n".join([*lines, ""])
+
+
+def _told(found: Found) -> dict[str, Any]:
+    """Keys of what was found: the contender's own, and those that differ from the plant's."""
+    here = dict(flat(reading.to_table(found.scenario)))
+    own = {f"control.{key}": here[f"control.{key}"] for key in found.contender.control}
+    return own | differences(found.scenario, found.case.plant)
 
 
 def _inline(value: Any) -> str:
@@ -422,37 +421,52 @@ def differences(scenario: Scenario, plant: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class FlownContender:
-    """A contender in a case, at one threshold."""
+    """A contender in a case, at one threshold and with one way of reporting."""
 
     contender: Contender
     threshold: float | None
     """Value of the contender's threshold; None where it has none."""
+    report: str
+    """Name of the way of reporting, of REPORTS."""
     tuned: bool
     """Whether the threshold is the one that the search has found."""
-    control: Mapping[str, Any]
+    keys: Mapping[str, Any]
     """Keys that differ from the plant's, with dots, and their values."""
+
+    @property
+    def name(self) -> tuple[str, float | None, str]:
+        """Contender, threshold and way of reporting."""
+        return self.contender.name, self.threshold, self.report
 
 
 def flying(
     contender: Contender, case: Case, tuned: Scenario, scale: ComparisonSize
 ) -> list[FlownContender]:
-    """A contender at all thresholds of its curve, in rising order; one of them is tuned.
-
-    At the weights of another case it flies at its tuned threshold alone.
-    """
+    """A contender with every way of reporting at all its thresholds, in rising order."""
     keys, key = differences(tuned, case.plant), contender.threshold
     keys = {path: value for path, value in keys.items() if path not in case.keys}
-    if not key:
-        return [FlownContender(contender, None, True, keys)]
-    here = getattr(tuned.control, key)
-    factors = (1,) if case.weights else contender.factors[:: scale.every]
-    values = {here * factor for factor in factors}
-    if isinstance(here, int):  # steps
-        values = {max(1, round(value)) for value in values}
+    values: list[float | None] = [None]
+    here = getattr(tuned.control, key) if key else None
+    if here is not None:
+        scaled = [here * factor for factor in contender.factors[:: scale.every]]
+        if isinstance(here, int):  # steps
+            scaled = [max(1, round(value)) for value in scaled]
+        values = sorted({*scaled})
     return [
-        FlownContender(contender, value, value == here, {**keys, f"control.{key}": value})
-        for value in sorted(values)
+        FlownContender(
+            contender,
+            value,
+            report,
+            value == here,
+            {**keys, **({f"control.{key}": value} if key else {}), **changes},
+        )
+        for value in values
+        for report, changes in REPORTS.items()
     ]
+
+
+Chosen = Mapping[tuple[str, float], FlownContender]
+"""What each contender flies within each budget, by its name and the budget [1/s]."""
 
 
 class Plan:
@@ -467,27 +481,65 @@ class Plan:
 
     def __init__(self, case: Case, weights: str, scale: ComparisonSize) -> None:
         self.case = case
-        self.flying: list[FlownContender] = []
+        self.points: list[FlownContender] = []
+        """Every contender at every threshold with every way of reporting."""
         known = reading.names(weights)
         for contender in scale.who(case):
             name = entry(contender, case)
             if f"{weights}/{name}" not in known:
                 there_is = "expected every contender in every case, as --tune writes them"
                 raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
-            self.flying += flying(contender, case, reading.load(f"{weights}/{name}"), scale)
-        values = tuple((each.contender.name, each.threshold) for each in self.flying)
-        changes = tuple(each.control for each in self.flying)
+            self.points += flying(contender, case, reading.load(f"{weights}/{name}"), scale)
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
-        """Number of flights of each contender at each threshold."""
+        """Number of flights of each point that is chosen."""
         plant = reading.to_table(reading.load(case.plant))
         lay(case.keys, plant)
         plant["duration"] = min(plant["duration"], scale.duration)
-        scenario = reading.check(plant, case.title)
-        self.sweep = Sweep(case.name, scenario, [GridAxis("contender", values, changes)], self.runs)
+        self._scenario = reading.check(plant, case.title)
+        scouted = replace(self._scenario, seed=SEARCH_SEED)
+        self.scouts = self._sweep(scouted, self.points, scale.scouts)
+        """Flights by which points are chosen."""
+
+    def _sweep(self, scenario: Scenario, points: Sequence[FlownContender], runs: int) -> Sweep:
+        names, changes = tuple(each.name for each in points), tuple(each.keys for each in points)
+        return Sweep(self.case.name, scenario, [GridAxis("contender", names, changes)], runs)
+
+    def comparison(self, points: Iterable[FlownContender]) -> Sweep:
+        """Flights of some points, each once."""
+        each = {point.name: point for point in points}
+        return self._sweep(self._scenario, list(each.values()), self.runs)
+
+    def choose(self, done: Results) -> Chosen:
+        """Point with the least RMSE xy within each budget, by contender and budget.
+
+        A contender of which no point is within a budget, and none of whose flights failed, or takes
+        more effort than the case allows, has no entry there.
+
+        Args:
+            done: what came of the scouts.
+        """
+        most = EFFORT_ROOM * self.case.effort_mps
+        found: dict[tuple[str, float], tuple[float, FlownContender]] = {}
+        for cell, point in enumerate(self.points):
+            runs = self.scouts.of_cell(done, cell)
+            if any(run.rmse_xy is None for run in runs):
+                continue
+            rmse, packets, effort = (
+                float(np.mean([getattr(run, figure) for run in runs]))
+                for figure in ("rmse_xy", "packets_per_s", "effort_mps")
+            )
+            for budget in BUDGETS:
+                name = (point.contender.name, budget)
+                is_within = packets <= budget and effort <= most
+                if is_within and (name not in found or rmse < found[name][0]):
+                    found[name] = rmse, point
+        return {name: point for name, (_, point) in found.items()}
 
     def tuned(self, name: str) -> Scenario:
-        """What a contender flies at the threshold that was found."""
-        (threshold,) = (
-            each.threshold for each in self.flying if each.contender.name == name and each.tuned
+        """What a contender flies at the threshold that was found, reporting at every step."""
+        (point,) = (
+            each
+            for each in self.points
+            if each.contender.name == name and each.tuned and each.report == EVERY
         )
-        return self.sweep.scenario_of((name, threshold))
+        return self.comparison([point]).scenario_of(point.name)

@@ -116,7 +116,10 @@ class Envelope:
 
     def keys(self, number: int) -> dict[str, Any]:
         """Keys of a point and their values; see `draw`."""
-        return draw(self.scenario.seed, number)
+        keys = draw(self.scenario.seed, number)
+        if self.scenario.terms().splines:  # nothing else leads a vehicle along a trajectory
+            keys["control.feedback"] = True
+        return keys
 
     def _table(self, number: int) -> dict[str, Any]:
         table = reading.to_table(self.scenario)

@@ -11,7 +11,7 @@ agree.
 import io
 import math
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import msgpack
@@ -20,30 +20,27 @@ import numpy as np
 from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
 from skytether.client.link import ClientLink
 from skytether.client.pilot import ALTITUDE, LAND_MPS
+from skytether.lab.courses import Course, FollowedCourse, PlannedCourse
 from skytether.server.gate import Call, Gate, WayBack
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns
 from skytether.shared.wire.protocol import (
-    DISTURBANCE,
-    FEEDBACK,
-    GAIN_P,
-    GAIN_V,
-    LED,
     NO_HORIZON,
     Horizon,
     Mode,
-    Observation,
+    Trajectory,
     decode,
     kind_of,
 )
 
-WELCOME, OBSERVATION, HORIZON = 2, 3, 4
+WELCOME, OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY = 2, 3, 4, 5, 7
 """Numbers of types of messages on the wire, see `shared.wire.protocol`."""
-ONCE = frozenset({OBSERVATION, HORIZON, 5})
+ONCE = frozenset({OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY})
 """Types of which each message is unlike all others, and so is believed once at most."""
 REMEMBERED = 8192
 """Number of newest messages of a direction that are remembered; none is under way for longer."""
@@ -149,48 +146,6 @@ class _Noted:
         return self.inner.seal(payload)
 
 
-class HorizonWatch:
-    """What a horizon tells and where that leads, worked out anew.
-
-    Args:
-        horizon: the horizon.
-        length: number of its inputs that may be flown.
-        terms: the rule of flight.
-    """
-
-    def __init__(self, horizon: Horizon, length: int, terms: Terms) -> None:
-        bound = np.array(terms.u_max)[:, None]
-        self._inputs = np.clip(horizon.inputs[:, :length].astype(float), -bound, bound)
-        self._speed = float(np.linalg.norm(self._inputs[:, -1]))
-        self._model, self._brake = terms.model, terms.brake
-        feedback = horizon.feedback.astype(float)
-        self.feeds_back = feedback.size > 0
-        """Whether it brings feedback."""
-        if not self.feeds_back:
-            feedback = np.zeros((terms.axes, FEEDBACK))
-        self._gain, self._disturbance = feedback[:, [GAIN_P, GAIN_V]], feedback[:, DISTURBANCE]
-        self._led, self._stage = feedback[:, LED], 0
-
-    def told(self, stage: int) -> Array:
-        """What it tells at a stage: its input, and after the last the braking curve [m/s]."""
-        length = self._inputs.shape[1]
-        u: Array = self._inputs[:, min(max(stage, 0), length - 1)]
-        left = self._speed - max(stage - length + 1, 0) * self._brake
-        return u * (max(0.0, left) / self._speed) if self._speed else 0.0 * u
-
-    def back(self, stage: int, state: Array) -> Array:
-        """Feedback at a stage, no earlier than those before, in a state of (axes, 2) [m/s]."""
-        if stage < 0 or not self.feeds_back:
-            return np.zeros(len(self._inputs))
-        for reached in range(self._stage, stage):
-            told = self.told(reached)
-            stands = reached >= self._inputs.shape[1] and not told.any()
-            self._led = self._model.step(self._led, told if stands else told + self._disturbance)
-        self._stage = max(self._stage, stage)
-        back: Array = (self._gain * (self._led - state)).sum(axis=1)
-        return back
-
-
 class WatchedLife(Recorder):
     """One life of a vehicle: its link, around the real one, and what takes its record.
 
@@ -206,7 +161,7 @@ class WatchedLife(Recorder):
         drifted_m: how far it may have flown while asleep, in the lives before [m].
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0915 - a docstring counts for a statement
         self,
         link: ClientLink,
         scenario: Scenario,
@@ -228,7 +183,10 @@ class WatchedLife(Recorder):
         self._terms, self._dt_ns = scenario.terms(), scenario.dt_ns
         self._timeout = seconds_to_ns(scenario.link.timeout_s) // self._dt_ns
         """Time-out [steps]."""
-        self._change_max = scenario.vehicle.slew_mps2 * self._terms.dt_s + ROUNDING
+        self._change_max = scenario.vehicle.slew_mps2 * self._terms.dt_s
+        """Largest change of the input from step to step [m/s]."""
+        self._gain = feedback_gain(scenario)
+        """K of the vehicle's own regulator."""
         self._extent = _extent(scenario)
         self._reach_m = _reach_m(scenario.link.age_max_s, self._terms)
 
@@ -246,15 +204,15 @@ class WatchedLife(Recorder):
         """Time since which the link has been good; None while it is lost."""
         self._speed_lost = 0.0
         """Speed at the last step before the link was lost [m/s]."""
-        self._epoch_ns: int | None = None
-        """Begin of step 0 [vehicle's clock]."""
         self._times_ns: OrderedDict[int, int] = OrderedDict()
         """Time of the world of each step that was flown."""
         self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HELD_MAX)
         """Session, life of the server and message of each horizon that was opened."""
-        self._held: tuple[int, int, Horizon] | None = None
+        self._held: tuple[int, int, Horizon | Trajectory] | None = None
         """The one in force, decoded."""
-        self._course: HorizonWatch | None = None
+        self._observed = -1
+        """Step of the observation that it was made from."""
+        self._course: Course | None = None
         """What it tells."""
         self._covered = False
         """Whether it had an input for the last step."""
@@ -262,12 +220,17 @@ class WatchedLife(Recorder):
         """Magnitude of what was flown last but for the feedback [m/s]."""
         self.drifted_m = drifted_m
         """How far it may have flown while asleep, in this life and those before [m]."""
+        self.disturbance: Callable[[], Sequence[float]] = tuple
+        """Tells the disturbance that its filter has found, of each axis [m/s]."""
         self.input = [0.0] * self._terms.axes
         """Input flown now, of each axis [m/s]."""
         self.mode = Mode.INIT
         """What the vehicle does."""
         self.step, self.steps, self.missed = -1, 0, 0
         """Its newest step, number of steps flown, and slept through."""
+        self.planned, self.followed = 0, 0
+        """Number of steps flown by a horizon of inputs, and along a trajectory, each of them as the
+        compiled rule has it."""
         self.row_ns = -1
         """Time of the world of its newest step, or -1."""
 
@@ -280,10 +243,6 @@ class WatchedLife(Recorder):
 
     def seal(self, payload: bytes) -> bytes:
         """See `ClientLink`."""
-        if self._epoch_ns is None:
-            observation = decode(payload, self._terms)
-            assert isinstance(observation, Observation)
-            self._epoch_ns = observation.stamp_ns - observation.step * self._dt_ns
         self._down.seal(self.vehicle, payload, self._number)
         return self._link.seal(payload)
 
@@ -299,7 +258,7 @@ class WatchedLife(Recorder):
             self._welcome = (session, life)
         elif self._session is not None and session == self._session[0]:
             self._hear()
-            if kind == HORIZON:
+            if kind in (HORIZON, TRAJECTORY):
                 self._horizons.append((session, life, payload))
         return payload
 
@@ -374,7 +333,7 @@ class WatchedLife(Recorder):
                 raise Violation("finite", f"an input of {u}")
             if abs(u) > most:
                 raise Violation("bounded", f"an input of {u} m/s, at most {most}")
-            if abs(u - before) > self._change_max:
+            if abs(u - before) > self._change_max + ROUNDING:
                 raise Violation("slew", f"from {before:.4f} to {u:.4f} m/s in a step")
 
     def _check_mode(self, mode: Mode, *, covered: bool, now_ns: int) -> None:
@@ -404,7 +363,8 @@ class WatchedLife(Recorder):
             self._held = self._course = None
             return
         if self._held is None or self._held[2].step != in_force:
-            self._held = self._find(in_force, step * self._dt_ns - age_ns)
+            self._observed = step - age_ns // self._dt_ns
+            self._held = self._find(in_force)
             self._course = None
             good_ns = self._good_ns
             if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * self._dt_ns:
@@ -414,22 +374,21 @@ class WatchedLife(Recorder):
         if (session, life) != self._session:
             said = f"of life {life} and session {session}, not {self._session}"
             raise Violation("foreign", f"a horizon {said}")
-        assert self._epoch_ns is not None
-        observed, rest_ns = divmod(horizon.observed_ns - self._epoch_ns, self._dt_ns)
-        observed_ns = self._times_ns.get(observed)
-        if rest_ns or observed_ns is None or observed > step:
-            raise Violation("observed", f"a horizon from an observation of step {observed}")
+        if self._observed not in self._times_ns or self._observed > step:
+            raise Violation("observed", f"a horizon from an observation of step {self._observed}")
         if self._course is None:
-            last = min(horizon.inputs.shape[1], observed + self._terms.age_max - in_force + 1)
-            self._course = HorizonWatch(horizon, last, self._terms)
+            last, terms = self._observed + self._terms.age_max - in_force + 1, self._terms
+            if isinstance(horizon, Trajectory):
+                self._course = FollowedCourse(horizon, last, terms, self._gain)
+            else:
+                self._course = PlannedCourse(horizon, min(horizon.inputs.shape[1], last), terms)
 
-    def _find(self, made_for: int, observed_ns: int) -> tuple[int, int, Horizon]:
+    def _find(self, made_for: int) -> tuple[int, int, Horizon | Trajectory]:
         """The horizon in force, by the step that it was made for and its observation."""
         for session, life, payload in reversed(self._horizons):
             horizon = decode(payload, self._terms)
-            assert isinstance(horizon, Horizon)
-            assert self._epoch_ns is not None
-            if horizon.step == made_for and horizon.observed_ns == self._epoch_ns + observed_ns:
+            assert isinstance(horizon, Horizon | Trajectory)
+            if horizon.step == made_for and horizon.step - horizon.age == self._observed:
                 return session, life, horizon
         raise Violation("foreign", f"a horizon for step {made_for} that has not come")
 
@@ -444,24 +403,36 @@ class WatchedLife(Recorder):
             self._speed, self._covered = math.hypot(*flown), covered
             return
         assert self._held is not None
-        assert self._epoch_ns is not None
-        horizon = self._held[2]
         if covered:
-            self._check_age(step, (horizon.observed_ns - self._epoch_ns) // self._dt_ns)
-        stage, most = step - horizon.step, math.inf
+            self._check_age(step, self._observed)
+        stage, most, found = step - self._held[2].step, math.inf, self.disturbance()
         told = course.told(stage)
         if not covered:
             most = max(0.0, self._speed - (0.0 if self._covered else self._terms.brake))
         told = told * min(1.0, most / max(float(np.linalg.norm(told)), ROUNDING))
         bound = np.array(self._terms.u_max)
-        want = np.clip(told + course.back(stage, state), -bound, bound)
+        want = np.clip(told + course.back(stage, state, found), -bound, bound)
         near = np.clip(want, before - self._change_max, before + self._change_max)
         for u, should, meant in zip(flown, near.tolist(), want.tolist(), strict=True):
             if abs(u - should) > 2.0 * ROUNDING:
                 raise Violation("follows", f"{u:.4f} m/s flown, {meant:.4f} planned")
+        if covered:
+            self._check_rule(course.by_rule(stage, state, found), flown)
+            self.followed += isinstance(course, FollowedCourse)
+            self.planned += isinstance(course, PlannedCourse)
         feeds_back = course.feeds_back
         self._speed = float(np.linalg.norm(told)) if feeds_back else math.hypot(*flown)
         self._covered = covered
+
+    def _check_rule(self, wanted: list[float], flown: list[float]) -> None:
+        """To the last bit it flies what the compiled rule wants, as fast as it may change."""
+        change, axes = self._change_max, zip(wanted, self.input, self._terms.u_max, strict=True)
+        should = [
+            min(max(min(max(u, last - change), last + change), -most), most)
+            for u, last, most in axes
+        ]
+        if flown != should:
+            raise Violation("rule", f"{flown} m/s flown, and {should} by the compiled rule")
 
     def _check_age(self, step: int, observed: int) -> None:
         """An input is flown no later after the observation behind it than it may be."""

@@ -387,9 +387,9 @@ class Bought:
     """A point of `trade`: what is spent, and the error that it leaves."""
 
     packets_per_s: float
-    """Packets up per second; of none a line is drawn."""
+    """Packets per second, both ways; of none a line is drawn."""
     bytes_per_s: float
-    """Bytes up per second."""
+    """Bytes per second, both ways and with headers."""
     effort_mps: float
     """RMS change of the command from step to step [m/s]."""
     rmse_m: float | None
@@ -398,8 +398,6 @@ class Bought:
     """Half the width of the 95 % interval of `rmse_m` [m]."""
     median_m: float | None
     """Median RMSE xy [m]; None where none flew."""
-    tuned: bool
-    """Whether the threshold is the one that was searched for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -435,7 +433,6 @@ def trade(
             rmse = np.array([point.rmse_m for point in flown], np.float64)
             half = np.array([point.rmse_half_m or 0.0 for point in flown], np.float64)
             median = np.array([point.median_m for point in flown], np.float64)
-            large = np.array([point.tuned for point in flown], np.bool_)
             low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic scale has no 0
             if flown and not flown[0].packets_per_s:
                 for plane in panes:
@@ -445,11 +442,8 @@ def trade(
             shape, label = curve.marker, curve.label
             for plane, spent in zip(panes, SPENT, strict=True):
                 cost = np.array([getattr(point, spent) for point in flown], np.float64)
-                plane.plot(cost, rmse, **style, marker=shape, markersize=2.5)
-                plane.plot(
-                    cost[large], rmse[large], **style, marker=shape, markersize=6, label=label
-                )
-                plane.plot(cost[large], median[large], **style, marker="_", markersize=9)
+                plane.plot(cost, rmse, **style, marker=shape, markersize=4, label=label)
+                plane.plot(cost, median, **style, marker="_", markersize=7)
                 if spent == "effort_mps":
                     continue  # with the threshold it may rise or fall
                 plane.plot(cost, rmse, color=style["color"], linewidth=0.8)
@@ -471,8 +465,8 @@ def trade(
 
 
 SPENT = {
-    "packets_per_s": "packets up /s",
-    "bytes_per_s": "bytes up /s",
+    "packets_per_s": "packets /s, both ways",
+    "bytes_per_s": "bytes /s, both ways",
     "effort_mps": "effort [m/s]",
 }
 """What is spent, and how an axis calls it."""

@@ -191,6 +191,11 @@ class Sweep:
             for cell in points
         ]
 
+    @property
+    def flights(self) -> int:
+        """Number of all its flights."""
+        return len(self.cells) * self.runs
+
     def _scenario(self, changes: Mapping[str, Any]) -> Scenario:
         table = reading.to_table(self.scenario)
         lay(changes, table)

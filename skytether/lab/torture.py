@@ -66,6 +66,8 @@ QUIET_NS = SECOND_NS
 SHORT_S = (8.0, 25.0)
 """Time within which the faults of a short trial begin and end [s], drawn between these."""
 RESTARTED = (Kind.RESTART, "client")
+TRAJECTORIES = 0.5
+"""Share of the trials that fly the scheme "trajectory"."""
 REKEYING = 0.3
 """Share of the trials in which vehicles want new keys every REKEY_NS."""
 REKEY_NS = 4 * SECOND_NS
@@ -113,7 +115,53 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
     if rng.random() < 0.3:
         late_s, gain = rng.uniform(0.0, 0.4, axes), rng.uniform(0.8, 1.2, axes)
         table["model"] |= {"dead_time_s": late_s.tolist(), "gain": gain.tolist()}
+    later = stream(seed, "torture", "trajectories")
+    if later.random() < TRAJECTORIES:
+        _follow_trajectories(table, later)
     return reading.check(table, "torture"), vehicles
+
+
+def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> None:
+    """Let a scenario fly the scheme "trajectory", with all that belongs to it drawn."""
+    axes = table["model"]["axes"]
+    error_m, silence_s = round(rng.uniform(0.003, 0.1), 3), round(rng.uniform(0.3, 2.0), 2)
+    gap = f"{round(float(np.exp(rng.uniform(np.log(0.01), np.log(3.0)))), 3)}"
+    table["control"] |= {
+        "scheme": "trajectory",
+        "feedback": True,
+        "input_weight": float(rng.choice((0.01, 0.1, 1.0))),
+        "spline_error_m": error_m,
+        "trigger": str(
+            rng.choice(
+                (
+                    f"expected_gap({gap}) | silence({silence_s})",
+                    f"expected_gap({gap}) | heartbeat",
+                    f"expected_gap({gap})",
+                    f"cost_gap({gap}) | heartbeat | silence({silence_s})",
+                    f"deviation({error_m}) | silence({silence_s})",
+                    f"(expected_gap({gap}) | heartbeat) & budget(5, 3) | silence({silence_s})",
+                )
+            )
+        ),
+    }
+    table["reference"]["preview"] = ("all", "none", 1.0, 3.0)[rng.integers(4)]
+    table["vehicle"]["report"] = str(
+        rng.choice(
+            (
+                "always",
+                f"deviation({error_m}) | silence({silence_s})",
+                f"deviation({error_m}) & periodic(2) | silence({silence_s})",
+                f"periodic(3) | silence({silence_s})",
+            )
+        )
+    )
+    table["link"]["heartbeat_s"] = (0.1, "auto")[rng.integers(2)]
+    if rng.random() < 0.3:
+        known = np.broadcast_to(table["model"].get("gain", 1.0), axes)
+        table["vehicle"] |= {
+            "gain": (known * rng.uniform(0.8, 1.2, axes)).tolist(),
+            "steady_wind_mps": rng.uniform(-0.2, 0.2, axes).tolist(),
+        }
 
 
 def short_trial(seed: int) -> Trial:
@@ -307,6 +355,7 @@ class Torture:
             link=life,
             recorder=life,
         )
+        life.disturbance = lambda: client.disturbance
         return life, Steady(client)
 
     def _renew(self, name: str) -> None:
@@ -327,6 +376,8 @@ class Torture:
 
     def _count(self, life: WatchedLife) -> None:
         self.counts["steps"] += life.steps
+        self.counts["steps by inputs"] += life.planned
+        self.counts["steps along trajectories"] += life.followed
         self.counts["steps slept through"] += life.missed
         self.counts["landed"] += life.mode is Mode.LAND
 
@@ -378,7 +429,8 @@ class Torture:
     def set_solver(self, share: float, *, failing: bool) -> None:
         """Let a share of solves of the present life of the server fail, or none any more."""
         planner = self._server.controller.planner
-        assert isinstance(planner, Planner)
+        if not isinstance(planner, Planner):  # trajectories take no solver
+            return
         solvers = [getattr(solver, "inner", solver) for solver in planner.solvers]
         if failing:
             rng = self._chance

@@ -117,7 +117,7 @@ def knobs(axes: int) -> tuple[Knob, ...]:
 
 
 THRESHOLDS = (
-    _compared("Threshold: cost gap", "Extra cost above which a plan is sent", "cost_gap", 20, 0.1),
+    _compared("Threshold: cost gap", "Extra cost above which a plan is sent", "cost_gap", 20, 0.05),
     _compared("Threshold: ε", "Tolerance of eq. (16)", "epsilon", 20, 0.1),
     _compared("Threshold: decay λ [1/s]", "Decay rate of eq. (16)", "decay_rate", 10, 0.1),
     _compared(

@@ -148,9 +148,9 @@ def of_flight(axes: int) -> tuple[Plot, ...]:
     )
 
 
-def of_network() -> tuple[Plot, ...]:
-    """Plots of packets, and of what plans cost."""
-    return (
+def of_network(*, solves: bool) -> tuple[Plot, ...]:
+    """Plots of packets, and of what plans cost where inputs are planned."""
+    packets = (
         Plot(
             "Packets up in a second",
             (
@@ -168,15 +168,16 @@ def of_network() -> tuple[Plot, ...]:
             grid=_bins_ms,
             crop=True,
         ),
-        Plot(
-            "Solving, against the deadline [ms]",
-            (
-                PlotLine("deadline", _deadline_ms, GREY, dash=(4, 4), once=True),
-                PlotLine("solving", lambda look: look.curves.solve_ms),
-            ),
-            log=True,
-        ),
     )
+    solving = Plot(
+        "Solving, against the deadline [ms]",
+        (
+            PlotLine("deadline", _deadline_ms, GREY, dash=(4, 4), once=True),
+            PlotLine("solving", lambda look: look.curves.solve_ms),
+        ),
+        log=True,
+    )
+    return (*packets, solving) if solves else packets
 
 
 class Plots:

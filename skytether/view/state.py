@@ -57,6 +57,8 @@ LOSS_S = 10.0
 """Time over which loss is measured [s]."""
 LOSS_HIGH = 0.3
 """Measured loss above which a link is called degraded."""
+TRAJECTORY_BYTES = 32
+"""Size between a heartbeat's and the shortest trajectory's [B], without a seal."""
 
 VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms")
 """Columns of a vehicle's ring that are NaN where nothing is known."""
@@ -500,9 +502,9 @@ class State:
             self.flights += 1
             self.name = opened.name
             self.scenario = scenario
-            terms = self.scenario.control
-            planned = 1 if terms.scheme == "trajectory" else terms.horizon
-            self.network = Network(4 * self.scenario.model.axes * planned)
+            control, axes = self.scenario.control, self.scenario.model.axes
+            follows = control.scheme == "trajectory"
+            self.network = Network(TRAJECTORY_BYTES if follows else 4 * axes * control.horizon)
         columns: dict[str, np.dtype[np.void]] = {}
         for part, described in opened.parts.items():
             with suppress(ValueError):

@@ -17,6 +17,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array, Indices, discretise
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import (
@@ -28,14 +29,13 @@ from skytether.shared.wire.protocol import (
     committed_max,
     decode,
     encode,
+    stamp_us,
 )
 
 NOISE = np.array([0.001, 0.01])
 """Standard deviation of a step's noise on position [m] and velocity [m/s]; shape (2,)."""
 DELAY_S = 0.44
 """Delay of an observation [s]: the mean of the paper's network."""
-AHEAD_NS = 1000 * SECOND_NS
-"""Offset of the vehicles' clock from the server's [ns]."""
 START_NS = 20 * SECOND_NS
 """Time of the first tick on the server's clock [ns]."""
 PERIOD_S = 27.5
@@ -133,14 +133,25 @@ class Airspace:
     def _observe(self) -> None:
         """Give the server an observation of every vehicle, late."""
         now_ns, late_ns = self._due_ns - MILLISECOND_NS, self._late * self._dt_ns
-        stamp_ns, echo_ns = self._due_ns + AHEAD_NS - late_ns, now_ns - 2 * late_ns
         step = (self._vehicles.step - self._late).tolist()
         for (vehicle, session, address), k, x in zip(
             self._sessions, step, self._past[0], strict=True
         ):
-            stamps = (stamp_ns, NO_HORIZON, 0, echo_ns, echo_ns + late_ns + AHEAD_NS)
-            still = np.zeros(len(x))
-            observation = Observation(vehicle, session, k, *stamps, Mode.TRACK, 1, x, still)
+            # What the server sent at now - 2 late came at now - late.
+            backward_us = stamp_us(k * self._dt_ns - self._due_ns + 2 * late_ns)
+            observation = Observation(
+                vehicle,
+                session,
+                k,
+                NO_HORIZON,
+                0,
+                backward_us,
+                k % NUMBERS,
+                Mode.TRACK,
+                1,
+                x,
+                np.zeros(len(x)),
+            )
             self.server.receive(Datagram(encode(observation), address), now_ns=now_ns)
 
     def wake(self) -> None:

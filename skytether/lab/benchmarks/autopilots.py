@@ -37,21 +37,30 @@ from skytether.station.joined import state_at, summary_of, within
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "straight.md"
 Air = Literal["calm", "wind"]
+INPUTS: dict[str, Any] = {
+    "scheme": "committed",
+    "trigger": "cost_gap | silence(1)",
+    "observer_s": 4.0,
+    "terminal_weight": [50.0, 20.0],
+    "input_reference": True,
+}
+"""Keys of `control` with which plans of inputs are sent."""
 OURS: dict[str, dict[str, dict[str, Any]]] = {
     "skytether": {},
-    "skytether, patient": {
-        "control": {"dt": 0.1},
-        "link": {"timeout_s": 8.0, "age_max_s": 12.0},
+    "skytether, inputs": {
+        "control": INPUTS,
+        "vehicle": {"report": "always"},
+        "link": {"heartbeat_s": 0.1, "timeout_s": 1.0},
     },
-    "skytether, trajectory": {
-        "control": {"scheme": "trajectory", "trigger": "expected_gap | silence(1)"},
-        "vehicle": {"report": "deviation(0.05) | silence(1)"},
-        "link": {"heartbeat_s": "auto", "timeout_s": 2.0},
+    "skytether, patient": {
+        "control": INPUTS | {"dt": 0.1},
+        "vehicle": {"report": "always"},
+        "link": {"heartbeat_s": 0.1, "timeout_s": 8.0, "age_max_s": 12.0},
     },
 }
-"""Contenders that are Skytether, with the keys that differ from the scenario's. The patient
-one flies its plan to the end, 8 s, however silent the server is; the others brake in a second or
-two. With the scheme trajectory, and reports by event, the packets are the fewest."""
+"""Contenders that are Skytether, with the keys that differ from the scenario's, which sends the
+desired trajectory. The others send inputs; the patient one flies its plan to the end, 8 s, however
+silent the server is, where the first two brake in two seconds and in one."""
 CALM: Air = "calm"
 WIND: Air = "wind"
 LEADS: dict[FlavourName, tuple[float, float]] = {"ardupilot": (0.55, 1.1), "px4": (0.85, 1.4)}

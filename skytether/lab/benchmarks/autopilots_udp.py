@@ -51,7 +51,7 @@ from skytether.sim.straight import AROUND_S, READY_S
 from skytether.station import laws
 from skytether.station.joined import joined
 
-CONTENDERS = ("led, gain 0.5", "skytether")
+CONTENDERS = ("led, gain 0.5", "skytether", "skytether, inputs")
 """Names of what is flown, see `autopilots.contenders`."""
 
 

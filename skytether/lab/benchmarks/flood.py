@@ -1,6 +1,6 @@
 """Floods beside a flight over real UDP: forged packets, and HELLOs from ever new ports.
 
-Five vehicles of the demonstration fly on a sealed link, 100 observations a second; the network
+Five vehicles of `demo-committed` fly on a sealed link, 100 observations a second; the network
 between is not impaired, so that whatever is lost, the flood has displaced. Somebody on the way
 has recorded what passes, and floods the server's port: with packets whose header, length and
 channel are those of a vehicle's own, half and half with random bytes; or with HELLOs, random ones
@@ -293,7 +293,7 @@ def _fly(kind: str, counts: FloodCounts, lateness: Lateness) -> Flood:
     """One flight, with one kind of flood or none."""
     duration_s = counts.lead_s + counts.seconds + AFTER_S
     # A report at each step: what is missing has been lost.
-    flown = derive("demo", duration=duration_s, settle=0.0, vehicle={"report": "always"})
+    flown = derive("demo-committed", duration=duration_s, settle=0.0, vehicle={"report": "always"})
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-")))
         lab = Lab(stack, folder, flown, range(1, NEWCOMER + 1))

@@ -2,7 +2,7 @@
 
 Each extra is installed into an environment of its own by uv, from its cache and at the versions of
 requirements-dev.lock, and compiled to bytecode afterwards, as pip leaves it; disk is what all of
-its files occupy. In the bare environment, `skytether client` flies the demonstration against a
+its files occupy. In the bare environment, `skytether client` flies `demo-committed` against a
 server on loopback, in plaintext and with keys. *First packet* is from the start of its process to
 when its first packet arrives; *CPU* is what it has computed until then, on however many cores.
 
@@ -94,8 +94,8 @@ def aboard(python: str, runs: int, flight_s: float) -> dict[str, dict[str, float
     """Figures of a client in plaintext and with keys, which some Python runs; medians."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        lab = Lab(stack, folder, reading.load("demo"))
-        plain = ChildProcess(stack, "server", "demo", "--bind", f"{HOST}:0")
+        lab = Lab(stack, folder, reading.load("demo-committed"))
+        plain = ChildProcess(stack, "server", "demo-committed", "--bind", f"{HOST}:0")
         links = {"plaintext": (plain, []), "keys": (lab.server(), ["--keys", str(lab.key_file)])}
         found: dict[str, list[dict[str, float]]] = {name: [] for name in links}
         for _ in range(runs):
@@ -111,7 +111,9 @@ def aboard(python: str, runs: int, flight_s: float) -> dict[str, dict[str, float
 def _flown(python: str, server: str, keys: Sequence[str], flight_s: float) -> dict[str, float]:
     """Memory of a client that has flown for some time [B]."""
     with ExitStack() as stack:
-        client = ChildProcess(stack, "client", "demo", "--server", server, *keys, python=python)
+        client = ChildProcess(
+            stack, "client", "demo-committed", "--server", server, *keys, python=python
+        )
         client.wait_for(Flying)
         time.sleep(flight_s)
         status = Path(f"/proc/{client.process.pid}/status").read_text()
@@ -127,7 +129,9 @@ def _started(python: str, keys: Sequence[str]) -> dict[str, float]:
         sink.bind((HOST, 0))
         began_ns = time.monotonic_ns()
         server = address_text(*sink.getsockname())
-        client = ChildProcess(stack, "client", "demo", "--server", server, *keys, python=python)
+        client = ChildProcess(
+            stack, "client", "demo-committed", "--server", server, *keys, python=python
+        )
         sink.recv(1)
         passed_ns = time.monotonic_ns() - began_ns
         tasks = Path(f"/proc/{client.process.pid}/task").glob("*/schedstat")

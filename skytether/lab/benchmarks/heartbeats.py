@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from skytether.netem.fate import SLOT_NS, Fates
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.law.heartbeat import Hearing, false_per_h, silences
+from skytether.shared.law.heartbeat import NUMBERS, Hearing, false_per_h, silences
 from skytether.shared.scenario.schema import DirectionConfig
 from skytether.shell import options
 
@@ -71,7 +71,7 @@ class WaitingEnd:
             at_ns, number = heappop(self._under_way)
             self.false += self.heard_ns is not None and at_ns - self.heard_ns > self._timeout_ns
             self.heard_ns = at_ns
-            self.hearing.hear(number)
+            self.hearing.hear(number % NUMBERS, number)
 
 
 def keep(

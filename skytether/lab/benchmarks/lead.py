@@ -58,7 +58,7 @@ class LeadBenchmarkOptions:
     """Length of each flight [s]."""
     networks: int = 20
     """Number of networks in virtual time, for each seed; the first is that of the seed."""
-    scenario: str = "target"
+    scenario: str = "target-committed"
     """Scenario whose target is led."""
 
 

@@ -157,10 +157,10 @@ class RestartVerdict:
 
 
 def scenario() -> Scenario:
-    """The demonstration in still air, on a network of our own, with a time-out of 1 s."""
+    """`demo-committed` in still air, on a network of our own, with a time-out of 1 s."""
     way = {"delay": "poisson", "minimum_s": 0.03, "slot_s": 0.005, "slots_mean": 1.0, "loss": 0.05}
     return derive(
-        "demo",
+        "demo-committed",
         duration=7200.0,
         vehicle={"wind": 0.0, "report": "always"},
         network={"uplink": way, "downlink": way},

@@ -20,6 +20,7 @@ from skytether.shared.wire.protocol import (
     Welcome,
     decode,
     encode,
+    stamp_us,
 )
 
 NOTHING = "nothing"
@@ -42,13 +43,13 @@ def messages(terms: Terms) -> list[Message]:
     inputs = rng.uniform(-1.0, 1.0, (terms.axes, terms.horizon)).astype(np.float32)
     state = rng.normal(0.0, 1.0, (terms.axes, 2))
     session, step = 2**31, 5000
-    told = now_ns, now_ns, Mode.TRACK, 1, state, np.zeros(terms.axes)
+    told = step - 20, step - 10, stamp_us(now_ns), 100, Mode.TRACK, 1, state, np.zeros(terms.axes)
     return [
         Hello(1, 2**60, terms),
         Welcome(1, session, 2**60, 2**60, now_ns, 0, terms),
-        Observation(1, session, step, now_ns, step - 20, step - 10, *told),
-        Horizon(1, session, step, now_ns, now_ns, inputs),
-        Heartbeat(1, session, now_ns, Idle.PLANS, 0),
+        Observation(1, session, step, *told),
+        Horizon(1, session, step, stamp_us(now_ns), 9, inputs),
+        Heartbeat(1, session, stamp_us(now_ns), Idle.PLANS, 0),
     ]
 
 

@@ -15,7 +15,7 @@ from skytether.lab.calibration import HERE, Rmse, SearchLimits
 from skytether.lab.commands import report_folder
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.contenders import CASES, PACKETS, SATURATED, ComparisonSize, Found, Plan
+from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, Found, Plan
 from skytether.lab.journal import Journal, write
 from skytether.lab.search import Search, SearchPoint, best
 from skytether.shared.scenario import reading
@@ -31,7 +31,7 @@ class CompareOptions:
     """Options of `skytether compare`."""
 
     runs: Annotated[int, tyro.conf.arg(metavar="N")] = 100
-    """Number of flights of each contender in each case at each threshold, with seeds from 1 on."""
+    """Number of flights of each contender in each case within each budget, with seeds from 1 on."""
     out: Path = Path("compare")
     """Folder for the report, and for weights and their searches; the same command goes on with
     what it holds."""
@@ -74,16 +74,21 @@ def compare(argv: Sequence[str]) -> None:
 def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) -> None:
     """Fly all contenders in all cases, and write the report."""
     plans = [Plan(case, options.weights, scale) for case in scale.cases]
-    total = sum(len(plan.sweep.cells) * plan.runs for plan in plans)
-    with crew(options.pool, "comparing", total) as flyers:
-        results = []
+    chosen = []
+    with crew(options.pool, "choosing", sum(plan.scouts.flights for plan in plans)) as flyers:
         for plan in plans:
-            folder = options.out / "sweeps" / plan.case.name
-            done = flyers.flown(plan.sweep, folder, plan.case.title)
+            folder = options.out / "scouts" / plan.case.name
+            chosen.append(plan.choose(flyers.flown(plan.scouts, folder, plan.case.title)))
+        runs = flyers.spent.runs
+    sweeps = [plan.comparison(each.values()) for plan, each in zip(plans, chosen, strict=True)]
+    results = []
+    with crew(options.pool, "comparing", sum(each.flights for each in sweeps)) as flyers:
+        for plan, points, sweep in zip(plans, chosen, sweeps, strict=True):
+            done = flyers.flown(sweep, options.out / "sweeps" / plan.case.name, plan.case.title)
             beside = _beside(flyers, plan, options.out / "beside" / plan.case.name)
-            results.append(comparison.compared(plan, done, beside))
+            results.append(comparison.compared(plan, points, sweep, done, beside))
+        runs += flyers.spent.runs
     drawn = comparison.draw(results)
-    runs = flyers.spent.runs
     report_folder.write(options.out, drawn, reading.load(CASES[0].plant), call, runs)
     for table in drawn.tables:
         report_folder.show(table)
@@ -110,7 +115,7 @@ def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
     with crew(options.pool, "searching", total, "generations") as flyers:
         for contender, case in scale.searched:
             start = contenders.search_start(contender, case, scale)
-            objective = Rmse(start, SearchLimits(PACKETS, case.effort_mps, SATURATED))
+            objective = Rmse(start, SearchLimits(PACKETS, case.effort_mps))
             search = Search(
                 start=start,
                 objective=objective,

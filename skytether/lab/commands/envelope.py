@@ -28,7 +28,7 @@ class EnvelopeOptions:
 
     out: Path
     """Folder for the results; the same command, with more points if you like, goes on there."""
-    scenario: ScenarioName = "demo"
+    scenario: ScenarioName = "demo-committed"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
     points: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
     """Number of points, which follow from --seed: the first N of always the same ones."""

@@ -124,7 +124,7 @@ class Crew:
             ConfigError: the trajectory's file has changed since the sweep began.
         """
         todo = plan.todo(skytether.lab.sweep.results(journal.entries))
-        before = len(plan.cells) * plan.runs - sum(len(task.seeds) for task in todo)
+        before = plan.flights - sum(len(task.seeds) for task in todo)
         self.advance(before, text)
 
         def keep(_: int, result: tuple[Done, float]) -> None:

@@ -79,7 +79,7 @@ def _measure(
     maps, periods = studies.map_sweep(scenario, scale), studies.period_sweep(scenario, scale)
     points = sum(study.runs * len(study.axis.values) for study in (table, *curves))
     total = points * (len(studies.METHODS.values) + 1)
-    total += sum(len(plan.cells) * plan.runs for plan in (maps, periods))
+    total += maps.flights + periods.flights
     sweeps = options.out / "sweeps"
     # Another reproduction's folder is refused before anything is flown.
     Journal(sweeps / table.name, table.first().settings(), Done).close()

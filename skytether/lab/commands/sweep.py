@@ -66,7 +66,7 @@ def sweep(argv: Sequence[str]) -> None:
         writing(options.out),
         closing(Journal(options.out, plan.settings(), Done)) as journal,
     ):
-        with crew(options.pool, title, len(plan.cells) * plan.runs) as flyers:
+        with crew(options.pool, title, plan.flights) as flyers:
             flyers.fly(plan, journal)
         _finish(options, plan, journal, flyers.spent)
 

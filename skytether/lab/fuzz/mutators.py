@@ -11,6 +11,7 @@ import numpy as np
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import (
     FEEDBACK,
+    NO_INPUT,
     Close,
     Heartbeat,
     Hello,
@@ -72,10 +73,10 @@ def seeds(terms: Terms) -> list[bytes]:
     axes, n = terms.axes, terms.horizon
     inputs = np.zeros((axes, n), np.float32)
     feedback = np.ones((axes, FEEDBACK), np.float32)
-    state, flown = np.zeros((axes, 2)), np.zeros(axes)
+    state, flown = np.zeros((axes, 2)), NO_INPUT if terms.splines else np.zeros(axes)
     plans: list[Message] = [
-        Horizon(1, 7, 5, 10, 9, inputs),
-        Horizon(1, 7, 5, 10, 9, inputs, feedback),
+        Horizon(1, 7, 5, 10, 1, inputs),
+        Horizon(1, 7, 5, 10, 1, inputs, feedback),
     ]
     if terms.splines:
         plans = [Trajectory(1, 7, 5, 10, 1, 4, np.zeros((axes, 3, 2), np.float32))]
@@ -84,7 +85,7 @@ def seeds(terms: Terms) -> list[bytes]:
         for message in (
             Hello(1, 2**50, terms),
             Welcome(1, 7, 5, 3, 10, 0, terms),
-            Observation(1, 7, 5, 10, 4, 4, 8, 9, 3, 1, state, flown),
+            Observation(1, 7, 5, 4, 4, 8, 9, 3, 1, state, flown),
             *plans,
             Heartbeat(1, 7, 10, 0, 0),
             Close(1, 7),

@@ -86,12 +86,14 @@ class Panel:
             ground.colors = np.array(GROUND_RGB[light.value], np.uint8)
 
         titles = [each.title for each in flights]
-        axes = max(each.state.scenario.model.axes for each in flights)
+        scenarios = [each.state.scenario for each in flights]
+        axes = max(each.model.axes for each in scenarios)
+        solves = any(each.control.scheme != "trajectory" for each in scenarios)
         panel = gui.add_panel()
         with panel.add_tab("Flight"):
             self._plots = [Plots(gui, titles, of_flight(axes))]
         with panel.add_tab("Network"):
-            self._plots.append(Plots(gui, titles, of_network()))
+            self._plots.append(Plots(gui, titles, of_network(solves=solves)))
         with panel.add_tab("Events"):
             self._said = gui.add_html("")
         if client.camera.image_width > NARROW:

@@ -1,0 +1,177 @@
+"""The rule of flight as kernels have it, and as a vehicle flies by it: equal to the last bit."""
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skytether.client.compensator import Compensator
+from skytether.lab.courses import FollowedCourse, PlannedCourse
+from skytether.server.control import trajectory
+from skytether.server.control.committed import Replay
+from skytether.server.control.scheme import Foresight
+from skytether.server.control.trajectory import Guidance
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Horizon, Trajectory
+from skytether.sim.flight import fly
+
+AXES, AGE_MAX, H = 2, 30, 20
+FLIGHT = 60
+"""Number of steps that are flown by one message: it ends, and is braked along."""
+ANEW = 3000
+"""Number of stages that are compared with the equations written anew, too."""
+
+
+def terms(scheme: str, exhausted: str, rng: np.random.Generator) -> Terms:
+    """Terms of some vehicle."""
+    table = {
+        "model": {"tau_s": rng.uniform(0.2, 2.0, AXES).tolist(), "gain": [0.8, 1.1]},
+        "control": {"dt": 0.1, "horizon": H, "scheme": scheme},
+        "vehicle": {"exhausted": exhausted, "brake_mps2": float(rng.uniform(0.5, 4.0))},
+        "network": {"uplink": {"delay": "none"}, "downlink": {"delay": "none"}},
+        "link": {"age_max_s": 0.1 * AGE_MAX},
+    }
+    return reading.check(table, "test").terms()
+
+
+def mismatches(scheme: str, stages: int, seed: int) -> tuple[int, float]:
+    """Stages at which a vehicle flies another input than the compiled rule says, of so many.
+
+    Messages, states, wind, and the steps at which it is awake are drawn.
+
+    Returns:
+        their number, and the largest difference from the equations written anew [m/s].
+    """
+    rng, differ, away, compared = np.random.default_rng(seed), 0, 0.0, 0
+    while compared < stages:
+        flown = terms(scheme, ("brake", "hold")[rng.integers(2)], rng)
+        gain = rng.uniform(0.0, 3.0, (AXES, 2))
+        aboard = Compensator(flown, gain)
+        step, age = int(rng.integers(9, 40)), int(rng.integers(3, 9))
+        course: FollowedCourse | PlannedCourse
+        if scheme == "trajectory":
+            count = int(rng.integers(1, KNOTS_MAX + 1))
+            knots = rng.normal(0.0, 3.0, (AXES, count, 2)).astype(np.float32)
+            sent = Trajectory(1, 1, step, 0, age, int(rng.integers(1, 12)), knots)
+            aboard.offer(sent, step - 2, step - age)
+            course = FollowedCourse(sent, AGE_MAX - age + 1, flown, gain)
+        else:
+            inputs = rng.normal(0.0, 1.5, (AXES, H)).astype(np.float32)
+            feedback = rng.normal(0.0, 1.0, (AXES, FEEDBACK * int(rng.integers(2))))
+            horizon = Horizon(1, 1, step, 0, 0, inputs, feedback.astype(np.float32))
+            aboard.offer(horizon, step - 2, step - age)
+            course = PlannedCourse(horizon, min(H, AGE_MAX - age + 1), flown)
+        for k in range(step - 2, step + FLIGHT):
+            if rng.random() < 0.1:  # it has slept
+                continue
+            state, found = rng.normal(0.0, 2.0, (AXES, 2)), rng.normal(0.0, 0.3, AXES).tolist()
+            u = aboard.choose(k, state.tolist(), found)
+            differ += u != course.by_rule(k - step, state, found)
+            assert all(map(math.isfinite, u))
+            compared += 1
+            if compared <= ANEW:
+                wanted = course.told(k - step) + course.back(k - step, state, found)
+                anew = np.clip(wanted, np.negative(flown.u_max), flown.u_max)
+                away = max(away, float(np.abs(anew - u).max()))
+    return differ, away
+
+
+@pytest.mark.parametrize("scheme", ["trajectory", "committed"])
+def test_what_is_flown_is_what_the_compiled_rule_says(scheme: str) -> None:
+    """To the last bit, before, along and after whatever is held; within rounding, as it is told."""
+    differ, away = mismatches(scheme, ANEW, 1)
+    assert differ == 0
+    assert away < 1e-9
+
+
+# -- in flight -------------------------------------------------------------------------------
+
+
+def kept_at_the_server(scheme: Any, found: Foresight, row: int, i: int) -> tuple[Array, Array, int]:
+    """What the server keeps of what was sent last: numbers, feedback, and steps between knots."""
+    memory = scheme._memory
+    if isinstance(scheme, Guidance):
+        slot = (memory.vehicles["sent"][row] - 1) % trajectory.ROOM
+        count = memory.sent["count"][row, slot]
+        knots = memory.knots[row, slot, :, : 2 * count]
+        return (
+            knots.reshape(len(knots), count, 2).copy(),
+            np.zeros(0),
+            memory.sent["spacing"][row, slot],
+        )
+    slot = memory.sent["step"][row].argmax()
+    return memory.inputs[row, slot].copy(), found.feedback[i].astype(float), 0
+
+
+def flown_mismatches(flown: Scenario) -> tuple[int, int]:
+    """Steps flown by a plan or along a trajectory, and inputs that are another than should be.
+
+    What should be flown follows from what the server keeps of what it sent, from the state and the
+    disturbance that the vehicle has found, by the compiled rule; and from how fast it may change.
+    """
+    kept: dict[int, tuple[Array, Array, int]] = {}
+    winds: dict[int, list[float]] = {}
+    terms, gain = flown.terms(), feedback_gain(flown)
+    follows = terms.splines
+    scheme = Guidance if follows else Replay
+    remember, choose = scheme.remember, Compensator.choose
+
+    def spy(self: Any, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
+        remember(self, rows, step, found, event)
+        for i in event.nonzero()[0].tolist():
+            kept[int(step[i])] = kept_at_the_server(self, found, int(rows[i]), i)
+
+    def look(self: Compensator, step: int, state: Any, disturbance: Any) -> list[float]:
+        winds[step] = list(disturbance)
+        return choose(self, step, state, disturbance)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scheme, "remember", spy)
+        patch.setattr(Compensator, "choose", look)
+        client = fly(flown).client
+    steps, differ, courses = 0, 0, {}
+    change = flown.vehicle.slew_mps2 * terms.dt_s
+    for before, row in pairwise(client):
+        step, made = int(row["step"]), int(row["in_force"])
+        if not row["covered"]:
+            continue
+        if made not in courses:
+            numbers, feedback, spacing = kept[made]
+            observed = step - int(row["age_ns"]) // terms.dt_ns
+            last = observed + terms.age_max - made + 1
+            if follows:
+                sent = Trajectory(1, 1, made, 0, made - observed, spacing, numbers.astype("f4"))
+                courses[made] = FollowedCourse(sent, last, terms, gain)
+            else:
+                told = feedback.astype("f4") if terms.feedback else np.zeros((terms.axes, 0), "f4")
+                horizon = Horizon(1, 1, made, 0, 0, numbers.astype("f4"), told)
+                courses[made] = PlannedCourse(horizon, min(numbers.shape[1], last), terms)
+        wanted = courses[made].by_rule(step - made, row["estimate"], winds[step])
+        last_flown = before["input"]
+        near = np.clip(wanted, last_flown - change, last_flown + change)
+        differ += (np.clip(near, np.negative(terms.u_max), terms.u_max) != row["input"]).any()
+        steps += 1
+    return steps, differ
+
+
+def demo(scheme: str, duration_s: float, seed: int) -> Scenario:
+    """The demonstration, in wind that it does not know and with a gain that it does not have."""
+    table = reading.to_table(reading.load("demo")) | {"duration": duration_s, "seed": seed}
+    trigger = "expected_gap(0.05)" if scheme == "trajectory" else "cost_gap(3)"
+    table["control"] |= {"scheme": scheme, "trigger": f"{trigger} | silence(1)"}
+    table["vehicle"] |= {"gain": [0.9], "steady_wind_mps": [0.2, -0.1], "wind": 0.1}
+    return reading.check(table, "demo")
+
+
+@pytest.mark.parametrize("scheme", ["trajectory", "committed"])
+def test_what_is_flown_follows_from_what_the_server_keeps(scheme: str) -> None:
+    """No input differs by a bit: mismatch 0."""
+    steps, differ = flown_mismatches(demo(scheme, 30.0, 1))
+    assert steps > 400
+    assert differ == 0
