@@ -1,12 +1,19 @@
-"""A link: one direction of the network, a bounded heap of packets by due time, and statistics."""
+"""A link: one direction of the network, a bounded heap of packets by due time, and statistics.
+
+packet → bottleneck, where the direction has a finite rate → lost, or delayed → out
+"""
 
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
-from typing import Any
+from typing import Any, NamedTuple
 
-from skytether.netem.fate import SLOT_NS, Fates
+from skytether.netem.bottleneck import Bottleneck
+from skytether.netem.fate import Fates
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Datagram
+from skytether.shared.scenario.air.draws import SLOT_NS, Fate
+from skytether.shared.scenario.air.path import Path
+from skytether.shared.scenario.air.queues import HEADER_BYTES
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
 
@@ -22,6 +29,8 @@ DELAY_EDGES_MS = (20, 40, 60, 80, 100, 140, 200, 300, 400, 500, 600, 800, 1000, 
 """Edges between which delays are counted for those who draw them over time [ms]."""
 ERROR_BIN_NS = MILLISECOND_NS // 50
 """Width of the bins in which errors of delays are counted [ns]."""
+QUEUEING_BIN_NS = MILLISECOND_NS
+"""Width of the bins in which times in a queue are counted [ns]."""
 
 
 @dataclass(slots=True)
@@ -42,6 +51,19 @@ class Lane:
     """Number of packets so far, lost ones included."""
     newest_out: int = -1
     """Highest number of a packet that has left, or -1."""
+    latest_ns: int = 0
+    """Time at which the last of its packets is due."""
+
+
+class Entered(NamedTuple):
+    """A packet that has entered, and waits to pass a finite rate."""
+
+    datagram: Datagram
+    lane: Lane
+    number: int
+    """Its number in the lane."""
+    fate: Fate
+    entered_ns: int
 
 
 @dataclass(slots=True)
@@ -62,12 +84,20 @@ class Counts:
     """Packets dropped because they were longer than `network.mtu`."""
     overflowed: int = 0
     """Packets dropped because QUEUE_MAX or QUEUE_BYTES_MAX were under way."""
+    dropped: int = 0
+    """Packets that the queue of a finite rate has dropped."""
+    duplicated: int = 0
+    """Copies of packets."""
+    corrupted: int = 0
+    """Packets of which a bit was flipped."""
     depth_max: int = 0
     """Most packets that were under way at once."""
     delay: Histogram = field(default_factory=lambda: Histogram(DELAY_BIN_NS))
     """Delays of forwarded packets, as drawn."""
     error: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN_NS))
     """Times by which forwarded packets left later than drawn."""
+    queueing: Histogram = field(default_factory=lambda: Histogram(QUEUEING_BIN_NS))
+    """Times that packets took to pass a finite rate, from when they entered."""
 
 
 class Link:
@@ -77,18 +107,34 @@ class Link:
         direction: UPLINK or DOWNLINK, for the record.
         mtu: longest UDP payload that passes [B].
         recorder: takes one row a packet, where there is one.
+        path: order and finite rate of the direction.
     """
 
-    def __init__(self, direction: int, mtu: int, recorder: Recorder | None) -> None:
+    def __init__(
+        self, direction: int, mtu: int, recorder: Recorder | None, path: Path | None = None
+    ) -> None:
         self._direction = direction
         self._mtu = mtu
         self._recorder = recorder
-        self._heap: list[tuple[int, int, Datagram, Lane, int, int]] = []
-        """Heap of due time [ns], order of entry, packet, lane, number in the lane, delay [ns]."""
+        self._heap: list[tuple[int, int, Datagram, Lane, int, int, bool]] = []
+        """Heap of due time [ns], order of entry, packet, lane, number in the lane, delay [ns], and
+        whether it is a copy."""
         self._bytes = 0
-        """UDP payload under way [B]."""
+        """UDP payload in the heap [B]."""
         self._entered = 0
+        self._path = path or Path(())
+        self._bottleneck = _bottleneck(self._path)
         self.counts = Counts()
+
+    def change(self, path: Path, *, now_ns: int) -> None:
+        """Have another order and rate; packets that wait go on to wait, if they fit."""
+        self._pass(now_ns)
+        was, self._path = self._path, path
+        if path.queue is was.queue:
+            return
+        before, self._bottleneck = self._bottleneck, _bottleneck(path)
+        for waiting in before.drain() if before else ():
+            self._queue(waiting.item, now_ns)
 
     def take(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> None:
         """Take a packet that enters, addressed to where it is to come out."""
@@ -96,35 +142,100 @@ class Link:
         slot = (now_ns - lane.began_ns) // SLOT_NS
         lane.rank = lane.rank + 1 if slot == lane.slot else 0
         lane.slot = slot
-        delay_ns, lost = lane.fates.at(slot, lane.rank)
+        fate = lane.fates.at(slot, lane.rank)
         lane.taken += 1
         counts.packets += 1
         counts.bytes += size
-        depth = len(self._heap)
         if size > self._mtu:
             counts.oversized += 1
-        elif lost:
-            counts.lost += 1
-            if self._recorder is not None:
-                self._recorder.append_row(
-                    self._direction, lane.flow, number, size, now_ns, delay_ns, True, False
-                )
-        elif depth >= QUEUE_MAX or self._bytes + size > QUEUE_BYTES_MAX:
-            counts.overflowed += 1
+        elif self._bottleneck is None:
+            self._delay(datagram, lane, number, fate, now_ns, now_ns)
         else:
+            self._pass(now_ns)
+            self._queue(Entered(datagram, lane, number, fate, now_ns), now_ns)
+
+    def _queue(self, entered: Entered, now_ns: int) -> None:
+        """Let a packet enter the bottleneck, where there is one."""
+        bottleneck, size = self._bottleneck, len(entered.datagram.payload)
+        if bottleneck is None:
+            self._delay(*entered, now_ns)
+        elif self._is_full(size):
+            self.counts.overflowed += 1
+        else:
+            flow = entered.lane.flow
+            bottleneck.take(entered, size + HEADER_BYTES, flow, now_ns=now_ns)
+            self._count_dropped(bottleneck)
+
+    def _pass(self, now_ns: int) -> None:
+        """Take on what has passed the bottleneck by now."""
+        bottleneck = self._bottleneck
+        if bottleneck is None:
+            return
+        for entered, passed_ns in bottleneck.give(now_ns=now_ns):
+            self.counts.queueing.add(passed_ns - entered.entered_ns)
+            self._delay(*entered, passed_ns)
+        self._count_dropped(bottleneck)
+
+    def _count_dropped(self, bottleneck: Bottleneck[Entered]) -> None:
+        for datagram, lane, number, fate, entered_ns in bottleneck.dropped:
+            self.counts.dropped += 1
+            self._record_lost(lane, number, len(datagram.payload), entered_ns, fate.delay_ns)
+        bottleneck.dropped.clear()
+
+    def _delay(
+        self,
+        datagram: Datagram,
+        lane: Lane,
+        number: int,
+        fate: Fate,
+        entered_ns: int,
+        now_ns: int,
+    ) -> None:
+        """Lose a packet, or hold it until it is due; it has passed a finite rate now, if any."""
+        counts, due_ns, size = self.counts, now_ns + fate.delay_ns, len(datagram.payload)
+        if fate.lost:
+            counts.lost += 1
+            self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)
+            return
+        if self._path.is_ordered:
+            due_ns = lane.latest_ns = max(due_ns, lane.latest_ns)
+        if fate.flipped is not None and size:
+            counts.corrupted += 1
+            datagram = datagram._replace(payload=_flipped(datagram.payload, fate.flipped))
+        counts.duplicated += fate.copies
+        for copy in range(1 + fate.copies):
+            if self._is_full(size):
+                counts.overflowed += 1
+                continue
             self._bytes += size
             self._entered += 1
-            due_ns = now_ns + delay_ns
-            heappush(self._heap, (due_ns, self._entered, datagram, lane, number, delay_ns))
-            if depth >= counts.depth_max:
-                counts.depth_max = depth + 1
+            delay_ns = due_ns - entered_ns
+            is_copy = copy > 0
+            heappush(self._heap, (due_ns, self._entered, datagram, lane, number, delay_ns, is_copy))
+            counts.depth_max = max(counts.depth_max, len(self._heap))
+
+    def _is_full(self, size: int) -> bool:
+        """Whether there is no room for another packet of this size."""
+        if self._bottleneck is None:
+            return len(self._heap) >= QUEUE_MAX or self._bytes + size > QUEUE_BYTES_MAX
+        return self.depth() >= QUEUE_MAX or self.depth_bytes() + size > QUEUE_BYTES_MAX
+
+    def _record_lost(
+        self, lane: Lane, number: int, size: int, entered_ns: int, delay_ns: int
+    ) -> None:
+        if self._recorder is not None:
+            self._recorder.append_row(
+                self._direction, lane.flow, number, size, entered_ns, delay_ns, True, False
+            )
 
     def give(self, *, now_ns: int) -> list[Datagram]:
         """Packets that are due, which so leave."""
+        self._pass(now_ns)
         heap, counts, out = self._heap, self.counts, []
         while heap and heap[0][0] <= now_ns:
-            due_ns, _, datagram, lane, number, delay_ns = heappop(heap)
-            self._bytes -= len(datagram.payload)
+            due_ns, _, datagram, lane, number, delay_ns, is_copy = heappop(heap)
+            size = len(datagram.payload)
+            self._bytes -= size
             overtaken = number < lane.newest_out
             if overtaken:
                 counts.reordered += 1
@@ -133,25 +244,32 @@ class Link:
             counts.forwarded += 1
             counts.delay.add(delay_ns)
             counts.error.add(now_ns - due_ns)
-            if self._recorder is not None:
-                size, arrived_ns = len(datagram.payload), due_ns - delay_ns
+            if self._recorder is not None and not is_copy:
+                entered_ns = due_ns - delay_ns
                 self._recorder.append_row(
-                    self._direction, lane.flow, number, size, arrived_ns, delay_ns, False, overtaken
+                    self._direction, lane.flow, number, size, entered_ns, delay_ns, False, overtaken
                 )
             out.append(datagram)
         return out
 
     def next_due_ns(self) -> int | None:
-        """Time at which the next packet is due, or None."""
-        return self._heap[0][0] if self._heap else None
+        """Time at which the next packet is due, or has passed the bottleneck, or None."""
+        due_ns = self._heap[0][0] if self._heap else None
+        if self._bottleneck is None:
+            return due_ns
+        passed_ns = self._bottleneck.next_due_ns()
+        if due_ns is None or (passed_ns is not None and passed_ns < due_ns):
+            return passed_ns
+        return due_ns
 
     def depth(self) -> int:
         """Number of packets under way."""
-        return len(self._heap)
+        waiting = self._bottleneck.waiting if self._bottleneck else 0
+        return len(self._heap) + waiting
 
     def depth_bytes(self) -> int:
-        """UDP payload under way [B]."""
-        return self._bytes
+        """UDP payload under way, of packets that wait with their headers [B]."""
+        return self._bytes + (self._bottleneck.waiting_bytes if self._bottleneck else 0)
 
     def figures(self) -> dict[str, Any]:
         """Statistics by name, as in `Endpoint.figures`."""
@@ -164,6 +282,9 @@ class Link:
             "reordered": counts.reordered,
             "oversized": counts.oversized,
             "overflowed": counts.overflowed,
+            "dropped": counts.dropped,
+            "duplicated": counts.duplicated,
+            "corrupted": counts.corrupted,
             "queue": self.depth(),
             "queue_max": counts.depth_max,
             "delays_ms": counts.delay.by_bin(),
@@ -171,4 +292,18 @@ class Link:
             "error_ms_p50": counts.error.quantile_ms(0.5),
             "error_ms_p99": counts.error.quantile_ms(0.99),
             "error_ms_max": counts.error.largest_ns / MILLISECOND_NS,
+            "queueing_ms_p50": counts.queueing.quantile_ms(0.5),
+            "queueing_ms_p99": counts.queueing.quantile_ms(0.99),
         }
+
+
+def _bottleneck(path: Path) -> Bottleneck[Entered] | None:
+    return Bottleneck(path.queue) if path.queue is not None else None
+
+
+def _flipped(payload: bytes, place: float) -> bytes:
+    """A payload with one bit flipped, at a share of its length below 1."""
+    bit = int(place * 8 * len(payload))
+    changed = bytearray(payload)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)

@@ -55,7 +55,7 @@ class Proxy(Endpoint):
         recorder: takes one row a packet.
     """
 
-    changeable = keys_of(InFlight.IMPAIRMENT)
+    changeable = keys_of(InFlight.IMPAIRMENT) | {"network.uplink", "network.downlink"}
 
     def __init__(
         self,
@@ -70,8 +70,9 @@ class Proxy(Endpoint):
         self._scenario = scenario
         self._server = server
         mtu = scenario.network.mtu
-        self.uplink = Link(UPLINK, mtu, recorder)
-        self.downlink = Link(DOWNLINK, mtu, recorder)
+        network = scenario.network
+        self.uplink = Link(UPLINK, mtu, recorder, network.uplink.path)
+        self.downlink = Link(DOWNLINK, mtu, recorder, network.downlink.path)
         self._answered: OrderedDict[Address, Flow] = OrderedDict()
         """Flows through which a packet of the server's has come, by client, oldest packet first."""
         self._unanswered: OrderedDict[Address, Flow] = OrderedDict()
@@ -150,9 +151,17 @@ class Proxy(Endpoint):
         direction: DirectionConfig = getattr(self._scenario.network, name)
         return Fates(direction, self._scenario.seed, name, flow)
 
-    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+    def change(
+        self,
+        scenario: Scenario,
+        keys: frozenset[str],  # noqa: ARG002
+        *,
+        now_ns: int,
+    ) -> None:
         """See `Endpoint`; packets that are under way keep their fate."""
         self._scenario = scenario
+        self.uplink.change(scenario.network.uplink.path, now_ns=now_ns)
+        self.downlink.change(scenario.network.downlink.path, now_ns=now_ns)
         for flow in self._by_socket.values():
             flow.uplink.fates = self._fates("uplink", flow.uplink.flow)
             flow.downlink.fates = self._fates("downlink", flow.downlink.flow)

@@ -33,6 +33,7 @@ reorders and loses their packets.
   triggers              policies for control.trigger, a sentence each
   reports               policies for vehicle.report, a sentence each
   references            shapes for reference.shape, a sentence each
+  impairments           what a network does to packets, a sentence each
   vehicles              what may fly, for vehicle.kind, a sentence each
   keygen FILE           keys for vehicles, so that nobody else can fly them
   server [SCENARIO]     one process by hand: plans for vehicles
@@ -85,6 +86,7 @@ COMMANDS = {
     "triggers": "skytether.cli.names:triggers",
     "reports": "skytether.cli.names:reports",
     "references": "skytether.cli.names:references",
+    "impairments": "skytether.cli.names:impairments",
     "vehicles": "skytether.cli.names:vehicles",
     "keygen": "skytether.cli.keygen:keygen",
     "server": "skytether.server.__main__:serve",

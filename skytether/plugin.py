@@ -1,10 +1,13 @@
 """Names that a plug-in imports: the decorators, and the types of what its functions are given.
 
-docs/triggers.md has triggers, docs/targets.md references, docs/vehicles.md vehicles.
+docs/triggers.md has triggers, docs/targets.md references, docs/vehicles.md vehicles,
+docs/network.md impairments.
 """
 
 from skytether.client.vehicle import Measurement, Vehicle
 from skytether.client.vehicles import vehicle
+from skytether.shared.scenario.air.draws import Draws, Fate
+from skytether.shared.scenario.air.impairment import Impairment, Share, Time, impairment
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.trajectories import reference
@@ -13,14 +16,20 @@ from skytether.shared.scenario.triggers import Compared, Situation, Trigger, Ver
 __all__ = [
     "Compared",
     "ControlConfig",
+    "Draws",
+    "Fate",
+    "Impairment",
     "Measurement",
     "Reference",
     "Scenario",
+    "Share",
     "Situation",
+    "Time",
     "Trigger",
     "Vehicle",
     "Verdict",
     "above",
+    "impairment",
     "reference",
     "trigger",
     "vehicle",

@@ -8,9 +8,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy import stats
 
-from skytether.netem import fate as fate_module
-from skytether.netem.fate import SLOT_NS, Fate, Fates
+from skytether.netem.fate import Fates
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.scenario.air import delays
+from skytether.shared.scenario.air.draws import SLOT_NS, Draws, Fate, Stream
 from skytether.shared.scenario.schema import DirectionConfig
 
 SAMPLES = 20_000
@@ -170,25 +171,27 @@ def test_bursts_are_as_long_and_lose_as_much_as_asked(loss: float, burst_s: floa
 
 def test_a_channel_is_as_it_was_drawn_at_the_newest_moment_before() -> None:
     """Moments of every cell, one after the other up to its end, found here all at once."""
-    fates = Fates(replace(PAPER, loss=0.3, burst_s=0.1), 5, "uplink", 0)
+    names, mean_s = (5, "uplink", 0, "moments"), 0.1
+    draws, moments_of = Draws(Stream("packets"), 0, names), Stream(*names)
     drawn: list[tuple[float, float]] = []
     for cell in range(-40, 200):
         moment, number = float(cell), 0
         while True:
-            gap, state = fate_module._uniform(fates._moments, cell, number)
+            gap, state = moments_of.pair(cell, number)
             moment, number = moment - np.log1p(-gap), number + 1
             if moment > cell + 1.0:
                 break
             drawn.append((moment, state))
     moments = [moment for moment, _ in drawn]
-    for time in np.linspace(0.0, 199.0, 2000).tolist():
-        assert fates._state(time) == drawn[bisect_right(moments, time) - 1][1]
+    for slot in range(0, 19_900, 10):
+        time = slot * SLOT_NS / (mean_s * SECOND_NS)
+        assert draws.lasting(Fate(slot), mean_s) == drawn[bisect_right(moments, time) - 1][1]
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.3, 2.0, 50.0, 1000.0])
 def test_no_draw_lies_beyond_the_last_number_of_slots(mean: float) -> None:
     """The probabilities rise to 1 exactly, for a draw may come as close to it as it likes."""
-    _, cumulative = fate_module._poisson(mean)
+    _, cumulative = delays._poisson(mean)
     assert cumulative[-1] == 1.0
     assert list(cumulative) == sorted(cumulative)
 

@@ -8,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether.netem import link as link_module
-from skytether.netem.fate import SLOT_NS, Fate, Fates
+from skytether.netem.fate import Fates
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Datagram
+from skytether.shared.scenario.air.draws import SLOT_NS, Fate
 from skytether.shared.scenario.schema import DirectionConfig
 from skytether.shared.telemetry.record import (
     DOWNLINK,
@@ -44,7 +45,7 @@ class Listed(Fates):
 def make_lane(*delays_ns: int, flow: int = 0, lost: Iterable[int] = ()) -> Lane:
     """A flow whose packets have these delays; those with the numbers in `lost` are lost."""
     lost = set(lost)
-    listed = Listed(Fate(delay, i in lost) for i, delay in enumerate(delays_ns))
+    listed = Listed(Fate(delay_ns=delay, lost=i in lost) for i, delay in enumerate(delays_ns))
     return Lane(flow, listed, began_ns=0)
 
 

@@ -341,7 +341,9 @@ def test_the_figures_name_every_statistic() -> None:
     hear(proxy, b"!", SERVER, 1, at=3 * ms)
     hear(proxy, b"!", BOB, 1, at=3 * ms)
     proxy.wake(now_ns=21 * ms)
-    nothing = dict.fromkeys(("forwarded", "lost", "reordered", "oversized", "overflowed"), 0)
+    counts = "forwarded", "lost", "reordered", "oversized", "overflowed"
+    nothing = dict.fromkeys((*counts, "dropped", "duplicated", "corrupted"), 0)
+    nothing |= dict.fromkeys(("queueing_ms_p50", "queueing_ms_p99"), 0.0)
     errors = ("error_ms_p50", "error_ms_p99", "error_ms_max")
 
     def within(count: int) -> dict[str, int]:

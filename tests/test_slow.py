@@ -15,7 +15,7 @@ import pytest
 
 import skytether.netem.proxy
 from skytether.client.compensator import Compensator
-from skytether.netem.fate import SLOT_NS, Fate, Fates
+from skytether.netem.fate import Fates
 from skytether.server.control.clock import ClockMap
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import (
@@ -26,6 +26,7 @@ from skytether.shared.core.events import (
     PlanningStopped,
 )
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.air.draws import SLOT_NS, Fate
 from skytether.shared.scenario.schema import DirectionConfig, Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
@@ -67,7 +68,7 @@ def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Rec
 
         def at(self, slot: int, rank: int = 0) -> Fate:  # noqa: ARG002
             """See `Fates`."""
-            return Fate(round(self._delay(slot * SLOT_NS / SECOND_NS) * SECOND_NS), False)
+            return Fate(delay_ns=round(self._delay(slot * SLOT_NS / SECOND_NS) * SECOND_NS))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(skytether.netem.proxy, "Fates", Clocked)

@@ -4,13 +4,14 @@ import math
 from collections.abc import Iterator
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, margins
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
-from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.scenario.schema import ControlConfig, DirectionConfig, Scenario
 from skytether.shared.scenario.triggers import make_trigger
 from skytether.shared.wire.protocol import INPUTS_MAX
 
@@ -76,8 +77,7 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
         yield "control.feedback", "false", "true with control.scheme = 'trajectory'"
     if control.scheme == "none" and control.feedback:
         yield "control.feedback", "true", "false with control.scheme = 'none'"
-    yield from _too_slow(scenario)
-    yield from _too_short(scenario)
+    yield from list(_no_impairments(scenario)) or _too_late(scenario)
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
     if known is None or scenario.reference != known.reference or axes != known.model.axes:
@@ -86,10 +86,16 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
         yield from list(_no_room(scenario)) or _outside(scenario)
 
 
+def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why plans come too late over the scenario's network, or end too early."""
+    yield from _too_slow(scenario)
+    yield from _too_short(scenario)
+
+
 def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
     """Why no horizon can come in time over the scenario's network."""
     control, link, axes = scenario.control, scenario.link, scenario.model.axes
-    up, down = scenario.network.uplink, scenario.network.downlink
+    up, down = scenario.network.uplink.path, scenario.network.downlink.path
     # As the server sees it, whose clock map knows no more than half of the smallest round trip.
     delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
     seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
@@ -115,7 +121,7 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
 def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
     """Why the vehicle would brake further than it follows plans; the more so, the more are lost."""
     control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
-    covered_s, lossy = control.horizon * control.dt, scenario.network.uplink.loss > LOSSY
+    covered_s, lossy = control.horizon * control.dt, scenario.network.uplink.path.loss > LOSSY
     least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
     plans = control.scheme in ("committed", "predictive")
     if vehicle.exhausted == "brake" and plans and covered_s < least_s - TINY:
@@ -127,6 +133,26 @@ def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
             control.horizon,
             f"horizon · dt (now {covered_s:g} s) to be {least}",
         )
+
+
+def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why a direction of the network cannot be made."""
+    for way, direction in (
+        ("uplink", scenario.network.uplink),
+        ("downlink", scenario.network.downlink),
+    ):
+        key = f"network.{way}"
+        short = msgspec.structs.replace(direction, impairments="")
+        if direction.impairments and short != DirectionConfig():
+            expected = "no other keys beside it, for it says all: add to the text instead"
+            yield f"{key}.impairments", repr(direction.impairments), expected
+        try:
+            _ = direction.path
+        except policies.PolicyError as error:
+            yield key, repr(error.given), error.expected
+        except Exception as error:
+            expected = f"impairments that can be made ({type(error).__name__}: {error})"
+            yield key, repr(direction.text), expected
 
 
 def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:

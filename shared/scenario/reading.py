@@ -9,6 +9,7 @@ import re
 import tomllib
 import typing
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -20,8 +21,10 @@ from skytether import scenarios
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
+from skytether.shared.scenario.air import path as air
 from skytether.shared.scenario.contradictions import contradictions
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 
 SCENARIOS = Path(scenarios.__file__).parent
 """Folder of the scenarios that come with Skytether."""
@@ -31,6 +34,14 @@ EXTENDS_MAX = 20
 """Largest number of scenarios that a scenario is laid over, each over the next."""
 GIVEN_MAX = 200
 """Largest number of characters that a message repeats of what was given."""
+DIRECTIONS = {
+    way: msgspec.to_builtins(direction)
+    for way, direction in (
+        ("uplink", NetworkConfig().uplink),
+        ("downlink", NetworkConfig().downlink),
+    )
+}
+"""Raw tables of the directions of a network, as they are where nothing is written."""
 COMPARED = "compare"
 """The file of the scenarios that `skytether compare` flies."""
 
@@ -77,6 +88,7 @@ def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = 
         ConfigError: the first thing that is wrong.
     """
     where = f"{source}: " if source else ""
+    raw = _with_directions(raw)
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
@@ -85,6 +97,13 @@ def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = 
     for key, given, expected in wrong:
         raise ConfigError(f"{where}{key}: got {_short(str(given))}, expected {expected}")
     return scenario
+
+
+def with_directions(scenario: Scenario, directions: Mapping[str, str]) -> Scenario:
+    """A scenario with other directions of its network, unchecked; texts by name of the way."""
+    made = {way: DirectionConfig(impairments=text) for way, text in directions.items()}
+    network = msgspec.structs.replace(scenario.network, **made)
+    return msgspec.structs.replace(scenario, network=network)
 
 
 def to_table(scenario: Scenario) -> dict[str, Any]:
@@ -119,6 +138,7 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
     table = raw.get("reference")
     if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
         table["file"] = str((path.parent / table["file"]).absolute())
+    raw = _with_directions(raw, path.parent)
     base = raw.pop("extends", None)
     if base is None:
         return raw
@@ -127,6 +147,27 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
     if ".toml" in base:
         base = str(path.parent / base)
     return _overlay(_read(base, {**seen, (path, entry): name}), raw)
+
+
+def _with_directions(raw: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
+    """A raw table in which each direction of the network that is a text is a table.
+
+    Args:
+        folder: folder that names of files in the text are relative to; None: they stay.
+    """
+    network = raw.get("network")
+    if not isinstance(network, dict):
+        return dict(raw)
+    network = dict(network)
+    for way in DIRECTIONS.keys() & network.keys():
+        given = network[way]
+        if isinstance(given, str):
+            network[way] = given = {**DIRECTIONS[way], "impairments": given}
+        if folder and isinstance(given, dict) and isinstance(given.get("impairments"), str):
+            with suppress(PolicyError):  # said by `check`
+                text = air.with_files(given["impairments"], lambda file: str(folder / file))
+                network[way] = {**given, "impairments": text}
+    return {**raw, "network": network}
 
 
 def _path(file: str) -> Path:

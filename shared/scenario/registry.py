@@ -6,8 +6,9 @@
 
 A table is the decorator of its entries. Name, bounds and the sentence of help are those of the
 function or class itself. The program gives it a fixed number of arguments (here `now`); those
-behind are numbers that a scenario writes in parentheses, as in `slip(0.3)`. Nothing is imported
-here: `shell.plugins` imports plug-ins, before a scenario is read.
+behind are what a scenario writes in parentheses, as in `slip(0.3)`: numbers, and for impairments
+words and names of files, too. Nothing is imported here: `shell.plugins` imports plug-ins, before a
+scenario is read.
 """
 
 import inspect
@@ -17,7 +18,7 @@ import re
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar, overload
+from typing import Annotated, Any, Literal, NewType, TypeVar, overload
 
 from msgspec import Meta
 
@@ -35,9 +36,13 @@ class DefaultKey:
     name: str
 
 
+File = NewType("File", str)
+"""Annotation of a parameter that is the name of a file."""
+
+
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number that an entry takes."""
+    """A number that an entry takes, or one of some words, or the name of a file."""
 
     name: str
     low: float = -math.inf
@@ -45,13 +50,18 @@ class Parameter:
     high: float = math.inf
     """Largest value; it is finite in any case."""
     whole: bool = False
-    default: float | None = None
+    words: tuple[str, ...] = ()
+    """Words of which it is one; empty for a number or a file."""
+    file: bool = False
+    default: float | str | None = None
     """Value where the entry stands without arguments."""
     key: str = ""
     """Key whose value it has there instead, in the section of the scenario that names the entry."""
 
     def takes(self, value: Any) -> bool:
         """Whether the parameter may have this value."""
+        if self.words or self.file:
+            return isinstance(value, str) and (value in self.words or self.file)
         kinds = (int,) if self.whole else (int, float)
         return type(value) in kinds and self.low <= value <= self.high and math.isfinite(value)
 
@@ -61,6 +71,8 @@ class Parameter:
         return bool(self.key) or self.default is not None
 
     def __str__(self) -> str:
+        if self.words or self.file:
+            return f"{self.name} {'a file' if self.file else ' or '.join(self.words)}"
         low = f"{self.low:.15g} <= " if math.isfinite(self.low) else ""
         high = f" <= {self.high:.15g}" if math.isfinite(self.high) else ""
         return f"{low}{self.name}{high}{' (whole)' * self.whole}"
@@ -92,11 +104,16 @@ class Entry:
 
     def takes(self, values: Sequence[Any]) -> bool:
         """Whether these arguments are allowed; none at all where there is a value for each."""
-        if not values and all(parameter.may_miss for parameter in self.parameters):
+        if not values and self.may_stand_alone:
             return True
         return len(values) == len(self.parameters) and all(
             parameter.takes(value) for parameter, value in zip(self.parameters, values, strict=True)
         )
+
+    @property
+    def may_stand_alone(self) -> bool:
+        """Whether it may be written without arguments."""
+        return all(parameter.may_miss for parameter in self.parameters)
 
     def form(self, name: str) -> str:
         """What may be written of an entry with this name."""
@@ -126,13 +143,27 @@ class PluginTable(dict[str, Entry]):
         kind: the noun for an entry, in messages.
         form: what an entry may look like in a scenario, in messages.
         given: number of arguments that the program gives to a function; a class is given `class_`.
+        texts: whether entries take words and names of files beside numbers.
     """
 
-    def __init__(self, kind: str, form: str, *, given: int, class_: int) -> None:
+    def __init__(
+        self, kind: str, form: str, *, given: int, class_: int, texts: bool = False
+    ) -> None:
         super().__init__()
         self.kind = kind
         self.form = form
-        self._given, self._class = given, class_
+        self._given, self._class, self._texts = given, class_, texts
+
+    def written(self, name: str) -> str:
+        """What may be written of the entry with this name."""
+        entry = self[name]
+        if not (self._texts and entry.parameters):
+            return entry.form(name)
+        shown = ", ".join(
+            each.name if each.default is None else f"{each.name}={each.default}"
+            for each in entry.parameters
+        )
+        return f"{name}({shown}) with {' and '.join(map(str, entry.parameters))}"
 
     @overload
     def __call__(self, make: F) -> F: ...
@@ -169,13 +200,16 @@ class PluginTable(dict[str, Entry]):
         there = self.get(name)
         if there and there.source != make.__module__:
             raise ConfigError(f"{what}: expected another name, {there.source} has one of this name")
-        parameters = _parameters(what, make, self._class if isinstance(make, type) else self._given)
+        given = self._class if isinstance(make, type) else self._given
+        parameters = _parameters(what, make, given, texts=self._texts)
         about = inspect.cleandoc(make.__doc__ or "").partition("\n\n")[0]
         self[name] = Entry(make, parameters, " ".join(about.split()), schemes)
 
 
-def _parameters(what: str, make: Callable[..., Any], given: int) -> tuple[Parameter, ...]:
-    """Numbers that a function or class takes behind what it is given.
+def _parameters(
+    what: str, make: Callable[..., Any], given: int, *, texts: bool
+) -> tuple[Parameter, ...]:
+    """Parameters that a function or class takes behind what it is given.
 
     Raises:
         ConfigError: it takes something else, or not even what it is given.
@@ -188,14 +222,16 @@ def _parameters(what: str, make: Callable[..., Any], given: int) -> tuple[Parame
     taken = list(inspect.signature(make).parameters.values())
     if len(taken) < given:
         raise ConfigError(f"{what}: got {len(taken)} parameters, expected at least {given}")
-    return tuple(_parameter(what, each, hints.get(each.name, float)) for each in taken[given:])
+    return tuple(
+        _parameter(what, each, hints.get(each.name, float), texts=texts) for each in taken[given:]
+    )
 
 
-def _parameter(what: str, taken: inspect.Parameter, hint: Any) -> Parameter:
+def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -> Parameter:
     """One parameter, with the bounds and the key in its annotation.
 
     Raises:
-        ConfigError: no number can be given for it.
+        ConfigError: nothing that a scenario writes can be given for it.
     """
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     default = None if taken.default is taken.empty else taken.default
@@ -203,8 +239,11 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any) -> Parameter:
     low = next((mark.ge for mark in bounds if mark.ge is not None), -math.inf)
     high = next((mark.le for mark in bounds if mark.le is not None), math.inf)
     key = next((mark.name for mark in marks if isinstance(mark, DefaultKey)), "")
-    parameter = Parameter(taken.name, low, high, kind is int, default, key)
-    if taken.kind is not taken.POSITIONAL_OR_KEYWORD or kind not in (int, float):
+    words = typing.get_args(kind) if texts and typing.get_origin(kind) is Literal else ()
+    file = texts and kind is File
+    parameter = Parameter(taken.name, low, high, kind is int, words, file, default, key)
+    written = kind in (int, float) or words or file
+    if taken.kind is not taken.POSITIONAL_OR_KEYWORD or not written:
         raise ConfigError(f"{what}: {taken}: expected a number, as in {taken.name}: float")
     if default is not None and not parameter.takes(default):
         raise ConfigError(f"{what}: got the default {taken.name} = {default}, expected {parameter}")
@@ -226,5 +265,13 @@ VEHICLES = PluginTable(
 )
 """Vehicles of `vehicle.kind`, given the `Scenario` and the vehicle's number. See
 `client.vehicles`."""
-TABLES = (TRIGGERS, REFERENCES, VEHICLES)
+IMPAIRMENTS = PluginTable(
+    "impairment",
+    "impairments such as 'constant(0.05) & loss(0.1)'",
+    given=0,
+    class_=0,
+    texts=True,
+)
+"""Impairments of a direction of the network: classes. See `shared.scenario.air`."""
+TABLES = (TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
 """All tables that plug-ins add to."""

@@ -24,6 +24,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
+from skytether.shared.scenario.air import path as air
 from skytether.shared.scenario.owners import (
     InFlight,
     Key,
@@ -312,8 +313,11 @@ class MavlinkConfig(Section, frozen=True):
 
 
 class DirectionConfig(Section, frozen=True):
-    """One direction of the network."""
+    """One direction of the network. A text in its place is that of `impairments`."""
 
+    impairments: OfImpairment[Annotated[str, Meta(max_length=air.TEXT_MAX)]] = ""
+    """Impairments, combined with &, see `skytether impairments`; left out: those that the keys
+    below are short for. Also written as the direction itself: network.uplink = "…"."""
     delay: OfImpairment[Literal["poisson", "constant", "none"]] = "poisson"
     """Law of the delay: minimum_s + slot_s · Poisson(slots_mean) (17), just minimum_s, or none."""
     minimum_s: OfImpairment[Duration] = 0.4
@@ -328,14 +332,34 @@ class DirectionConfig(Section, frozen=True):
     """Mean length of a burst of losses [s]; 0: each packet is lost independently."""
 
     @property
-    def least_s(self) -> float:
-        """Smallest delay [s]."""
-        return 0.0 if self.delay == "none" else self.minimum_s
+    def text(self) -> str:
+        """Impairments as a text, also of those that the other keys are short for."""
+        if self.impairments:
+            return self.impairments
+        parts = []
+        if self.delay == "poisson":
+            parts.append(f"paper({self.minimum_s!r}, {self.slot_s!r}, {self.slots_mean!r})")
+        elif self.delay == "constant":
+            parts.append(f"constant({self.minimum_s!r})")
+        if self.burst_s:
+            parts.append(f"gilbert_elliott({self.loss!r}, {self.burst_s!r})")
+        elif self.loss:
+            parts.append(f"loss({self.loss!r})")
+        return " & ".join(parts)
+
+    @property
+    def path(self) -> air.Path:
+        """Impairments that the text describes.
+
+        Raises:
+            PolicyError: with the part of it that is wrong.
+        """
+        return air.path(self.text)
 
     @property
     def mean_s(self) -> float:
         """Mean delay [s]."""
-        return self.least_s + (self.slot_s * self.slots_mean if self.delay == "poisson" else 0.0)
+        return self.path.mean_s
 
 
 class NetworkConfig(Section, frozen=True):

@@ -21,7 +21,7 @@ def names(title: str, table: registry.PluginTable, about: str, argv: Sequence[st
     options.read(ListingOptions(), argv, f"skytether {title}", about)
     for name, entry in table.items():
         source = "" if entry.is_ours else f" (from {entry.source})"
-        print(f"{entry.form(name)}\n    {entry.about}{source}")
+        print(f"{table.written(name)}\n    {entry.about}{source}")
 
 
 triggers = partial(
@@ -32,5 +32,11 @@ reports = partial(
 )
 references = partial(
     names, "references", registry.REFERENCES, "List what reference.shape may be, a sentence each."
+)
+impairments = partial(
+    names,
+    "impairments",
+    registry.IMPAIRMENTS,
+    "List what network.uplink and network.downlink are made of, a sentence each.",
 )
 vehicles = partial(names, "vehicles", vehicle, "List what vehicle.kind may be, a sentence each.")

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 import time
+from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
@@ -128,8 +129,10 @@ def parse(
     plugins.load(plugins.named(argv))
     named = leads and argv and not argv[0].startswith("-")
     name = argv[0] if named else defaults.scenario
+    argv, directions = _directions(argv)
     while True:
-        default = replace(defaults, scenario=name, config=reading.load(name))  # type: ignore[type-var]
+        config = reading.with_directions(reading.load(name), directions)
+        default = replace(defaults, scenario=name, config=config)  # type: ignore[type-var]
         options = read(default, argv, prog, help_)
         if options.scenario == name:
             break
@@ -138,6 +141,18 @@ def parse(
     for option in OUTPUTS:
         check_output(f"--{option}", getattr(options, option, None))
     return replace(options, config=checked)  # type: ignore[type-var]
+
+
+def _directions(argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """A command line without directions of the network that it gives as texts, and these."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for way in reading.DIRECTIONS:
+        parser.add_argument(f"--network.{way}", dest=way)
+    try:
+        found, rest = parser.parse_known_args(list(argv))
+    except ArgumentError as error:
+        raise CommandError(f"{error.argument_name}: expected a text", CONFIGURATION) from None
+    return rest, {way: text for way, text in vars(found).items() if text is not None}
 
 
 def address(flag: str, text: str) -> Address:

@@ -191,6 +191,19 @@ _NETEM = (
         "counter",
         "Packets for which there was no room.",
     ),
+    *_each_way(
+        ("dropped",),
+        "netem_dropped_packets_total",
+        "counter",
+        "Packets that the queue of a finite rate has dropped.",
+    ),
+    *_each_way(("duplicated",), "netem_duplicated_packets_total", "counter", "Copies made."),
+    *_each_way(
+        ("corrupted",),
+        "netem_corrupted_packets_total",
+        "counter",
+        "Packets of which a bit was flipped.",
+    ),
     *_each_way(("queue",), "netem_queued_packets", "gauge", "Packets under way."),
     *_each_way(
         ("delays_within_ms", Label("le")),
@@ -207,6 +220,18 @@ _NETEM = (
             "netem_lateness_seconds",
             "summary",
             "Time by which packets left later than drawn.",
+            MILLI,
+            quantile=quantile,
+        )
+    ),
+    *(
+        metric
+        for figure, quantile in (("p50", "0.5"), ("p99", "0.99"))
+        for metric in _each_way(
+            (f"queueing_ms_{figure}",),
+            "netem_queueing_seconds",
+            "summary",
+            "Time that packets took to pass a finite rate.",
             MILLI,
             quantile=quantile,
         )

@@ -19,7 +19,13 @@ from typing import Any, NamedTuple
 
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.scenario.registry import REFERENCES, TABLES, TRIGGERS, VEHICLES
+from skytether.shared.scenario.registry import (
+    IMPAIRMENTS,
+    REFERENCES,
+    TABLES,
+    TRIGGERS,
+    VEHICLES,
+)
 
 FLAG = "--plugin"
 FILE_BYTES_MAX = 1_000_000
@@ -28,6 +34,7 @@ GROUPS = {
     "skytether.triggers": TRIGGERS,
     "skytether.references": REFERENCES,
     "skytether.vehicles": VEHICLES,
+    "skytether.impairments": IMPAIRMENTS,
 }
 """Groups of entry points, and the tables that they add to."""
 
@@ -113,7 +120,7 @@ def _import(plugin: Plugin) -> None:
                 if entry.source == path:
                     table[name], found = replace(entry, version=version), found + 1
         if not found:
-            expected = "a function or class with @trigger, @reference or @vehicle, see docs"
+            expected = "@trigger, @reference, @vehicle or @impairment on something, see docs"
             raise ConfigError(f"{FLAG}: {path}: adds nothing, expected {expected}")
 
 

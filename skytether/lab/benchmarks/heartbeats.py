@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-from skytether.netem.fate import SLOT_NS, Fates
+from skytether.netem.fate import Fates
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.law.heartbeat import NUMBERS, Hearing, false_per_h, silences
+from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.schema import DirectionConfig
 from skytether.shell import options
 

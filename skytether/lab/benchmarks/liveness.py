@@ -26,12 +26,13 @@ import numpy as np
 from skytether.client.failsafe import TABLE, Failsafe
 from skytether.lab.benchmarks.harness import TextTable, progress, refresh
 from skytether.lab.benchmarks.heartbeats import computed
-from skytether.netem.fate import SLOT_NS, Fates
+from skytether.netem.fate import Fates
 from skytether.server.sessions import Session
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import ModeChanged
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.dotted import lay
 from skytether.shared.scenario.schema import DirectionConfig, Scenario
 from skytether.shared.telemetry.record import Reason

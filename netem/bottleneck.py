@@ -1,0 +1,231 @@
+"""A bottleneck: packets of all flows go through a finite rate one after the other, and wait.
+
+It is a server of one packet at a time, driven by time: a packet that enters goes at once where
+nobody is served, and else waits in a queue of so many bytes. Sizes are those on the wire, with the
+headers of IP and UDP.
+"""
+
+from bisect import bisect_left
+from collections import OrderedDict, deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from math import ceil, sqrt
+from typing import Generic, TypeVar
+
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.scenario.air.queues import Deliveries, Queued
+from skytether.shared.scenario.air.traces import DELIVERY_BYTES
+
+QUANTUM_BYTES = 1514
+"""Bytes that each flow may send in its turn, where flows are served fairly [B]."""
+TARGET_NS, INTERVAL_NS = 5 * MILLISECOND_NS, 100 * MILLISECOND_NS
+"""CoDel's parameters: time in the queue that is fine, and time to react to more (RFC 8289) [ns]."""
+
+T = TypeVar("T")
+
+
+@dataclass(slots=True)
+class Waiting(Generic[T]):
+    """One packet in the queue."""
+
+    item: T
+    size: int
+    """Bytes on the wire [B]."""
+    flow: int
+    entered_ns: int
+
+
+@dataclass(slots=True)
+class Codel:
+    """Controlled delay, RFC 8289: drops packets that have waited, ever faster, until waits fall."""
+
+    above_ns: int = 0
+    """Time at which waits will have been too long for INTERVAL_NS; 0 while they are not."""
+    drop_ns: int = 0
+    """Time of the next drop."""
+    count: int = 0
+    last_count: int = 0
+    dropping: bool = False
+
+    def drops(self, now_ns: int, *, is_fine: bool) -> bool:
+        """Whether to drop the packet at the front.
+
+        Args:
+            is_fine: whether it has not waited too long, or nearly nothing waits behind it.
+        """
+        late = False
+        if is_fine:
+            self.above_ns = 0
+        elif not self.above_ns:
+            self.above_ns = now_ns + INTERVAL_NS
+        else:
+            late = now_ns >= self.above_ns
+        if not late:
+            self.dropping = False
+            return False
+        if self.dropping:
+            if now_ns < self.drop_ns:
+                return False
+            self.count += 1
+            self.drop_ns += round(INTERVAL_NS / sqrt(self.count))
+            return True
+        self.dropping = True
+        recent = now_ns - self.drop_ns < 16 * INTERVAL_NS
+        self.count = max(1, self.count - self.last_count) if recent else 1
+        self.last_count = self.count
+        self.drop_ns = now_ns + round(INTERVAL_NS / sqrt(self.count))
+        return True
+
+
+@dataclass(slots=True)
+class Line(Generic[T]):
+    """Packets that wait in one line: all of a direction, or those of a flow."""
+
+    packets: "deque[Waiting[T]]" = field(default_factory=deque)
+    bytes: int = 0
+    credit: int = 0
+    """Bytes that it may still send in its turn."""
+    codel: Codel = field(default_factory=Codel)
+
+
+class Bottleneck(Generic[T]):
+    """Serves packets at a finite rate.
+
+    Args:
+        queue: rate, room and order of serving.
+    """
+
+    def __init__(self, queue: Queued) -> None:
+        self._queue = queue
+        self._is_fair = queue.serve == "fair"
+        self._lines: OrderedDict[int, Line[T]] = OrderedDict()
+        """Lines in which packets wait, that whose turn it is first."""
+        self._served: Waiting[T] | None = None
+        self._done_ns = 0
+        """Time at which the packet that is served has passed."""
+        self._largest = 0
+        self.waiting = 0
+        """Number of packets that wait, without the one that is served."""
+        self.waiting_bytes = 0
+        """Their size on the wire [B]."""
+        self.dropped: list[T] = []
+        """What was dropped; whoever counts it takes it out."""
+        self._pace: _Rate | _Deliveries = (
+            _Deliveries(queue) if isinstance(queue, Deliveries) else _Rate(queue.bytes_per_s)
+        )
+
+    def take(self, item: T, size: int, flow: int, *, now_ns: int) -> None:
+        """Take a packet that enters; all that was due before must have been given.
+
+        Args:
+            size: its bytes on the wire [B].
+        """
+        packet = Waiting(item, size, flow, now_ns)
+        self._largest = max(self._largest, size)
+        if self._served is None:
+            self._serve(packet, now_ns)
+            return
+        key = flow if self._is_fair else 0
+        line = self._lines.get(key)
+        if line is None:
+            line = self._lines[key] = Line(credit=QUANTUM_BYTES)
+        line.packets.append(packet)
+        self._count(key, packet, 1)
+        while self.waiting_bytes > self._queue.room_bytes:
+            longest = max(self._lines, key=lambda each: self._lines[each].bytes)
+            last = self._lines[longest].packets.pop()
+            self._count(longest, last, -1)
+            self.dropped.append(last.item)
+
+    def give(self, *, now_ns: int) -> Iterator[tuple[T, int]]:
+        """Packets that have passed by now, each with the time at which it has [ns]."""
+        while self._served is not None and self._done_ns <= now_ns:
+            item, at_ns = self._served.item, self._done_ns
+            self._served = None
+            packet = self._next(at_ns)
+            if packet is not None:
+                self._serve(packet, at_ns)
+            yield item, at_ns
+
+    def next_due_ns(self) -> int | None:
+        """Time at which the next packet has passed, or None."""
+        return None if self._served is None else self._done_ns
+
+    def drain(self) -> Iterator[Waiting[T]]:
+        """All packets within, in order of entry; the bottleneck is empty then."""
+        lines = [packet for line in self._lines.values() for packet in line.packets]
+        served = [] if self._served is None else [self._served]
+        self._lines.clear()
+        self._served, self.waiting, self.waiting_bytes = None, 0, 0
+        yield from sorted(served + lines, key=lambda packet: packet.entered_ns)
+
+    def _serve(self, packet: Waiting[T], now_ns: int) -> None:
+        self._served = packet
+        self._done_ns = self._pace.done_ns(now_ns, packet.size)
+
+    def _next(self, now_ns: int) -> Waiting[T] | None:
+        """The packet to serve next, without those that CoDel drops before it."""
+        while self.waiting:
+            key, line = next(iter(self._lines.items()))
+            if self._is_fair and line.credit <= 0:
+                line.credit += QUANTUM_BYTES
+                self._lines.move_to_end(key)
+                continue
+            packet = line.packets.popleft()
+            line.credit -= packet.size
+            self._count(key, packet, -1)
+            if self._queue.drop == "tail" or not self._is_late(line, packet, now_ns):
+                return packet
+            self.dropped.append(packet.item)
+        return None
+
+    def _is_late(self, line: Line[T], packet: Waiting[T], now_ns: int) -> bool:
+        """Whether CoDel drops a packet that was next in its line."""
+        waited_ns = now_ns - packet.entered_ns
+        target_ns = max(TARGET_NS, round(self._largest / self._queue.bytes_per_s * SECOND_NS))
+        is_fine = waited_ns < target_ns or line.bytes <= self._largest
+        return line.codel.drops(now_ns, is_fine=is_fine)
+
+    def _count(self, key: int, packet: Waiting[T], one: int) -> None:
+        """Count a packet that has entered a line (1) or left it (-1)."""
+        line = self._lines[key]
+        line.bytes += one * packet.size
+        self.waiting_bytes += one * packet.size
+        self.waiting += one
+        if self._is_fair and not line.packets:
+            del self._lines[key]
+
+
+class _Rate:
+    """Pace of a constant rate [B/s]."""
+
+    def __init__(self, bytes_per_s: float) -> None:
+        self._bytes_per_s = bytes_per_s
+
+    def done_ns(self, now_ns: int, size: int) -> int:
+        """Time at which a packet has passed that is served from now on."""
+        return now_ns + round(size / self._bytes_per_s * SECOND_NS)
+
+
+class _Deliveries:
+    """Pace of a file of mahimahi, over and over, from the first packet on.
+
+    Packets share the bytes of a delivery; what nobody waits for is lost.
+    """
+
+    def __init__(self, queue: Deliveries) -> None:
+        self._times_ns: list[int] = [round(time_s * SECOND_NS) for time_s in queue.times_s]
+        self._began_ns: int | None = None
+        self._used_bytes = 0
+        """Bytes of the deliveries so far that are used, or lost."""
+
+    def done_ns(self, now_ns: int, size: int) -> int:
+        """Time at which a packet has passed that is served from now on."""
+        if self._began_ns is None:
+            self._began_ns = now_ns
+        times_ns = self._times_ns
+        rounds, at_ns = divmod(now_ns - self._began_ns, times_ns[-1])
+        before = rounds * len(times_ns) + bisect_left(times_ns, at_ns)
+        self._used_bytes = max(self._used_bytes, before * DELIVERY_BYTES) + size
+        rounds, last = divmod(ceil(self._used_bytes / DELIVERY_BYTES) - 1, len(times_ns))
+        return max(now_ns, self._began_ns + rounds * times_ns[-1] + times_ns[last])

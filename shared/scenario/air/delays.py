@@ -1,0 +1,220 @@
+"""Laws of the delay. Delays of several in one direction add up.
+
+Each is made of its quantile function: a uniform number becomes a delay. With `correlation_s` that
+number stays for a while (`Draws.lasting`), so that the autocorrelation of delays falls to 1/e in
+that time, and each is still distributed as the law says.
+"""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from functools import lru_cache
+from math import exp, floor, inf, lgamma, log, pi, sqrt
+from statistics import NormalDist
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+
+from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.scenario.air.draws import Draws, Fate
+from skytether.shared.scenario.air.impairment import Impairment, Time, impairment
+
+_NORMAL = NormalDist()
+_TAIL = 2.0**-54
+"""Half of the smallest step of a uniform number: nothing lies further out."""
+
+
+class Delay(Impairment):
+    """Delay that is drawn from a distribution."""
+
+    kind = "delay"
+
+    def __init__(self, correlation_s: float = 0.0) -> None:
+        self._correlation_s = correlation_s
+
+    def quantile_ns(self, share: float) -> int:
+        """Delay that a share of packets does not exceed [ns]."""
+        raise NotImplementedError
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:
+        """See `Impairment`."""
+        correlation_s = self._correlation_s
+        drawn = draws.lasting(fate, correlation_s) if correlation_s else draws.uniform(fate)
+        fate.delay_ns += self.quantile_ns(drawn)
+
+
+@impairment(name="constant")
+class Constant(Delay):
+    """Delays every packet by so many seconds."""
+
+    def __init__(self, delay_s: Time) -> None:
+        super().__init__()
+        self.least_s = self.mean_s = delay_s
+        self._delay_ns = seconds_to_ns(delay_s)
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
+        """See `Impairment`."""
+        fate.delay_ns += self._delay_ns
+
+    def quantile_ns(self, share: float) -> int:  # noqa: ARG002
+        """See `Delay`."""
+        return self._delay_ns
+
+
+@impairment(name="paper")
+class Paper(Delay):
+    """Delays by minimum_s + slot_s · Poisson(slots_mean), as the paper, eq. (17) as corrected."""
+
+    def __init__(
+        self,
+        minimum_s: Time,
+        slot_s: Time,
+        slots_mean: Annotated[float, Meta(ge=0, le=1e6)],
+        correlation_s: Time = 0.0,
+    ) -> None:
+        super().__init__(correlation_s)
+        self.least_s, self.mean_s = minimum_s, minimum_s + slot_s * slots_mean
+        self._least_ns, self._slot_ns = seconds_to_ns(minimum_s), seconds_to_ns(slot_s)
+        self._fewest, self._cumulative = _poisson(slots_mean)
+
+    def quantile_ns(self, share: float) -> int:
+        """See `Delay`."""
+        slots = self._fewest + bisect_right(self._cumulative, share)
+        return self._least_ns + slots * self._slot_ns
+
+
+@impairment(name="uniform")
+class Uniform(Delay):
+    """Delays by a time from low_s to high_s, each as likely."""
+
+    def __init__(self, low_s: Time, high_s: Time, correlation_s: Time = 0.0) -> None:
+        super().__init__(correlation_s)
+        if high_s < low_s:
+            raise ValueError(f"high_s to be at least low_s = {low_s:g}")
+        self.least_s, self.mean_s = low_s, (low_s + high_s) / 2.0
+        self._low_s, self._width_s = low_s, high_s - low_s
+
+    def quantile_ns(self, share: float) -> int:
+        """See `Delay`."""
+        return seconds_to_ns(self._low_s + self._width_s * share)
+
+
+@impairment(name="normal")
+class Normal(Delay):
+    """Delays by a normally distributed time, and not at all where that is negative."""
+
+    def __init__(self, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
+        super().__init__(correlation_s)
+        self._mean_s, self._sd_s = mean_s, sd_s
+        reach = mean_s / sd_s if sd_s else inf
+        density = exp(-reach * reach / 2.0) / sqrt(2.0 * pi)
+        self.mean_s = mean_s * _NORMAL.cdf(reach) + sd_s * density
+        self.least_s = self.quantile_ns(0.0) * 1e-9
+
+    def quantile_ns(self, share: float) -> int:
+        """See `Delay`."""
+        return max(0, seconds_to_ns(self._mean_s + self._sd_s * _standard(share)))
+
+
+@impairment(name="lognormal")
+class Lognormal(Delay):
+    """Delays by least_s and a lognormally distributed time; mean and deviation of the whole."""
+
+    def __init__(self, least_s: Time, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
+        super().__init__(correlation_s)
+        over_s = _over(least_s, mean_s)
+        self.least_s, self.mean_s = least_s, mean_s
+        variance = log(1.0 + (sd_s / over_s) ** 2) if over_s else 0.0
+        self._sigma = sqrt(variance)
+        self._scale_s = over_s * exp(-variance / 2.0)
+
+    def quantile_ns(self, share: float) -> int:
+        """See `Delay`."""
+        return seconds_to_ns(self.least_s + self._scale_s * exp(self._sigma * _standard(share)))
+
+
+@impairment(name="gamma")
+class Gamma(Delay):
+    """Delays by least_s and a gamma-distributed time; mean and deviation of the whole."""
+
+    def __init__(self, least_s: Time, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
+        super().__init__(correlation_s)
+        over_s = _over(least_s, mean_s)
+        self.least_s, self.mean_s = least_s, mean_s
+        if sd_s and not 0.1 <= (over_s / sd_s) ** 2 <= 1e4:
+            raise ValueError("sd_s of 0, or of a hundredth to three times mean_s - least_s")
+        shape = (over_s / sd_s) ** 2 if sd_s else 0.0
+        self._scale_s = over_s / shape if shape else 0.0
+        self._shares, self._multiples = _gamma(shape) if shape else ((0.0,), (0.0,))
+        self._constant_s = 0.0 if shape else over_s
+
+    def quantile_ns(self, share: float) -> int:
+        """See `Delay`."""
+        multiple = interpolated(share, self._shares, self._multiples)
+        return seconds_to_ns(self.least_s + self._constant_s + self._scale_s * multiple)
+
+
+def interpolated(at: float, places: Sequence[float], values: Sequence[float]) -> float:
+    """Value between those at places, on a straight line; the outermost beyond them.
+
+    Args:
+        places: rising.
+        values: as many.
+    """
+    after = bisect_right(places, at)
+    if after == 0 or after == len(places):
+        return values[0 if after == 0 else -1]
+    before = after - 1
+    part = (at - places[before]) / (places[after] - places[before])
+    return values[before] + part * (values[after] - values[before])
+
+
+def _standard(share: float) -> float:
+    """Quantile of the standard normal distribution."""
+    return _NORMAL.inv_cdf(min(max(share, _TAIL), 1.0 - 2.0**-53))
+
+
+def _over(least_s: float, mean_s: float) -> float:
+    """Mean delay beyond the least [s].
+
+    Raises:
+        ValueError: there is none.
+    """
+    if mean_s < least_s:
+        raise ValueError(f"mean_s to be at least least_s = {least_s:g}")
+    return mean_s - least_s
+
+
+@lru_cache(maxsize=64)
+def _poisson(mean: float) -> tuple[int, Sequence[float]]:
+    """Cumulative probabilities of a Poisson law, as far as they differ from 0 and from 1.
+
+    Returns:
+        The number that the first of them is of, and the probabilities of no more than each number.
+    """
+    if mean == 0.0:
+        return 0, (1.0,)
+    wide = 10.0 * sqrt(mean) + 20.0
+    numbers = range(max(0, floor(mean - wide)), floor(mean + wide))
+    logs = [number * log(mean) - mean - lgamma(number + 1.0) for number in numbers]
+    cumulative = np.cumsum(np.exp(logs))
+    return numbers[0], (cumulative / cumulative[-1]).tolist()
+
+
+@lru_cache(maxsize=64)
+def _gamma(shape: float) -> tuple[Sequence[float], Sequence[float]]:
+    """Cumulative probabilities of a gamma law of scale 1, and the values they belong to.
+
+    The density is integrated over x^shape, on which it is bounded, however small the shape, and
+    for large shapes over x.
+    """
+    power = min(shape, 1.0)
+    low = max(0.0, shape - 9.0 * sqrt(shape)) ** power
+    high = (shape + 9.0 * sqrt(shape) + 40.0) ** power
+    y = np.linspace(low, high, 20_001)
+    middle = (y[1:] + y[:-1]) / 2.0
+    x = middle ** (1.0 / power)
+    density = np.exp((shape - power) * np.log(x) - x - (lgamma(shape) + log(power)))
+    cumulative = np.concatenate([[0.0], np.cumsum(density * np.diff(y))])
+    rising = np.flatnonzero(np.diff(cumulative, prepend=-1.0) > 0.0)
+    return (cumulative / cumulative[-1])[rising].tolist(), (y ** (1.0 / power))[rising].tolist()

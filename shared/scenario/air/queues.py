@@ -1,0 +1,83 @@
+"""Impairments that depend on what else is sent: finite rates with their queues, and order."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from skytether.shared.scenario.air.impairment import Impairment, impairment
+from skytether.shared.scenario.air.traces import DELIVERY_BYTES, deliveries_in
+from skytether.shared.scenario.registry import File
+
+HEADER_BYTES = 28
+"""IP and UDP headers of a packet [B], which take their time, too."""
+QUEUE_BYTES = 64_000
+"""Room in a queue unless another is given [B]."""
+
+Bytes = Annotated[int, Meta(ge=1, le=67_108_864)]
+Drop = Literal["tail", "codel"]
+"""What a queue drops: what does not fit, or what keeps it from ever being empty (RFC 8289)."""
+Served = Literal["first", "fair"]
+"""Whose packet goes next: who came first, or each flow in turn by as many bytes."""
+
+
+@impairment(name="ordered")
+class Ordered(Impairment):
+    """Lets no packet overtake another of its flow: it waits for those before it."""
+
+
+class Queued(Impairment):
+    """Finite rate with a queue, through which packets of all flows go one after the other."""
+
+    def __init__(self, queue: int, drop: Drop, serve: Served) -> None:
+        self.room_bytes = queue
+        self.drop: Drop = drop
+        self.serve: Served = serve
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Mean rate [B/s]."""
+        raise NotImplementedError
+
+
+@impairment(name="rate")
+class Rate(Queued):
+    """Lets so many bytes a second pass, IP and UDP headers included; others wait in a queue."""
+
+    def __init__(
+        self,
+        bytes_per_s: Annotated[float, Meta(ge=1, le=1e10)],
+        queue: Bytes = QUEUE_BYTES,
+        drop: Drop = "tail",
+        serve: Served = "first",
+    ) -> None:
+        super().__init__(queue, drop, serve)
+        self._bytes_per_s = bytes_per_s
+
+    @property
+    def bytes_per_s(self) -> float:
+        """See `Queued`."""
+        return self._bytes_per_s
+
+
+@impairment(name="deliveries")
+class Deliveries(Queued):
+    """Lets packets pass at the times in a file of mahimahi, over and over, from a queue."""
+
+    def __init__(
+        self,
+        file: File,
+        queue: Bytes = QUEUE_BYTES,
+        drop: Drop = "tail",
+        serve: Served = "first",
+    ) -> None:
+        super().__init__(queue, drop, serve)
+        try:
+            self.times_s = deliveries_in(file)
+        except ValueError as error:
+            raise ValueError(f"a file of mahimahi ({error})") from None
+        """Times at which packets of DELIVERY_BYTES may go [s]; the last is also the period."""
+
+    @property
+    def bytes_per_s(self) -> float:
+        """See `Queued`."""
+        return len(self.times_s) * DELIVERY_BYTES / float(self.times_s[-1])
