@@ -182,13 +182,8 @@ def test_a_file_that_cannot_be_written_is_told_before_the_flight(
         said = f"{command}: {flag}: {file}: cannot be written: {reason}\n"
         assert capfd.readouterr().err == said
     for fine in (kept, tmp_path / "new.png"):  # and what is wrong is something else
-        assert (
-            main(
-                [*argv, flag, str(fine), "--control.scheme", "committed", "--control.horizon", "1"]
-            )
-            == 2
-        )
-        assert "control.horizon" in capfd.readouterr().err
+        assert main([*argv, flag, str(fine), "--link.heartbeat_s", "9"]) == 2
+        assert "link.timeout_s" in capfd.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["kept.png"]
     assert kept.read_text() == "kept"
 
