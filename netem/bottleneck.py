@@ -16,8 +16,9 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.scenario.air.queues import Deliveries, Queued
 from skytether.shared.scenario.air.traces import DELIVERY_BYTES
 
-QUANTUM_BYTES = 1514
-"""Bytes that each flow may send in its turn, where flows are served fairly [B]."""
+QUANTUM_BYTES = 300
+"""Bytes that each flow may send in its turn, where flows are served fairly [B]: a few small
+packets; a longer one waits some turns for it."""
 TARGET_NS, INTERVAL_NS = 5 * MILLISECOND_NS, 100 * MILLISECOND_NS
 """CoDel's parameters: time in the queue that is fine, and time to react to more (RFC 8289) [ns]."""
 

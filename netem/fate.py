@@ -6,13 +6,25 @@ which the packet enters, and on nothing that was sent before: so two controllers
 network, however often each of them sends. Of packets that enter in one slot each has a fate of its
 own, by its rank among them: the three CLOSEs that are sent at once are not lost all together.
 Control traffic is so sparse that nearly every packet is the first of its slot.
+
+An impairment of a plug-in that raises an exception, or asks for what cannot be, changes nothing: a
+mistake in it ends no flight.
 """
 
+import traceback
 from collections import Counter
+from dataclasses import replace
 
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario.air.draws import Draws, Fate, Stream
 from skytether.shared.scenario.air.impairment import Impairment
+from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.scenario.schema import DirectionConfig
+
+DELAY_MAX_NS = 86_400 * SECOND_NS
+"""Largest delay that a plug-in may ask for [ns]."""
+COPIES_MAX = 100
+"""Largest number of copies that a plug-in may ask for."""
 
 
 class Fates:
@@ -29,6 +41,9 @@ class Fates:
         at = seed, name, flow
         packets = Stream(*at, "packets")
         self._impairments: list[tuple[Impairment, Draws]] = []
+        self.fault = ""
+        """Traceback of the first mistake of a plug-in's, or empty."""
+        self._guarded = False
         kinds: Counter[str] = Counter()
         names: Counter[str] = Counter()
         for name_, each in direction.path.impairments:
@@ -43,6 +58,7 @@ class Fates:
                 own = f"{name_} {names[name_]}"
                 draws = Draws(Stream(*at, own), 0, (*at, f"moments of {own}"))
             self._impairments.append((each, draws))
+            self._guarded |= not IMPAIRMENTS[name_].is_ours
 
     def at(self, slot: int, rank: int = 0) -> Fate:
         """Fate of a packet.
@@ -52,6 +68,34 @@ class Fates:
             rank: number of the packets of the flow that have entered in that slot before it.
         """
         fate = Fate(slot, rank)
+        if self._guarded:
+            return self._tried(fate)
         for impairment, draws in self._impairments:
             impairment(fate, draws)
         return fate
+
+    def _tried(self, fate: Fate) -> Fate:
+        """A fate without what impairments get wrong."""
+        for impairment, draws in self._impairments:
+            tried = replace(fate)
+            try:
+                impairment(tried, draws)
+                fate = _possible(tried)
+            except Exception:
+                self.fault = self.fault or traceback.format_exc()
+        return fate
+
+
+def _possible(fate: Fate) -> Fate:
+    """A fate that can be met.
+
+    Raises:
+        ValueError, TypeError: something in it cannot be.
+    """
+    if not 0 <= fate.delay_ns <= DELAY_MAX_NS:
+        raise ValueError(f"got delay_ns = {fate.delay_ns}, expected 0 to {DELAY_MAX_NS}")
+    if not 0 <= fate.copies <= COPIES_MAX:
+        raise ValueError(f"got copies = {fate.copies}, expected 0 to {COPIES_MAX}")
+    if fate.flipped is not None and not 0.0 <= fate.flipped < 1.0:
+        raise ValueError(f"got flipped = {fate.flipped}, expected a share below 1")
+    return replace(fate, delay_ns=int(fate.delay_ns), copies=int(fate.copies))

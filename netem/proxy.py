@@ -17,7 +17,7 @@ from skytether.netem.fate import Fates
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import FlowOpened
+from skytether.shared.core.events import Fault, FlowOpened
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import DirectionConfig, Scenario
@@ -79,6 +79,8 @@ class Proxy(Endpoint):
         """All other flows, likewise."""
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
+        self._faults: set[str] = set()
+        """Mistakes of plug-ins that were told."""
         self.refused = 0
         """Packets of clients for which there is no flow, and of strangers at a flow's socket."""
 
@@ -102,6 +104,10 @@ class Proxy(Endpoint):
             if flow.order is self._unanswered:
                 flow.order = self._answered
                 self._answered[flow.client] = self._unanswered.pop(flow.client)
+        for lane in (flow.uplink, flow.downlink):
+            if lane.fates.fault and lane.fates.fault not in self._faults:
+                self._faults.add(lane.fates.fault)
+                self._events.append(Fault(traceback=lane.fates.fault))
         flow.used_ns = now_ns
         flow.order.move_to_end(flow.client)
         self._forward(now_ns)

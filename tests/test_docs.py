@@ -60,6 +60,7 @@ def skytether(line: str) -> list[str]:
                 "skytether ma",
                 "skytether st",
                 "skytether id",
+                "skytether im",
             )
         )
         and "--control " not in line  # by test_the_documented_changes_are_made_in_flight
@@ -259,6 +260,7 @@ def test_every_documented_command_is_tested() -> None:
     known: tuple[str, ...] = ("pip install .", "pip install '.[all]'")  # by test_packaging.py
     known += ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
     known += ("skytether scenarios", "skytether calibrate ", "skytether envelope ")
+    known += ("skytether impairments",)
     known += ("skytether margins ", "skytether straight", "skytether identify ")
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py

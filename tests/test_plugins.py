@@ -33,8 +33,8 @@ from skytether.shell import plugins
 from skytether.sim.flight import fly, fly_batch
 
 ROOT = Path(__file__).parent.parent
-TRIGGERS_MD, TARGETS_MD, VEHICLES_MD = (
-    ROOT / "docs" / f"{name}.md" for name in ("triggers", "targets", "vehicles")
+TRIGGERS_MD, TARGETS_MD, VEHICLES_MD, NETWORK_MD = (
+    ROOT / "docs" / f"{name}.md" for name in ("triggers", "targets", "vehicles", "network")
 )
 HEAD = "import numpy as np\nfrom skytether.plugin import *\n"
 NEVER = """\
@@ -50,6 +50,12 @@ def slope(scenario, mps: float = 0.5):
         state[..., 0, 0], state[..., 0, 1] = mps * t, mps
         return state
     return at
+"""
+IMPAIRING = """\
+@impairment
+class bad(Impairment):
+    def __call__(self, fate, draws):
+        {mistake}
 """
 
 
@@ -109,8 +115,13 @@ def example(document: Path) -> str:
 
 @pytest.mark.parametrize(
     ("document", "file"),
-    [(TRIGGERS_MD, "slip.py"), (TARGETS_MD, "spiral.py"), (VEHICLES_MD, "cart.py")],
-    ids=["trigger", "reference", "vehicle"],
+    [
+        (TRIGGERS_MD, "slip.py"),
+        (TARGETS_MD, "spiral.py"),
+        (VEHICLES_MD, "cart.py"),
+        (NETWORK_MD, "fading.py"),
+    ],
+    ids=["trigger", "reference", "vehicle", "impairment"],
 )
 def test_the_documented_plugin_flies_with_the_documented_command(
     document: Path, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -375,7 +386,7 @@ def test_a_trigger_that_cannot_be_made_is_refused_before_a_flight(tmp_path: Path
     assert said.endswith("expected a trigger that can be made (ValueError: low is above high)")
 
 
-ADDS = "expected a function or class with @trigger, @reference or @vehicle, see docs"
+ADDS = "expected @trigger, @reference, @vehicle or @impairment on something, see docs"
 OURS = "skytether.shared.scenario.triggers"
 WRONG = {
     "a syntax error": ("def f(:\n", "line 3: SyntaxError: invalid syntax"),
@@ -691,6 +702,30 @@ def test_a_package_whose_entry_point_leads_nowhere_is_named(
         "triggers: entry point slip = no_such_module:slip of broken 2.0: "
         "ModuleNotFoundError: No module named 'no_such_module'\n"
     )
+
+
+def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path) -> None:
+    """As it adds the others."""
+    listed = run("impairments", folder=tmp_path, path=installed)
+    assert "dark(every_s) with 1 <= every_s\n    Loses what is sent in every other" in listed
+    network = ("--network.uplink", "constant(0.2) & dark(2)")
+    said = run(
+        "fly demo --virtual --settle 0 --duration 8", *network, folder=tmp_path, path=installed
+    )
+    assert "RMSE" in said
+
+
+@pytest.mark.parametrize(
+    "mistake", ["raise RuntimeError('no')", "fate.delay_ns = -1", "fate.delay_ns = None"]
+)
+def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path) -> None:
+    """It changes nothing, and is told once a flow and direction."""
+    plug(tmp_path, IMPAIRING.format(mistake=mistake))
+    network = {"uplink": "constant(0.2) & bad", "downlink": "constant(0.2)"}
+    flight = fly(scenario(network=network))
+    assert len(faults(flight)) == 1
+    plain = fly(scenario(network=dict.fromkeys(network, "constant(0.2)")))
+    assert np.array_equal(flight.client, plain.client)
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.scenario.air.draws import Draws, Fate
 from skytether.shared.scenario.air.impairment import Impairment, Time, impairment
 
@@ -109,7 +109,7 @@ class Normal(Delay):
         reach = mean_s / sd_s if sd_s else inf
         density = exp(-reach * reach / 2.0) / sqrt(2.0 * pi)
         self.mean_s = mean_s * _NORMAL.cdf(reach) + sd_s * density
-        self.least_s = self.quantile_ns(0.0) * 1e-9
+        self.least_s = self.quantile_ns(0.0) / SECOND_NS
 
     def quantile_ns(self, share: float) -> int:
         """See `Delay`."""
@@ -123,14 +123,15 @@ class Lognormal(Delay):
     def __init__(self, least_s: Time, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
         super().__init__(correlation_s)
         over_s = _over(least_s, mean_s)
-        self.least_s, self.mean_s = least_s, mean_s
+        self._least_s, self.mean_s = least_s, mean_s
         variance = log(1.0 + (sd_s / over_s) ** 2) if over_s else 0.0
         self._sigma = sqrt(variance)
         self._scale_s = over_s * exp(-variance / 2.0)
+        self.least_s = self.quantile_ns(0.0) / SECOND_NS
 
     def quantile_ns(self, share: float) -> int:
         """See `Delay`."""
-        return seconds_to_ns(self.least_s + self._scale_s * exp(self._sigma * _standard(share)))
+        return seconds_to_ns(self._least_s + self._scale_s * exp(self._sigma * _standard(share)))
 
 
 @impairment(name="gamma")
@@ -140,18 +141,19 @@ class Gamma(Delay):
     def __init__(self, least_s: Time, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
         super().__init__(correlation_s)
         over_s = _over(least_s, mean_s)
-        self.least_s, self.mean_s = least_s, mean_s
+        self.mean_s = mean_s
         if sd_s and not 0.1 <= (over_s / sd_s) ** 2 <= 1e4:
             raise ValueError("sd_s of 0, or of a hundredth to three times mean_s - least_s")
         shape = (over_s / sd_s) ** 2 if sd_s else 0.0
         self._scale_s = over_s / shape if shape else 0.0
         self._shares, self._multiples = _gamma(shape) if shape else ((0.0,), (0.0,))
-        self._constant_s = 0.0 if shape else over_s
+        self._constant_s = least_s if shape else mean_s
+        self.least_s = self.quantile_ns(0.0) / SECOND_NS
 
     def quantile_ns(self, share: float) -> int:
         """See `Delay`."""
         multiple = interpolated(share, self._shares, self._multiples)
-        return seconds_to_ns(self.least_s + self._constant_s + self._scale_s * multiple)
+        return seconds_to_ns(self._constant_s + self._scale_s * multiple)
 
 
 def interpolated(at: float, places: Sequence[float], values: Sequence[float]) -> float:

@@ -17,6 +17,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 SLOT_NS = MILLISECOND_NS
 """Length of a slot [ns]: shorter than any step, so that no two horizons and no two observations
 share one."""
+SLOT_S = SLOT_NS / SECOND_NS
 _PLACE = Struct("<qq")
 """Place of a draw: slot and rank, or cell and number."""
 _DRAWN = Struct("<QQ")

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from skytether.shared.scenario.air.draws import Draws, Fate
+from skytether.shared.scenario.air.draws import SLOT_S, Draws, Fate
 from skytether.shared.scenario.air.impairment import Impairment, Share, Time, impairment
 
 
@@ -39,6 +39,9 @@ class GilbertElliott(Impairment):
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
         """See `Impairment`."""
+        if self._cell_s <= SLOT_S:  # each packet meets a state of its own
+            fate.lost |= draws.uniform(fate) < self.loss
+            return
         bad = draws.lasting(fate, self._cell_s) < self._share
         loses = self._bad if bad else self._good
         if loses and (loses == 1.0 or draws.uniform(fate) < loses):

@@ -160,7 +160,7 @@ def _text(file: str) -> str:
     except (OSError, ValueError) as error:
         raise ValueError(f"{file}: cannot be read: {_reason(error)}") from None
     if not text.strip():
-        raise ValueError(f"{file}: got an empty file, expected delays, see docs/traces.md")
+        raise ValueError(f"{file}: got an empty file, expected delays, see docs/network.md")
     return text
 
 
@@ -170,9 +170,9 @@ def _reason(error: Exception) -> str:
 
 def _table(file: str, text: str, names: list[str]) -> Array:
     """Numbers below a line of names; shape (rows, columns). What is left out is NaN."""
-    rows = text.count("\n") + 1
-    if rows > ROWS_MAX + 2:
-        raise ValueError(f"{file}: got {rows - 1} rows, expected at most {ROWS_MAX}")
+    rows = text.rstrip().count("\n")
+    if rows > ROWS_MAX:
+        raise ValueError(f"{file}: got {rows} rows, expected at most {ROWS_MAX}")
     body = text.split("\n", 1)[1] if "\n" in text else ""
     if not body.strip():
         raise ValueError(f"{file}: got no rows, expected at least one below {','.join(names)}")

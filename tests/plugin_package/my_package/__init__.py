@@ -8,6 +8,9 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from skytether.plugin import (
+    Draws,
+    Fate,
+    Impairment,
     Measurement,
     Reference,
     Scenario,
@@ -15,6 +18,7 @@ from skytether.plugin import (
     Vehicle,
     Verdict,
     above,
+    impairment,
     reference,
     trigger,
     vehicle,
@@ -63,3 +67,15 @@ class Rail(Vehicle):
             state = self._position.tolist(), self._velocity.tolist()
             told.append(Measurement(self._measured_ns, *state))
         return told
+
+
+@impairment(name="dark")
+class Dark(Impairment):
+    """Loses what is sent in every other span of so many seconds."""
+
+    def __init__(self, every_s: Annotated[float, Meta(ge=1)]) -> None:
+        self._every_s, self.loss = every_s, 0.5
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
+        """Change the fate of a packet that enters."""
+        fate.lost |= fate.time_s // self._every_s % 2 == 1

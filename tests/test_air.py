@@ -1,0 +1,268 @@
+"""`scenario.air`: impairments against their distributions, and texts against the grammar."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import stats
+
+from skytether.netem.fate import Fates
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.air.draws import SLOT_NS, Fate
+from skytether.shared.scenario.air.path import Part, parse, path, with_files
+from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.schema import DirectionConfig
+
+SEEDS = range(10)
+SAMPLES = 3000
+P_MIN = 0.001
+
+
+def fates(text: str, seed: int = 1, count: int = SAMPLES, every: int = 7) -> list[Fate]:
+    """Fates of packets that enter every so many slots."""
+    made = Fates(DirectionConfig(impairments=text), seed, "uplink", 0)
+    return [made.at(every * number) for number in range(count)]
+
+
+def delays_s(text: str, seed: int, every: int = 7, count: int = SAMPLES) -> NDArray[np.float64]:
+    """Delays of packets [s]; shape (count,)."""
+    return np.array([fate.delay_ns for fate in fates(text, seed, count, every)]) / SECOND_NS
+
+
+def lognormal(least: float, mean: float, sd: float) -> Any:
+    """The distribution of `lognormal`."""
+    variance = np.log(1 + (sd / (mean - least)) ** 2)
+    scale = (mean - least) * np.exp(-variance / 2)
+    return stats.lognorm(np.sqrt(variance), loc=least, scale=scale)
+
+
+def gamma(least: float, mean: float, sd: float) -> Any:
+    """The distribution of `gamma`."""
+    shape = ((mean - least) / sd) ** 2
+    return stats.gamma(shape, loc=least, scale=(mean - least) / shape)
+
+
+LAWS = {
+    "uniform(0.05, 0.2)": stats.uniform(0.05, 0.15),
+    "normal(0.3, 0.04)": stats.norm(0.3, 0.04),
+    "lognormal(0.02, 0.05, 0.03)": lognormal(0.02, 0.05, 0.03),
+    "gamma(0.02, 0.05, 0.01)": gamma(0.02, 0.05, 0.01),
+    "gamma(0.02, 0.05, 0.06)": gamma(0.02, 0.05, 0.06),
+    "gamma(0, 0.5, 0.005)": gamma(0, 0.5, 0.005),
+}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("text", LAWS)
+def test_delays_follow_their_law(text: str, seed: int) -> None:
+    """By a Kolmogorov-Smirnov test; a nanosecond of rounding is nothing to it."""
+    assert stats.kstest(delays_s(text, seed), LAWS[text].cdf).pvalue > P_MIN
+
+
+@pytest.mark.parametrize("text", LAWS)
+def test_what_a_law_says_of_itself_is_so(text: str) -> None:
+    """Least and mean delay, which the server's bounds are made of."""
+    made, law = path(text), LAWS[text]
+    assert made.mean_s == pytest.approx(law.mean(), rel=1e-6)
+    assert made.least_s == pytest.approx(max(0.0, law.ppf(2.0**-54)), abs=0.01)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_papers_delays_follow_a_poisson_law(seed: int) -> None:
+    """By a chi-square test over the numbers of slots."""
+    slots = np.rint((delays_s("paper(0.4, 0.02, 2)", seed) - 0.4) / 0.02).astype(int)
+    counts = np.bincount(np.minimum(slots, 7), minlength=8)
+    shares = [*stats.poisson.pmf(range(7), 2), stats.poisson.sf(6, 2)]
+    assert stats.chisquare(counts, np.multiply(shares, SAMPLES)).pvalue > P_MIN
+
+
+@pytest.mark.parametrize("law", ["uniform(0, 1", "gamma(0, 0.5, 0.3", "paper(0, 0.1, 3"])
+def test_correlated_delays_keep_their_law_and_their_memory(law: str) -> None:
+    """The autocorrelation falls to 1/e in the time that is asked for."""
+    every, correlation_s = 50, 0.5
+    text = f"{law}, correlation_s={correlation_s})"
+    drawn = np.concatenate([delays_s(text, seed, every, 8000) for seed in SEEDS])
+    alone = np.concatenate([delays_s(f"{law})", seed, every, 8000) for seed in SEEDS])
+    assert drawn.mean() == pytest.approx(alone.mean(), rel=0.03)
+    assert drawn.std() == pytest.approx(alone.std(), rel=0.03)
+    lag = round(correlation_s * SECOND_NS / (every * SLOT_NS))
+    centred = drawn - drawn.mean()
+    correlation = np.mean(centred[lag:] * centred[:-lag]) / np.mean(centred**2)
+    assert correlation == pytest.approx(np.exp(-1), abs=0.03)
+    centred = alone - alone.mean()
+    assert abs(np.mean(centred[1:] * centred[:-1]) / np.mean(centred**2)) < 0.02
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(
+    ("text", "befell", "share"),
+    [
+        ("loss(0.1)", lambda fate: fate.lost, 0.1),
+        ("duplicate(0.2)", lambda fate: fate.copies == 1, 0.2),
+        ("corrupt(0.3)", lambda fate: fate.flipped is not None, 0.3),
+        ("loss(0.2) & loss(0.5)", lambda fate: fate.lost, 0.6),
+        ("gilbert_elliott(0.3, 0.001, 0.5, 0.1)", lambda fate: fate.lost, 0.22),
+    ],
+)
+def test_shares_are_those_asked_for(
+    text: str, befell: Callable[[Fate], bool], share: float, seed: int
+) -> None:
+    """By an exact binomial test; where packets are lost, the path says so, too."""
+    count = sum(befell(fate) for fate in fates(text, seed))
+    assert stats.binomtest(count, SAMPLES, share).pvalue > P_MIN
+    if "loss" in text or "gilbert" in text:
+        assert path(text).loss == pytest.approx(share)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_flipped_bits_lie_anywhere(seed: int) -> None:
+    """Uniformly over the packet."""
+    places = [fate.flipped for fate in fates("corrupt(0.5)", seed) if fate.flipped is not None]
+    assert stats.kstest(places, stats.uniform.cdf).pvalue > P_MIN
+
+
+@pytest.mark.parametrize(
+    ("text", "share", "burst_s"),
+    [("gilbert_elliott(0.2, 0.4)", 0.2, 0.4), ("outages(3, 1)", 0.25, 1.0)],
+)
+def test_bursts_last_as_long_as_asked_for(text: str, share: float, burst_s: float) -> None:
+    """Share and mean length, over many bursts; lengths are exponential."""
+    every, count = 20, 60_000
+    lost = np.concatenate(
+        [[fate.lost for fate in fates(text, seed, count, every)] for seed in range(4)]
+    )
+    edges = np.flatnonzero(np.diff(lost.astype(int), prepend=0, append=0))
+    lengths_s = np.diff(edges)[::2] * every * SLOT_NS / SECOND_NS
+    error = 4 / np.sqrt(len(lengths_s))
+    assert lengths_s.mean() == pytest.approx(burst_s, rel=error + 0.03)
+    assert lengths_s.std() == pytest.approx(burst_s, rel=2 * error + 0.03)
+    assert lost.mean() == pytest.approx(share, rel=2 * error)
+
+
+def test_an_outage_keeps_its_schedule() -> None:
+    """From at_s on for for_s seconds, again every every_s, or once."""
+    once = [fate.lost for fate in fates("outage(2, 0.5)", every=100, count=100)]
+    assert np.flatnonzero(once).tolist() == [20, 21, 22, 23, 24]
+    again = [fate.lost for fate in fates("outage(2, 0.5, every_s=3)", every=100, count=100)]
+    assert np.flatnonzero(again).tolist() == [
+        first + more for first in (20, 50, 80) for more in range(5)
+    ]
+
+
+def test_delays_add_up() -> None:
+    """Of all impairments in a direction."""
+    assert {fate.delay_ns for fate in fates("constant(0.1) & constant(0.05)")} == {150_000_000}
+    assert path("constant(0.1) & uniform(0.1, 0.3)").mean_s == pytest.approx(0.3)
+
+
+def test_another_impairment_changes_no_draw_of_the_others() -> None:
+    """Who adds a loss meets the same delays, and who adds a delay the same losses."""
+    alone, both = fates("gamma(0, 0.1, 0.05)"), fates("loss(0.3) & gamma(0, 0.1, 0.05)")
+    assert [fate.delay_ns for fate in alone] == [fate.delay_ns for fate in both]
+    lost = [fate.lost for fate in fates("loss(0.3)")]
+    assert lost == [fate.lost for fate in both]
+    assert lost == [fate.lost for fate in fates("corrupt(0.3) & loss(0.3) & duplicate(0.3)")]
+
+
+def test_a_network_is_met_whatever_was_sent_before() -> None:
+    """Fates follow from the slot: those who send at other times meet the same ones."""
+    text = "gamma(0, 0.1, 0.05, correlation_s=0.3) & gilbert_elliott(0.2, 0.2) & duplicate(0.2)"
+    made = Fates(DirectionConfig(impairments=text), 3, "uplink", 0)
+    order = np.random.default_rng(1).permutation(500)
+    shuffled = {int(slot): made.at(int(slot)) for slot in order}
+    again = Fates(DirectionConfig(impairments=text), 3, "uplink", 0)
+    assert [again.at(slot) for slot in range(500)] == [shuffled[slot] for slot in range(500)]
+
+
+@pytest.mark.parametrize("delay", ["poisson", "constant", "none"])
+@pytest.mark.parametrize(("loss", "burst_s"), [(0.1, 0.0), (0.3, 0.5), (0.0, 0.0)])
+def test_short_keys_are_short_for_a_text(delay: Any, loss: float, burst_s: float) -> None:
+    """The same fates, packet by packet."""
+    short = DirectionConfig(delay=delay, loss=loss, burst_s=burst_s)
+    made = Fates(short, 5, "downlink", 2)
+    text = short.text or "constant(0)"
+    other = Fates(DirectionConfig(impairments=text), 5, "downlink", 2)
+    assert [made.at(slot) for slot in range(300)] == [other.at(slot) for slot in range(300)]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("gama(1)", "got 'gama(1)', expected an impairment; did you mean gamma?"),
+        ("loss", "got 'loss', expected loss(share) with 0 <= share <= 1"),
+        ("loss(2)", "got 'loss(2)', expected loss(share) with 0 <= share <= 1"),
+        ("loss(nan)", "got 'loss(nan)', expected loss(share) with"),
+        ("loss(0.1, 0.2)", "expected loss(share) with"),
+        ("loss(0.1, share=0.2)", "expected loss(share) with"),
+        ("loss(lost=0.1)", "expected loss(share) with"),
+        ("loss(0.1) &", "expected impairments such as"),
+        ("loss(0.1) | loss(0.2)", "expected impairments such as"),
+        ("loss((0.1))", "expected impairments such as"),
+        ("uniform(0.3, 0.1)", "expected high_s to be at least low_s = 0.3"),
+        ("gamma(0.2, 0.1, 0.1)", "expected mean_s to be at least least_s = 0.2"),
+        ("gamma(0, 0.1, 10)", "expected sd_s of 0, or of a hundredth"),
+        ("outage(0, 2, 1)", "expected every_s of 0, or of more than for_s = 2"),
+        ("rate(1000, queue=1.5)", "1 <= queue <= 67108864 (whole)"),
+        ("rate(1000, drop=head)", "drop tail or codel"),
+        ("rate(1000) & rate(2000)", "expected one rate or deliveries in a direction"),
+        ("trace(no such.csv)", "no such.csv: cannot be read: No such file or directory"),
+        (" & ".join(["loss(0.1)"] * 17), "expected at most 16 impairments"),
+    ],
+)
+def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
+    """By what was given, and what was expected."""
+    with pytest.raises(PolicyError) as raised:
+        path(text)
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@given(st.text("()&,=.\"' -0123456789alosrtequnif_\n", max_size=60))
+def test_no_text_does_anything_but_be_refused(text: str) -> None:
+    """Whatever is written."""
+    with suppress(PolicyError):
+        path(text)
+
+
+def test_arguments_may_have_names_and_defaults() -> None:
+    """In any order, and left out from the end."""
+    expected = (Part("rate", (12500, 20000, "codel", "fair")),)
+    assert parse("rate(12500, queue=20000, serve=fair, drop=codel)") == expected
+    assert parse("rate(12500,20000,codel,fair)") == expected
+    assert parse("gilbert_elliott( share=.1 ,burst_s = 2)")[0].values == (0.1, 2, 1.0, 0.0)
+
+
+def test_files_are_found_beside_the_scenario(tmp_path: Any) -> None:
+    """Whatever their names."""
+    assert with_files("trace(a.csv) & loss(0.1)", lambda file: f"/x/{file}") == (
+        'trace("/x/a.csv", loop, auto) & loss(0.1)'
+    )
+    assert with_files("loss(0.1)", lambda file: f"/x/{file}") == "loss(0.1)"
+    (tmp_path / "a, b (c).csv").write_text("time_s,delay_s\n0,0.1\n1,0.2\n")
+    (tmp_path / "mine.toml").write_text(
+        "extends = 'demo'\nnetwork.uplink = 'trace(\"a, b (c).csv\")'\n"
+        "network.downlink.impairments = 'loss(0.5)'\n"
+    )
+    network = reading.load(str(tmp_path / "mine.toml")).network
+    assert network.uplink.path.mean_s == pytest.approx(0.15)
+    assert network.downlink.path.loss == 0.5
+
+
+def test_a_text_says_all_of_a_direction(tmp_path: Any) -> None:
+    """Over keys of the scenario that it extends; keys beside it are refused, not passed over."""
+    (tmp_path / "lossy.toml").write_text("extends = 'demo'\nnetwork.uplink.loss = 0.3\n")
+    above = tmp_path / "above.toml"
+    above.write_text("extends = 'lossy.toml'\nnetwork.uplink = 'constant(0.1)'\n")
+    assert reading.load(str(above)).network.uplink.text == "constant(0.1)"
+    above.write_text("extends = '5g-urban'\nnetwork.uplink.loss = 0.3\n")
+    with pytest.raises(ConfigError, match="no other keys beside it"):
+        reading.load(str(above))
+    again = reading.check(reading.to_table(reading.load("5g-urban")))
+    assert again == reading.load("5g-urban")
