@@ -22,7 +22,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
@@ -250,13 +250,17 @@ def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Conne
 
 
 def start_netem(
-    stack: ExitStack, server_port: int, seed: int, record: Path
+    stack: ExitStack,
+    server_port: int,
+    seed: int,
+    record: Path,
+    network: Sequence[str] = ("--network.downlink.loss=0",),
 ) -> tuple[subprocess.Popen[str], int]:
-    """Run netem with the paper's delays and without losses; the process and its port."""
+    """Run netem, by default with the paper's delays and no losses; the process and its port."""
     # -P: without it, a `netem` in the working directory would come first.
     command = [sys.executable, "-P", "-m", "skytether.netem", "paper", f"--seed={seed}"]
     command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--log=json"]
-    command += ["--network.downlink.loss=0", f"--record={record}"]
+    command += [*network, f"--record={record}"]
     netem = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     stack.callback(netem.wait)
     stack.callback(netem.kill)
