@@ -9,6 +9,8 @@ feedback is on the state in which the next input meets the vehicle, for which th
 (`shared.law.dead_time`).
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from skytether.shared.law.model import Array, Model
@@ -40,16 +42,25 @@ def stationary_gain(model: Model, control: ControlConfig) -> Array:
     Returns:
         on position [1/s] and velocity; shape (axes, 2).
     """
-    Q, R = np.diag(control.state_weight), control.input_weight + control.change_weight
-    A, B = model.A, model.B
+    weight = control.input_weight + control.change_weight
+    return _settled(model.A.tobytes(), model.B.tobytes(), control.state_weight, weight)
+
+
+@lru_cache(maxsize=64)
+def _settled(a: bytes, b: bytes, state_weight: tuple[float, float], input_weight: float) -> Array:
+    """K, which many vehicles of one scenario ask for; arguments are A and B of (4), Q and R + S."""
+    Q, R = np.diag(state_weight), input_weight
+    B = np.frombuffer(b).reshape(-1, 2)
+    A = np.frombuffer(a).reshape(-1, 2, 2)
     cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 2, 2))
     gain = np.zeros_like(B)
     for _ in range(ROUNDS):
-        if np.allclose(cost, before, rtol=1e-12, atol=0.0):
+        if (np.abs(cost - before) <= 1e-12 * np.abs(before)).all():
             break
         ahead = np.einsum("ai,aij->aj", B, cost)
         weight = R + np.einsum("aj,aj->a", ahead, B)
         gain = np.einsum("ai,aij->aj", ahead, A) / weight[:, None]
         left = A - B[:, :, None] * gain[:, None, :]
         cost, before = Q + np.einsum("aji,ajk,akl->ail", A, cost, left), cost
+    gain.setflags(write=False)
     return gain
