@@ -9,11 +9,12 @@ if __name__ == "__main__":  # before the imports below, which take a while
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from skytether.netem.proxy import FLOWS_MAX, Proxy
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell import command
@@ -35,6 +36,12 @@ class NetemOptions:
     address, if it has one."""
     server: str = "127.0.0.1:47001"
     """HOST:PORT of the server, of the same family as the clients' addresses or not."""
+    uplink: str | None = None
+    """What befalls packets from the server to clients: impairments joined by &, as in
+    "constant(0.05) & loss(0.1)", see `skytether impairments`. In place of the scenario's; where
+    only one of uplink and downlink is given, the other passes everything at once."""
+    downlink: str | None = None
+    """The same for packets from clients to the server."""
     log: LogFormat = "text"
     """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None
@@ -58,9 +65,17 @@ class NetemOptions:
 def emulate(argv: Sequence[str]) -> None:
     """Delay, reorder and lose datagrams between clients and a server, until SIGINT or SIGTERM.
 
-    SIGUSR1 prints what was counted so far.
+    It carries any UDP. Clients send to --bind in place of the server, and need to know no more:
+
+        skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000 --uplink "constant(0.05)"
+            --downlink "gamma(0.02, 0.08, 0.03) & loss(0.05) & rate(125000, queue=30000)"
+
+    SIGUSR1 prints what was counted so far, the end does so, too. With --control, `skytether set`
+    changes directions meanwhile. Without --uplink and --downlink the network is the scenario's.
     """
-    options = command.parse(NetemOptions(), argv, "skytether netem", emulate.__doc__)
+    options = _with_directions(
+        command.parse(NetemOptions(), argv, "skytether netem", emulate.__doc__)
+    )
     flows = _flows(options.flows)
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
@@ -86,6 +101,19 @@ def emulate(argv: Sequence[str]) -> None:
             feed=feed,
             metrics=command.optional_address("--metrics", options.metrics),
         )
+
+
+def _with_directions(options: NetemOptions) -> NetemOptions:
+    """Options with the network that --uplink and --downlink describe.
+
+    Raises:
+        CommandError: they describe none.
+    """
+    if options.uplink is None and options.downlink is None:
+        return options
+    directions = {"uplink": options.uplink or "none", "downlink": options.downlink or "none"}
+    laid = reading.with_directions(options.config, directions)
+    return replace(options, config=reading.check(reading.to_table(laid), "the command line"))
 
 
 def _flows(given: int | None) -> int:

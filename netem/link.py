@@ -287,6 +287,8 @@ class Link:
             "corrupted": counts.corrupted,
             "queue": self.depth(),
             "queue_max": counts.depth_max,
+            "delay_ms_p50": counts.delay.quantile_ms(0.5),
+            "delay_ms_p99": counts.delay.quantile_ms(0.99),
             "delays_ms": counts.delay.by_bin(),
             "delays_within_ms": counts.delay.within(DELAY_EDGES_MS),
             "error_ms_p50": counts.error.quantile_ms(0.5),

@@ -55,7 +55,7 @@ class Proxy(Endpoint):
         recorder: takes one row a packet.
     """
 
-    changeable = keys_of(InFlight.IMPAIRMENT) | {"network.uplink", "network.downlink"}
+    changeable = keys_of(InFlight.IMPAIRMENT)
 
     def __init__(
         self,

@@ -369,9 +369,9 @@ def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_p
     server.wait_for(rf"vehicle 1 flies, from {re.escape(host)}:\d+")
     netem.popen.send_signal(signal.SIGUSR1)
     for pattern in (
-        *("counted so far:", r"flows +1$", "uplink$", r"  forwarded +\d+$", r"  lost +0$"),
-        *(r"  overflowed +0$", r"  queue +\d+$", r"  delays_ms$", r"    20 +\d+$"),
-        *(r"  error_ms_p50 +[\d.]+$", "downlink$"),
+        *("counted so far:", r"flows +1$", "uplink  downlink$", r"  forwarded +\d+ +\d+$"),
+        *(r"  lost +0 +0$", r"  overflowed +0 +0$", r"  queue +\d+ +\d+$"),
+        *(r"  delays_ms 20 +\d+ +\d+$", r"  error_ms_p50 +[\d.]+ +[\d.]+$"),
     ):
         netem.wait_for(pattern)
     assert client.ended() == 0

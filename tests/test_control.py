@@ -35,7 +35,7 @@ class Closing(Proxy):
     def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """Change, and perhaps end."""
         super().change(scenario, keys, now_ns=now_ns)
-        self.finished = scenario.network.uplink.loss == 1.0
+        self.finished = scenario.network.uplink.path.loss == 1.0
 
 
 def running() -> Running:
@@ -383,8 +383,9 @@ def test_set_prints_what_may_change_what_has_and_what_was_refused(
 
     def operate() -> None:
         calls = [[], ["network.uplink.loss=0.3", "network.downlink.delay=none"], ["control.dt=1"]]
+        calls.append(["network.uplink=constant(0.1) & loss(0.6)"])
         codes.extend(command.main(set_keys, [str(path), *call], "set") for call in calls)
-        command.main(set_keys, [str(path), "network.uplink.loss=1"], "set")
+        command.main(set_keys, [str(path), "network.uplink=loss(1)"], "set")
 
     endpoint = Closing(DEMO, server=("127.0.0.1", 1))
     with controlled(path, Running(endpoint, DEMO)) as control:
@@ -393,11 +394,15 @@ def test_set_prints_what_may_change_what_has_and_what_was_refused(
         thread.join()
     out, err = capsys.readouterr()
     lines = out.splitlines()
-    assert codes == [0, 0, 2]
+    assert codes == [0, 0, 2, 0]
     assert lines[:2] == ["network.downlink.burst_s = 0.0", 'network.downlink.delay = "poisson"']
-    assert lines[12:14] == [
+    assert lines[14:17] == [
         "network.uplink.loss is 0.3 from now on, it was 0.1",
         'network.downlink.delay is "none" from now on, it was "poisson"',
+        (
+            'network.uplink is "constant(0.1) & loss(0.6)" from now on, it was '
+            '"paper(0.4, 0.02, 2.0) & loss(0.3)"'
+        ),
     ]
     assert err.startswith(f"set: {path}: control.dt: cannot be changed in flight; what can be here")
 

@@ -310,6 +310,22 @@ def test_figures_are_names_and_numbers_in_two_columns() -> None:
     ]
 
 
+def test_two_groups_of_a_kind_share_the_lines() -> None:
+    """As the two directions of netem do; what one of them has alone is 0 in the other."""
+    ways = {
+        "uplink": {"lost": 12, "delays_ms": {"20": 7}},
+        "downlink": {"lost": 3, "delays_ms": {"40": 1234}},
+    }
+    assert rendered({"flows": 1, **ways, "cpu_s": 0.5}) == [
+        "flows  1",
+        "cpu_s  0.5",
+        "              uplink  downlink",
+        "lost              12         3",
+        "delays_ms 20       7         0",
+        "delays_ms 40       0      1234",
+    ]
+
+
 AT = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} server\.1: ")
 """Beginning of a line of text."""
 

@@ -344,6 +344,7 @@ def test_the_figures_name_every_statistic() -> None:
     counts = "forwarded", "lost", "reordered", "oversized", "overflowed"
     nothing = dict.fromkeys((*counts, "dropped", "duplicated", "corrupted"), 0)
     nothing |= dict.fromkeys(("queueing_ms_p50", "queueing_ms_p99"), 0.0)
+    nothing |= dict.fromkeys(("delay_ms_p50", "delay_ms_p99"), 0.0)
     errors = ("error_ms_p50", "error_ms_p99", "error_ms_max")
 
     def within(count: int) -> dict[str, int]:
@@ -371,6 +372,7 @@ def test_the_figures_name_every_statistic() -> None:
             "queue": 1,
             "queue_max": 2,
             "delays_ms": {"20": 1},
+            **dict.fromkeys(("delay_ms_p50", "delay_ms_p99"), 20.0),
             "delays_within_ms": {**within(1), "20": 0},
             **dict.fromkeys(errors, 1.0),
         },

@@ -18,10 +18,12 @@ from skytether.shared.base.hint import hint
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Changed, ChangeRefused
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.schema import DirectionConfig, Scenario
 
 REQUEST_BYTES_MAX = 4096
 """Largest size of a request [B]."""
+WHOLE = "impairments"
+"""Key that says all of a direction of the network: the direction itself stands for it."""
 KEY_SHOWN_MAX = 60
 """Largest number of characters that a message repeats of a key that there is not."""
 
@@ -83,7 +85,8 @@ class Running:
         changed = tuple(
             Changed(key=key, before=was, after=becomes)
             for key in values
-            if (was := _text(_at(before, key))) != (becomes := _text(_at(after, key)))
+            if (was := _text(_shown(_at(before, key))))
+            != (becomes := _text(_shown(_at(after, key))))
         )
         for event in changed:
             self._endpoint.tell(event)
@@ -127,7 +130,7 @@ class Running:
         """
         may = sorted(self.changeable)
         for key in values:
-            if key in may:
+            if key in may or f"{key}.{WHOLE}" in may:
                 continue
             try:
                 _at(table, key)
@@ -160,6 +163,13 @@ def _at(table: Any, key: str) -> Any:
     for name in filter(None, key.split(".")):
         table = table[name]
     return table
+
+
+def _shown(value: Any) -> Any:
+    """A value as a user would give it: a direction of the network is its text."""
+    if isinstance(value, dict):
+        return msgspec.convert(value, DirectionConfig).text
+    return value
 
 
 def _text(value: Any) -> str:

@@ -113,7 +113,14 @@ class Log:
 
 
 def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
-    """Figures as lines: names and numbers in two columns, the groups among them indented."""
+    """Figures as lines: names and numbers in two columns, the groups among them indented.
+
+    Two groups of the same kind, as of two directions, share the lines, a column each.
+    """
+    groups = {name: value for name, value in figures.items() if isinstance(value, Mapping)}
+    if len(groups) == 2 and len({frozenset(group) for group in groups.values()} - {()}) == 1:
+        alone = {name: value for name, value in figures.items() if name not in groups}
+        return rendered(alone, indent=indent) + _columns(groups, indent)
     width = max(map(len, figures), default=0)
     lines = []
     for name, value in figures.items():
@@ -121,6 +128,34 @@ def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
             lines.append(f"{'':{indent}}{name}" if value else f"{'':{indent}}{name:{width}}  none")
             lines += rendered(value, indent=indent + 2)
         else:
-            shown = f"{value:g}" if isinstance(value, float) else value
-            lines.append(f"{'':{indent}}{name:{width}}  {shown}")
+            lines.append(f"{'':{indent}}{name:{width}}  {_shown(value)}")
     return lines
+
+
+def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:
+    """Groups of the same kind, a column each, and below their names what each has."""
+    flat = [_flat(group) for group in groups.values()]
+    names = dict.fromkeys(name for each in flat for name in each)
+    table = [
+        ("", *groups),
+        *((name, *(_shown(each.get(name, 0)) for each in flat)) for name in names),
+    ]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return [
+        f"{'':{indent}}{name:{widths[0]}}"
+        + "".join(f"  {text:>{width}}" for text, width in zip(shown, widths[1:], strict=True))
+        for name, *shown in table
+    ]
+
+
+def _flat(group: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Numbers of a group and of those within it, by names joined by spaces."""
+    flat: dict[str, Any] = {}
+    for name, value in group.items():
+        inner = isinstance(value, Mapping)
+        flat |= _flat(value, f"{before}{name} ") if inner else {f"{before}{name}": value}
+    return flat
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -348,6 +348,7 @@ LEFT_OUT: dict[str, tuple[Path, ...]] = {
         ("tick_ms_p99",),
     ),
     "netem": (
+        *((way, f"delay_ms_{each}") for way in ("uplink", "downlink") for each in ("p50", "p99")),
         ("uplink", "delays_ms", Label("ms")),  # up to 500 numbers
         ("downlink", "delays_ms", Label("ms")),
         ("uplink", "queue_max"),  # of all time; a gatherer has the largest of any time

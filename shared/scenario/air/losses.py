@@ -8,6 +8,11 @@ from skytether.shared.scenario.air.draws import SLOT_S, Draws, Fate
 from skytether.shared.scenario.air.impairment import Impairment, Share, Time, impairment
 
 
+@impairment(name="none")
+class Nothing(Impairment):
+    """Passes every packet at once, as it came."""
+
+
 @impairment(name="loss")
 class Loss(Impairment):
     """Loses a share of the packets, each independently of the others (Bernoulli)."""
