@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 from skytether.netem.bottleneck import Bottleneck
 from skytether.netem.fate import Fates
-from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
 from skytether.shared.scenario.air.path import Path
-from skytether.shared.scenario.air.queues import HEADER_BYTES
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
 

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from skytether.netem.bottleneck import INTERVAL_NS, TARGET_NS, Bottleneck
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane, Link
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.air.queues import HEADER_BYTES
 from skytether.shared.scenario.schema import DirectionConfig
 from skytether.shared.telemetry.record import UPLINK
 

@@ -17,7 +17,11 @@ ROOT = Path(__file__).parents[1]
 FILE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 SERVICES: dict[str, dict[str, Any]] = FILE["services"]
 ALWAYS = {"keys", "server", "netem", "client", "page"}
-PROFILES = {"observe": {"prometheus", "grafana"}, "px4": {"px4", "aboard"}}
+PROFILES = {
+    "observe": {"prometheus", "grafana"},
+    "px4": {"px4", "aboard"},
+    "netem": {"relay"},
+}
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 
 

@@ -274,6 +274,8 @@ def test_every_documented_command_is_tested() -> None:
     known += ("docker compose --profile observe up",)
     known += ("SCENARIO=px4 docker compose --profile px4 up",)
     known += ("skytether autopilot ",)  # by test_aboard_udp.py
+    # By test_netem.py and test_compose.py.
+    known += ("python echo.py", "python ask.py", "openssl s_", "UPLINK=")
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     by_hand += ("skytether station ", "skytether autopilot ")
     for line in COMMANDS:

@@ -5,6 +5,7 @@ import math
 import msgspec
 import numpy as np
 
+from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows
@@ -12,10 +13,6 @@ from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 AT_BOUND = 1.0 - 1e-6
 """Share of the bound from which an input is at it: inputs are rounded on the wire."""
-
-
-HEADER_BYTES = 28
-"""Headers of IPv4 and UDP on each packet [B]."""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):

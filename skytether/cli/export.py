@@ -13,6 +13,8 @@ from skytether.shell import command
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
 from skytether.view import export as view
+from skytether.view import traffic
+from skytether.view.recording import Recorded
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,11 @@ class ExportOptions:
     """Folder for the tables as CSV."""
     parquet: Path | None = None
     """Folder for the tables as Parquet; takes pyarrow."""
+    traces: Path | None = None
+    """Folder for traces of what netem did to packets, one a direction and flow, which `trace(FILE)`
+    replays; see docs/network.md."""
+    pcap: Path | None = None
+    """File for what came out of netem, as a capture: made-up headers, true lengths, no contents."""
     plugin: command.Plugins = ()
 
 
@@ -34,11 +41,15 @@ def export(argv: Sequence[str]) -> None:
     A column has its unit in its name, as in position_x_m; the folder is made where there is none.
     """
     options = read(ExportOptions(tyro.MISSING), argv, "skytether export", export.__doc__)
-    if not (options.csv or options.parquet):
-        said = "got neither --csv nor --parquet, expected a folder for the tables"
+    if not (options.csv or options.parquet or options.traces or options.pcap):
+        said = "got none of --csv, --parquet, --traces and --pcap, expected where to write"
         raise CommandError(said, CONFIGURATION)
     to_parquet = view.parquet() if options.parquet else None
     with recordings.opened(options.file) as recorded:
+        if options.traces or options.pcap:
+            _traffic(options, recorded)
+        if not (options.csv or options.parquet):
+            return
         tables = view.tables(recorded)
     for folder in filter(None, (options.csv, options.parquet)):
         folder.mkdir(parents=True, exist_ok=True)
@@ -49,6 +60,24 @@ def export(argv: Sequence[str]) -> None:
         if options.parquet and to_parquet:
             path = options.parquet / f"{name}.parquet"
             _write(path, to_parquet(columns))
+
+
+def _traffic(options: ExportOptions, recorded: Recorded) -> None:
+    """Write traces and a capture of what passed netem.
+
+    Raises:
+        CommandError: netem has no part in the recording, or a file cannot be written.
+    """
+    packets = recorded.parts().get("netem")
+    if packets is None or not len(packets):
+        said = f"{options.file}: netem has recorded nothing in it, expected packets"
+        raise CommandError(said, CONFIGURATION)
+    if options.traces:
+        options.traces.mkdir(parents=True, exist_ok=True)
+        for name, trace in traffic.traces(packets).items():
+            _write(options.traces / f"{name}.csv", trace.encode())
+    if options.pcap:
+        _write(options.pcap, traffic.pcap(packets))
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -106,7 +106,7 @@ class Log:
             return [msgspec.json.encode(line) + b"\n"]
         lines = str(event).splitlines()
         if isinstance(event, Counted):
-            lines += rendered(event.figures, indent=2)
+            lines += rendered(_for_people(event.figures), indent=2)
         now = f"{datetime.now():%Y-%m-%d %H:%M:%S.%f}"[:-3]  # noqa: DTZ005 - the operator's own
         # Not `encode()` alone: the name of a file need not be Unicode.
         return [f"{now} {self._process}: {line}\n".encode(errors="replace") for line in lines]
@@ -130,6 +130,15 @@ def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
         else:
             lines.append(f"{'':{indent}}{name:{width}}  {_shown(value)}")
     return lines
+
+
+def _for_people(figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Figures without cumulative histograms, which are for programs that gather them."""
+    return {
+        name: _for_people(value) if isinstance(value, Mapping) else value
+        for name, value in figures.items()
+        if not name.endswith("_within_ms")
+    }
 
 
 def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:

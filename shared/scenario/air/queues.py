@@ -8,8 +8,6 @@ from skytether.shared.scenario.air.impairment import Impairment, impairment
 from skytether.shared.scenario.air.traces import DELIVERY_BYTES, deliveries_in
 from skytether.shared.scenario.registry import File
 
-HEADER_BYTES = 28
-"""IP and UDP headers of a packet [B], which take their time, too."""
 QUEUE_BYTES = 64_000
 """Room in a queue unless another is given [B]."""
 

@@ -36,10 +36,9 @@ from skytether.lab.benchmarks.netem import (
     start,
     start_netem,
 )
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.air.queues import HEADER_BYTES
 from skytether.shared.telemetry.record import DOWNLINK, read
 
 DELAYS = {

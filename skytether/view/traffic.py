@@ -1,0 +1,71 @@
+"""What passed netem, for other programs: traces of delays, and a capture in pcap's format.
+
+A recording of netem's knows when each packet entered, how long it was delayed, its size and its
+fate, and nothing of its content. So the capture has headers that are made up (clients are 10.0.x.y,
+the server is 10.255.255.254) and the true lengths: enough to see rates, bursts and gaps.
+"""
+
+import struct
+from collections.abc import Mapping
+
+import numpy as np
+
+from skytether.figures.tables import to_csv
+from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows
+
+WAYS = {"uplink": UPLINK, "downlink": DOWNLINK}
+RAW_IP = 101
+"""LINKTYPE_RAW: each packet begins with its IP header."""
+SERVER = bytes((10, 255, 255, 254))
+CLIENT_PORT, SERVER_PORT = 47000, 47001
+_UDP = 17
+
+
+def traces(packets: Rows) -> Mapping[str, str]:
+    """Traces that the impairment `trace` replays, by name: one a direction and flow, as CSV."""
+    found = {}
+    for way, direction in WAYS.items():
+        for flow in np.unique(packets["flow"]):
+            rows = packets[(packets["direction"] == direction) & (packets["flow"] == flow)]
+            rows = rows[np.argsort(rows["arrived_ns"], kind="stable")]
+            rows = rows[np.diff(rows["arrived_ns"], prepend=-1) > 0]  # a trace has one at a time
+            if not len(rows):
+                continue
+            time_s = (rows["arrived_ns"] - rows["arrived_ns"][0]) / SECOND_NS
+            columns = time_s, rows["delay_ns"] / SECOND_NS, rows["lost"].astype(int)
+            lines = zip(*(column.tolist() for column in columns), strict=True)
+            found[f"{way}-{flow}"] = to_csv(("time_s", "delay_s", "lost"), lines)
+    return found
+
+
+def pcap(packets: Rows, began_ns: int = 0) -> bytes:
+    """A capture of the packets as they left, behind netem; those that were lost are not in it.
+
+    Args:
+        began_ns: time of the clock that the packets' times are counted on [ns since 1970].
+    """
+    rows = packets[~packets["lost"]]
+    left_ns = rows["arrived_ns"] + rows["delay_ns"] + began_ns
+    order = np.argsort(left_ns, kind="stable")
+    # Magic of times in nanoseconds; version 2.4; the header alone of each packet is kept.
+    pieces = [struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, HEADER_BYTES, RAW_IP)]
+    for row, time_ns in zip(rows[order], left_ns[order].tolist(), strict=True):
+        size = int(row["bytes"]) + HEADER_BYTES
+        seconds, rest_ns = divmod(time_ns, SECOND_NS)
+        pieces.append(struct.pack("<IIII", seconds, rest_ns, HEADER_BYTES, size))
+        pieces.append(_header(int(row["direction"]), int(row["flow"]), size))
+    return b"".join(pieces)
+
+
+def _header(direction: int, flow: int, size: int) -> bytes:
+    """IP and UDP header of a packet of so many bytes, headers included."""
+    client = bytes((10, 0, (flow + 1) >> 8 & 0xFF, flow + 1 & 0xFF)), CLIENT_PORT
+    ends = [client, (SERVER, SERVER_PORT)]
+    (source, source_port), (target, target_port) = ends if direction == DOWNLINK else ends[::-1]
+    length = min(size, 0xFFFF)
+    ip = struct.pack(">BBHHHBBH", 0x45, 0, length, 0, 0, 64, _UDP, 0) + source + target
+    total = sum(struct.unpack(">10H", ip))
+    checksum = 0xFFFF & ~((total & 0xFFFF) + (total >> 16))
+    ip = ip[:10] + struct.pack(">H", checksum) + ip[12:]
+    return ip + struct.pack(">HHHH", source_port, target_port, length - 20, 0)
