@@ -27,7 +27,16 @@ from skytether.view.browser import serve
 from skytether.view.browser.access import Visitor, is_loopback, may_play
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player
-from skytether.view.controls import CUT, THRESHOLDS, TRIGGERS, compared, knobs, triggers
+from skytether.view.controls import (
+    THRESHOLDS,
+    TRIGGERS,
+    compared,
+    cut,
+    is_written,
+    knobs,
+    texts,
+    triggers,
+)
 from skytether.view.frames import of_flight
 from skytether.view.report import with_gaps
 from skytether.view.scene import extent, fence, grid, home, quadrotor, segments
@@ -135,6 +144,14 @@ def test_every_trigger_that_is_offered_can_be_flown() -> None:
     assert {name for each in TRIGGERS for name in [each.split(" ")[0]]} <= set(registry.TRIGGERS)
 
 
+NETWORK = {
+    f"network.{way}.{key}": value
+    for way in ("uplink", "downlink")
+    for key, value in msgspec.to_builtins(schema.DirectionConfig()).items()
+}
+"""Values of netem as it tells them."""
+
+
 def test_only_the_thresholds_of_the_trigger_are_shown() -> None:
     """Those that it compares with, unless they stand in it."""
     assert compared("cost_gap | silence(1)") == {"control.cost_gap"}
@@ -151,13 +168,38 @@ def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) ->
     flight.cut()
     assert not asked, "nothing is known of the network yet"
     before = {"network.uplink.loss": 0.1, "network.downlink.loss": 0.3}
-    flight.values["netem"] = dict(before)
+    flight.values["netem"] = NETWORK | before
     flight.cut()
-    flight.values["netem"] = dict(CUT)
+    flight.values["netem"] = NETWORK | asked[0][1]
     assert flight.is_cut
     flight.cut()
     flight.heal()
-    assert asked == [("netem", CUT), ("netem", before)]
+    cuts = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
+    assert asked == [("netem", cuts), ("netem", before)]
+    flight.close()
+
+
+def test_a_network_that_is_written_is_cut_and_healed_in_its_text(tmp_path: Path) -> None:
+    """By a text behind it; what stood there comes back, also on a page that came later."""
+    written = {"network.uplink.impairments": "rate(5000)", "network.downlink.loss": 0.3}
+    values = NETWORK | written
+    assert is_written(values)
+    assert not is_written(NETWORK)
+    down = "paper(0.4, 0.02, 2.0) & loss(0.3)"
+    assert texts(values) == {"network.uplink": "rate(5000)", "network.downlink": down}
+    assert texts({}) == {}
+    changed = cut(values)
+    assert changed == {
+        "network.uplink.impairments": "rate(5000) & loss(1)",
+        "network.downlink.loss": 1.0,
+    }
+    asked: list[dict[str, Any]] = []
+    flight = PageFlight("", tmp_path)
+    flight.ask = lambda _, values: asked.append(dict(values))  # type: ignore[method-assign]
+    flight.values["netem"] = values | changed
+    flight.heal()
+    healed = {"network.uplink.impairments": "rate(5000)", "network.downlink.loss": 0.0}
+    assert asked == [healed]
     flight.close()
 
 

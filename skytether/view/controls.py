@@ -8,8 +8,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from skytether.shared.scenario import policies, registry
 from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.schema import DirectionConfig
 
 Values = Mapping[str, Any]
 """Values by key."""
@@ -17,8 +20,8 @@ Read = Callable[[Values], float]
 Write = Callable[[Values, float], dict[str, Any]]
 WAYS = ("network.uplink", "network.downlink")
 """Both directions of the network."""
-CUT: dict[str, Any] = {f"{way}.loss": 1.0 for way in WAYS}
-"""Values that cut the link."""
+ALL_LOST = " & loss(1)"
+"""What cuts a direction that is written as a text."""
 MODES_OF_DELAY = {"none": "constant"}
 """Law of the delay that packets get once they are to be delayed, by the law that they had."""
 
@@ -41,6 +44,49 @@ class Knob:
     """Number that values of the process have."""
     write: Write
     """Values by key that make it another, of the values before."""
+
+
+def texts(values: Values) -> dict[str, str]:
+    """Directions of the network as texts, by key of the direction; none where none may change."""
+    return {way: _direction(values, way).text for way in WAYS if f"{way}.impairments" in values}
+
+
+def is_written(values: Values) -> bool:
+    """Whether a direction is written as a text, which has no numbers to slide."""
+    return any(values.get(f"{way}.impairments") for way in WAYS)
+
+
+def cut(values: Values) -> dict[str, Any]:
+    """Values that lose every packet from now on."""
+    changed: dict[str, Any] = {}
+    for way in WAYS:
+        text = values.get(f"{way}.impairments")
+        changed |= {f"{way}.impairments": text + ALL_LOST} if text else {f"{way}.loss": 1.0}
+    return changed
+
+
+def is_cut(values: Values) -> bool:
+    """Whether every packet is lost, as `cut` makes it."""
+    return bool(values) and all(
+        values[f"{way}.loss"] == 1.0 or values[f"{way}.impairments"].endswith(ALL_LOST)
+        for way in WAYS
+    )
+
+
+def healed(values: Values) -> dict[str, Any]:
+    """Values with which a link that is cut loses no packets for that."""
+    changed: dict[str, Any] = {}
+    for way in WAYS:
+        text = values[f"{way}.impairments"].removesuffix(ALL_LOST)
+        changed |= {f"{way}.impairments": text} if text else {f"{way}.loss": 0.0}
+    return changed
+
+
+def _direction(values: Values, way: str) -> DirectionConfig:
+    keys = {key.removeprefix(f"{way}."): value for key, value in values.items()}
+    return msgspec.convert(
+        {name: keys[name] for name in DirectionConfig.__struct_fields__}, DirectionConfig
+    )
 
 
 def _own(key: str) -> tuple[Read, Write]:

@@ -9,8 +9,8 @@ from typing import Any
 from skytether.shared.core.change import Answer
 from skytether.shared.core.events import Changed
 from skytether.shared.telemetry.feed import Frame, Opened, Said
+from skytether.view import controls
 from skytether.view.browser.play import PROCESSES, Operator
-from skytether.view.controls import CUT, WAYS
 from skytether.view.state import LED, State
 
 
@@ -34,7 +34,7 @@ class PageFlight:
         self.refused = False
         """Whether that was refused."""
         self._before: dict[str, Any] = {}
-        """Losses from before the link was cut."""
+        """Values from before the link was cut."""
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:
@@ -72,20 +72,20 @@ class PageFlight:
     @property
     def is_cut(self) -> bool:
         """Whether every packet is lost."""
-        values = self.values.get("netem", {})
-        return bool(values) and all(values[key] == cut for key, cut in CUT.items())
+        return controls.is_cut(self.values.get("netem", {}))
 
     def cut(self) -> None:
         """Lose every packet from now on."""
         values = self.values.get("netem")
         if values and not self.is_cut:
-            self._before = {key: values[key] for key in CUT}
-            self.ask("netem", CUT)
+            changed = controls.cut(values)
+            self._before = {key: values[key] for key in changed}
+            self.ask("netem", changed)
 
     def heal(self) -> None:
         """Lose as many packets as before the link was cut, none where that is not known."""
         if self.is_cut:
-            self.ask("netem", self._before or {f"{way}.loss": 0.0 for way in WAYS})
+            self.ask("netem", self._before or controls.healed(self.values["netem"]))
 
     def close(self) -> None:
         """Ask for nothing more."""

@@ -5,6 +5,7 @@ Everything belongs to this browser alone: who may only look has nothing that cou
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,24 @@ import viser
 
 from skytether.view import words
 from skytether.view.browser.flight import PageFlight
-from skytether.view.controls import THRESHOLDS, Knob, Values, compared, knobs, triggers
+from skytether.view.controls import (
+    THRESHOLDS,
+    WAYS,
+    Knob,
+    Values,
+    compared,
+    is_written,
+    knobs,
+    texts,
+    triggers,
+)
 from skytether.view.plots import POINTS, Look, Plots, of_flight, of_network
 from skytether.view.scene import GROUND_RGB, WIDE, Scene, in_space
 from skytether.view.state import LED
 
 HELD_S = 1.5
 """Time for which a slider that was moved is left where it is [s]."""
+IMPAIRMENTS = 'Impairments joined by &, as in "constant(0.05) & loss(0.1)", see docs/network.md'
 FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
@@ -202,6 +214,33 @@ class _Slider:
             assign(self._slider, number)
 
 
+class _Network:
+    """Both directions of the network as texts, which this browser can change together."""
+
+    def __init__(self, gui: viser.GuiApi, ask: Callable[[dict[str, Any]], None]) -> None:
+        self._known: dict[str, str] = {}
+        self._folder = gui.add_folder("Network", expand_by_default=False, visible=False)
+        with self._folder:
+            self._texts = {
+                way: gui.add_text(label, "", hint=IMPAIRMENTS)
+                for way, label in zip(WAYS, ("To the vehicle", "To the server"), strict=True)
+            }
+            apply = gui.add_button("Change the network")
+
+        @apply.on_click
+        async def _(_: Any) -> None:
+            ask({way: text.value for way, text in self._texts.items()})
+
+    def show(self, values: Values) -> None:
+        """Show the directions once they are others than before."""
+        known = texts(values)
+        self._folder.visible = bool(known)
+        if known != self._known:
+            self._known = known
+            for way, text in known.items():
+                assign(self._texts[way], text)
+
+
 class Controls:
     """What one browser can change: the same of all flights on the page."""
 
@@ -214,6 +253,7 @@ class Controls:
         self._heal = gui.add_button("Heal it", color="green", icon=viser.Icon.PLUG_CONNECTED)
         self._answer = gui.add_html("")
         self._sliders = [_Slider(gui, knob, self._ask) for knob in knobs(scenario.model.axes)]
+        self._network = _Network(gui, partial(self._all, "netem"))
         self._trigger = gui.add_dropdown(
             "Trigger",
             triggers(scenario.control.scheme, scenario.control.trigger),
@@ -265,8 +305,12 @@ class Controls:
             self._trigger.options = triggers(scheme, trigger)
             assign(self._trigger, trigger)
         keys = compared(trigger)
+        netem = flight.values.get("netem", {})
+        self._network.show(netem)
         for slider in self._sliders:
-            slider.show(flight.values.get(slider.knob.process, {}), visible=True)
+            values = flight.values.get(slider.knob.process, {})
+            written = slider.knob.process == "netem" and is_written(netem)
+            slider.show(values, visible=not written)
         for slider in self._thresholds:
             slider.show(server, visible=slider.knob.key in keys)
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
