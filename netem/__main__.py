@@ -41,7 +41,7 @@ class NetemOptions:
     "constant(0.05) & loss(0.1)", see `skytether impairments`. In place of the scenario's; where
     only one of uplink and downlink is given, the other passes everything at once."""
     downlink: str | None = None
-    """The same for packets from clients to the server."""
+    """What befalls packets from clients to the server, written as for uplink."""
     log: LogFormat = "text"
     """What is printed for each event: a sentence, or a line of JSON for a program."""
     record: Path | None = None

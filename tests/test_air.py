@@ -157,7 +157,7 @@ def test_an_outage_keeps_its_schedule() -> None:
 
 
 def test_delays_add_up() -> None:
-    """Of all impairments in a direction."""
+    """The summary covers all impairments in a direction."""
     assert {fate.delay_ns for fate in fates("constant(0.1) & constant(0.05)")} == {150_000_000}
     assert path("constant(0.1) & uniform(0.1, 0.3)").mean_s == pytest.approx(0.3)
 
@@ -184,7 +184,7 @@ def test_a_network_is_met_whatever_was_sent_before() -> None:
 @pytest.mark.parametrize("delay", ["poisson", "constant", "none"])
 @pytest.mark.parametrize(("loss", "burst_s"), [(0.1, 0.0), (0.3, 0.5), (0.0, 0.0)])
 def test_short_keys_are_short_for_a_text(delay: Any, loss: float, burst_s: float) -> None:
-    """The same fates, packet by packet."""
+    """Both give the same fates, packet by packet."""
     short = DirectionConfig(delay=delay, loss=loss, burst_s=burst_s)
     made = Fates(short, 5, "downlink", 2)
     text = short.text or "constant(0)"

@@ -38,7 +38,7 @@ def passed(text: str, packets: Sequence[Packet]) -> tuple[dict[int, int], list[i
 
 
 def test_a_packet_takes_its_size_over_the_rate() -> None:
-    """And those that come meanwhile go one after the other."""
+    """Packets that come meanwhile go one after the other."""
     out, dropped = passed("rate(1000)", [(0, 100, 0), (0, 50, 0), (SECOND_NS, 100, 0)])
     assert out == {0: SECOND_NS // 10, 1: 15 * SECOND_NS // 100, 2: 11 * SECOND_NS // 10}
     assert dropped == []
@@ -171,7 +171,7 @@ def test_a_rate_that_changes_serves_those_who_wait() -> None:
 
 
 def test_ordered_lets_nobody_overtake() -> None:
-    """Of one flow; without it the same packets do."""
+    """Packets of one flow keep their order; without `ordered` the same packets do not."""
     for text, reordered in (("uniform(0, 0.1)", True), ("uniform(0, 0.1) & ordered", False)):
         direction = DirectionConfig(impairments=text)
         link = Link(UPLINK, 1472, None, direction.path)

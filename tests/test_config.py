@@ -466,7 +466,7 @@ def test_a_file_of_scenarios_holds_one_in_each_table(tmp_path: Path) -> None:
 
 def test_the_compared_scenarios_are_no_scenario_themselves() -> None:
     """But one of them is, and one that is not there is refused."""
-    assert refusal("compare").startswith("compare: no such scenario; there are autopilot, ")
+    assert refusal("compare").startswith("compare: no such scenario; there are 5g-")
     assert reading.load("compare/paper-event-gusts").vehicle.gust_mps2 == 1.0
     said = "compare/paper-evnt-gusts: no such scenario; did you mean paper-event-gusts?"
     assert refusal("compare/paper-evnt-gusts") == said

@@ -35,6 +35,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "triggers": (),
     "reports": (),
     "references": (),
+    "impairments": (),
     "vehicles": (),
     "set": (),
     "server": ("server",),
@@ -129,7 +130,7 @@ def test_a_command_runs_with_what_it_needs_and_names_what_it_misses(command: str
 
     One command of the laboratory stands for all: their package asks for the extra.
     """
-    lists = command in ("scenarios", "triggers", "reports", "references", "vehicles")
+    lists = command in ("scenarios", "triggers", "reports", "references", "vehicles", "impairments")
     shown = run([command] if lists else [command, "--help"], NEEDS[command])
     assert (shown.returncode, shown.stderr) == (0, "")
     if not NEEDS[command]:

@@ -1,4 +1,4 @@
-"""netem for any UDP: the examples of docs/netem.md, with real programs on loopback."""
+"""Netem for any UDP: the examples of docs/netem.md, with real programs on loopback."""
 
 import re
 import shlex
@@ -187,7 +187,7 @@ def test_changes_and_recordings(
 def test_a_wrong_direction_is_told_in_a_line(
     flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """And nothing is started."""
+    """It is refused, and nothing is started."""
     assert main(["netem", "--bind", "127.0.0.1:0", *flags]) == 2
     told = capsys.readouterr().err
     assert said in told
