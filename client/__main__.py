@@ -17,7 +17,7 @@ import msgspec
 
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
-from skytether.client.fleet import Fleet
+from skytether.client.fleet import Fleet, apart_ns
 from skytether.client.link import ClientLink, PlainLink
 from skytether.shared.core.aboard import ParametersUnsafe
 from skytether.shared.core.events import NoSession, SessionRefused
@@ -135,7 +135,7 @@ def fly(argv: Sequence[str]) -> None:
             for number, flies in zip(numbers, flying, strict=True)
         ]
         alone = len(clients) == 1
-        endpoint = clients[0] if alone else Fleet(clients)
+        endpoint = clients[0] if alone else Fleet(clients, apart_ns(len(clients), scenario.dt_ns))
         command.drive(
             "client",
             Steady(endpoint),

@@ -5,17 +5,37 @@ from heapq import heapify, heappop, heappush
 from typing import Any
 
 from skytether.client.endpoint import Client, figures
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Failure
 from skytether.shared.scenario.schema import Scenario
 
 
-class Fleet(Endpoint):
-    """Clients driven as one endpoint; the n-th uses socket n."""
+START_NS = 5 * SECOND_NS
+"""Longest time within which all vehicles of a fleet start [ns]."""
 
-    def __init__(self, clients: Sequence[Client]) -> None:
+
+def apart_ns(vehicles: int, dt_ns: int) -> int:
+    """Time from one vehicle's start to the next's [ns]: a step, less in a large fleet.
+
+    Vehicles that start at one instant say all that they say at one instant, and queue.
+    """
+    return min(dt_ns, START_NS // vehicles)
+
+
+class Fleet(Endpoint):
+    """Clients driven as one endpoint; the n-th uses socket n.
+
+    Args:
+        clients: vehicles; none has been woken yet.
+        apart_ns: time from one's start to the next's [ns].
+    """
+
+    def __init__(self, clients: Sequence[Client], apart_ns: int = 0) -> None:
         super().__init__()
         self._clients = clients
+        self._apart_ns = apart_ns
+        """Time from one start to the next [ns]; 0 once these are planned."""
         self.changeable = clients[0].changeable
         self._due_ns = [client.next_wake_ns() for client in clients]
         self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns) if due_ns is not None]
@@ -47,7 +67,11 @@ class Fleet(Endpoint):
         return heap[0][0] if heap else None
 
     def wake(self, *, now_ns: int) -> None:
-        """Wake all clients whose time has come."""
+        """Wake all clients whose time has come; at first, plan when each starts."""
+        if self._apart_ns:
+            self._due_ns = [now_ns + n * self._apart_ns for n in range(len(self._clients))]
+            self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns)]
+            self._apart_ns = 0
         while (due_ns := self.next_wake_ns()) is not None and due_ns <= now_ns:
             _, n = heappop(self._heap)
             self._due_ns[n] = None

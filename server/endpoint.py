@@ -6,7 +6,7 @@ with `control`. Here they are put together.
 
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,7 @@ class Server(Endpoint):
             `shared.telemetry.record.plan_columns`.
         stopwatch: measures the parts of a tick; the core has no clock of its own.
         references: desired trajectory of each vehicle, by its number, where they differ; left out:
-            the scenario's for all.
+            the scenario's.
     """
 
     def __init__(
@@ -72,6 +72,8 @@ class Server(Endpoint):
         super().__init__()
         self.changeable = TRIGGER | POINT if scenario.reference.shape == "live" else TRIGGER
         terms = scenario.terms()
+        if references is None and scenario.reference.shape == "target":
+            references = lru_cache(room)(scenario.make_reference)
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, terms.dt_ns)
         self.controller = Controller(scenario, terms, room, self._clock, self.stopwatch, references)
@@ -187,4 +189,5 @@ class Server(Endpoint):
             "dropped": by_name(self.dropped),
             "refused": by_name(self.refused),
             "by_vehicle": told,
+            **({"budget": self.controller.budget.figures()} if self.controller.budget else {}),
         }

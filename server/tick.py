@@ -26,6 +26,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import FIGURES, Recorder
+from skytether.shared.telemetry.summary import HEADER_BYTES
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     Heartbeat,
@@ -151,6 +152,8 @@ class Ticker:
         rows = self._sessions.rows
         step = self._clock.steps(rows, tick_ns)
         self._controller.desired.tick(tick_ns)
+        if self._controller.budget:
+            self._controller.budget.fill(rows, now_ns)
         owed = [each for each in self._sessions if each.is_owed(now_ns)]
         self._controller.owed[:] = False
         self._controller.owed[[each.row for each in owed]] = True
@@ -211,7 +214,7 @@ class Ticker:
                 session.hearing.silence,
             )
             begin = end
-            self._out += session.sealed(payload)
+            self._send(session, payload, is_plan=True)
 
     def _send_trajectories(self, decisions: Decisions, now_ns: int) -> None:
         sent, told, axes = decisions.sent, decisions.found.told, self._terms.axes
@@ -232,7 +235,7 @@ class Ticker:
                 session.number_next(now_ns),
                 session.hearing.silence,
             )
-            self._out += session.sealed(encode(message))
+            self._send(session, encode(message), is_plan=True)
 
     def _send_heartbeats(self, owed: Sequence[Session], now_ns: int) -> None:
         """Say that the server lives to vehicles that nothing else was sent to at this tick."""
@@ -248,7 +251,14 @@ class Ticker:
                     session.number_next(now_ns),
                     session.hearing.silence,
                 )
-                self._out += session.sealed(encode(beat))
+                self._send(session, encode(beat), is_plan=False)
+
+    def _send(self, session: Session, payload: bytes, *, is_plan: bool) -> None:
+        datagrams, budget = session.sealed(payload), self._controller.budget
+        self._out += datagrams
+        if budget:
+            size = sum(len(each.payload) + HEADER_BYTES for each in datagrams)
+            budget.charge(session.row, size, is_plan=is_plan)
 
     def _record(self, decisions: Decisions) -> None:
         if self._plans is not None and len(decisions.sent):

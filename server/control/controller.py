@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from skytether.server.control.budget import Budget
 from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.control.committed import Replay
 from skytether.server.control.desired import Desired
@@ -126,6 +127,9 @@ class Controller:
         self._takes = np.ones(room, dtype=np.bool_)
         """Whether each vehicle flies horizons, as it said last; shape (room,)."""
         self._counts: Counter[str] = Counter()
+        shared = control.shared_bytes_per_s
+        self.budget = Budget(shared, clock, room) if shared else None
+        """Bytes that all vehicles share, where there is a bound."""
 
     @property
     def counts(self) -> Counter[str]:
@@ -165,6 +169,8 @@ class Controller:
         self._scheme.forget(row)
         self.planner.forget(row)
         self._trigger.forget(row)
+        if self.budget:
+            self.budget.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Keep an observation, unless a newer one is known (E11); whether it was kept."""
@@ -209,6 +215,10 @@ class Controller:
         unsolved = _withhold(
             rows, step, found.ahead, self.observed_step, self._age_max, figures, self.idle, event
         )
+        if self.budget:
+            worth = verdict.figure if verdict.compares else figures["cost_gap"]
+            owed = self.owed[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
+            event = self.budget.choose(rows, event, owed, worth, situation.since_sent_s)
         sent = event.nonzero()[0]
         self._scheme.remember(rows, step, found, event)  # (12)
         if len(sent):

@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.model import Array
@@ -114,6 +115,10 @@ class ControlConfig(Section, frozen=True):
     is longer where observations are old. 0, and the scheme "none": no observer."""
     trigger: OfTrigger[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "cost_gap | silence(1)"
     """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`."""
+    shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)] | Literal["auto"]] = 0.0
+    """Bytes a second that the server sends to all its vehicles together, headers of IP and UDP
+    included; of the horizons that the trigger asks for, those expected to gain most a byte go
+    first [B/s]. auto: as many as go without queueing; 0: no bound."""
     period: OfTrigger[Annotated[int, Meta(ge=1, le=policies.PERIOD_MAX)]] = 10
     """Number of steps between two horizons of the policy `periodic`."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
@@ -501,11 +506,14 @@ class Scenario(Section, frozen=True):
             table=_digest(table),
         )
 
-    def make_reference(self) -> shapes.Reference:
-        """The desired trajectory."""
+    def make_reference(self, vehicle: int = 1) -> shapes.Reference:
+        """The desired trajectory of a vehicle, by its number; each has a target of its own."""
         shape = policies.shape(self.reference.shape, REFERENCES)
-        entry = REFERENCES[shape.name]
-        made: shapes.Reference = entry.make(self, *entry.numbers(shape.values, self.reference))
+        entry, flown = REFERENCES[shape.name], self
+        if shape.name == "target" and vehicle != 1:
+            seed = int(stream(self.seed, "target", vehicle).integers(2**32))
+            flown = msgspec.structs.replace(self, seed=seed)
+        made: shapes.Reference = entry.make(flown, *entry.numbers(shape.values, self.reference))
         return made
 
     def entries(self) -> Iterator[Entry]:

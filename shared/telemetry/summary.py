@@ -190,7 +190,8 @@ def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Arr
         server: rows of the server, of any vehicles.
     """
     if scenario.reference.shape != "live":
-        return scenario.make_reference()(client["step"] * scenario.control.dt)[..., 0]
+        times_s, vehicles = client["step"] * scenario.control.dt, client["vehicle"][:1].tolist()
+        return scenario.make_reference(*vehicles)(times_s)[..., 0]
     known = client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]
     if not len(known):
         return np.full((len(client), scenario.model.axes), np.nan)

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from types import MappingProxyType
 from typing import Any
 
@@ -24,6 +24,7 @@ import msgspec
 from skytether.client import secure as client_secure
 from skytether.client import vehicles as kinds
 from skytether.client.endpoint import Client
+from skytether.client.fleet import apart_ns
 from skytether.client.link import ClientLink
 from skytether.netem.proxy import Proxy
 from skytether.server import secure as server_secure
@@ -36,6 +37,7 @@ from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Endpoint
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
@@ -134,7 +136,8 @@ def fly_batch(
         ConfigError: a plug-in makes mistakes; a batch is to be measured, and this would be nothing.
     """
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
-    company = COMPANY_MAX if in_time else 1
+    alone = not in_time or scenario.control.shared_bytes_per_s  # which a server's vehicles share
+    company = 1 if alone else COMPANY_MAX
     groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
     flights = [flight for group in groups for flight in _fly(scenario, group, on_second, stopped)]
     for _, _, event in (event for flight in flights for event in flight.events):
@@ -203,7 +206,7 @@ class Run:
                 f"client {scenario.seed}.{vehicle}",
                 client,
                 clock=clock,
-                start_ns=start_ns,
+                start_ns=start_ns + (vehicle - 1) * apart_ns(vehicles, scenario.dt_ns),
                 on_finished=self._one_has_finished,
             )
             self.hosts[host] = client
@@ -289,7 +292,12 @@ def _fly(
     world, sink = World(on_event), io.BytesIO()
     entropy = stream(scenario.seed, "entropy").bytes
     each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]
-    targets = [run.make_reference() for run in each if run.reference.shape == "target"]
+
+    @cache
+    def target(vehicle: int) -> Reference:
+        run, number = divmod(vehicle - 1, vehicles)
+        return each[run].make_reference(number + 1)
+
     recorder = Recorder(server_columns(scenario.model.axes, scenario.control.scheme), sink)
     header_bytes, row_bytes = sink.tell(), recorder.columns.itemsize
     server = own_server or Server(
@@ -301,7 +309,7 @@ def _fly(
         recorder=recorder,
         plans=plans,
         stopwatch=stopwatch,
-        references=(lambda vehicle: targets[(vehicle - 1) // vehicles]) if targets else None,
+        references=target if scenario.reference.shape == "target" else None,
     )
 
     def server_rows() -> int:
