@@ -10,7 +10,6 @@ from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Failure
 from skytether.shared.scenario.schema import Scenario
 
-
 START_NS = 5 * SECOND_NS
 """Longest time within which all vehicles of a fleet start [ns]."""
 
@@ -69,8 +68,8 @@ class Fleet(Endpoint):
     def wake(self, *, now_ns: int) -> None:
         """Wake all clients whose time has come; at first, plan when each starts."""
         if self._apart_ns:
-            self._due_ns = [now_ns + n * self._apart_ns for n in range(len(self._clients))]
-            self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns)]
+            self._heap = [(now_ns + n * self._apart_ns, n) for n in range(len(self._clients))]
+            self._due_ns = [due_ns for due_ns, _ in self._heap]
             self._apart_ns = 0
         while (due_ns := self.next_wake_ns()) is not None and due_ns <= now_ns:
             _, n = heappop(self._heap)

@@ -23,10 +23,10 @@ from skytether.shared.core.events import Degraded, Fault, PlanningResumed, Plann
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.air.queues import HEADER_BYTES
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import FIGURES, Recorder
-from skytether.shared.telemetry.summary import HEADER_BYTES
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     Heartbeat,

@@ -13,6 +13,7 @@ reorders and loses their packets.
   fly [SCENARIO]        one flight, with everything it needs; the command to start with
   straight [SCENARIO]   the same by set-points sent straight to an autopilot, to compare with
   fleet [SCENARIO]      many vehicles on one server, and what each costs it
+  crowd [SCENARIO]      how many vehicles fly on one shared air, scheme by scheme
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
   envelope [SCENARIO]   the networks and settings that a scenario bears, by random flights
   margins [SCENARIO]    whether its loop is stable, and with which vehicles, computed
@@ -66,6 +67,7 @@ COMMANDS = {
     "fly": "skytether.cli.fly:fly",
     "straight": "skytether.cli.straight:straight",
     "fleet": "skytether.cli.fleet:fleet",
+    "crowd": "skytether.lab.commands.crowd:crowd",
     "sweep": "skytether.lab.commands.sweep:sweep",
     "envelope": "skytether.lab.commands.envelope:envelope",
     "margins": "skytether.lab.commands.margins:margins",

@@ -9,8 +9,8 @@ lets go as many as it has bytes for, in this order:
 3. all others by what their trigger compares, a byte.
 
 A token bucket: b ← b + r Δt, within ± r BURST_S, less what is sent, headers included; what is owed
-may take it below zero. So a window of T seconds has at most r (T + BURST_S) beside what is owed. The
-rate r is `control.shared_bytes_per_s`, or follows the queueing delay (`server.control.rate`).
+may take it below zero. So a window of T seconds has at most r (T + BURST_S) beside what is owed.
+The rate r is `control.shared_bytes_per_s`, or follows the queueing delay (`server.control.rate`).
 
 Who waits asks again at the next step. Vehicles of other blocks are ranked by what they asked for
 last, a step ago at most, so that blocks that are decided one after the other share one ranking.

@@ -66,7 +66,7 @@ class RateControl:
         self._told = np.zeros(capacity, dtype=np.int64)
         """Number of echoes of each vehicle that were counted."""
         self._delays_s: list[float] = []
-        """Delays above the least that the epoch's echoes tell [s], one a vehicle and step at most."""
+        """Delays above the least of the epoch's echoes, one a vehicle and step at most [s]."""
         self._began_ns: int | None = None
         self._spent = 0.0
         self._gain, self._deaf = FIRST_GAIN, 0

@@ -1,6 +1,6 @@
-"""Pictures of sweeps and of envelopes."""
+"""Pictures of sweeps, of envelopes and of crowds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from skytether.figures.flights import save
+from skytether.lab.crowd import TITLES, CrowdPoint, Flown, Scheme
 from skytether.lab.envelope import WRONG, Envelope, EnvelopePoint, Outcome
 from skytether.lab.sweep import GridAxis
 from skytether.shared.law.model import Array, Flags
@@ -199,6 +200,60 @@ def heat_map(
     figure.colorbar(mesh, label=name)
     plane.set_title(title, fontsize=10)
     save(figure, path, dpi=130)
+
+
+SCHEME_COLOURS: Mapping[Scheme, str] = {
+    "paper": "#c1272d",
+    "threshold": "#e69f00",
+    "budget": "#0072b2",
+}
+
+
+def crowd(path: Path, title: str, flown: Mapping[Scheme, Flown], limit_m: float) -> None:
+    """Draw error, queueing delay and loss over the number of vehicles, for each scheme.
+
+    Args:
+        path: file to write, in one of FORMATS.
+        flown: points of each scheme.
+        limit_m: largest error with which vehicles fly [m].
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 8.0), layout="constrained")
+    panes = figure.subplots(3, 1, sharex=True)
+    values: Sequence[tuple[str, Callable[[CrowdPoint], float | None]]] = (
+        ("RMSE of all vehicles [m]", lambda p: p.rmse_m),
+        ("queueing delay to a vehicle [ms]", lambda p: p.up_queueing_ms_p99),
+        ("share lost on the way to a vehicle", lambda p: p.up_lost),
+    )
+    for pane, (label, value) in zip(panes, values, strict=True):
+        for scheme, each in flown.items():
+            points = [point for point in each.points if value(point) is not None]
+            numbers = [point.vehicles for point in points]
+            colour = SCHEME_COLOURS[scheme]
+            drawn = np.array([value(point) for point in points], dtype=np.float64)
+            if numbers:
+                pane.plot(numbers, drawn, color=colour, linewidth=1.0, label=TITLES[scheme])
+            for flies, marker in ((True, "o"), (False, "X")):
+                here = [point.flies(limit_m) == flies for point in points]
+                pane.scatter(np.array(numbers)[here], drawn[here], color=colour, marker=marker)
+        pane.set_ylabel(label)
+        pane.grid(alpha=0.3)
+        pane.set_xscale("log", base=2)
+    panes[0].axhline(limit_m, color="k", linewidth=0.8, linestyle="--")
+    panes[0].set_yscale("log")
+    panes[0].legend(fontsize=8)
+    panes[1].set_title("99 of 100 packets take less; × where they no longer fly", fontsize=9)
+    panes[-1].set_xlabel("vehicles on the air")
+    ticks = sorted({2**i for i in range(13)} & set(range(1, _most(flown) + 1)))
+    panes[-1].set_xticks(ticks, list(map(str, ticks)))
+    figure.suptitle(title, fontsize=11)
+    save(figure, path, dpi=110)
+
+
+def _most(flown: Mapping[Scheme, Flown]) -> int:
+    """Largest number of vehicles that was flown."""
+    return max(point.vehicles for each in flown.values() for point in each.points)
 
 
 def _is_scale(axis: GridAxis) -> bool:

@@ -1,0 +1,193 @@
+"""`skytether crowd`: how many vehicles fly on one shared air, scheme by scheme."""
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, get_args
+
+import tyro
+from rich.table import Table
+
+from skytether.cli import processes
+from skytether.lab import figures
+from skytether.lab.commands.pool import Interrupted, writing
+from skytether.lab.crowd import TITLES, Crowd, CrowdPoint, Flown, Scheme, judge, points_csv
+from skytether.lab.journal import Journal, write
+from skytether.shared.base import kernel
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import record
+from skytether.shell import command, temporary
+from skytether.shell.command import Bar, CommandError, ScenarioFlags, ScenarioName
+from skytether.sim import flight
+
+VEHICLES_MAX = 4096
+"""Most vehicles of a flight."""
+
+
+@dataclass(frozen=True)
+class CrowdOptions:
+    """Options of `skytether crowd`."""
+
+    out: Path = Path("crowd")
+    """Folder for the results; the same command goes on there with what it holds."""
+    scenario: ScenarioName = "crowd"
+    """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
+    schemes: Annotated[tuple[Scheme, ...], tyro.conf.arg(metavar="SCHEME")] = get_args(Scheme)
+    """Schemes: paper (a packet at every step), threshold (the scenario's trigger for each vehicle)
+    and budget (the same, and control.shared_bytes_per_s)."""
+    vehicles: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")] = ()
+    """Numbers of vehicles; unless given, more and more until they no longer fly, and then between
+    the last that does and the first that does not."""
+    most: Annotated[int, tyro.conf.arg(metavar="N")] = 256
+    """Largest number of vehicles that is tried, unless they are given."""
+    limit: Annotated[float, tyro.conf.arg(metavar="M")] = 1.0
+    """Root mean square error with which vehicles no longer fly [m]."""
+    udp: bool = False
+    """Fly over real UDP on loopback, in real time; in virtual time else."""
+    plugin: command.Plugins = ()
+    config: ScenarioFlags = Scenario()
+
+
+def crowd(argv: Sequence[str]) -> None:
+    """Find how many vehicles fly on one air, for each scheme: with one more, it is too many.
+
+    All vehicles share the rates and queues of the scenario's network, one for each direction.
+    They fly where none brakes and their error stays within --limit. OUT/crowd.csv has a row for
+    each flight, OUT/crowd.png shows error, queueing delay and loss over the number of vehicles.
+    Everything flown is kept: after Ctrl-C the same command goes on.
+    """
+    options = command.parse(CrowdOptions(), argv, "skytether crowd", crowd.__doc__)
+    command.check_count("--most", options.most, VEHICLES_MAX)
+    for number in options.vehicles:
+        command.check_count("--vehicles", number, VEHICLES_MAX)
+    if options.udp:
+        command.check_sockets("--vehicles", max(options.vehicles, default=options.most))
+    if not options.limit > 0:
+        raise CommandError(f"--limit: got {options.limit:g}, expected more than 0", 2)
+    plan = Crowd(options.scenario, options.config, options.udp)
+    for scheme in options.schemes:
+        plan.of(scheme)
+    command.prepare(kernel.missing())
+    with (
+        writing(options.out),
+        closing(Journal(options.out, plan.settings(), CrowdPoint)) as journal,
+    ):
+        with (
+            command.interruptible() as interrupted,
+            command.progress(f"flying {options.scenario}", len(options.schemes), "schemes") as bar,
+        ):
+            done = 0
+            for scheme in options.schemes:
+                if not _fly_all(
+                    options, plan, scheme, journal, partial_bar(bar, done), interrupted
+                ):
+                    break
+                done += 1
+        if journal.entries:
+            _finish(options, journal.entries)
+    if done < len(options.schemes):
+        raise Interrupted(done, len(options.schemes), "schemes")
+
+
+def partial_bar(bar: Bar, done: int) -> Callable[[str], None]:
+    """What shows a text beside so many schemes that are done."""
+    return lambda text: bar(done, text)
+
+
+def _fly_all(
+    options: CrowdOptions,
+    plan: Crowd,
+    scheme: Scheme,
+    journal: Journal[CrowdPoint],
+    tell: Callable[[str], None],
+    interrupted: Callable[[], bool],
+) -> bool:
+    """Fly what is not done of a scheme; False where that was broken off."""
+    while True:
+        flown = Flown.of(journal.entries, scheme, options.limit)
+        known = {point.vehicles for point in flown.points}
+        left = [number for number in options.vehicles if number not in known]
+        number = next(iter(left), None) if options.vehicles else flown.next(options.most)
+        if number is None:
+            return True
+        point = _fly(plan, scheme, number, tell, interrupted)
+        if point is None:
+            return False
+        journal.append(point)
+
+
+def _fly(
+    plan: Crowd,
+    scheme: Scheme,
+    vehicles: int,
+    tell: Callable[[str], None],
+    interrupted: Callable[[], bool],
+) -> CrowdPoint | None:
+    """Fly so many vehicles; None where the flight was broken off."""
+    scenario = plan.of(scheme)
+
+    def on_second(time_s: float) -> None:
+        tell(f"{scheme}, {vehicles} vehicles, {min(time_s, scenario.duration):.0f} s")
+
+    on_second(0.0)
+    if not plan.udp:
+        kernel.load()
+        flown = flight.fly(scenario, vehicles=vehicles, on_second=on_second, stopped=interrupted)
+        client, netem = flown.client, flown.figures["netem"]
+    else:
+        with temporary.folder() as parts:
+            processes.run(
+                scenario,
+                parts,
+                on_second=on_second,
+                interrupted=interrupted,
+                vehicles=vehicles,
+                watched=False,
+            )
+            client = record.read(parts / "client")
+            netem = json.loads((parts / "netem.json").read_bytes())
+    if interrupted():
+        return None
+    return judge(scenario, scheme, vehicles, client, netem)
+
+
+def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
+    """Write and print what was flown."""
+    flown = {scheme: Flown.of(points, scheme, options.limit) for scheme in TITLES}
+    where = "over UDP" if options.udp else "in virtual time"
+    title = f"{options.scenario}, {where}, seed {options.config.seed}"
+    rows = [point for each in flown.values() for point in each.points]
+    write(options.out / "crowd.csv", points_csv(rows).encode())
+    figures.crowd(options.out / "crowd.png", title, flown, options.limit)
+    table = Table(title=title, title_justify="left")
+    headings = ("scheme", "vehicles", "fly", "RMSE [m]", "worst [m]", "brake or end")
+    way = ("up, down [B/s]", "queueing up p50, p99 [ms]", "down", "lost up, down")
+    for heading in (*headings, *way):
+        table.add_column(heading, justify="left" if heading == "scheme" else "right")
+    for each in flown.values():
+        for point in each.points:
+            table.add_row(*_cells(point, options.limit))
+    command.show(table)
+    for scheme, each in flown.items():
+        if each.points:
+            beyond = f"{each.too_many} do not" if each.too_many else "no more were tried"
+            print(f"{TITLES[scheme]}: {each.flying} vehicles fly, {beyond}")
+    print(f"{options.out}: crowd.csv, crowd.png")
+
+
+def _cells(point: CrowdPoint, limit_m: float) -> list[str]:
+    p = point
+    return [
+        p.scheme,
+        str(p.vehicles),
+        "yes" if p.flies(limit_m) else "no",
+        "-" if p.rmse_m is None else f"{p.rmse_m:.3f}",
+        "-" if p.rmse_worst_m is None else f"{p.rmse_worst_m:.3f}",
+        str(p.braked + p.ended),
+        f"{p.up_bytes_per_s:.0f}, {p.down_bytes_per_s:.0f}",
+        f"{p.up_queueing_ms_p50:.0f}, {p.up_queueing_ms_p99:.0f}",
+        f"{p.down_queueing_ms_p50:.0f}, {p.down_queueing_ms_p99:.0f}",
+        f"{p.up_lost:.3f}, {p.down_lost:.3f}",
+    ]
