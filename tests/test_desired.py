@@ -240,7 +240,7 @@ def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> 
     flown = replaced("target-committed", {"duration": 6.0, "settle": 0.0}, preview=preview)
     flights = []
     for scale in (0.5, -0.5):
-        monkeypatch.setattr(Scenario, "make_reference", lambda _, scale=scale: turning(scale))
+        monkeypatch.setattr(Scenario, "make_reference", lambda *_, scale=scale: turning(scale))
         flights.append(fly(flown))
     return flights
 

@@ -349,7 +349,17 @@ def test_a_vehicle_has_nothing_to_fly_until_it_is_sent_something_and_once_that_i
     assert server.at(11)["fresh"]
     assert server.at(12, send=True)["fresh"]
     last = 30 - server.d
-    assert [bool(server.at(step)["fresh"]) for step in (13, last, last + 1)] == [False, False, True]
+    assert not any(server.at(step)["fresh"] for step in (13, last))
+    server.observe(15)
+    assert server.at(last + 1)["fresh"]
+
+
+def test_a_vehicle_that_is_not_heard_is_not_flooded() -> None:
+    """What would be too old when it comes is not owed at every step, for it could not be flown."""
+    server = Server(scenario(link={"age_max_s": 2.0}, control={"delay_bound": 0.5}))
+    server.observe(10)
+    server.at(12, send=True)
+    assert not any(server.at(step)["fresh"] for step in range(13, 40))
 
 
 def test_a_vehicle_that_takes_nothing_holds_nothing() -> None:

@@ -30,7 +30,7 @@ from skytether.server.control.clock import UNSEEN, ClockMap
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array, Indices
 
-START, LEAST, MOST = 5_000.0, 500.0, 1e9
+START, LEAST, MOST = 2_000.0, 500.0, 1e9
 """First, smallest and largest rate [B/s]."""
 EPOCH_NS, PATIENCE_NS = SECOND_NS // 2, 5 * SECOND_NS
 """Shortest epoch, which also lasts a round trip, and time after which few echoes will do [ns]."""

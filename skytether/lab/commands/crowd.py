@@ -9,6 +9,7 @@ from typing import Annotated, get_args
 
 import tyro
 from rich.table import Table
+from rich.text import Text
 
 from skytether.cli import processes
 from skytether.lab import figures
@@ -165,7 +166,7 @@ def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
     headings = ("scheme", "vehicles", "fly", "RMSE [m]", "worst [m]", "brake or end")
     way = ("up, down [B/s]", "queueing up p50, p99 [ms]", "down", "lost up, down")
     for heading in (*headings, *way):
-        table.add_column(heading, justify="left" if heading == "scheme" else "right")
+        table.add_column(Text(heading), justify="left" if heading == "scheme" else "right")
     for each in flown.values():
         for point in each.points:
             table.add_row(*_cells(point, options.limit))

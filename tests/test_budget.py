@@ -1,0 +1,336 @@
+"""One budget for all vehicles: who goes first, how much goes, and the rate that an air passes."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skytether.client.fleet import apart_ns
+from skytether.lab.crowd import judge
+from skytether.server.control import budget as budgets
+from skytether.server.control import rate as rates
+from skytether.server.control.budget import BURST_S, GUESS_BYTES, WAIT_S, Budget
+from skytether.server.control.clock import ClockMap
+from skytether.server.control.rate import RateControl
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.schema import Scenario
+from skytether.sim.flight import fly, fly_batch
+
+DT_NS = 50 * MILLISECOND_NS
+DT_S = DT_NS / SECOND_NS
+
+
+class Crowd:
+    """Vehicles that share a budget and ask at every tick; a packet has as many bytes as its row."""
+
+    def __init__(self, bytes_per_s: float, sizes: list[int]) -> None:
+        n = len(sizes)
+        self.rows, self.sizes = np.arange(n), np.array(sizes)
+        self.budget = Budget(bytes_per_s, ClockMap(n, DT_NS), n)
+        self.since_s = np.zeros(n)
+        self.now_ns = 0
+
+    def tick(self, worth: Array, owed: list[int] | None = None, blocks: int = 1) -> list[int]:
+        """Vehicles that are sent something at the next tick, where all of them ask."""
+        self.now_ns += DT_NS
+        self.since_s += DT_S
+        self.budget.fill(self.rows, self.now_ns)
+        must = np.isin(self.rows, owed or [])
+        sent: list[int] = []
+        for block in np.array_split(self.rows, blocks):
+            asks = np.ones(len(block), dtype=np.bool_)
+            of_block = worth[block], self.since_s[block]
+            goes = block[self.budget.choose(block, asks, must[block], *of_block)]
+            for row in goes.tolist():
+                self.budget.charge(row, int(self.sizes[row]), is_plan=True)
+            sent += goes.tolist()
+        self.since_s[sent] = 0.0
+        return sent
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.integers(40, 400), min_size=1, max_size=12),
+    st.floats(200.0, 20_000.0),
+    st.integers(1, 3),
+    st.integers(0, 2**32 - 1),
+)
+def test_no_more_goes_than_the_rate(sizes: list[int], rate: float, blocks: int, seed: int) -> None:
+    """In any window of T at most r (T + BURST_S), and a packet that was longer than the last."""
+    crowd, rng = Crowd(rate, sizes), np.random.default_rng(seed)
+    spent = [
+        sum(sizes[row] for row in crowd.tick(rng.random(len(sizes)), blocks=blocks))
+        for _ in range(100)
+    ]
+    total = np.concatenate([[0], np.cumsum(spent)])
+    for begin in range(0, 100, 7):
+        for end in range(begin + 1, 101, 9):
+            window_s = (end - begin) * DT_S
+            grown = sum(sizes)  # sizes are guessed at first
+            assert total[end] - total[begin] <= rate * (window_s + BURST_S) + grown
+
+
+def test_a_rate_that_is_enough_holds_nobody_back() -> None:
+    """All that ask are sent to at once, and nothing is counted as deferred."""
+    crowd = Crowd(1e6, [100] * 8)
+    assert [len(crowd.tick(np.ones(8))) for _ in range(20)] == [8] * 20
+    assert crowd.budget.deferred == 0
+
+
+def test_who_gains_most_a_byte_goes_first() -> None:
+    """Not who gains most: of two packets that cost as much as one the larger sum counts."""
+    crowd = Crowd(2 * GUESS_BYTES / DT_S, [100, 100, 200, 100])
+    crowd.tick(np.zeros(4), owed=[0, 1, 2, 3])  # from here on sizes are known
+    for _ in range(8):  # the others pay for what was owed
+        crowd.tick(np.full(4, np.nan))
+    crowd.since_s[:] = 0.0
+    assert crowd.tick(np.array([1.0, 3.0, 5.0, 4.0])) == [1, 3]
+
+
+def test_what_is_owed_goes_in_any_case_and_the_others_pay() -> None:
+    """With a rate for one packet a tick, four that are owed take what there is for the others."""
+    crowd = Crowd(GUESS_BYTES / DT_S, [100] * 8)
+    assert sorted(crowd.tick(np.arange(8.0), owed=[0, 1, 2, 3]))[:4] == [0, 1, 2, 3]
+    after = [len(crowd.tick(np.arange(8.0))) for _ in range(4)]
+    assert after[0] == 0
+    assert sum(after) <= 3
+
+
+def test_debts_are_bounded() -> None:
+    """After a surge of what is owed the others wait no longer than twice BURST_S."""
+    crowd = Crowd(GUESS_BYTES / DT_S, [100] * 50)
+    crowd.tick(np.ones(50), owed=list(range(49)))
+    waited = 0
+    while not crowd.tick(np.ones(50)):
+        waited += 1
+    assert waited * DT_S <= 2 * BURST_S
+
+
+def longest_wait_s() -> float:
+    """Longest time that one vehicle waits for which little is at stake, beside greedy ones."""
+    crowd = Crowd(2 * GUESS_BYTES / DT_S, [100] * 12)
+    worth, longest_s = np.full(12, 100.0), 0.0
+    worth[0] = 1.0
+    for _ in range(400):
+        crowd.tick(worth)
+        longest_s = max(longest_s, crowd.since_s[0])
+    return longest_s
+
+
+def test_nobody_starves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who is sent nothing for WAIT_S goes first; without that bound it is never sent anything."""
+    assert longest_wait_s() <= WAIT_S + 3 * DT_S
+    monkeypatch.setattr(budgets, "WAIT_S", np.inf)
+    assert longest_wait_s() == pytest.approx(400 * DT_S)
+
+
+def test_blocks_share_one_ranking() -> None:
+    """Vehicles of the first block leave the bytes to those of the second that gain more."""
+    worth = np.array([1.0, 2.0, 3.0, 40.0, 50.0, 60.0])
+    sent = []
+    for blocks in (1, 2, 3):
+        crowd = Crowd(3 * GUESS_BYTES / DT_S, [100] * 6)
+        crowd.tick(worth, blocks=blocks)
+        crowd.tick(worth, blocks=blocks)
+        crowd.since_s[:] = 0.0
+        sent.append(sorted(crowd.tick(worth, blocks=blocks)))
+    assert sent == [[3, 4, 5]] * 3
+
+
+def test_who_no_longer_asks_holds_nobody_back() -> None:
+    """A vehicle that is gone had asked for more than all others, and was not sent anything."""
+    crowd = Crowd(GUESS_BYTES / DT_S, [100, 100])
+    for _ in range(4):
+        crowd.tick(np.array([1.0, 9.0]), owed=[0])
+    crowd.rows = np.array([0])
+    crowd.tick(np.array([1.0]))
+    crowd.tick(np.array([1.0]))
+    assert crowd.tick(np.array([1.0])) == [0]
+
+
+# -- the rate --------------------------------------------------------------------------------
+
+
+class Air:
+    """Bytes that go through a queue of finite rate, and echoes that tell a server of their delays.
+
+    Args:
+        rate: bytes that pass [B/s].
+        jitter_s: standard deviation of the delay beside the queue [s].
+        loss: share of echoes that never come.
+    """
+
+    def __init__(self, rate: float, *, jitter_s: float = 0.0, loss: float = 0.0) -> None:
+        self.vehicles, self.rate, self.jitter_s, self.loss = 10, rate, jitter_s, loss
+        self.clock = ClockMap(self.vehicles, DT_NS)
+        self.control = RateControl(self.clock, self.vehicles)
+        self.rng = np.random.default_rng(3)
+        self.queue_s, self.sent, self.now_ns = 0.0, 0.0, 0
+        self.queues_s: list[float] = []
+        self.rates: list[float] = []
+
+    def run(self, seconds: float, wanted: float = np.inf) -> "Air":
+        """Let time pass in which so much was to be sent [B/s], and send what the rate lets pass."""
+        rows = np.arange(self.vehicles)
+        for step in range(round(seconds / DT_S)):
+            self.now_ns += DT_NS
+            spent = min(self.control.bytes_per_s, wanted) * DT_S
+            self.control.needed |= wanted > self.control.bytes_per_s
+            self.queue_s = max(self.queue_s + spent / self.rate - DT_S, 0.0)
+            self.queues_s.append(self.queue_s)
+            self.rates.append(spent / DT_S)
+            row = step % self.vehicles  # it tells of what was sent half a second ago
+            before_s = self.queues_s[-min(10, len(self.queues_s))]
+            delay_s = 0.4 + before_s + abs(self.rng.normal(0.0, self.jitter_s or 1e-9))
+            if self.rng.random() >= self.loss:
+                backward_ns = round(delay_s * SECOND_NS)
+                self.clock.observe(
+                    row, 400 * MILLISECOND_NS, backward_ns, heard=step % 128, now_ns=self.now_ns
+                )
+            self.control.update(rows, spent, self.now_ns)
+        return self
+
+
+@pytest.mark.parametrize("rate", [2_000.0, 12_500.0, 100_000.0])
+def test_the_rate_of_the_air_is_found(rate: float) -> None:
+    """After a minute most of it is used, and the queue is short."""
+    air = Air(rate, jitter_s=0.03).run(240.0)
+    late = slice(len(air.rates) // 4, None)
+    assert 0.75 * rate < np.mean(air.rates[late]) <= 1.02 * rate
+    assert np.quantile(air.queues_s[late], 0.95) < 0.35
+
+
+def test_without_following_the_queue_grows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A target that no queue reaches is none: the queue grows to seconds."""
+    assert max(Air(12_500.0).run(60.0).queues_s) < 1.0
+    monkeypatch.setattr(rates, "TARGET_S", np.inf)
+    assert Air(12_500.0).run(60.0).queues_s[-1] > 10.0
+
+
+@pytest.mark.parametrize(("loss", "jitter_s"), [(0.0, 0.15), (0.5, 0.0), (0.7, 0.03)])
+def test_neither_loss_nor_jitter_lowers_the_rate(loss: float, jitter_s: float) -> None:
+    """Where there is no queue all that is wanted goes in the end, and goes on to."""
+    air = Air(1e9, loss=loss, jitter_s=jitter_s).run(240.0, wanted=20_000.0)
+    late = slice(len(air.rates) // 2, None)
+    assert np.mean(air.rates[late]) > 0.9 * 20_000.0
+
+
+def test_an_air_that_slows_down_is_followed() -> None:
+    """It passes a quarter from one moment on, and all again later."""
+    air = Air(20_000.0).run(60.0)
+    air.rate = 5_000.0
+    air.run(60.0)
+    assert np.mean(air.rates[-600:]) < 5_500.0
+    assert np.quantile(air.queues_s[-600:], 0.9) < 0.5
+    air.rate = 20_000.0
+    assert np.mean(air.run(90.0).rates[-600:]) > 13_000.0
+
+
+def test_a_rate_that_nobody_uses_does_not_rise() -> None:
+    """What was never sent says nothing of the air."""
+    air = Air(12_500.0).run(60.0, wanted=2_000.0)
+    assert air.control.bytes_per_s == rates.START
+
+
+# -- flights ---------------------------------------------------------------------------------
+
+AIR = "paper(0.4, 0.02, 2) & rate(3000, queue=5000)"
+"""A quarter of the air of the scenario `crowd`."""
+
+
+def crowd(keys: Mapping[str, Any], network: str = AIR) -> Scenario:
+    """The scenario `crowd` for 25 s."""
+    table = reading.to_table(reading.load("crowd"))
+    table["network"] = {"uplink": network, "downlink": network}
+    lay({"duration": 25.0, "settle": 12.0, **keys}, table)
+    return reading.check(table, "test")
+
+
+def flown(keys: Mapping[str, Any], vehicles: int, network: str = AIR) -> tuple[bool, float]:
+    """Whether so many vehicles fly, and the error of all of them [m]."""
+    scenario = crowd(keys, network)
+    record = fly(scenario, vehicles=vehicles)
+    point = judge(scenario, "budget", vehicles, record.client, record.figures["netem"])
+    return point.flies(1.0), np.inf if point.rmse_m is None else point.rmse_m
+
+
+AUTO = {"control.shared_bytes_per_s": "auto"}
+
+
+@pytest.mark.long
+def test_a_budget_flies_where_thresholds_fill_the_queue() -> None:
+    """A quarter more vehicles than the air bears at their thresholds, and a share of their error
+    alone.
+    """
+    vehicles = 22
+    flies, _ = flown({}, vehicles)
+    assert not flies
+    flies, rmse_m = flown(AUTO, vehicles)
+    assert flies
+    assert rmse_m < 0.8
+    flies, _ = flown({"control.shared_bytes_per_s": 2700.0}, vehicles)
+    assert flies
+
+
+@pytest.mark.long
+def test_random_loss_costs_no_budget() -> None:
+    """Half of the packets are lost and nobody queues: the error is that of thresholds; a rate cut
+    by losses, as a queue's would be, is far worse.
+    """
+    lossy = "paper(0.4, 0.02, 2) & loss(0.5)"
+    _, threshold_m = flown({}, 8, lossy)
+    _, budget_m = flown(AUTO, 8, lossy)
+    _, cut_m = flown({"control.shared_bytes_per_s": 400.0}, 8, lossy)
+    assert budget_m < 1.05 * threshold_m
+    assert cut_m > 1.1 * threshold_m
+
+
+@pytest.mark.long
+def test_a_run_with_a_budget_is_the_same_in_any_company() -> None:
+    """Runs of a batch share a server, and no budget."""
+    scenario = crowd({**AUTO, "duration": 4.0, "settle": 1.0})
+    for seed, together in zip((1, 2), fly_batch(scenario, (1, 2)), strict=True):
+        alone = fly(crowd({**AUTO, "duration": 4.0, "settle": 1.0, "seed": seed}))
+        assert (together.client == alone.client).all()
+
+
+def test_a_budget_is_told_among_the_figures() -> None:
+    """And there is none unless asked for."""
+    record = fly(crowd({**AUTO, "duration": 3.0, "settle": 1.0}), vehicles=2)
+    assert record.figures["server"]["budget"]["bytes_per_s"] >= rates.LEAST
+    record = fly(crowd({"duration": 1.0, "settle": 0.5}))
+    assert "budget" not in record.figures["server"]
+
+
+def test_each_vehicle_of_a_fleet_has_a_target_of_its_own() -> None:
+    """The first has the scenario's; and the record's error is from the vehicle's own."""
+    scenario = crowd({"duration": 3.0, "settle": 1.0})
+    times_s = np.arange(100.0)
+    own = [scenario.make_reference(vehicle)(times_s) for vehicle in (1, 2, 3)]
+    np.testing.assert_array_equal(own[0], scenario.make_reference()(times_s))
+    assert np.abs(own[1] - own[2]).max() > 1.0
+    record = fly(scenario, vehicles=3)
+    for row in record.server[:: len(record.server) // 9]:
+        wanted = scenario.make_reference(int(row["vehicle"]))(np.array(row["step"] * DT_S))
+        np.testing.assert_allclose(row["reference"], wanted, atol=1e-9)
+
+
+def test_vehicles_of_a_fleet_start_one_after_the_other() -> None:
+    """A step apart, and all of a large fleet within five seconds."""
+    record = fly(crowd({"duration": 2.0, "settle": 1.0}), vehicles=3)
+    netem = record.netem[np.unique(record.netem["flow"], return_index=True)[1]]
+    assert np.diff(netem["arrived_ns"]).tolist() == [DT_NS, DT_NS]
+    assert apart_ns(1000, DT_NS) * 1000 == 5 * SECOND_NS
+
+
+def test_a_rate_below_nothing_is_refused() -> None:
+    """In one line."""
+    with pytest.raises(ConfigError, match=r"control\.shared_bytes_per_s: got -1"):
+        crowd({"control.shared_bytes_per_s": -1.0})
