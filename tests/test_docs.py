@@ -56,6 +56,7 @@ def skytether(line: str) -> list[str]:
                 "skytether sc",
                 "skytether sw",
                 "skytether ca",
+                "skytether cr",
                 "skytether en",
                 "skytether ma",
                 "skytether st",
@@ -81,6 +82,9 @@ def test_a_documented_flight_flies(
         line += " --settle 0 --duration 1 --points 3"
     if "margins" in line:
         line += " --runs 1"
+    if "crowd --out" in line:
+        line = re.sub(r"--vehicles [\d ]+", "", line)
+        line += " --vehicles 2 --settle 0 --duration 4"
     if "--maps" in line:
         line += " --tau 1 --gain 1 --dead-time 0 --burst 0 --settle 0 --duration 1"
     if "calibrate" in line:
@@ -260,7 +264,7 @@ def test_every_documented_command_is_tested() -> None:
     known: tuple[str, ...] = ("pip install .", "pip install '.[all]'")  # by test_packaging.py
     known += ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
     known += ("skytether scenarios", "skytether calibrate ", "skytether envelope ")
-    known += ("skytether impairments",)
+    known += ("skytether impairments", "skytether crowd ")
     known += ("skytether margins ", "skytether straight", "skytether identify ")
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py

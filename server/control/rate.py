@@ -10,12 +10,14 @@ and the median M of what the echoes of an epoch are above the least,
 
 and with the rate r, and b bytes a second sent in the epoch,
 
-    r ← max(r, b) GAIN         q ≤ LOW s, something had to wait, b > USED r
-    r ← CUT b / (1 + Δq / Δt)  q > s, and it does not fall by itself
+    r ← CUT p,  p = b / (1 + Δq / Δt)     q > s, and it does not fall by itself
+    r ← p (1 + (1 - CUT) (t / K - 1)³)    q ≤ LOW s, something had to wait, b > USED r
 
-Where a queue grows by Δq in an epoch of Δt, so much less passes than is sent. b is that of the
-epoch before, which the echoes tell of. GAIN is larger until q has been above s once. The epochs
-after a cut tell of packets that were sent before it, and change nothing.
+Where a queue grows by Δq in an epoch of Δt, so much less passes than is sent: p, with the b of the
+epoch before, which the echoes tell of. After a cut r is p again when it has risen for K, where it
+stays longest, and from there on rises ever faster (the window of CUBIC, RFC 9438); t is the time
+for which it rises. Until q has been above s once, r ← r FIRST_GAIN. r never falls below b as it
+rises. The epochs after a cut tell of packets that were sent before it, and change nothing.
 
 Losses are not asked for. Where chance loses packets a lower rate would lose as many of them and
 deliver less; where a queue overflows the delay has grown before. A queue too short to delay by
@@ -46,11 +48,13 @@ FALLS = 0.7
 """Share of the q before, at most which q falls by itself."""
 USED = 0.8
 """Share of r that must have been sent for it to rise: what nobody uses says nothing of the air."""
-FIRST_GAIN, GAIN = 1.25, 1.05
-"""Factor of a rise, before the first cut and after it."""
+FIRST_GAIN = 1.25
+"""Factor of a rise, before the first cut."""
+K_S = 8.0
+"""Time for which r rises from a cut to where it was too large [s]."""
 DEAF = 2
 """Number of epochs after a cut that tell of what was sent before: a report is awaited, too."""
-CUT = 0.8
+CUT = 0.85
 """Share of what passes that is sent after a cut, so that the queue empties."""
 
 
@@ -69,7 +73,10 @@ class RateControl:
         """Delays above the least of the epoch's echoes, one a vehicle and step at most [s]."""
         self._began_ns: int | None = None
         self._spent = 0.0
-        self._gain, self._deaf = FIRST_GAIN, 0
+        self._passes: float | None = None
+        """Rate that passed when r was cut last, p [B/s]; None before."""
+        self._risen_s, self._deaf = 0.0, 0
+        """Time t for which r has risen since then [s], and epochs that tell of what was before."""
         self._low_s: deque[float] = deque(maxlen=BASE)
         """Q of the newest epochs [s]."""
         self._sent = 0.0
@@ -126,7 +133,15 @@ class RateControl:
         if self._deaf:
             self._deaf -= 1
         elif q > most and q > FALLS * before:
-            passes = told / (1.0 + max(q - before, 0.0) * SECOND_NS / passed_ns)
-            self.bytes_per_s, self._gain, self._deaf = max(CUT * passes, LEAST), GAIN, DEAF
+            self._passes = told / (1.0 + max(q - before, 0.0) * SECOND_NS / passed_ns)
+            self._risen_s, self._deaf = 0.0, DEAF
+            self.bytes_per_s = max(CUT * self._passes, LEAST)
         elif q <= LOW * most and self.needed and sent > USED * self.bytes_per_s:
-            self.bytes_per_s = min(max(self.bytes_per_s, sent) * self._gain, MOST)
+            self._risen_s += passed_ns / SECOND_NS
+            self.bytes_per_s = min(max(self.bytes_per_s, sent, self._risen()), MOST)
+
+    def _risen(self) -> float:
+        """The rate after a rise [B/s]."""
+        if self._passes is None:
+            return self.bytes_per_s * FIRST_GAIN
+        return self._passes * (1.0 + (1.0 - CUT) * (self._risen_s / K_S - 1.0) ** 3)
