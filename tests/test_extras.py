@@ -26,7 +26,17 @@ ALL = (
     "cluster",
     "lab",
 )
-LAB = ("sweep", "envelope", "margins", "identify", "torture", "reproduce", "compare", "calibrate")
+LAB = (
+    "crowd",
+    "sweep",
+    "envelope",
+    "margins",
+    "identify",
+    "torture",
+    "reproduce",
+    "compare",
+    "calibrate",
+)
 NEEDS: dict[str, tuple[str, ...]] = {
     "client": (),
     "netem": (),
