@@ -17,13 +17,12 @@ from skytether.server.control.knots import inputs_along
 from skytether.server.control.law import axes_of
 from skytether.server.control.scheme import in_a_row
 from skytether.server.sessions import Session, Sessions
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
 from skytether.shared.core.events import Degraded, Fault, PlanningResumed, PlanningStopped
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.air.queues import HEADER_BYTES
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import FIGURES, Recorder

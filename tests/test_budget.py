@@ -302,7 +302,7 @@ def test_a_run_with_a_budget_is_the_same_in_any_company() -> None:
 
 
 def test_a_budget_is_told_among_the_figures() -> None:
-    """And there is none unless asked for."""
+    """Without the key there is no budget."""
     record = fly(crowd({**AUTO, "duration": 3.0, "settle": 1.0}), vehicles=2)
     assert record.figures["server"]["budget"]["bytes_per_s"] >= rates.LEAST
     record = fly(crowd({"duration": 1.0, "settle": 0.5}))

@@ -15,9 +15,9 @@ import numpy as np
 
 from skytether.figures.tables import to_csv
 from skytether.lab.journal import digests
+from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.queues import HEADER_BYTES
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
