@@ -5,6 +5,8 @@ Pictures of it lie in `page-test/` afterwards, light and dark, wide and narrow.
 
 import os
 import re
+import signal
+import socket
 import subprocess
 import sys
 import time
@@ -113,6 +115,47 @@ def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(
         page.get_by_role("button", name="Heal it").click()
         until(lambda: "TRACK" in status(page), "it flies a plan once the link is healed")
         until(lambda: "link good" in status(page), "the link is good again")
+
+
+def test_a_network_is_written_and_measured_on_a_page_of_its_own(
+    browser: "sync_api.Browser", tmp_path: Path
+) -> None:
+    """Netem alone, with two sockets in place of a client and a server."""
+    netem = [sys.executable, "-P", "-m", "skytether", "netem", "--downlink", "constant(0.02)"]
+    folder, client = tmp_path / "air", socket.socket(type=socket.SOCK_DGRAM)
+    folder.mkdir()
+    with client, socket.socket(type=socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+        host, port = server.getsockname()
+        with socket.socket(type=socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            at = free.getsockname()
+        addresses = ["--bind", f"{at[0]}:{at[1]}", "--server", f"{host}:{port}"]
+        sockets = ["--feed", str(folder / "netem.feed"), "--control", str(folder / "netem")]
+        process = subprocess.Popen([*netem, *addresses, *sockets])
+
+        def measured() -> str:
+            client.sendto(b"asks", at)
+            return status(page)
+
+        try:
+            with (
+                served("page", str(folder), "--page", "127.0.0.1:0") as address,
+                opened(browser, address) as page,
+            ):
+                until(lambda: "0 % down" in measured(), "nothing is lost")
+                assert "TRACK" not in status(page)
+                assert page.get_by_text("Trigger").count() == 0
+                put(page, "To the server", "loss(2)")
+                page.get_by_role("button", name="Change the network").click()
+                until(lambda: page.get_by_text("expected loss(share)").count(), "it is refused")
+                put(page, "To the server", "loss(1)")
+                page.get_by_role("button", name="Change the network").click()
+                until(lambda: "100 % down" in measured(), "everything is lost")
+                picture(page, PICTURES / "netem-dark-wide.png")
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(timeout=30)
 
 
 def test_it_is_light_and_dark_wide_and_narrow(browser: "sync_api.Browser", flight: str) -> None:

@@ -25,8 +25,9 @@ from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
 from skytether.view import plots, words
 from skytether.view.frames import of_flight
+from skytether.view.network import BINS, DELAY_BINS, SPAN_S
 from skytether.view.rows import planned
-from skytether.view.state import BINS, DELAY_BINS, SAID_MAX, SLOTS_MAX, SPAN_S, VEHICLES_MAX, State
+from skytether.view.state import SAID_MAX, SLOTS_MAX, VEHICLES_MAX, State
 
 
 @dataclass(frozen=True)
@@ -349,3 +350,32 @@ def test_it_says_how_old_what_the_server_knows_is() -> None:
     said = words.status(shown.state, 1, shown.now_ns)
     assert f"age of what the server knows</td><td>{track.known_s:.2f} s" in said
     assert not np.isnan(track.trail(5.0)).any()
+
+
+def test_netem_alone_is_a_network_and_no_flight() -> None:
+    """Its packets, losses and queues are shown, and no vehicle is waited for."""
+    frames = [frame for frame in demo().frames if frame[1] == "netem"]
+    state = state_of(tuple(frames))
+    assert not state.flies
+    assert demo().state.flies
+    now_ns = demo().now_ns
+    figures = {"flows": 3, "uplink": {"queue": 7, "lost": 2}, "downlink": {"queue": "many"}}
+    state.take("netem", Figures(time_ns=state.newest_ns, figures=figures))
+    whole = demo().state.network
+    for direction in (UPLINK, DOWNLINK):
+        assert state.network.rates(direction, now_ns).sum() > 50
+        loads = state.network.loads(direction, now_ns)
+        assert np.array_equal(loads, whole.loads(direction, now_ns))
+        losses = state.network.losses(direction, now_ns)
+        assert 0.02 < np.nanmean(losses) < 0.3
+    assert state.network.waiting(UPLINK, now_ns)[-1] == 7
+    assert state.network.waiting(DOWNLINK, now_ns)[-1] == 0
+    assert 12.0 < state.time_s(now_ns) < 15.0
+    shown = words.status(state, 1, now_ns)
+    assert "no vehicle" not in shown
+    assert "every step" not in shown
+    assert "2 lost" in shown
+    assert ">3<" in shown
+    for plot in plots.of_link():
+        look = plots.Look(state, demo().state.vehicles[1].curves(plots.POINTS), now_ns)
+        assert {len(line.values(look)) for line in plot.lines} == {len(plot.grid(look))}

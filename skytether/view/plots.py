@@ -13,8 +13,9 @@ from skytether.figures.colours import css
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.view.network import DELAY_BIN_NS, DELAY_BINS, SPAN_S, Network
 from skytether.view.scene import FLIGHT_RGB
-from skytether.view.state import DELAY_BIN_NS, DELAY_BINS, SPAN_S, Curves, State
+from skytether.view.state import Curves, State
 
 POINTS = 400
 """Number of points of a line."""
@@ -123,6 +124,18 @@ def _compared(look: Look) -> Array:
     return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
 
 
+BY_DELAY = Plot(
+    "Packets by their delay [ms], %",
+    (
+        PlotLine("up", _share(UPLINK)),
+        PlotLine("down", _share(DOWNLINK), GREY, dash=(2, 3), once=True),
+    ),
+    grid=_bins_ms,
+    crop=True,
+)
+"""Plot of how many packets took how long."""
+
+
 def of_flight(axes: int) -> tuple[Plot, ...]:
     """Plots of a vehicle with so many axes."""
     return (
@@ -159,15 +172,7 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
             ),
             grid=_seconds,
         ),
-        Plot(
-            "Packets by their delay [ms], %",
-            (
-                PlotLine("up", _share(UPLINK)),
-                PlotLine("down", _share(DOWNLINK), GREY, dash=(2, 3), once=True),
-            ),
-            grid=_bins_ms,
-            crop=True,
-        ),
+        BY_DELAY,
     )
     solving = Plot(
         "Solving, against the deadline [ms]",
@@ -178,6 +183,28 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
         log=True,
     )
     return (*packets, solving) if solves else packets
+
+
+def of_link() -> tuple[Plot, ...]:
+    """Plots of both directions of a network, whatever it carries."""
+    return (
+        _ways("Packets in a second", Network.rates),
+        _ways("Payload in a second [kB]", Network.loads, 1e-3),
+        _ways("Lost [%]", Network.losses, 100.0),
+        _ways("Delay, mean [ms]", Network.delays_s, 1e3),
+        _ways("Packets under way", Network.waiting),
+        BY_DELAY,
+    )
+
+
+def _ways(title: str, values: Callable[[Network, int, int], Array], scale: float = 1.0) -> Plot:
+    """A plot of what a network has of each direction in each of the last seconds, scaled."""
+
+    def line(direction: int) -> Values:
+        return lambda look: scale * values(look.state.network, direction, look.now_ns)
+
+    down = PlotLine("down", line(DOWNLINK), GREY, once=True)
+    return Plot(title, (PlotLine("up", line(UPLINK)), down), grid=_seconds)
 
 
 class Plots:

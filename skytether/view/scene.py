@@ -303,6 +303,7 @@ class Scene:
         self._flights = [
             _Flight(scene, place, state.scenario, self.reach_m, title)
             for place, (state, title) in enumerate(zip(states, titles, strict=True))
+            if state.flies
         ]
 
     def camera(self, aspect: float) -> tuple[Array, Array]:
@@ -319,10 +320,14 @@ class Scene:
 
     def move(self, states: Sequence[State]) -> None:
         """Put vehicles where they are."""
-        for flight, state in zip(self._flights, states, strict=True):
+        for flight, state in zip(self._flights, filter(_flies, states), strict=True):
             flight.move(state)
 
     def draw(self, states: Sequence[State]) -> None:
         """Draw lines."""
-        for flight, state in zip(self._flights, states, strict=True):
+        for flight, state in zip(self._flights, filter(_flies, states), strict=True):
             flight.draw(state)
+
+
+def _flies(state: State) -> bool:
+    return state.flies

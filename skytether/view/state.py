@@ -30,27 +30,18 @@ from skytether.shared.telemetry.feed import (
     columns_of,
     table,
 )
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, compared
+from skytether.shared.telemetry.record import Reason, compared
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.wire.protocol import Mode
+from skytether.view.network import DIRECTIONS, SPAN_S, Network
 from skytether.view.rows import check_columns, check_values, planned
 
-SPAN_S = 60.0
-"""Time that is kept [s]."""
 SLOTS_MAX = 1200
 """Most steps that are kept of a vehicle; where a minute has more, every second or third is."""
 VEHICLES_MAX = 64
 """Most vehicles of a flight that are shown."""
 SAID_MAX = 50
 """Most events that are kept."""
-BIN_NS = 250 * MILLISECOND_NS
-"""Width of a bin of the network's ring [ns]."""
-BINS = int(SPAN_S * SECOND_NS) // BIN_NS
-"""Number of bins of the network's ring."""
-DELAY_BIN_NS = 20 * MILLISECOND_NS
-"""Width of a bin of a histogram of delays [ns]."""
-DELAY_BINS = 100
-"""Number of bins of a histogram of delays; the last takes all that is longer."""
 LED = "reference.points_m"
 """Key that changes many times a second where a target is led: not worth a sentence each time."""
 LOSS_S = 10.0
@@ -64,9 +55,6 @@ VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms")
 """Columns of a vehicle's ring that are NaN where nothing is known."""
 ROUNDING = 1e-6
 """Rounding tolerance of a time over the length of a slot."""
-
-DIRECTIONS = {UPLINK: "up", DOWNLINK: "down"}
-"""What the directions are called: up to the vehicle, down from it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,123 +287,18 @@ class VehicleTrack:
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class Traffic:
-    """One direction of the network in the last seconds."""
-
-    packets_per_s: float
-    bytes_per_s: float
-    loss: float
-    """Share of its packets that were lost; NaN of none."""
-    delay_ms_p50: float
-    """Median of the delay of those that were not [ms]; NaN of none."""
-    delay_ms_p99: float
+def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
+    """A group of figures within others; empty where there is none."""
+    for name in names:
+        found = figures.get(name)
+        figures = found if isinstance(found, dict) else {}
+    return figures
 
 
-class Network:
-    """The last minute of the network, in bins of a quarter of a second.
-
-    Args:
-        horizon_bytes: size from which on a packet up carries a horizon [B].
-    """
-
-    def __init__(self, horizon_bytes: int) -> None:
-        self._horizon_bytes = horizon_bytes
-        shape = (BINS, len(DIRECTIONS))
-        self._bin = np.full(BINS, -1, np.int64)
-        self._packets = np.zeros(shape, np.int64)
-        self._bytes = np.zeros(shape, np.int64)
-        self._lost = np.zeros(shape, np.int64)
-        self._delay_ns = np.zeros(shape, np.int64)
-        """Sum of the delays of those that were not lost [ns]."""
-        self._delays = np.zeros((*shape, DELAY_BINS), np.int64)
-        self._horizons = np.zeros((BINS, 2), np.int64)
-        """Packets up that carry a horizon, and their bytes."""
-        self.heard_ns: dict[int, int] = {}
-        """Time at which a packet of each direction last got through [ns]."""
-
-    def take(self, rows: Table, *, time_ns: int) -> None:
-        """Take rows of netem's part."""
-        number = time_ns // BIN_NS
-        at = number % BINS
-        if self._bin[at] != number:
-            if self._bin[at] > number:
-                return
-            self._bin[at] = number
-            for counts in (self._packets, self._bytes, self._lost, self._delay_ns, self._delays):
-                counts[at] = 0
-            self._horizons[at] = 0
-        direction, lost, size = rows["direction"], rows["lost"], rows["bytes"].astype(np.int64)
-        np.add.at(self._packets[at], direction, 1)
-        np.add.at(self._bytes[at], direction, size)
-        np.add.at(self._lost[at], direction, lost)
-        through = ~lost
-        there, delay_ns = direction[through], rows["delay_ns"][through]
-        np.add.at(self._delay_ns[at], there, delay_ns)
-        bins = np.minimum(delay_ns // DELAY_BIN_NS, DELAY_BINS - 1)
-        np.add.at(self._delays[at], (there, bins), 1)
-        planned = (direction == UPLINK) & (size >= self._horizon_bytes)
-        self._horizons[at] += (int(planned.sum()), int(size[planned].sum()))
-        for each in np.unique(there):
-            self.heard_ns[int(each)] = time_ns
-
-    def _since(self, seconds: float, now_ns: int) -> NDArray[np.bool_]:
-        """Which bins are of the last seconds, as far as they are over."""
-        last = now_ns // BIN_NS
-        recent: NDArray[np.bool_] = (self._bin < last) & (
-            self._bin >= last - round(seconds * SECOND_NS / BIN_NS)
-        )
-        return recent & (self._bin >= 0)
-
-    def traffic(self, direction: int, seconds: float, now_ns: int) -> Traffic:
-        """What went one way in the last seconds."""
-        recent = self._since(seconds, now_ns)
-        packets = int(self._packets[recent, direction].sum())
-        lost = int(self._lost[recent, direction].sum())
-        return Traffic(
-            packets_per_s=packets / seconds,
-            bytes_per_s=float(self._bytes[recent, direction].sum()) / seconds,
-            loss=lost / packets if packets else np.nan,
-            delay_ms_p50=self._quantile_ms(recent, direction, 0.5),
-            delay_ms_p99=self._quantile_ms(recent, direction, 0.99),
-        )
-
-    def _quantile_ms(self, recent: NDArray[np.bool_], direction: int, share: float) -> float:
-        counts = self._delays[recent, direction].sum(axis=0).cumsum()
-        if not len(counts) or not counts[-1]:
-            return np.nan
-        index = int(np.searchsorted(counts, share * counts[-1]))
-        return (index + 0.5) * DELAY_BIN_NS / MILLISECOND_NS
-
-    def histogram(self, direction: int, now_ns: int) -> Array:
-        """Number of packets of the last minute by their delay; shape (DELAY_BINS,)."""
-        recent = self._since(SPAN_S, now_ns)
-        return self._delays[recent, direction].sum(axis=0).astype(np.float64)
-
-    def rates(self, direction: int, now_ns: int) -> Array:
-        """Packets in each of the last SPAN_S seconds, oldest first; shape (SPAN_S,)."""
-        return self._by_second(self._packets[:, direction], now_ns)
-
-    def delays_s(self, direction: int, now_ns: int) -> Array:
-        """Mean delay in each of the last SPAN_S seconds [s], NaN of none; shape (SPAN_S,)."""
-        through = self._packets[:, direction] - self._lost[:, direction]
-        total_ns = self._by_second(self._delay_ns[:, direction], now_ns)
-        count = self._by_second(through, now_ns)
-        return np.where(count > 0, total_ns / np.maximum(count, 1), np.nan) / SECOND_NS
-
-    def _by_second(self, counts: NDArray[np.int64], now_ns: int) -> Array:
-        """Sums of counts by the seconds that they are old, oldest first."""
-        recent = self._since(SPAN_S, now_ns)
-        per_second = SECOND_NS // BIN_NS
-        old = (now_ns // BIN_NS - 1 - self._bin[recent]) // per_second
-        sums = np.zeros(int(SPAN_S))
-        np.add.at(sums, len(sums) - 1 - old, counts[recent])
-        return sums
-
-    def horizon_bytes(self, now_ns: int) -> float:
-        """Mean size of the last minute's packets that carry a horizon [B]; NaN of none."""
-        count, size = self._horizons[self._since(SPAN_S, now_ns)].sum(axis=0)
-        return float(size / count) if count else np.nan
+def told(figures: dict[str, Any], *names: str) -> float:
+    """A figure within groups of figures; NaN where there is none."""
+    value = group(figures, *names[:-1]).get(names[-1])
+    return float(value) if isinstance(value, int | float) else np.nan
 
 
 @dataclass(slots=True)
@@ -481,6 +364,9 @@ class State:
             self._said(frame.event, frame.time_ns)
         elif isinstance(frame, Figures):
             known.figures = frame.figures
+            if process == "netem":
+                waiting = [told(frame.figures, way, "queue") for way in ("uplink", "downlink")]
+                self.network.wait(np.nan_to_num(waiting), time_ns=frame.time_ns)
 
     def lose(self, process: str) -> None:
         """Note that a process is not heard any more."""
@@ -554,9 +440,17 @@ class State:
 
     # -- what is shown -----------------------------------------------------------------------
 
+    @property
+    def flies(self) -> bool:
+        """Whether a vehicle or a server is known; netem may carry anything."""
+        return any(name != "netem" for name in self._processes)
+
     def time_s(self, time_ns: int) -> float:
-        """Time of flight [s] at a time [ns]; 0 before it has begun."""
-        return 0.0 if self.begin_ns is None else (time_ns - self.begin_ns) / SECOND_NS
+        """Time of flight [s] at a time [ns], 0 before it has begun; of netem alone that it runs."""
+        begin_ns = self.begin_ns
+        if begin_ns is None and not self.flies:
+            begin_ns = min((each.opened.time_ns for each in self._processes.values()), default=None)
+        return 0.0 if begin_ns is None else (time_ns - begin_ns) / SECOND_NS
 
     @property
     def title(self) -> str:

@@ -1,15 +1,13 @@
 """What a page says of a flight, as HTML."""
 
-import math
 from collections.abc import Sequence
 from html import escape
-from typing import Any
 
 import numpy as np
 
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
-from skytether.view.state import LOSS_S, State, Word
+from skytether.view.state import LOSS_S, State, Word, group, told
 
 CSS = {
     "grey": "var(--mantine-color-gray-6)",
@@ -24,6 +22,9 @@ NEWEST = 3
 """Number of events that stand beside the state of a vehicle."""
 SAID_SHOWN = 50
 """Most events that are shown."""
+
+FATES = ("packets", "lost", "dropped", "reordered", "duplicated", "corrupted")
+"""What netem counts of a direction, and what is shown of that."""
 
 FLOWN_S = "data-flown-s"
 """Attribute that tells programs the time of flight [s]."""
@@ -50,6 +51,8 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     """What a vehicle does and how its link is, in words and numbers."""
     if not state.name:
         return f'<div style="{_BODY}">{escape(title)} Nothing has been heard of a flight yet.</div>'
+    if not state.flies:
+        return _carried(state, now_ns, title)
     track = state.vehicles.get(vehicle)
     head = f"<b>{escape(title or state.title)}</b>"
     if track is None:
@@ -66,21 +69,46 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     if len(solved):
         p99 = np.quantile(solved, 0.99)
         rows.append(("solving, p99", f"{p99:.2f} of {deadline_ms:g} ms"))
+    return (
+        f'<div style="{_BODY}" class="skytether-status" {FLOWN_S}="{track.time_s:.0f}">{head}'
+        f"<div>{badge(track.does)}</div>"
+        f'<div style="margin:0.3em 0">{badge(_link(state, vehicle, now_ns))}</div>'
+        f"{_gone(state)}{_table(rows)}"
+        f'<div style="{_DIM};margin-top:0.3em">{_newest(state)}</div></div>'
+    )
+
+
+def _carried(state: State, now_ns: int, title: str) -> str:
+    """What netem carries for programs of others, in numbers."""
+    counted = state.figures("netem")
+    rows = [("clients", number(told(counted, "flows"), ".0f")), *_network(state, now_ns)]
+    for way, name in (("uplink", "up"), ("downlink", "down")):
+        counts = (f"{number(told(counted, way, each), '.0f')} {each}" for each in FATES)
+        rows.append((f"{name}, so far", ", ".join(counts)))
+        queue, p99_ms = told(counted, way, "queue"), told(counted, way, "queueing_ms_p99")
+        queued = f"{number(p99_ms, '.0f')} ms (p99) at the finite rate"
+        rows.append((f"{name}, under way", f"{number(queue, '.0f')} packets; {queued}"))
+    return (
+        f'<div style="{_BODY}" class="skytether-status" {FLOWN_S}="{state.time_s(now_ns):.0f}">'
+        f"<b>{escape(title or 'netem')}</b>{_gone(state)}{_table(rows)}"
+        f'<div style="{_DIM};margin-top:0.3em">{_newest(state)}</div></div>'
+    )
+
+
+def _table(rows: Sequence[tuple[str, str]]) -> str:
+    """Names and values, a line each."""
     lines = "".join(
         f'<tr><td style="{_DIM};padding-right:0.8em;vertical-align:top">{escape(name)}</td>'
         f"<td>{escape(value)}</td></tr>"
         for name, value in rows
     )
-    gone = ""
-    if state.lost:
-        gone = f'<div style="color:{CSS["red"]}">no feed of {", ".join(state.lost)}</div>'
-    return (
-        f'<div style="{_BODY}" class="skytether-status" {FLOWN_S}="{track.time_s:.0f}">{head}'
-        f"<div>{badge(track.does)}</div>"
-        f'<div style="margin:0.3em 0">{badge(_link(state, vehicle, now_ns))}</div>{gone}'
-        f'<table style="border-spacing:0">{lines}</table>'
-        f'<div style="{_DIM};margin-top:0.3em">{_newest(state)}</div></div>'
-    )
+    return f'<table style="border-spacing:0">{lines}</table>'
+
+
+def _gone(state: State) -> str:
+    """Processes that are not heard any more; empty where there is none."""
+    names = ", ".join(state.lost)
+    return f'<div style="color:{CSS["red"]}">no feed of {names}</div>' if names else ""
 
 
 def _newest(state: State) -> str:
@@ -98,32 +126,18 @@ def _link(state: State, vehicle: int, now_ns: int) -> Word:
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
     """Rows of what the vehicle's autopilot says of itself; none without one."""
-    told = _group(_group(state.figures("client"), "by_vehicle", str(vehicle)), "autopilot")
-    if not told:
+    says = group(state.figures("client"), "by_vehicle", str(vehicle), "autopilot")
+    if not says:
         return []
-    armed = "armed" if told.get("armed") else "disarmed"
-    charge, volts = 100.0 * _told(told, "battery"), _told(told, "voltage_v")
-    place = _group(told, "home")
-    home = (number(_told(place, f"{each}_deg"), ".6f", "°") for each in ("latitude", "longitude"))
+    armed = "armed" if says.get("armed") else "disarmed"
+    charge, volts = 100.0 * told(says, "battery"), told(says, "voltage_v")
+    places = (told(says, "home", f"{each}_deg") for each in ("latitude", "longitude"))
+    home = (number(place, ".6f", "°") for place in places)
     return [
-        ("autopilot", f"{told.get('mode', '–')}, {armed}"),
+        ("autopilot", f"{says.get('mode', '–')}, {armed}"),
         ("battery", f"{number(charge, '.0f', ' %')}, {number(volts, '.1f', ' V')}"),
         ("home", ", ".join(home)),
     ]
-
-
-def _group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
-    """A group of figures within others; empty where there is none."""
-    for name in names:
-        found = figures.get(name)
-        figures = found if isinstance(found, dict) else {}
-    return figures
-
-
-def _told(figures: dict[str, Any], name: str) -> float:
-    """A figure; NaN where there is none."""
-    value = figures.get(name)
-    return float(value) if isinstance(value, int | float) else math.nan
 
 
 def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
@@ -137,7 +151,7 @@ def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
                 f"{traffic.packets_per_s:.1f} packets/s, {traffic.bytes_per_s / 1e3:.2f} kB/s",
             )
         )
-        if direction == UPLINK:
+        if direction == UPLINK and state.flies:
             size = state.network.horizon_bytes(now_ns)
             if not np.isnan(size):
                 rate = state.every_step

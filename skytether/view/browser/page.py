@@ -102,7 +102,7 @@ class Page:
         states = [flight.state for flight in self._flights]
         if not all(state.name for state in states):
             return
-        shown = tuple(state.flights for state in states)
+        shown = tuple((state.flights, state.flies) for state in states)
         if self._scene is None or self._shown != shown:
             self._begin(shown)
         assert self._scene is not None

@@ -24,9 +24,9 @@ from skytether.view.controls import (
     texts,
     triggers,
 )
-from skytether.view.plots import POINTS, Look, Plots, of_flight, of_network
+from skytether.view.plots import POINTS, Look, Plots, of_flight, of_link, of_network
 from skytether.view.scene import GROUND_RGB, WIDE, Scene, in_space
-from skytether.view.state import LED
+from skytether.view.state import LED, VehicleTrack
 
 HELD_S = 1.5
 """Time for which a slider that was moved is left where it is [s]."""
@@ -35,6 +35,8 @@ FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
 )
+WIDE_PLOTS = 760
+"""Width of plots where no flight is shown beside them [pixels]."""
 NARROW = 800
 """Width up to which panels lie over the scene, and not beside it [pixels]."""
 MOVED_M = 0.05
@@ -102,15 +104,21 @@ class Panel:
         axes = max(each.model.axes for each in scenarios)
         solves = any(each.control.scheme != "trajectory" for each in scenarios)
         panel = gui.add_panel()
-        with panel.add_tab("Flight"):
-            self._plots = [Plots(gui, titles, of_flight(axes))]
+        self._plots = []
+        flies = any(each.state.flies for each in flights)
+        self._nobody = None if flies else VehicleTrack(0, scenarios[0])
+        """Stands for a vehicle where netem is alone."""
+        if flies:
+            with panel.add_tab("Flight"):
+                self._plots.append(Plots(gui, titles, of_flight(axes)))
         with panel.add_tab("Network"):
-            self._plots.append(Plots(gui, titles, of_network(solves=solves)))
+            of_air = of_network(solves=solves) if flies else of_link()
+            self._plots.append(Plots(gui, titles, of_air))
         with panel.add_tab("Events"):
             self._said = gui.add_html("")
         if client.camera.image_width > NARROW:
             panel.dock_left()
-        panel.set_width(400)
+        panel.set_width(400 if flies else WIDE_PLOTS)
         self._scene = scene
         self._aimed = scene.camera(WIDE)[0]
         """Where the camera was put."""
@@ -161,7 +169,7 @@ class Panel:
         for status, flight in zip(self._status, self._flights, strict=True):
             status.content = words.status(flight.state, vehicle, now_ns, flight.title)
         self._said.content = words.said([(each.title, each.state) for each in self._flights])
-        tracks = [each.state.vehicles.get(vehicle) for each in self._flights]
+        tracks = [each.state.vehicles.get(vehicle, self._nobody) for each in self._flights]
         known = [track for track in tracks if track]
         if len(known) == len(tracks):
             end_s = max(track.time_s for track in known)
@@ -217,13 +225,16 @@ class _Slider:
 class _Network:
     """Both directions of the network as texts, which this browser can change together."""
 
-    def __init__(self, gui: viser.GuiApi, ask: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, ask: Callable[[dict[str, Any]], None], *, flies: bool
+    ) -> None:
+        to = ("To the vehicle" if flies else "To clients", "To the server")
         self._known: dict[str, str] = {}
-        self._folder = gui.add_folder("Network", expand_by_default=False, visible=False)
+        self._folder = gui.add_folder("Network", expand_by_default=not flies, visible=False)
         with self._folder:
             self._texts = {
                 way: gui.add_text(label, "", hint=IMPAIRMENTS)
-                for way, label in zip(WAYS, ("To the vehicle", "To the server"), strict=True)
+                for way, label in zip(WAYS, to, strict=True)
             }
             apply = gui.add_button("Change the network")
 
@@ -249,21 +260,16 @@ class Controls:
         self._flights = [each for each in flights if each.operator]
         gui = client.gui
         scenario = self._flights[0].state.scenario
+        flies = any(each.state.flies for each in self._flights)
         self._cut = gui.add_button("Cut the link", color="red", icon=viser.Icon.PLUG_CONNECTED_X)
         self._heal = gui.add_button("Heal it", color="green", icon=viser.Icon.PLUG_CONNECTED)
         self._answer = gui.add_html("")
         self._sliders = [_Slider(gui, knob, self._ask) for knob in knobs(scenario.model.axes)]
-        self._network = _Network(gui, partial(self._all, "netem"))
-        self._trigger = gui.add_dropdown(
-            "Trigger",
-            triggers(scenario.control.scheme, scenario.control.trigger),
-            initial_value=scenario.control.trigger,
-            hint="Rule for sending a plan",
-        )
-        self._thresholds = [_Slider(gui, knob, self._ask) for knob in THRESHOLDS]
-        self._armed = gui.add_checkbox("Armed", True, hint="Whether plans are flown at all")
-        gui.add_text("Scheme", scenario.control.scheme, disabled=True, hint=FIXED)
-        self._lead = _Lead(client, self._flights) if scenario.reference.shape == "live" else None
+        self._network = _Network(gui, partial(self._all, "netem"), flies=flies)
+        self._thresholds: list[_Slider] = []
+        self._lead: _Lead | None = None
+        if flies:
+            self._let_fly()
 
         @self._cut.on_click
         def _(_: Any) -> None:
@@ -274,6 +280,21 @@ class Controls:
         def _(_: Any) -> None:
             for flight in self._flights:
                 flight.heal()
+
+    def _let_fly(self) -> None:
+        """Add what only a flight has."""
+        gui, scenario = self._client.gui, self._flights[0].state.scenario
+        self._trigger = gui.add_dropdown(
+            "Trigger",
+            triggers(scenario.control.scheme, scenario.control.trigger),
+            initial_value=scenario.control.trigger,
+            hint="Rule for sending a plan",
+        )
+        self._thresholds = [_Slider(gui, knob, self._ask) for knob in THRESHOLDS]
+        self._armed = gui.add_checkbox("Armed", True, hint="Whether plans are flown at all")
+        gui.add_text("Scheme", scenario.control.scheme, disabled=True, hint=FIXED)
+        if scenario.reference.shape == "live":
+            self._lead = _Lead(self._client, self._flights)
 
         @self._trigger.on_update
         async def _(event: Any) -> None:
@@ -298,6 +319,21 @@ class Controls:
     def show(self) -> None:
         """Show what flies, and what was answered."""
         flight = self._flights[0]
+        if self._flights[0].state.flies:
+            self._show_flight(flight)
+        netem = flight.values.get("netem", {})
+        self._network.show(netem)
+        for slider in self._sliders:
+            values = flight.values.get(slider.knob.process, {})
+            written = slider.knob.process == "netem" and is_written(netem)
+            slider.show(values, visible=not written)
+        self._cut.disabled = flight.is_cut or "netem" not in flight.values
+        self._heal.disabled = not flight.is_cut
+        self._answer.content = "".join(
+            words.answer(flight.answer, refused=flight.refused) for flight in self._flights
+        )
+
+    def _show_flight(self, flight: PageFlight) -> None:
         server = flight.values.get("server", {})
         trigger = server.get("control.trigger", self._trigger.value)
         if trigger != self._trigger.value:
@@ -305,22 +341,11 @@ class Controls:
             self._trigger.options = triggers(scheme, trigger)
             assign(self._trigger, trigger)
         keys = compared(trigger)
-        netem = flight.values.get("netem", {})
-        self._network.show(netem)
-        for slider in self._sliders:
-            values = flight.values.get(slider.knob.process, {})
-            written = slider.knob.process == "netem" and is_written(netem)
-            slider.show(values, visible=not written)
         for slider in self._thresholds:
             slider.show(server, visible=slider.knob.key in keys)
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
         if armed != self._armed.value:
             assign(self._armed, armed)
-        self._cut.disabled = flight.is_cut or "netem" not in flight.values
-        self._heal.disabled = not flight.is_cut
-        self._answer.content = "".join(
-            words.answer(flight.answer, refused=flight.refused) for flight in self._flights
-        )
         if self._lead:
             self._lead.show()
 
