@@ -1,0 +1,289 @@
+"""`skytether probe`: measure a real path, and fly over what was measured."""
+
+import secrets
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+
+from skytether.client.link import ClientLink, PlainLink
+from skytether.probe.listener import Listener
+from skytether.probe.outcome import Outcome, WayTold, outcome, rows, trace
+from skytether.probe.prober import BYTES_MIN, PROBES_MAX, Prober
+from skytether.probe.wire import NONCE_BYTES
+from skytether.server.gate import Gate, PlainGate
+from skytether.shared.base import files
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import Counted, Event, Listening, Plaintext, address_text
+from skytether.shared.telemetry.record import PACKET_COLUMNS
+from skytether.shared.wire import keys
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
+from skytether.shell import command, driver
+from skytether.shell.command import CONFIGURATION, INTERRUPTED, CommandError
+from skytether.shell.log import Log
+from skytether.shell.options import Argument, read
+from skytether.shell.udp import AddressError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+SECONDS_MAX, RATE_MAX = 86_400.0, 1000.0
+"""Longest measurement [s], and largest rate [1/s]."""
+SECRET_BYTES = 32
+
+
+@dataclass(frozen=True)
+class ProbeOptions:
+    """Options of `skytether probe`."""
+
+    target: Annotated[str, Argument(metavar="HOST:PORT", positional=True)] = ""
+    """The other end, where `skytether probe --listen` runs; an IPv6 host in brackets."""
+    listen: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
+    """Be the other end: answer probes at this address until Ctrl-C."""
+    seconds: float = 60.0
+    """Length of the measurement [s]."""
+    rate: float = 20.0
+    """Packets a second, each way."""
+    bytes: int = 400
+    """UDP payload of each packet [B]."""
+    keys: Path | None = None
+    """File with the vehicle's key, or those of all vehicles where it listens, made by `skytether
+    keygen`: packets are sealed. Without it they are plaintext, which is refused beyond this
+    machine."""
+    number: Annotated[int, Argument(name="id")] = 1
+    """Number of the vehicle whose key is used."""
+    insecure: bool = False
+    """Do without keys even beyond this machine: anybody on the way can alter what is measured."""
+    out: Path = Path("probed")
+    """Folder for the traces, uplink.csv and downlink.csv."""
+    json: Path | None = None
+    """File for all figures."""
+    figure: Path | None = None
+    """Picture of the delays, .png, .svg or .pdf."""
+    record: Path | None = None
+    """File for a row a packet, as netem records them."""
+
+
+def probe(argv: Sequence[str]) -> None:
+    """Measure a path over UDP: delays each way, losses, bursts, order, rate, and what flies like it.
+
+    One end listens, the other sends numbered packets, which are answered, and tells what came of
+    them. Run it where the vehicle will be, and the listener where the server will be: then packets
+    that it sends go by the downlink, and answers by the uplink. Ctrl-C ends it, and what was
+    measured is told.
+    """
+    options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
+    if bool(options.target) == (options.listen is not None):
+        given = "both" if options.target else "neither"
+        said = f"got {given}, expected either HOST:PORT to measure the way to, or --listen HOST:PORT"
+        raise CommandError(said, CONFIGURATION)
+    if options.listen is not None:
+        _listen(options, command.address("--listen", options.listen))
+    else:
+        _probe(options, command.address("HOST:PORT", options.target))
+
+
+# -- the far end ----------------------------------------------------------------------------------
+
+
+def _listen(options: ProbeOptions, bind: Address) -> None:
+    """Answer probes until SIGINT or SIGTERM."""
+    gate: Gate = PlainGate()
+    if options.keys:
+        from skytether.server.secure import SecureGate
+
+        gate = SecureGate(keys.load(options.keys), entropy=secrets.token_bytes)
+    command.check_sealed(bind, secure=gate.secure or options.insecure)
+    listener = Listener(gate, secrets.token_bytes(SECRET_BYTES))
+    try:
+        shell = driver.Shell(listener, bind)
+    except AddressError as error:
+        raise CommandError(str(error)) from None
+    with closing(Log("probe", "text", lambda _: None)) as out:
+
+        def start() -> None:
+            host, port = shell.address
+            out.say(Listening(host=host, port=port, waiting_for="probes"))
+            if not gate.secure:
+                out.say(Plaintext(local=shell.is_local))
+
+        def told() -> Counted:
+            return Counted(figures=listener.figures() | {"kernel_drops": shell.kernel_drops()})
+
+        driver.run(
+            [shell],
+            on_start=start,
+            on_event=out.hear,
+            on_usr1=lambda: out.say(told()),
+            on_second=out.each_second,
+        )
+        out.say(told())
+
+
+# -- the near end ---------------------------------------------------------------------------------
+
+
+def _probe(options: ProbeOptions, listener: Address) -> None:
+    """Measure, and tell what came of it."""
+    _check(options)
+    link: ClientLink = PlainLink()
+    if options.keys:
+        from skytether.client.secure import SecureLink
+
+        key = keys.load(options.keys).of(options.number)
+        link = SecureLink(key, entropy=secrets.token_bytes)
+    prober = Prober(
+        link,
+        listener,
+        secrets.token_bytes(NONCE_BYTES),
+        probes=max(1, round(options.seconds * options.rate)),
+        period_ns=round(SECOND_NS / options.rate),
+        size=options.bytes,
+    )
+    try:
+        shell = driver.Shell(prober, None, [listener])
+    except AddressError as error:
+        raise CommandError(str(error)) from None
+    command.check_sealed(listener, secure=link.secure or options.insecure)
+    with command.progress(f"probing {options.target}", options.seconds) as bar:
+        driver.run([shell], on_event=_say, on_second=lambda: bar(prober.probed_s))
+    if prober.refused:
+        raise CommandError(f"{options.target} has no room for another measurement")
+    if prober.failed:
+        raise CommandError(f"no answer from {options.target}: is `skytether probe --listen` there?")
+    measured = prober.measured()
+    try:
+        found = outcome(measured, options.target, secure=link.secure)
+    except ValueError as error:
+        raise CommandError(f"nothing can be told: {error}") from None
+    _write(options, found)
+    if options.record:
+        with command.recorded(options.record, PACKET_COLUMNS) as recording:
+            for row in rows(measured, found.clocks).tolist():
+                recording.recorder.append_row(*row)
+    _tell(options, found)
+    if not prober.finished:
+        seconds = found.told.seconds
+        raise CommandError(f"ended early, after {seconds:.3g} s: all this is of these", INTERRUPTED)
+
+
+def _say(event: Event) -> None:
+    print(event, file=sys.stderr)
+
+
+def _check(options: ProbeOptions) -> None:
+    """Refuse what cannot be measured, and files that cannot be written.
+
+    Raises:
+        CommandError: with the flag, what it was given and what was expected.
+    """
+    for flag, given, least, most in (
+        ("--seconds", options.seconds, 1.0, SECONDS_MAX),
+        ("--rate", options.rate, 0.1, RATE_MAX),
+        ("--bytes", options.bytes, BYTES_MIN, PAYLOAD_BYTES_MAX),
+        ("--id", options.number, 0, 65_535),
+    ):
+        if not least <= given <= most:
+            raise CommandError(f"{flag}: got {given:g}, expected {least:g} to {most:g}", 2)
+    probes = options.seconds * options.rate
+    if probes > PROBES_MAX:
+        said = f"got {probes:.0f} packets, expected at most {PROBES_MAX}"
+        raise CommandError(f"--seconds and --rate: {said}", CONFIGURATION)
+    for flag in command.OUTPUTS:
+        command.check_output(f"--{flag}", getattr(options, flag))
+    if options.figure:
+        from skytether.figures import flights
+
+        flights.check(options.figure)
+    with _writing(options.out):
+        options.out.mkdir(parents=True, exist_ok=True)
+
+
+def _write(options: ProbeOptions, found: Outcome) -> None:
+    """Write traces, figures and picture.
+
+    Raises:
+        CommandError: a file cannot be written.
+    """
+    for name, delays in found.delays.items():
+        with _writing(file := options.out / f"{name}.csv"):
+            files.write(file, trace(delays).encode())
+    if options.json:
+        command.write(options.json, msgspec.json.encode(found.told))
+    if options.figure:
+        from skytether.figures import flights, probing
+
+        with _writing(options.figure):
+            flights.save(probing.drawn(found), options.figure, dpi=130)
+
+
+def _tell(options: ProbeOptions, found: Outcome) -> None:
+    """Print tables of both directions, what is in doubt, and what to fly."""
+    told = found.told
+    ways = {"downlink": told.downlink, "uplink": told.uplink}
+    command.show(_table("measured", ways, _figures))
+    for name, way in ways.items():
+        models = [*way.delay_models, *way.loss_models]
+        if models:
+            shown = ", ".join(f"{model.text} {model.bic:.0f}" for model in models)
+            print(f"{name}, models and their BIC (the smaller, the better): {shown}")
+    print(
+        f"Clocks: the other end's runs {told.drift_ppm:+.1f} ± {told.drift_doubt_ppm:.1f} ppm "
+        f"faster. The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms and "
+        f"{1e3 * told.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the least "
+        f"is taken for each way, so one-way delays may be wrong by up to "
+        f"{1e3 * told.offset_doubt_s:.2f} ms, one way too long and the other too short."
+    )
+    if told.unreported:
+        print(f"{told.unreported} arrivals were forgotten by the other end, and are left out.")
+    print("To fly over the models, or over what was measured:")
+    texts = [f'--network.{name} "{way.text}"' for name, way in ways.items() if way.text]
+    if texts:
+        print(f"skytether fly demo --virtual {' '.join(texts)}")
+    traces = [f'--network.{name} "trace({options.out / name}.csv)"' for name in ways]
+    print(f"skytether fly demo --virtual {' '.join(traces)}")
+
+
+def _figures(way: WayTold) -> dict[str, str]:
+    """Figures of a direction, as they are shown."""
+    found = {
+        "packets sent, arrived": f"{way.sent}, {way.came}",
+        "lost [%], 95 % interval": f"{100 * way.loss:.3g} ({100 * way.loss_low:.3g} to "
+        f"{100 * way.loss_high:.3g})",
+        "bursts of lost packets, mean length": f"{way.bursts}, {way.burst_packets:.3g}",
+        "arrived again": f"{way.copies}",
+        "reordered [%]": f"{100 * way.reordered:.3g}",
+        "delay, mean [ms]": f"{1e3 * way.mean_s:.2f}",
+        "standard deviation [ms]": f"{1e3 * way.sd_s:.2f}",
+    }
+    for share, delay_s in way.quantiles_s.items():
+        name = {"0": "least", "1": "largest"}.get(share, f"{100 * float(share):g} %")
+        found[f"delay, {name} [ms]"] = f"{1e3 * delay_s:.2f}"
+    found["correlation of delays lasts [s]"] = f"{way.correlation_s:.3g}"
+    rate = "none seen"
+    if way.rate_bytes_per_s:
+        rate = f"{way.rate_bytes_per_s:.4g} ({way.rate_low:.4g} to {way.rate_high:.4g})"
+    found["rate [B/s], 95 % interval"] = rate
+    found["last of a train waits [ms]"] = f"{1e3 * way.train_wait_s:.2f}"
+    return found
+
+
+def _table(
+    title: str, ways: dict[str, WayTold], figures: Callable[[WayTold], dict[str, str]]
+) -> "Table":
+    """Figures of both directions side by side."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left")
+    for each in ("", *ways):
+        table.add_column(Text(each))
+    shown = [figures(way) for way in ways.values()]
+    for name in shown[0]:
+        table.add_row(Text(name), *(Text(each[name]) for each in shown))
+    return table

@@ -1,0 +1,56 @@
+"""The picture of a measured path: delays over time, and how they are distributed."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from skytether.probe.outcome import Outcome
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.scenario.air.delays import Delay
+from skytether.shared.scenario.air.path import path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DOTS_MAX = 20_000
+"""Largest number of packets that are drawn one by one."""
+
+
+def drawn(outcome: Outcome) -> "Figure":
+    """Delays of both directions over time, lost packets marked, and beside them their distribution
+    with that of the best model.
+    """
+    from matplotlib.figure import Figure  # takes half a second to import
+
+    figure = Figure(figsize=(10.0, 5.6), layout="constrained")
+    grid = figure.subplots(2, 2, width_ratios=(5, 3))
+    for (name, delays), (over_time, shares) in zip(outcome.delays.items(), grid, strict=True):
+        told = getattr(outcome.told, name)
+        every = max(1, len(delays.time_s) // DOTS_MAX)
+        time_s, delay_ms = delays.time_s[::every], 1e3 * delays.delay_s[::every]
+        came = np.isfinite(delay_ms)
+        over_time.plot(time_s[came], delay_ms[came], ".", markersize=2, color="tab:blue")
+        lost_s = time_s[~came]
+        over_time.plot(lost_s, np.zeros(len(lost_s)), "|", markersize=8, color="tab:red")
+        over_time.set_title(
+            f"{name}: {told.sent} packets, {told.loss:.2%} lost (red)", fontsize=10, loc="left"
+        )
+        over_time.set_ylabel("delay [ms]")
+        sorted_ms = np.sort(1e3 * delays.delay_s[delays.came])
+        at = (np.arange(len(sorted_ms)) + 0.5) / len(sorted_ms)
+        shares.step(sorted_ms, at, color="tab:blue", label="measured", where="post")
+        if told.delay_models:
+            _, model = path(told.delay_models[0].text).impairments[0]
+            assert isinstance(model, Delay)
+            passes_s = (outcome.told.bytes + 28) / told.rate_bytes_per_s if told.rate_bytes_per_s else 0.0
+            grid_of = np.linspace(0.001, 0.999, 500)
+            model_ms = [1e3 * (model.quantile_ns(each) / SECOND_NS + passes_s) for each in grid_of]
+            label = told.delay_models[0].text.partition("(")[0]
+            shares.plot(model_ms, grid_of, "--", color="tab:orange", label=label)
+        shares.set_title("share of packets", fontsize=10, loc="left")
+        shares.legend(loc="lower right", fontsize=8)
+        for each in (over_time, shares):
+            each.grid(alpha=0.3)
+    grid[1, 0].set_xlabel("time [s]")
+    grid[1, 1].set_xlabel("delay [ms]")
+    return figure

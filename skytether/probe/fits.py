@@ -1,0 +1,232 @@
+"""Models of delay and loss fitted to what was measured: those of `skytether impairments`.
+
+Each is fitted by maximum likelihood. They are compared by BIC, k ln n - 2 ln L with k parameters,
+where n packets that are correlated count as fewer, see `analysis.effective`. Likelihoods are of
+densities, with times no finer than RESOLUTION_S: the paper's lattice of slots is taken with a
+normal error of at least that, and a delay stays that far from the bound of its law. Delays that
+hardly vary are called constant.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from math import exp, lgamma, log, pi, sqrt
+
+import numpy as np
+
+from skytether.probe.analysis import Bools, highest
+from skytether.shared.law.model import Array
+
+RESOLUTION_S = 50e-6
+"""Finest time that is told apart [s]."""
+CONSTANT_S = 0.5e-3
+"""Largest standard deviation of a delay that is called constant [s]."""
+LEASTS = 60
+"""Number of least delays that are tried for a law that has one."""
+SLOTS = 4000
+"""Number of slots that are tried for the paper's law."""
+PAIRS_MIN = 20
+"""Smallest number of packets that anything is fitted to."""
+BURST_MIN, BURST_MAX_S = 0.1, 3600.0
+"""Shortest time that a bad channel is redrawn in, in mean times between packets, and longest [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A model that was fitted."""
+
+    name: str
+    """Name of the impairment."""
+    numbers: tuple[float, ...]
+    """Its arguments."""
+    bic: float
+    """Bayesian information criterion: the smaller, the better."""
+
+    def text(self, correlation_s: float = 0.0) -> str:
+        """The impairment as a scenario writes it."""
+        shown = [f"{number:.5g}" for number in self.numbers]
+        if correlation_s:
+            shown.append(f"correlation_s={correlation_s:.3g}")
+        return f"{self.name}({', '.join(shown)})"
+
+
+# -- delays -------------------------------------------------------------------------------------
+
+
+def fit_delays(delay_s: Array, independent: float) -> list[Fit]:
+    """Models of delays, the best first.
+
+    Args:
+        delay_s: delays of the packets that came [s]; shape (n,).
+        independent: number of independent packets that they count as.
+    """
+    if len(delay_s) < PAIRS_MIN:
+        return []
+    if float(np.std(delay_s)) <= CONSTANT_S:
+        return [Fit("constant", (float(np.mean(delay_s)),), 0.0)]
+    found = [_uniform(delay_s), _normal(delay_s), _paper(delay_s)]
+    found += [_with_least(delay_s, "gamma"), _with_least(delay_s, "lognormal")]
+    weight = min(1.0, independent / len(delay_s))
+    fits = [
+        Fit(name, numbers, parameters * log(max(independent, 2.0)) - 2.0 * weight * likelihood)
+        for name, numbers, parameters, likelihood in filter(None, found)
+    ]
+    return sorted(fits, key=lambda fit: fit.bic)
+
+
+Found = tuple[str, tuple[float, ...], int, float]
+"""Name of a law, its arguments, number of parameters, and logarithm of its likelihood."""
+
+
+def _normal_likelihood(left: Array, sd: float) -> float:
+    return -len(left) * log(sd * sqrt(2.0 * pi)) - float(left @ left) / (2.0 * sd * sd)
+
+
+def _uniform(delay_s: Array) -> Found:
+    low, high = float(delay_s.min()), float(delay_s.max())
+    width = max(high - low, RESOLUTION_S)
+    return "uniform", (low, high), 2, -len(delay_s) * log(width)
+
+
+def _normal(delay_s: Array) -> Found:
+    mean, sd = float(np.mean(delay_s)), max(float(np.std(delay_s)), RESOLUTION_S)
+    return "normal", (mean, sd), 2, _normal_likelihood(delay_s - mean, sd)
+
+
+def _with_least(delay_s: Array, name: str) -> Found:
+    """Gamma or lognormal law beyond a least delay: the best least delay, by trial."""
+    first, span = float(delay_s.min()), float(np.mean(delay_s) - delay_s.min())
+    law = _gamma if name == "gamma" else _lognormal
+    below = np.minimum(np.geomspace(RESOLUTION_S, 30.0 * span, LEASTS), first)
+    tried = [law(delay_s, first - each)[0] for each in below.tolist()]
+    best = int(np.argmax(tried))
+    low, high = below[max(best - 1, 0)], below[min(best + 1, LEASTS - 1)]
+    at = highest(lambda each: law(delay_s, first - each)[0], float(low), float(high), 25)
+    likelihood, mean, sd = law(delay_s, first - at)
+    return name, (max(first - at, 0.0), mean, sd), 3, likelihood
+
+
+def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
+    """Likelihood, mean and standard deviation of the best lognormal law beyond a least delay."""
+    over = np.maximum(delay_s - least_s, RESOLUTION_S)
+    logs = np.log(over)
+    mu, sigma = float(np.mean(logs)), max(float(np.std(logs)), 1e-6)
+    mean = exp(min(mu + sigma * sigma / 2.0, 50.0))
+    sd = mean * sqrt(exp(min(sigma * sigma, 50.0)) - 1.0)
+    return _normal_likelihood(logs - mu, sigma) - float(logs.sum()), least_s + mean, sd
+
+
+def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
+    """Likelihood, mean and standard deviation of the best gamma law beyond a least delay."""
+    over = np.maximum(delay_s - least_s, RESOLUTION_S)
+    count, mean, mean_log = len(over), float(np.mean(over)), float(np.mean(np.log(over)))
+
+    def likelihood(log_shape: float) -> float:
+        shape = exp(log_shape)
+        rate = shape / mean
+        return count * (shape * log(rate) - lgamma(shape) + (shape - 1.0) * mean_log - shape)
+
+    log_shape = highest(likelihood, log(0.1), log(1e4), 60)
+    return likelihood(log_shape), least_s + mean, mean / sqrt(exp(log_shape))
+
+
+def _paper(delay_s: Array) -> Found | None:
+    """Least delay and a Poisson number of slots, with a normal error; None without slots."""
+    first, span = float(delay_s.min()), float(delay_s.max() - delay_s.min())
+    if span < 20.0 * RESOLUTION_S:
+        return None
+    shift = delay_s - first
+    some = shift[:: max(1, len(shift) // 2000)]
+
+    def concentration(slot_s: float) -> float:
+        return abs(complex(np.mean(np.exp(2j * pi * some / slot_s))))
+
+    # Slots at equal distances of 1/slot: a peak is as wide as 1/span.
+    inverse = np.linspace(1.0 / span, min(SLOTS / (4.0 * span), 1e3), SLOTS)
+    scores = np.array([concentration(1.0 / each) for each in inverse.tolist()])
+    good = np.flatnonzero(scores > max(0.9 * float(scores.max()), 0.8))
+    if not len(good):
+        return None
+    # Every fraction of a slot has as good a score: the longest is the slot.
+    run = good[: int(np.argmax(np.diff(good, append=10**9) > 1)) + 1]
+    peak = inverse[run[np.argmax(scores[run])]]
+    step = inverse[1] - inverse[0]
+    slot = 1.0 / highest(lambda each: concentration(1.0 / each), peak - step, peak + step, 60)
+    phase = float(np.angle(np.mean(np.exp(2j * pi * shift / slot)))) * slot / (2.0 * pi)
+    places = np.rint((shift - phase) / slot)
+    slot, begin = (float(each) for each in np.polyfit(places, delay_s, 1))
+    left = delay_s - begin - slot * places
+    error = max(float(np.std(left)), RESOLUTION_S)
+    places -= places.min()
+    begin = float(np.mean(delay_s - slot * places))
+
+    def likelihood(before: int) -> float:
+        """Of the Poisson numbers, where the least delay has so many slots that never came."""
+        counts, times = np.unique(places + before, return_counts=True)
+        mean = float(np.mean(places)) + before
+        logs = [count * log(mean) - mean - lgamma(count + 1.0) for count in counts.tolist()]
+        return float(np.array(logs) @ times)
+
+    befores = range(max(0, int(begin / slot)) + 1) if float(np.mean(places)) > 0.0 else range(0)
+    if not befores:
+        return None
+    before = max(befores[:200], key=likelihood)
+    numbers = max(begin - before * slot, 0.0), slot, float(np.mean(places)) + before
+    return "paper", numbers, 4, likelihood(before) + _normal_likelihood(left, error)
+
+
+# -- losses -------------------------------------------------------------------------------------
+
+
+def fit_losses(time_s: Array, lost: Bools) -> list[Fit]:
+    """Models of losses, the best first; none where nothing was lost, or everything.
+
+    The channel of `gilbert_elliott` is drawn anew at random moments, bad with the share, and loses
+    everything while it is bad: it is as at the packet before with the chance exp(-Δt / cell), and
+    lasts for cell / (1 - share).
+
+    Args:
+        time_s: times of sending, in the order of sending [s]; shape (n,).
+        lost: whether each was lost; shape (n,).
+    """
+    count, gone = len(lost), int(np.sum(lost))
+    if count < PAIRS_MIN or gone in (0, count):
+        return []
+    share = gone / count
+    bernoulli = gone * log(share) + (count - gone) * log(1.0 - share)
+    fits = [Fit("loss", (share,), log(count) - 2.0 * bernoulli)]
+    between = np.maximum(np.diff(time_s), 0.0)
+    before, after = lost[:-1].astype(bool), lost[1:].astype(bool)
+    groups = [between[(before == one) & (after == other)] for one, other in _TURNS]
+    likelihood = partial(_gilbert, groups)
+    spacing = max(float(np.median(between)), 1e-6)
+    low, high = log(BURST_MIN * spacing), log(BURST_MAX_S)
+    best_share = share
+    cell = spacing
+    for _ in range(20):  # one after the other: they hardly depend on each other
+        cell = exp(highest(lambda each, s=best_share: likelihood(s, exp(each)), low, high, 40))
+        best_share = highest(lambda each, c=cell: likelihood(each, c), 1e-6, 1.0 - 1e-6, 50)
+    first = log(best_share if lost[0] else 1.0 - best_share)
+    numbers = best_share, cell / (1.0 - best_share)
+    if numbers[1] <= BURST_MAX_S:
+        bic = 2.0 * log(count) - 2.0 * (likelihood(best_share, cell) + first)
+        fits.append(Fit("gilbert_elliott", numbers, bic))
+    return sorted(fits, key=lambda fit: fit.bic)
+
+
+_TURNS = ((True, True), (True, False), (False, True), (False, False))
+"""Whether a packet was lost, and whether the next one was."""
+
+
+def _gilbert(groups: list[Array], share: float, cell_s: float) -> float:
+    """Logarithm of the likelihood of what became of each packet after the one before.
+
+    Args:
+        groups: times between two packets, of each of the four turns [s].
+    """
+    total = 0.0
+    for (before, after), between in zip(_TURNS, groups, strict=True):
+        same = np.exp(-between / cell_s)
+        to_bad = share * (1.0 - same) + (same if before else 0.0)
+        chance = to_bad if after else 1.0 - to_bad
+        total += float(np.log(np.maximum(chance, 1e-12)).sum())
+    return total

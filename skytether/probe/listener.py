@@ -1,0 +1,203 @@
+"""The far end of a measurement: it answers each probe with one packet that is no longer.
+
+An answer has the listener's time, and tells of probes that have arrived, from the first on that the
+prober has not been told of: so an answer that is lost loses no arrival. The probes of a train are
+answered together once all have come, so that the answers are a train as well.
+
+Nothing is kept of a HELLO: its session is made of a secret and the sender's address. State is kept
+from the first PROBE on, which only who can be answered at that address can send.
+"""
+
+import hashlib
+import hmac
+from collections import Counter, OrderedDict, deque
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+from skytether.probe.wire import (
+    COOKIE_BYTES,
+    NO_NUMBER,
+    NONCE_BYTES,
+    Answer,
+    Hello,
+    Probe,
+    Welcome,
+    decode,
+    encode,
+)
+from skytether.server.gate import Call, Gate
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.wire.channel import OVERHEAD_BYTES
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+
+SESSIONS_MAX = 16
+"""Number of measurements at once; one that is silent for IDLE_NS gives way."""
+IDLE_NS = 60 * SECOND_NS
+"""Time without a probe after which a measurement gives way to another [ns]."""
+HISTORY_MAX = 65_536
+"""Number of arrivals kept until the prober has been told of them; older ones are forgotten."""
+HOLD_NS = 500 * MILLISECOND_NS
+"""Time for which the rest of a train is waited for after each of its packets [ns]."""
+_TOLD_MAX = PAYLOAD_BYTES_MAX // 12
+"""Number of arrivals that have room in an answer."""
+
+
+@dataclass(slots=True)
+class Held:
+    """Packet of a train whose answer waits for the others."""
+
+    number: int
+    """Number of its arrival."""
+    call: Call
+    peer: Address
+    size: int
+    """Size of the datagram [B]."""
+
+
+@dataclass(slots=True)
+class Session:
+    """One measurement."""
+
+    heard_ns: int
+    """Time of the newest probe [ns]."""
+    logged: int = 0
+    """Number of arrivals so far."""
+    log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
+    """Newest arrivals that the prober may not have been told of: number and time [ns]."""
+    train: list[Held] = field(default_factory=list)
+    """Packets of a train that wait for the others."""
+
+
+class Listener(Endpoint):
+    """Answers probes.
+
+    Args:
+        gate: opens what comes, and answers it.
+        secret: bytes that nobody else can know, which sessions are made of.
+    """
+
+    def __init__(self, gate: Gate, secret: bytes) -> None:
+        super().__init__()
+        self._gate, self._secret = gate, secret
+        self._sessions: OrderedDict[bytes, Session] = OrderedDict()
+        """Measurements by session, the one first whose newest probe is oldest."""
+        self._dropped: Counter[Drop] = Counter()
+        self._answered = 0
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        try:
+            call = self._gate.open(datagram, now_ns=now_ns)
+            if call is not None:
+                self._hear(call, datagram, now_ns)
+        except ProtocolError as error:
+            self._dropped[error.reason] += 1
+        self._out += self._gate.outbox()
+
+    def _hear(self, call: Call, datagram: Datagram, now_ns: int) -> None:
+        message = decode(call.payload)
+        if isinstance(message, Hello):
+            room = len(self._sessions) < SESSIONS_MAX or self._oldest_idle(now_ns) is not None
+            welcome = Welcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
+            packet = call.line.seal(encode(welcome))
+            if len(packet) > len(datagram.payload):
+                raise ProtocolError(Drop.LENGTH)
+            self.send(packet, datagram.peer)
+            self._gate.admit(call, now_ns=now_ns)
+        elif isinstance(message, Probe):
+            session = self._session(message.session, datagram.peer, now_ns)
+            self._probe(session, message, call, datagram, now_ns)
+        else:
+            raise ProtocolError(Drop.NOT_FOR_A_SERVER)
+
+    def _session(self, name: bytes, peer: Address, now_ns: int) -> Session:
+        """Measurement of a session, begun where there is none.
+
+        Raises:
+            ProtocolError: it is no session of this listener's, or there is no room.
+        """
+        session = self._sessions.get(name)
+        if session is None:
+            nonce, cookie = name[:NONCE_BYTES], name[NONCE_BYTES:]
+            if not hmac.compare_digest(cookie, self._cookie(nonce, peer)):
+                raise ProtocolError(Drop.UNKNOWN_SESSION)
+            if len(self._sessions) >= SESSIONS_MAX:
+                idle = self._oldest_idle(now_ns)
+                if idle is None:
+                    raise ProtocolError(Drop.FULL)
+                del self._sessions[idle]
+            session = self._sessions[name] = Session(now_ns)
+        session.heard_ns = now_ns
+        self._sessions.move_to_end(name)
+        return session
+
+    def _oldest_idle(self, now_ns: int) -> bytes | None:
+        """Session that gives way to another, if one does."""
+        name, session = next(iter(self._sessions.items()), (None, None))
+        return name if session and now_ns - session.heard_ns > IDLE_NS else None
+
+    def _probe(
+        self, session: Session, probe: Probe, call: Call, datagram: Datagram, now_ns: int
+    ) -> None:
+        log = session.log
+        while log and session.logged - len(log) < probe.held:
+            log.popleft()
+        if probe.number == NO_NUMBER:
+            number = NO_NUMBER
+        else:
+            number = session.logged
+            log.append((probe.number, now_ns))
+            session.logged += 1
+        waits = Held(number, call, datagram.peer, len(datagram.payload))
+        if probe.train > 1 and number != NO_NUMBER:
+            session.train.append(waits)
+            if len(session.train) >= probe.train:
+                self._release(session, probe.session, now_ns)
+        else:
+            self._answer(session, probe.session, waits, now_ns)
+
+    def _release(self, session: Session, name: bytes, now_ns: int) -> None:
+        """Answer the packets of a train."""
+        for each in session.train:
+            self._answer(session, name, each, now_ns)
+        session.train.clear()
+
+    def _answer(self, session: Session, name: bytes, held: Held, now_ns: int) -> None:
+        log, line = session.log, held.call.line
+        first = session.logged - len(log)
+        arrivals = tuple(islice(log, _TOLD_MAX))
+        answer = Answer(name, held.number, now_ns, first, session.logged, arrivals)
+        size = held.size - (OVERHEAD_BYTES if self._gate.secure else 0)
+        packet = line.seal(encode(answer, size))
+        if len(packet) <= held.size:  # a shorter probe than any prober's has no answer
+            self.send(packet, held.peer)
+            self._answered += 1
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`; the rest of a train is not waited for for ever."""
+        for name, session in self._sessions.items():
+            if session.train and now_ns >= session.heard_ns + HOLD_NS:
+                self._release(session, name, now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """Time at which a train is answered as far as it has come."""
+        return min(
+            (each.heard_ns + HOLD_NS for each in self._sessions.values() if each.train),
+            default=None,
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`."""
+        return {
+            "sessions": len(self._sessions),
+            "answered": self._answered,
+            "dropped": by_name(self._dropped),
+        }
+
+    def _cookie(self, nonce: bytes, peer: Address) -> bytes:
+        """Cookie for a prober's nonce and address."""
+        host, port = peer
+        told = nonce + f"{host} {port}".encode()
+        return hashlib.blake2s(told, key=self._secret, digest_size=COOKIE_BYTES).digest()

@@ -1,0 +1,259 @@
+"""What is told of a measured path: figures of each direction, and the text that flies it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from skytether.probe import analysis, fits
+from skytether.probe.analysis import QUANTILES, Clocks, Delays, Rate
+from skytether.probe.prober import TRAIN, Longs, Measured, Way
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.air.queues import HEADER_BYTES
+from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
+
+TEXT_CORRELATION_MIN = 0.5
+"""Shortest correlation time that is told of a model, in times between two packets."""
+ORDERED_SHARE = 0.01
+"""Share of packets that independent delays would reorder, from which on a path that reorders none
+is called ordered."""
+
+
+class Model(msgspec.Struct, frozen=True):
+    """A model that was fitted."""
+
+    text: str
+    """The impairment as a scenario writes it."""
+    bic: float
+    """Bayesian information criterion: the smaller, the better."""
+
+
+class WayTold(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of one direction. Delays and losses are those of packets that were sent alone."""
+
+    sent: int
+    came: int
+    copies: int
+    """Packets that arrived again, those of trains included."""
+    loss: float
+    """Share of the packets that were lost."""
+    loss_low: float
+    loss_high: float
+    """Bounds of the interval of 95 % of that share."""
+    bursts: int
+    """Runs of lost packets."""
+    burst_packets: float
+    """Mean length of a run [packets]."""
+    reordered: float
+    """Share of the packets that arrived after one that was sent later."""
+    mean_s: float
+    """Mean one-way delay [s]."""
+    sd_s: float
+    """Standard deviation of the delay [s]."""
+    quantiles_s: dict[str, float]
+    """Delay that a share of the packets does not exceed [s], by that share."""
+    correlation: list[tuple[float, float]]
+    """Time between two packets [s], and correlation of their delays."""
+    correlation_s: float
+    """Time in which the correlation falls to 1/e [s]; 0 where there is none to speak of."""
+    rate_bytes_per_s: float | None
+    """Rate of the narrowest part, with headers [B/s]; None where trains show none."""
+    rate_low: float | None
+    rate_high: float | None
+    """Bounds of the interval of 95 % of that rate [B/s]."""
+    trains: int
+    """Trains of which enough came."""
+    train_wait_s: float
+    """Time for which the last packet of a train waits in the queue [s]."""
+    delay_models: list[Model]
+    """Models of the delay without the time that a packet takes to pass that rate, the best first."""
+    loss_models: list[Model]
+    """Models of the losses, the best first."""
+    text: str
+    """The best models as one text, for `network.uplink` or `network.downlink`."""
+
+
+class PathTold(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of a path, for a program."""
+
+    listener: str
+    secure: bool
+    seconds: float
+    """Length of the measurement [s]."""
+    bytes: int
+    """UDP payload of a packet [B]."""
+    every_s: float
+    """Time between two packets [s]."""
+    offset_s: float
+    """Offset of the listener's clock at the first probe [s]."""
+    offset_doubt_s: float
+    """Largest error of that offset, and of all one-way delays, one way up and the other down [s]."""
+    drift_ppm: float
+    """Drift of the listener's clock [10⁻⁶]; 0 where none is sure."""
+    drift_doubt_ppm: float
+    """Standard error of the drift [10⁻⁶]."""
+    round_trip_mean_s: float
+    """Mean delay of both ways together [s], which depends on no clock."""
+    round_trip_least_s: float
+    """Sum of the two least delays [s]."""
+    unreported: int
+    """Arrivals that the listener had to forget before it could tell of them."""
+    uplink: WayTold
+    """Direction from the listener to the prober."""
+    downlink: WayTold
+    """Direction from the prober to the listener."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a measurement."""
+
+    clocks: Clocks
+    delays: Mapping[str, Delays]
+    """Packets of the uplink and of the downlink."""
+    told: PathTold
+
+
+def outcome(measured: Measured, listener: str, *, secure: bool) -> Outcome:
+    """What came of a measurement.
+
+    Args:
+        listener: HOST:PORT of the other end.
+        secure: whether packets were sealed.
+
+    Raises:
+        ValueError: too few packets went each way.
+    """
+    ways = {"uplink": measured.uplink, "downlink": measured.downlink}
+    rates = {name: analysis.rate(way, measured.size) for name, way in ways.items()}
+    wire = measured.size + HEADER_BYTES
+    service_s = {name: wire / rate.bytes_per_s if rate else 0.0 for name, rate in rates.items()}
+    clocks, down, up = analysis.delays(measured, service_s["downlink"], service_s["uplink"])
+    delays = {"uplink": up, "downlink": down}
+    told = {
+        name: _way_told(way, delays[name], rates[name], service_s[name])
+        for name, way in ways.items()
+    }
+    near = measured.downlink.sent_ns
+    path = PathTold(
+        listener=listener,
+        secure=secure,
+        seconds=float(near[-1] - near[0]) / SECOND_NS,
+        bytes=measured.size,
+        every_s=measured.period_ns / SECOND_NS,
+        offset_s=clocks.offset_s,
+        offset_doubt_s=clocks.doubt_s,
+        drift_ppm=clocks.drift * 1e6,
+        drift_doubt_ppm=clocks.drift_doubt * 1e6,
+        round_trip_mean_s=told["uplink"].mean_s + told["downlink"].mean_s,
+        round_trip_least_s=clocks.least_sum_s,
+        unreported=measured.unreported,
+        **told,
+    )
+    return Outcome(clocks, delays, path)
+
+
+def _way_told(way: Way, delays: Delays, rate: Rate | None, service_s: float) -> WayTold:
+    lost = ~delays.came
+    delay_s = delays.delay_s[delays.came]
+    apart_s, correlations = analysis.autocorrelation(delays.time_s, delays.delay_s)
+    _, together = analysis.autocorrelation(delays.time_s, lost.astype(np.float64))
+    correlation_s = analysis.correlation_time_s(apart_s, correlations, len(delay_s))
+    loss = float(lost.mean())
+    low, high = analysis.wilson(loss, analysis.effective(len(lost), together))
+    runs, length = analysis.bursts(lost)
+    independent = analysis.effective(len(delay_s), correlations)
+    delay_models = fits.fit_delays(np.maximum(delay_s - service_s, 0.0), independent)
+    loss_models = fits.fit_losses(delays.time_s, lost)
+    reordered = analysis.reordered(way)
+    spacing_s = float(apart_s[0]) if len(apart_s) else np.inf
+    lasting_s = correlation_s if correlation_s > TEXT_CORRELATION_MIN * spacing_s else 0.0
+    models = [Model(fit.text(lasting_s), fit.bic) for fit in delay_models]
+    losses = [Model(fit.text(), fit.bic) for fit in loss_models]
+    parts = [each[0].text for each in (models, losses) if each]
+    if rate:
+        parts.append(f"rate({rate.bytes_per_s:.4g})")
+    if models and not reordered and _would_reorder(delays) > ORDERED_SHARE:
+        parts.append("ordered")
+    return WayTold(
+        sent=len(lost),
+        came=len(delay_s),
+        copies=way.copies,
+        loss=loss,
+        loss_low=low,
+        loss_high=high,
+        bursts=runs,
+        burst_packets=length,
+        reordered=reordered,
+        mean_s=float(delay_s.mean()),
+        sd_s=float(delay_s.std()),
+        quantiles_s={f"{q:g}": float(np.quantile(delay_s, q)) for q in QUANTILES},
+        correlation=list(zip(apart_s.tolist(), correlations.tolist(), strict=True)),
+        correlation_s=correlation_s,
+        rate_bytes_per_s=rate.bytes_per_s if rate else None,
+        rate_low=rate.low if rate else None,
+        rate_high=rate.high if rate else None,
+        trains=rate.trains if rate else 0,
+        train_wait_s=(TRAIN - 1) * service_s,
+        delay_models=models,
+        loss_models=losses,
+        text=" & ".join(parts),
+    )
+
+
+def _would_reorder(delays: Delays) -> float:
+    """Share of the packets that would be overtaken, were their delays independent."""
+    came = delays.came
+    time_s, delay_s = delays.time_s[came], delays.delay_s[came]
+    mixed = np.random.default_rng(0).permutation(delay_s)
+    order = np.argsort(time_s + mixed, kind="stable")
+    return float((order < np.maximum.accumulate(order)).mean())
+
+
+def trace(delays: Delays) -> str:
+    """Packets of a direction as a file of `trace`: CSV text, a row a packet."""
+    lines, last = ["time_s,delay_s,lost"], -np.inf
+    begin = float(delays.time_s[0])
+    for time_s, delay_s in zip(delays.time_s.tolist(), delays.delay_s.tolist(), strict=True):
+        at = round(time_s - begin, 6)
+        if at > last:  # of two at one instant, which a trace has no place for, the first
+            last = at
+            lost = delay_s != delay_s
+            lines.append(f"{at:.6f},,1" if lost else f"{at:.6f},{max(delay_s, 0.0):.6f},0")
+    return "\n".join(lines) + "\n"
+
+
+def rows(measured: Measured, clocks: Clocks) -> Rows:
+    """Packets as netem records them, a row each, those of trains included.
+
+    Times are those of the prober's clock; `delay_ns` of a lost packet is 0.
+    """
+    parts = []
+    for direction, way in ((DOWNLINK, measured.downlink), (UPLINK, measured.uplink)):
+        ahead_ns = _ahead_ns(way, measured, clocks)
+        part = np.zeros(len(way.sent_ns), PACKET_COLUMNS)
+        sign = -1 if direction == DOWNLINK else 1
+        part["direction"], part["bytes"] = direction, measured.size
+        part["number"] = np.arange(len(part))
+        part["arrived_ns"] = way.sent_ns - (ahead_ns if direction == UPLINK else 0)
+        delay_ns = way.came_ns - way.sent_ns + sign * ahead_ns
+        part["delay_ns"] = np.where(way.came, delay_ns, 0)
+        part["lost"] = ~way.came
+        came = np.flatnonzero(way.came)
+        order = came[np.argsort(way.came_ns[came], kind="stable")]
+        part["overtaken"][order] = order < np.maximum.accumulate(order)
+        parts.append(part)
+    return np.concatenate(parts)
+
+
+def _ahead_ns(way: Way, measured: Measured, clocks: Clocks) -> Longs:
+    """Time by which the listener's clock is ahead when each packet is sent [ns]; shape (n,)."""
+    near_ns = measured.downlink.sent_ns[0]
+    base_ns = round(clocks.offset_s * SECOND_NS)
+    since: Array = (way.sent_ns - near_ns).astype(np.float64)
+    if way is measured.uplink:
+        since -= base_ns
+    ahead: Longs = base_ns + np.rint(since * clocks.drift).astype(np.int64)
+    return ahead

@@ -1,0 +1,349 @@
+"""The near end of a measurement: it sends probes on a grid, and keeps what came of them.
+
+    HELLO until WELCOME → probes for so many seconds → polls until all arrivals are known, and until
+    the last answers have had time to come
+
+Once in a while a train of packets is sent at once, for the rate of the path. It takes the place of
+as many probes as it has packets, so that a path that carries the probes has emptied its queue
+before the next one: delays are measured on an idle path.
+"""
+
+from array import array
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.client.link import ClientLink
+from skytether.probe.wire import (
+    MESSAGE_BYTES_MIN,
+    NO_NUMBER,
+    NONCE_BYTES,
+    Answer,
+    Hello,
+    Probe,
+    Welcome,
+    decode,
+    encode,
+)
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.wire.channel import OVERHEAD_BYTES
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+
+BYTES_MIN = MESSAGE_BYTES_MIN + OVERHEAD_BYTES
+"""Smallest size of a probe, sealed or not [B]."""
+PROBES_MAX = 1_000_000
+"""Largest number of probes: as many as a trace has rows."""
+TRAIN = 16
+"""Number of packets of a train."""
+TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
+"""Shortest time [ns], and smallest number of probes, from one train to the next."""
+HELLO_BYTES = 64
+"""Size of a HELLO without keys: its WELCOME is shorter [B]."""
+PATIENCE_NS = 10 * SECOND_NS
+"""Time for which a first answer is waited for [ns]."""
+POLL_NS = 100 * MILLISECOND_NS
+"""Time between two polls [ns]."""
+LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
+"""Shortest and longest time for which the last answers are waited for [ns]; between them, twice the
+longest round trip."""
+
+Longs = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Packets of one direction, in the order in which they were sent. Times are of monotonic
+    clocks, the sender's and the receiver's, which have nothing in common.
+    """
+
+    sent_ns: Longs
+    """Time of sending, by the sender's clock [ns]; shape (n,)."""
+    came_ns: Longs
+    """Time of arrival, by the receiver's clock [ns]; 0 of a lost packet; shape (n,)."""
+    came: Bools
+    """Whether each arrived; shape (n,)."""
+    train: Longs
+    """Number of the train that each belongs to, -1 of a packet sent alone; shape (n,)."""
+    copies: int
+    """Number of packets that arrived again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Packets that went both ways."""
+
+    downlink: Way
+    """Packets from the prober to the listener, as from a vehicle to the server."""
+    uplink: Way
+    """Packets from the listener to the prober."""
+    size: int
+    """UDP payload of each packet [B]."""
+    period_ns: int
+    """Time between two probes [ns]."""
+    unreported: int
+    """Number of arrivals that the listener had to forget before it could tell of them."""
+
+
+class Prober(Endpoint):
+    """Sends probes, and keeps when each was sent, when it arrived, and when its answer did.
+
+    Args:
+        link: seals what is sent, and opens what comes.
+        listener: address of the other end.
+        nonce: NONCE_BYTES that no other measurement has.
+        probes: number of places on the grid, at most PROBES_MAX.
+        period_ns: time between two of them [ns].
+        size: UDP payload of a probe, BYTES_MIN to PAYLOAD_BYTES_MAX [B].
+    """
+
+    def __init__(
+        self,
+        link: ClientLink,
+        listener: Address,
+        nonce: bytes,
+        *,
+        probes: int,
+        period_ns: int,
+        size: int,
+    ) -> None:
+        super().__init__()
+        assert len(nonce) == NONCE_BYTES
+        assert BYTES_MIN <= size <= PAYLOAD_BYTES_MAX
+        assert 1 <= probes <= PROBES_MAX
+        self._link, self._listener, self._nonce = link, listener, nonce
+        self._slots, self._period_ns, self._size = probes, period_ns, size
+        self._train_every = max(TRAIN_EVERY_SLOTS, TRAIN_EVERY_NS // period_ns)
+        self._session = b""
+        self._hello = encode(Hello(nonce), 0 if link.secure else HELLO_BYTES)
+        self._due_ns: int | None = 0
+        """Time of the next wake; 0 before the first."""
+        self._hello_ns = 0
+        """Time of the newest HELLO."""
+        self._began_ns: int | None = None
+        """Time of the first HELLO."""
+        self._zero_ns = 0
+        """Time of the first probe."""
+        self._slot = 0
+        """Place on the grid of the next probe."""
+        self._over_ns: int | None = None
+        """Time of the last probe, once it was sent."""
+        self._longest_ns = 0
+        """Longest round trip so far."""
+        self.refused = False
+        """Whether the listener has no room."""
+        self.failed = False
+        """Whether no listener has answered."""
+        self._done = False
+        self._sent_ns, self._train = array("q"), array("q")
+        self._logged_number, self._logged_ns = array("q"), array("q")
+        self._answer_number, self._answer_sent_ns, self._answer_came_ns = (
+            array("q"),
+            array("q"),
+            array("q"),
+        )
+        self._logged = 0
+        """Number of arrivals that the listener has told of, known or forgotten."""
+        self._total = 0
+        """Number of arrivals that the listener has counted, as far as is known."""
+        self._settled = False
+        self._trains = 0
+        self._dropped: Counter[Drop] = Counter()
+
+    # -- what comes ----------------------------------------------------------------------------
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        try:
+            if datagram.peer != self._listener:
+                raise ProtocolError(Drop.ELSEWHERE)
+            payload = self._link.open(datagram.payload, now_ns=now_ns)
+            if payload is not None:
+                self._hear(payload, now_ns)
+        except ProtocolError as error:
+            self._dropped[error.reason] += 1
+        for packet in self._link.outbox():
+            self.send(packet, self._listener)
+
+    def _hear(self, payload: bytes, now_ns: int) -> None:
+        message = decode(payload)
+        if isinstance(message, Welcome):
+            if message.nonce != self._nonce:
+                raise ProtocolError(Drop.UNASKED)
+            self._link.adopt(now_ns=now_ns)
+            if not self._session:
+                self._session = message.nonce + message.cookie
+                self.refused = self._done = not message.room
+                self._zero_ns = self._due_ns = now_ns
+        elif isinstance(message, Answer):
+            if message.session != self._session:
+                raise ProtocolError(Drop.UNKNOWN_SESSION)
+            self._learn(message, now_ns)
+        else:
+            raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
+
+    def _learn(self, answer: Answer, now_ns: int) -> None:
+        """Keep what an answer tells."""
+        # An attacker without keys may claim anything; more than twice the probes is none of ours.
+        if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
+            raise ProtocolError(Drop.FIELD)
+        if any(number >= len(self._sent_ns) for number, _ in answer.arrivals):
+            raise ProtocolError(Drop.FIELD)
+        self._total = max(self._total, answer.logged)
+        known = self._logged
+        if answer.first > known:  # the listener has no room for more: what was between is gone
+            for _ in range(answer.first - known):
+                self._logged_number.append(-1)
+                self._logged_ns.append(0)
+            self._logged = known = answer.first
+        for number, came_ns in answer.arrivals[known - answer.first :]:
+            self._logged_number.append(number)
+            self._logged_ns.append(came_ns)
+            self._logged += 1
+        if answer.number != NO_NUMBER:
+            self._answer_number.append(answer.number)
+            self._answer_sent_ns.append(answer.sent_ns)
+            self._answer_came_ns.append(now_ns)
+            if answer.number < self._logged and self._logged_number[answer.number] >= 0:
+                probe = self._logged_number[answer.number]
+                self._longest_ns = max(self._longest_ns, now_ns - self._sent_ns[probe])
+
+    # -- what is sent --------------------------------------------------------------------------
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        if self._done:
+            return
+        if self._began_ns is None:
+            self._began_ns = now_ns
+        if not self._session:
+            if now_ns - self._began_ns >= PATIENCE_NS:
+                self.failed = self._done = True
+                return
+            self._greet(now_ns)
+            self._due_ns = now_ns + self._link.hello_ns
+            return
+        if self._link.wants_hello(now_ns) and now_ns - self._hello_ns >= SECOND_NS:
+            self._greet(now_ns)
+        if self._over_ns is None:
+            self._probe(now_ns)
+        else:
+            self._poll(now_ns, self._over_ns)
+
+    def _greet(self, now_ns: int) -> None:
+        self._hello_ns = now_ns
+        self.send(self._link.hello(self._hello, now_ns=now_ns), self._listener)
+
+    def _probe(self, now_ns: int) -> None:
+        """Send the probe, or the train, of this place on the grid; places slept through are left
+        out.
+        """
+        slot = max(self._slot, (now_ns - self._zero_ns) // self._period_ns)
+        if now_ns < self._zero_ns + slot * self._period_ns:
+            return
+        every = self._train_every
+        if slot % every == every // 2 and slot + TRAIN <= self._slots:
+            for _ in range(TRAIN):
+                self._send(TRAIN, self._trains, now_ns)
+            self._trains += 1
+            self._slot = slot + TRAIN
+        elif slot < self._slots:
+            self._send(0, -1, now_ns)
+            self._slot = slot + 1
+        else:
+            self._slot = self._slots
+        if self._slot >= self._slots:
+            self._over_ns = now_ns
+        self._due_ns = self._zero_ns + self._slot * self._period_ns
+
+    def _send(self, train: int, number: int, now_ns: int) -> None:
+        self._put(len(self._sent_ns), train)
+        self._sent_ns.append(now_ns)
+        self._train.append(number)
+
+    def _poll(self, now_ns: int, over_ns: int) -> None:
+        """Ask for arrivals until all are known, or for as long as is reasonable."""
+        waited_ns = now_ns - over_ns
+        least_ns = min(max(LAST_MIN_NS, 2 * self._longest_ns), LAST_MAX_NS)
+        if waited_ns >= LAST_MAX_NS or (waited_ns >= least_ns and self._logged >= self._total):
+            self._settled = self._logged >= self._total
+            self._done = True
+            return
+        self._put(NO_NUMBER, 0)
+        self._due_ns = now_ns + POLL_NS
+
+    def _put(self, number: int, train: int) -> None:
+        size = self._size - (OVERHEAD_BYTES if self._link.secure else 0)
+        probe = Probe(self._session, number, train, self._logged)
+        self.send(self._link.seal(encode(probe, size)), self._listener)
+
+    def next_wake_ns(self) -> int | None:
+        """See `Endpoint`."""
+        return None if self._done else self._due_ns
+
+    @property
+    def finished(self) -> bool:
+        """See `Endpoint`."""
+        return self._done
+
+    # -- what was measured ---------------------------------------------------------------------
+
+    @property
+    def probed_s(self) -> float:
+        """Length of the measurement so far [s]."""
+        return self._slot * self._period_ns / SECOND_NS
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`."""
+        return {
+            "sent": len(self._sent_ns),
+            "arrived": self._logged,
+            "answered": len(self._answer_number),
+            "dropped": by_name(self._dropped),
+        }
+
+    def measured(self) -> Measured:
+        """Packets so far. Where the measurement was ended early, those that may still be under way
+        are left out: the ones after the newest of which anything is known.
+        """
+        number = np.array(self._logged_number, np.int64)
+        logged_ns = np.array(self._logged_ns, np.int64)
+        downlink = self._downlink(number, logged_ns)
+        return Measured(
+            downlink,
+            self._uplink(number, logged_ns),
+            self._size,
+            self._period_ns,
+            int((number < 0).sum()),
+        )
+
+    def _downlink(self, number: Longs, logged_ns: Longs) -> Way:
+        sent_ns, train = np.array(self._sent_ns, np.int64), np.array(self._train, np.int64)
+        known = number >= 0
+        first, at = np.unique(number[known], return_index=True)
+        came_ns, came = np.zeros(len(sent_ns), np.int64), np.zeros(len(sent_ns), bool)
+        came_ns[first], came[first] = logged_ns[known][at], True
+        end = len(sent_ns) if self._settled else int(first.max(initial=-1)) + 1
+        copies = int(known.sum()) - len(first)
+        return Way(sent_ns[:end], came_ns[:end], came[:end], train[:end], copies)
+
+    def _uplink(self, number: Longs, logged_ns: Longs) -> Way:
+        """Answers; the time of sending of a lost one is that of the arrival that drew it."""
+        answered = np.array(self._answer_number, np.int64)
+        first, at = np.unique(answered[answered < len(number)], return_index=True)
+        end = len(number) if self._settled else int(first.max(initial=-1)) + 1
+        sent_ns, came_ns, came = logged_ns.copy(), np.zeros(len(number), np.int64), number < -1
+        at = np.flatnonzero(answered < len(number))[at]
+        sent_ns[first] = np.array(self._answer_sent_ns, np.int64)[at]
+        came_ns[first] = np.array(self._answer_came_ns, np.int64)[at]
+        came[first] = True
+        train = np.array(self._train, np.int64)[np.maximum(number, 0)]
+        kept = (number >= 0) & (np.arange(len(number)) < end)
+        way = Way(sent_ns[kept], came_ns[kept], came[kept], train[kept], len(answered) - len(first))
+        order = np.argsort(way.sent_ns, kind="stable")
+        return Way(*(each[order] for each in (way.sent_ns, way.came_ns, way.came, way.train)),
+                   copies=way.copies)

@@ -1,0 +1,169 @@
+"""Packets of a measurement: four messages, each one msgpack array in one UDP datagram.
+
+    [version, type, ...]
+
+| type | message | sent by  | fields                                              |
+|------|---------|----------|-----------------------------------------------------|
+| 1    | HELLO   | prober   | nonce, padding                                      |
+| 2    | WELCOME | listener | nonce, cookie, room                                 |
+| 3    | PROBE   | prober   | session, number, train, held, padding               |
+| 4    | ANSWER  | listener | session, number, sent_ns, first, logged, arrivals,  |
+|      |         |          | padding                                             |
+
+HELLO and WELCOME have the types that a handshake of `shared.wire.handshake` may carry. The session
+is nonce and cookie together. A PROBE is as long as is asked for, and its ANSWER no longer.
+"""
+
+from struct import Struct
+from typing import Any, NamedTuple
+
+import msgpack
+
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+
+VERSION = 64
+"""Version of these messages; no endpoint of a flight takes one of them for its own."""
+NONCE_BYTES = COOKIE_BYTES = 8
+SESSION_BYTES = NONCE_BYTES + COOKIE_BYTES
+MESSAGE_BYTES_MIN = 96
+"""Smallest size of a PROBE: its ANSWER has room for two arrivals [B]."""
+TRAIN_MAX = 64
+"""Largest number of packets of a train."""
+NO_NUMBER = 2**32 - 1
+"""Number of a PROBE that only asks for arrivals, and of its ANSWER."""
+
+_ARRIVAL = Struct("<IQ")
+"""An arrival: number of the PROBE, and the listener's time [ns]."""
+_PADDING = bytes(PAYLOAD_BYTES_MAX)
+
+
+class Hello(NamedTuple):
+    """Prober asks for a session."""
+
+    nonce: bytes
+
+
+class Welcome(NamedTuple):
+    """Listener gives a session."""
+
+    nonce: bytes
+    """Nonce of the HELLO that it answers."""
+    cookie: bytes
+    room: bool
+    """Whether the listener has room for another session."""
+
+
+class Probe(NamedTuple):
+    """Packet from the prober to the listener."""
+
+    session: bytes
+    number: int
+    """Number of the packet, from 0; or NO_NUMBER."""
+    train: int
+    """Number of packets of the train that it belongs to; 0 of a packet sent alone."""
+    held: int
+    """Number of arrivals that the prober has been told of."""
+
+
+class Answer(NamedTuple):
+    """Packet from the listener to the prober."""
+
+    session: bytes
+    number: int
+    """Number of the arrival that it answers, from 0; or NO_NUMBER."""
+    sent_ns: int
+    """Time of sending, by the listener's clock [ns]."""
+    first: int
+    """Number of the first arrival that it tells of."""
+    logged: int
+    """Number of arrivals so far."""
+    arrivals: tuple[tuple[int, int], ...]
+    """Number of the PROBE and the listener's time [ns], of each arrival from the first on."""
+
+
+Message = Hello | Welcome | Probe | Answer
+_TYPES: tuple[type[Message], ...] = (Hello, Welcome, Probe, Answer)
+
+
+def encode(message: Message, size: int = 0) -> bytes:
+    """Bytes of a message.
+
+    Args:
+        size: size that it is padded to, which it falls short of by one byte at most [B]. An ANSWER
+            leaves out the arrivals that have no room.
+    """
+    fields: tuple[Any, ...] = message
+    if isinstance(message, Answer):
+        room = size - len(_packed(Answer, (*message[:-1], b""), b"")) - 1
+        told = message.arrivals[: max(0, room // _ARRIVAL.size)]
+        fields = *message[:-1], b"".join(_ARRIVAL.pack(*each) for each in told)
+    if isinstance(message, Welcome):
+        return msgpack.packb((VERSION, 2, *message))
+    bare = _packed(type(message), fields, b"")
+    room = size - len(bare)
+    # The header of more than 255 bytes is longer by one.
+    return _packed(type(message), fields, _PADDING[: max(0, room - (room > 255))])
+
+
+def _packed(kind: type[Message], fields: tuple[Any, ...], padding: bytes) -> bytes:
+    packed: bytes = msgpack.packb((VERSION, _TYPES.index(kind) + 1, *fields, padding))
+    return packed
+
+
+def decode(payload: bytes) -> Message:
+    """Message in a datagram, every field checked.
+
+    Raises:
+        ProtocolError: it is none of these.
+    """
+    if len(payload) > PAYLOAD_BYTES_MAX:
+        raise ProtocolError(Drop.TOO_LONG)
+    try:
+        fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise ProtocolError(Drop.NOT_MSGPACK) from error
+    if type(fields) is not tuple or len(fields) < 2:
+        raise ProtocolError(Drop.NOT_A_MESSAGE)
+    version, number, *body = fields
+    if type(version) is not int or version != VERSION:
+        raise ProtocolError(Drop.VERSION)
+    match number, body:
+        case 1, [bytes(nonce), bytes()] if len(nonce) == NONCE_BYTES:
+            return Hello(nonce)
+        case 2, [bytes(nonce), bytes(cookie), bool(room)] if (
+            len(nonce) == NONCE_BYTES and len(cookie) == COOKIE_BYTES
+        ):
+            return Welcome(nonce, cookie, room)
+        case 3, [bytes(session), int(probe), int(train), int(held), bytes()]:
+            _check(session, (probe, held))
+            if not 0 <= train <= TRAIN_MAX or isinstance(train, bool):
+                raise ProtocolError(Drop.FIELD)
+            return Probe(session, probe, train, held)
+        case 4, [
+            bytes(session),
+            int(answer),
+            int(sent_ns),
+            int(first),
+            int(logged),
+            bytes(told),
+            bytes(),
+        ]:
+            _check(session, (answer, first, logged))
+            if not 0 <= sent_ns < 2**63 or len(told) % _ARRIVAL.size:
+                raise ProtocolError(Drop.FIELD)
+            arrivals = tuple(_ARRIVAL.iter_unpack(told))
+            if first + len(arrivals) > logged or any(at_ns >= 2**63 for _, at_ns in arrivals):
+                raise ProtocolError(Drop.FIELD)
+            return Answer(session, answer, sent_ns, first, logged, arrivals)
+    raise ProtocolError(Drop.TYPE if number not in (1, 2, 3, 4) else Drop.FIELD)
+
+
+def _check(session: bytes, numbers: tuple[int, ...]) -> None:
+    """Refuse a session of another length, and numbers that no field has.
+
+    Raises:
+        ProtocolError: with the field.
+    """
+    wrong = any(isinstance(each, bool) or not 0 <= each <= NO_NUMBER for each in numbers)
+    if wrong or len(session) != SESSION_BYTES:
+        raise ProtocolError(Drop.FIELD)
