@@ -30,6 +30,7 @@ reorders and loses their packets.
   recover FILE          a recording whose flight was killed, mended
   join FILE... --out F  recordings of server, netem and client, as one
   set PATH KEY=VALUE    change something while it flies, at a process with --control
+  probe HOST:PORT       a real path measured both ways, and flown over; with --listen, its far end
   scenarios             what can be flown
   triggers              policies for control.trigger, a sentence each
   reports               policies for vehicle.report, a sentence each
@@ -84,6 +85,7 @@ COMMANDS = {
     "recover": "skytether.cli.recover:recover",
     "join": "skytether.cli.join:join",
     "set": "skytether.cli.set:set_keys",
+    "probe": "skytether.cli.probe:probe",
     "scenarios": "skytether.__main__:list_scenarios",
     "triggers": "skytether.cli.names:triggers",
     "reports": "skytether.cli.names:reports",

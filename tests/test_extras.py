@@ -48,6 +48,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "impairments": (),
     "vehicles": (),
     "set": (),
+    "probe": (),
     "server": ("server",),
     "autopilot": ("mavlink", "server"),
     "station": ("mavlink",),

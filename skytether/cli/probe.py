@@ -1,9 +1,10 @@
 """`skytether probe`: measure a real path, and fly over what was measured."""
 
+import io
 import secrets
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,7 +21,7 @@ from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Counted, Event, Listening, Plaintext, address_text
-from skytether.shared.telemetry.record import PACKET_COLUMNS
+from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorder, Rows
 from skytether.shared.wire import keys
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 from skytether.shell import command, driver
@@ -86,6 +87,20 @@ def probe(argv: Sequence[str]) -> None:
         _listen(options, command.address("--listen", options.listen))
     else:
         _probe(options, command.address("HOST:PORT", options.target))
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Name the file or folder that cannot be written, in one line.
+
+    Raises:
+        CommandError: something within it raised an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        said = f"{error.filename or path}: cannot be written: {error.strerror or error}"
+        raise CommandError(said, CONFIGURATION) from None
 
 
 # -- the far end ----------------------------------------------------------------------------------
@@ -163,9 +178,7 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         raise CommandError(f"nothing can be told: {error}") from None
     _write(options, found)
     if options.record:
-        with command.recorded(options.record, PACKET_COLUMNS) as recording:
-            for row in rows(measured, found.clocks).tolist():
-                recording.recorder.append_row(*row)
+        _record(options.record, rows(measured, found.clocks))
     _tell(options, found)
     if not prober.finished:
         seconds = found.told.seconds
@@ -194,6 +207,9 @@ def _check(options: ProbeOptions) -> None:
     if probes > PROBES_MAX:
         said = f"got {probes:.0f} packets, expected at most {PROBES_MAX}"
         raise CommandError(f"--seconds and --rate: {said}", CONFIGURATION)
+    if options.record and options.record.suffix == RECORDING:
+        said = f"got {options.record}, expected another suffix: a row a packet is no flight"
+        raise CommandError(f"--record: {said}", CONFIGURATION)
     for flag in command.OUTPUTS:
         command.check_output(f"--{flag}", getattr(options, flag))
     if options.figure:
@@ -222,11 +238,24 @@ def _write(options: ProbeOptions, found: Outcome) -> None:
             flights.save(probing.drawn(found), options.figure, dpi=130)
 
 
+def _record(path: Path, packets: Rows) -> None:
+    """Write a row a packet.
+
+    Raises:
+        CommandError: the file cannot be written.
+    """
+    content = io.BytesIO()
+    recorder = Recorder(PACKET_COLUMNS, content)
+    recorder.append(len(packets), **{name: packets[name] for name in PACKET_COLUMNS.names or ()})
+    with _writing(path):
+        files.write(path, content.getvalue())
+
+
 def _tell(options: ProbeOptions, found: Outcome) -> None:
     """Print tables of both directions, what is in doubt, and what to fly."""
     told = found.told
     ways = {"downlink": told.downlink, "uplink": told.uplink}
-    command.show(_table("measured", ways, _figures))
+    command.show(_table(ways))
     for name, way in ways.items():
         models = [*way.delay_models, *way.loss_models]
         if models:
@@ -273,17 +302,15 @@ def _figures(way: WayTold) -> dict[str, str]:
     return found
 
 
-def _table(
-    title: str, ways: dict[str, WayTold], figures: Callable[[WayTold], dict[str, str]]
-) -> "Table":
+def _table(ways: dict[str, WayTold]) -> "Table":
     """Figures of both directions side by side."""
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title="measured", title_justify="left")
     for each in ("", *ways):
         table.add_column(Text(each))
-    shown = [figures(way) for way in ways.values()]
+    shown = [_figures(way) for way in ways.values()]
     for name in shown[0]:
         table.add_row(Text(name), *(Text(each[name]) for each in shown))
     return table

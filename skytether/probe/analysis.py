@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from skytether.probe.prober import Longs, Measured, Way
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.air.queues import HEADER_BYTES
+from skytether.shared.base.units import HEADER_BYTES
 
 Bools = NDArray[np.bool_]
 

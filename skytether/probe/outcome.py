@@ -11,7 +11,7 @@ from skytether.probe.analysis import QUANTILES, Clocks, Delays, Rate
 from skytether.probe.prober import TRAIN, Longs, Measured, Way
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.air.queues import HEADER_BYTES
+from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5
