@@ -20,7 +20,7 @@ from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Counted, Event, Listening, Plaintext, address_text
+from skytether.shared.core.events import Counted, Event, Listening, Plaintext
 from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorder, Rows
 from skytether.shared.wire import keys
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
@@ -81,7 +81,9 @@ def probe(argv: Sequence[str]) -> None:
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
     if bool(options.target) == (options.listen is not None):
         given = "both" if options.target else "neither"
-        said = f"got {given}, expected either HOST:PORT to measure the way to, or --listen HOST:PORT"
+        said = (
+            f"got {given}, expected either HOST:PORT to measure the way to, or --listen HOST:PORT"
+        )
         raise CommandError(said, CONFIGURATION)
     if options.listen is not None:
         _listen(options, command.address("--listen", options.listen))

@@ -42,7 +42,9 @@ def drawn(outcome: Outcome) -> "Figure":
         if told.delay_models:
             _, model = path(told.delay_models[0].text).impairments[0]
             assert isinstance(model, Delay)
-            passes_s = (outcome.told.bytes + 28) / told.rate_bytes_per_s if told.rate_bytes_per_s else 0.0
+            passes_s = (
+                (outcome.told.bytes + 28) / told.rate_bytes_per_s if told.rate_bytes_per_s else 0.0
+            )
             grid_of = np.linspace(0.001, 0.999, 500)
             model_ms = [1e3 * (model.quantile_ns(each) / SECOND_NS + passes_s) for each in grid_of]
             label = told.delay_models[0].text.partition("(")[0]

@@ -22,9 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.probe.prober import Longs, Measured, Way
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.base.units import HEADER_BYTES
 
 Bools = NDArray[np.bool_]
 
@@ -120,9 +119,7 @@ def delays(
     least_sum_s = max(floor_down + floor_up, 0.0)
     half = max(least_sum_s - service_down_s - service_up_s, 0.0) / 2.0
     offset_s = floor_down - half - service_down_s
-    clocks = Clocks(
-        (far_ns - near_ns) / SECOND_NS + offset_s, drift, doubt, least_sum_s, half
-    )
+    clocks = Clocks((far_ns - near_ns) / SECOND_NS + offset_s, drift, doubt, least_sum_s, half)
     delay_down = y_down - drift * x_down - offset_s
     delay_up = y_up + drift * x_up + offset_s
     # A lost answer has no arrival: it was sent when its probe arrived there.

@@ -9,9 +9,8 @@ import numpy as np
 from skytether.probe import analysis, fits
 from skytether.probe.analysis import QUANTILES, Clocks, Delays, Rate
 from skytether.probe.prober import TRAIN, Longs, Measured, Way
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5

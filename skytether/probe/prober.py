@@ -345,5 +345,7 @@ class Prober(Endpoint):
         kept = (number >= 0) & (np.arange(len(number)) < end)
         way = Way(sent_ns[kept], came_ns[kept], came[kept], train[kept], len(answered) - len(first))
         order = np.argsort(way.sent_ns, kind="stable")
-        return Way(*(each[order] for each in (way.sent_ns, way.came_ns, way.came, way.train)),
-                   copies=way.copies)
+        return Way(
+            *(each[order] for each in (way.sent_ns, way.came_ns, way.came, way.train)),
+            copies=way.copies,
+        )
