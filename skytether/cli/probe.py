@@ -20,7 +20,7 @@ from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Counted, Event, Listening, Plaintext
+from skytether.shared.core.events import Counted, Event, Listening
 from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorder, Rows
 from skytether.shared.wire import keys
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
@@ -71,7 +71,7 @@ class ProbeOptions:
 
 
 def probe(argv: Sequence[str]) -> None:
-    """Measure a path over UDP: delays each way, losses, bursts, order, rate, and what flies like it.
+    """Measure a path over UDP: delays each way, losses, bursts, order, rate, and models of them.
 
     One end listens, the other sends numbered packets, which are answered, and tells what came of
     them. Run it where the vehicle will be, and the listener where the server will be: then packets
@@ -126,8 +126,6 @@ def _listen(options: ProbeOptions, bind: Address) -> None:
         def start() -> None:
             host, port = shell.address
             out.say(Listening(host=host, port=port, waiting_for="probes"))
-            if not gate.secure:
-                out.say(Plaintext(local=shell.is_local))
 
         def told() -> Counted:
             return Counted(figures=listener.figures() | {"kernel_drops": shell.kernel_drops()})
@@ -266,8 +264,8 @@ def _tell(options: ProbeOptions, found: Outcome) -> None:
     print(
         f"Clocks: the other end's runs {told.drift_ppm:+.1f} ± {told.drift_doubt_ppm:.1f} ppm "
         f"faster. The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms and "
-        f"{1e3 * told.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the least "
-        f"is taken for each way, so one-way delays may be wrong by up to "
+        f"{1e3 * told.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the "
+        f"least is taken for each way, so one-way delays may be wrong by up to "
         f"{1e3 * told.offset_doubt_s:.2f} ms, one way too long and the other too short."
     )
     if told.unreported:

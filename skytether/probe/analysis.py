@@ -10,13 +10,17 @@ offset cancels: half of it is taken for each direction.
 Loss: the interval is Wilson's, of as many packets as were lost independently of each other.
 
 Rate: packets of a train that are sent at once leave a bottleneck one behind the other, each after
-size / rate. A straight line through arrivals over places in the train, with one slope for all
-trains, has that slope (packet dispersion).
+size / rate (packet dispersion). So the i-th of a train has the delay of a packet that was sent
+alone, and i size / rate more. That time is found in two ways, and the surer one is taken: as the
+slope of a straight line through delays over places, with one slope for all trains, which does not
+mind delays that last; and as the most likely time, with the measured distribution of the delays of
+packets sent alone, which makes the most of delays that do not last.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import sqrt
+from itertools import pairwise
+from math import pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +35,8 @@ DRIFT_MAX = 500e-6
 """Largest drift between two clocks that is believed: as fast as clocks are slewed."""
 WINDOWS = 12
 """Number of parts of a measurement whose least delays tell how sure the drift is."""
+CERTAIN = 3.5
+"""Standard errors from which on a drift is no chance, told by so few parts."""
 Z95 = 1.959964
 """Quantile of the standard normal distribution, of an interval of 95 %."""
 ALIKE_S = 50e-6
@@ -41,6 +47,12 @@ TOGETHER_NS = 2 * MILLISECOND_NS
 """Longest time in which the packets of a train are sent [ns]."""
 SPREAD_MIN_S = 1e-3
 """Spread of a train that tells a finite rate from a machine that is busy [s]."""
+ARRIVED_MIN = 4
+"""Smallest number of packets of a train that came, for it to count."""
+GROUPS_MIN, GROUPS_MAX = 4, 10
+"""Number of groups of trains, each left out in turn, that tell how sure a time is."""
+ALONE_MIN, KERNELS = 100, 500
+"""Smallest number of packets that tell a distribution, and largest number of its kernels."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
 """Shares of which quantiles are told."""
 
@@ -63,21 +75,6 @@ class Clocks:
 
 
 @dataclass(frozen=True, slots=True)
-class Delays:
-    """Packets of one direction that were sent alone, in the order of sending."""
-
-    time_s: Array
-    """Time of sending, by the prober's clock from the first probe on [s]; shape (n,)."""
-    delay_s: Array
-    """One-way delay [s]; NaN of a lost packet; shape (n,)."""
-
-    @property
-    def came(self) -> Bools:
-        """Whether each arrived; shape (n,)."""
-        return np.isfinite(self.delay_s)
-
-
-@dataclass(frozen=True, slots=True)
 class Rate:
     """Rate of the narrowest part of a path."""
 
@@ -90,16 +87,28 @@ class Rate:
     """Number of trains that it was found from."""
 
 
+@dataclass(frozen=True, slots=True)
+class Delays:
+    """Packets of one direction that were sent alone, in the order of sending."""
+
+    time_s: Array
+    """Time of sending, by the prober's clock from the first probe on [s]; shape (n,)."""
+    delay_s: Array
+    """One-way delay [s]; NaN of a lost packet; shape (n,)."""
+    rate: Rate | None
+    """Rate of the direction; None where trains show none."""
+
+    @property
+    def came(self) -> Bools:
+        """Whether each arrived; shape (n,)."""
+        return np.isfinite(self.delay_s)
+
+
 # -- clocks and delays --------------------------------------------------------------------------
 
 
-def delays(
-    measured: Measured, service_down_s: float = 0.0, service_up_s: float = 0.0
-) -> tuple[Clocks, Delays, Delays]:
+def delays(measured: Measured) -> tuple[Clocks, Delays, Delays]:
     """Clocks, and delays of the downlink and of the uplink.
-
-    Args:
-        service_down_s, service_up_s: times that a packet takes to pass a finite rate [s].
 
     Raises:
         ValueError: too few packets went a way.
@@ -112,32 +121,36 @@ def delays(
     x_down, y_down = _points(down.sent_ns - near_ns, down.came_ns - far_ns)
     y_up = (up.came_ns - near_ns - (up.sent_ns - far_ns)) / SECOND_NS
     x_up = (up.came_ns - near_ns) / SECOND_NS
-    at = x_down[alone[0]], y_down[alone[0]], x_up[alone[1]], y_up[alone[1]]
-    drift, doubt = _drift(*at)
-    floor_down = float(np.min(at[1] - drift * at[0]))
-    floor_up = float(np.min(at[3] + drift * at[2]))
+    drift, doubt = _drift(x_down[alone[0]], y_down[alone[0]], x_up[alone[1]], y_up[alone[1]])
+    y_down, y_up = y_down - drift * x_down, y_up + drift * x_up
+    rates = [rate(way, y, measured.size) for way, y in ((down, y_down), (up, y_up))]
+    wire = measured.size + HEADER_BYTES
+    service_down, service_up = (wire / each.bytes_per_s if each else 0.0 for each in rates)
+    floor_down, floor_up = float(y_down[alone[0]].min()), float(y_up[alone[1]].min())
     least_sum_s = max(floor_down + floor_up, 0.0)
-    half = max(least_sum_s - service_down_s - service_up_s, 0.0) / 2.0
-    offset_s = floor_down - half - service_down_s
+    half = max(least_sum_s - service_down - service_up, 0.0) / 2.0
+    offset_s = floor_down - half - service_down
     clocks = Clocks((far_ns - near_ns) / SECOND_NS + offset_s, drift, doubt, least_sum_s, half)
-    delay_down = y_down - drift * x_down - offset_s
-    delay_up = y_up + drift * x_up + offset_s
     # A lost answer has no arrival: it was sent when its probe arrived there.
     x_up = (up.sent_ns - far_ns) / SECOND_NS - offset_s
-    return clocks, _alone(down, x_down, delay_down), _alone(up, x_up, delay_up)
+    return (
+        clocks,
+        _alone(down, x_down, y_down - offset_s, rates[0]),
+        _alone(up, x_up, y_up + offset_s, rates[1]),
+    )
 
 
 def _points(sent_ns: Longs, came_ns: Longs) -> tuple[Array, Array]:
     return sent_ns / SECOND_NS, (came_ns - sent_ns) / SECOND_NS
 
 
-def _alone(way: Way, time_s: Array, delay_s: Array) -> Delays:
+def _alone(way: Way, time_s: Array, delay_s: Array, found: Rate | None) -> Delays:
     alone = way.train < 0
-    return Delays(time_s[alone], np.where(way.came, delay_s, np.nan)[alone])
+    return Delays(time_s[alone], np.where(way.came, delay_s, np.nan)[alone], found)
 
 
 def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[float, float]:
-    """Slope of both lines, and its standard error; 0 where it is less than twice that."""
+    """Slope of both lines, and its standard error; 0 where it is not certain."""
     if x_down[-1] - x_down[0] <= 0.0:
         return 0.0, DRIFT_MAX
     down, up = lower_hull(x_down, y_down), lower_hull(x_up, y_up)
@@ -150,7 +163,7 @@ def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[floa
 
     slope = highest(height, -DRIFT_MAX, DRIFT_MAX)
     doubt = _drift_doubt(x_down, y_down - slope * x_down, x_up, y_up + slope * x_up)
-    return (slope if abs(slope) > 2.0 * doubt else 0.0), doubt
+    return (slope if abs(slope) > CERTAIN * doubt else 0.0), doubt
 
 
 def _drift_doubt(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> float:
@@ -161,7 +174,7 @@ def _drift_doubt(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> floa
     """
     edges = np.linspace(0.0, max(x_down[-1], x_up.max()), WINDOWS + 1)
     offsets, times = [], []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges.tolist()):
         in_down = (x_down >= low) & (x_down <= high)
         in_up = (x_up >= low) & (x_up <= high)
         if in_down.any() and in_up.any():
@@ -291,36 +304,93 @@ def reordered(way: Way) -> float:
 # -- rate ---------------------------------------------------------------------------------------
 
 
-def rate(way: Way, size: int) -> Rate | None:
+def rate(way: Way, delay_s: Array, size: int) -> Rate | None:
     """Rate of the narrowest part of a path; None where trains show none.
 
     Args:
+        delay_s: delays of all packets, those of lost ones ignored, from any zero on [s];
+            shape (n,).
         size: UDP payload of each packet [B].
     """
-    sxx = sxy = left = 0.0
-    trains, points = 0, 0
-    rows: list[tuple[Array, Array]] = []
+    trains = []
     for number in range(int(way.train.max(initial=-1)) + 1):
         at = np.flatnonzero(way.train == number)
         at = at[way.sent_ns[at] - way.sent_ns[at[0]] <= TOGETHER_NS] if len(at) else at
-        came = way.came[at]
-        if came.sum() < 4:
-            continue
-        x = np.flatnonzero(came).astype(np.float64)
-        y = (way.came_ns[at][came] - way.came_ns[at][came].min()) / SECOND_NS
-        x, y = x - x.mean(), y - y.mean()
-        sxx, sxy = sxx + float(x @ x), sxy + float(x @ y)
-        rows.append((x, y))
-        trains, points = trains + 1, points + len(x)
-    if not trains or points - trains < 2:
+        came = np.flatnonzero(way.came[at])
+        if len(came) >= ARRIVED_MIN:
+            trains.append((came.astype(np.float64), delay_s[at[came]]))
+    if not trains:
         return None
-    slope = sxy / sxx
-    for x, y in rows:
-        off = y - slope * x
-        left += float(off @ off)
-    error = sqrt(left / (points - trains - 1) / sxx)
-    if slope * (points / trains - 1.0) < SPREAD_MIN_S or slope < 4.0 * error:
+    alone = np.sort(delay_s[way.came & (way.train < 0)])
+    found = [_slope(trains)]
+    if len(trains) >= GROUPS_MIN and len(alone) >= ALONE_MIN:
+        found.append(_likeliest(trains, alone, *found[0]))
+    time_s, error = min(found, key=lambda each: each[1])
+    spread_s = time_s * max(float(places[-1]) for places, _ in trains)
+    if spread_s < SPREAD_MIN_S or time_s < 4.0 * error:
         return None
     wire = size + HEADER_BYTES
-    fastest = slope - Z95 * error
-    return Rate(wire / slope, wire / (slope + Z95 * error), wire / fastest, trains)
+    low, high = wire / (time_s + Z95 * error), wire / (time_s - Z95 * error)
+    return Rate(wire / time_s, low, high, len(trains))
+
+
+Trains = list[tuple[Array, Array]]
+"""Places in a train, from 0, and delays [s] of its packets that came; a pair for each train."""
+
+
+def _slope(trains: Trains) -> tuple[float, float]:
+    """Slope of straight lines through trains, each at a height of its own, and standard error."""
+    centred = [(x - x.mean(), y - y.mean()) for x, y in trains]
+    sxx = sum(float(x @ x) for x, _ in centred)
+    slope = sum(float(x @ y) for x, y in centred) / sxx
+    left = sum(float((y - slope * x) @ (y - slope * x)) for x, y in centred)
+    free = max(sum(len(x) - 1 for x, _ in centred) - 1, 1)
+    return slope, sqrt(left / free / sxx)
+
+
+def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tuple[float, float]:
+    """Most likely time to pass, and its standard error by the jackknife over groups of trains.
+
+    Args:
+        alone: delays of packets that were sent alone, ascending [s].
+        first, doubt: a time that it is near, and the standard error of that [s].
+    """
+    count = min(len(alone), KERNELS)
+    kernels = np.quantile(alone, (np.arange(count) + 0.5) / count)
+    middle = float(np.subtract(*np.quantile(alone, (0.75, 0.25)))) / 1.34
+    width = max(0.9 * min(float(alone.std()), middle) * count**-0.2, ALIKE_S)
+    floor = 1e-3 / (float(alone[-1] - alone[0]) + width)
+
+    def likelihood(time_s: float, some: Trains) -> float:
+        total = 0.0
+        for places, delay_s in some:
+            off = (delay_s - time_s * places)[:, None] - kernels
+            density = np.exp(-0.5 * (off / width) ** 2).mean(axis=1) / (width * sqrt(2.0 * pi))
+            total += float(np.log(density + floor).sum())
+        return total
+
+    def best(some: Trains, low: float, high: float, steps: int) -> float:
+        return highest(lambda each: likelihood(each, some), low, high, steps)
+
+    reach = 4.0 * doubt
+    grid = np.linspace(max(first - reach, 0.0), first + reach, 41)
+    near = float(grid[np.argmax([likelihood(each, trains) for each in grid.tolist()])])
+    cell = float(grid[1] - grid[0])
+    time_s = best(trains, near - cell, near + cell, 25)
+    groups = min(len(trains), GROUPS_MAX)
+    without = [
+        best(
+            [one for n, one in enumerate(trains) if n % groups != group],
+            near - 3 * cell,
+            near + 3 * cell,
+            20,
+        )
+        for group in range(groups)
+    ]
+    spread = np.array(without) - np.mean(without)
+    error = sqrt((groups - 1) / groups * float(spread @ spread))
+    # A time that is hardly likelier than none is not sure, however alike the groups are.
+    gain = likelihood(time_s, trains) - likelihood(0.0, trains)
+    error = max(error, time_s / sqrt(2.0 * max(gain, 1e-9)))
+    few = 1.0 + (Z95**2 + 1.0) / (4.0 * (groups - 1))  # as Student's t is wider than the normal law
+    return time_s, max(few * error, 1e-9)

@@ -7,6 +7,7 @@ normal error of at least that, and a delay stays that far from the bound of its 
 hardly vary are called constant.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import exp, lgamma, log, pi, sqrt
@@ -27,7 +28,7 @@ SLOTS = 4000
 PAIRS_MIN = 20
 """Smallest number of packets that anything is fitted to."""
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
-"""Shortest time that a bad channel is redrawn in, in mean times between packets, and longest [s]."""
+"""Shortest time in which a channel is redrawn, in mean times between packets, and longest [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,14 +204,24 @@ def fit_losses(time_s: Array, lost: Bools) -> list[Fit]:
     best_share = share
     cell = spacing
     for _ in range(20):  # one after the other: they hardly depend on each other
-        cell = exp(highest(lambda each, s=best_share: likelihood(s, exp(each)), low, high, 40))
-        best_share = highest(lambda each, c=cell: likelihood(each, c), 1e-6, 1.0 - 1e-6, 50)
+        cell = exp(highest(partial(_at_share, likelihood, best_share), low, high, 40))
+        best_share = highest(partial(_at_cell, likelihood, cell), 1e-6, 1.0 - 1e-6, 50)
     first = log(best_share if lost[0] else 1.0 - best_share)
     numbers = best_share, cell / (1.0 - best_share)
     if numbers[1] <= BURST_MAX_S:
         bic = 2.0 * log(count) - 2.0 * (likelihood(best_share, cell) + first)
         fits.append(Fit("gilbert_elliott", numbers, bic))
     return sorted(fits, key=lambda fit: fit.bic)
+
+
+def _at_share(likelihood: Callable[[float, float], float], share: float, cell: float) -> float:
+    """Likelihood of a share and the logarithm of a cell's length."""
+    return likelihood(share, exp(cell))
+
+
+def _at_cell(likelihood: Callable[[float, float], float], cell_s: float, share: float) -> float:
+    """Likelihood of a cell's length and a share."""
+    return likelihood(share, cell_s)
 
 
 _TURNS = ((True, True), (True, False), (False, True), (False, False))

@@ -38,7 +38,7 @@ IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement gives way to another [ns]."""
 HISTORY_MAX = 65_536
 """Number of arrivals kept until the prober has been told of them; older ones are forgotten."""
-HOLD_NS = 500 * MILLISECOND_NS
+HOLD_NS = 200 * MILLISECOND_NS
 """Time for which the rest of a train is waited for after each of its packets [ns]."""
 _TOLD_MAX = PAYLOAD_BYTES_MAX // 12
 """Number of arrivals that have room in an answer."""
@@ -68,6 +68,8 @@ class Session:
     """Newest arrivals that the prober may not have been told of: number and time [ns]."""
     train: list[Held] = field(default_factory=list)
     """Packets of a train that wait for the others."""
+    train_ns: int = 0
+    """Time of the newest of these [ns]."""
 
 
 class Listener(Endpoint):
@@ -153,6 +155,7 @@ class Listener(Endpoint):
         waits = Held(number, call, datagram.peer, len(datagram.payload))
         if probe.train > 1 and number != NO_NUMBER:
             session.train.append(waits)
+            session.train_ns = now_ns
             if len(session.train) >= probe.train:
                 self._release(session, probe.session, now_ns)
         else:
@@ -178,13 +181,13 @@ class Listener(Endpoint):
     def wake(self, *, now_ns: int) -> None:
         """See `Endpoint`; the rest of a train is not waited for for ever."""
         for name, session in self._sessions.items():
-            if session.train and now_ns >= session.heard_ns + HOLD_NS:
+            if session.train and now_ns >= session.train_ns + HOLD_NS:
                 self._release(session, name, now_ns)
 
     def next_wake_ns(self) -> int | None:
         """Time at which a train is answered as far as it has come."""
         return min(
-            (each.heard_ns + HOLD_NS for each in self._sessions.values() if each.train),
+            (each.train_ns + HOLD_NS for each in self._sessions.values() if each.train),
             default=None,
         )
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isnan
 
 import msgspec
 import numpy as np
 
 from skytether.probe import analysis, fits
-from skytether.probe.analysis import QUANTILES, Clocks, Delays, Rate
+from skytether.probe.analysis import QUANTILES, Clocks, Delays
 from skytether.probe.prober import TRAIN, Longs, Measured, Way
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.law.model import Array
@@ -67,7 +68,7 @@ class WayTold(msgspec.Struct, frozen=True, kw_only=True):
     train_wait_s: float
     """Time for which the last packet of a train waits in the queue [s]."""
     delay_models: list[Model]
-    """Models of the delay without the time that a packet takes to pass that rate, the best first."""
+    """Models of the delay, without the time to pass that rate, the best first."""
     loss_models: list[Model]
     """Models of the losses, the best first."""
     text: str
@@ -88,7 +89,7 @@ class PathTold(msgspec.Struct, frozen=True, kw_only=True):
     offset_s: float
     """Offset of the listener's clock at the first probe [s]."""
     offset_doubt_s: float
-    """Largest error of that offset, and of all one-way delays, one way up and the other down [s]."""
+    """Largest error of that offset, and of all one-way delays, with opposite signs [s]."""
     drift_ppm: float
     """Drift of the listener's clock [10⁻⁶]; 0 where none is sure."""
     drift_doubt_ppm: float
@@ -126,15 +127,9 @@ def outcome(measured: Measured, listener: str, *, secure: bool) -> Outcome:
         ValueError: too few packets went each way.
     """
     ways = {"uplink": measured.uplink, "downlink": measured.downlink}
-    rates = {name: analysis.rate(way, measured.size) for name, way in ways.items()}
-    wire = measured.size + HEADER_BYTES
-    service_s = {name: wire / rate.bytes_per_s if rate else 0.0 for name, rate in rates.items()}
-    clocks, down, up = analysis.delays(measured, service_s["downlink"], service_s["uplink"])
+    clocks, down, up = analysis.delays(measured)
     delays = {"uplink": up, "downlink": down}
-    told = {
-        name: _way_told(way, delays[name], rates[name], service_s[name])
-        for name, way in ways.items()
-    }
+    told = {name: _way_told(way, delays[name], measured.size) for name, way in ways.items()}
     near = measured.downlink.sent_ns
     path = PathTold(
         listener=listener,
@@ -154,7 +149,9 @@ def outcome(measured: Measured, listener: str, *, secure: bool) -> Outcome:
     return Outcome(clocks, delays, path)
 
 
-def _way_told(way: Way, delays: Delays, rate: Rate | None, service_s: float) -> WayTold:
+def _way_told(way: Way, delays: Delays, size: int) -> WayTold:
+    rate = delays.rate
+    service_s = (size + HEADER_BYTES) / rate.bytes_per_s if rate else 0.0
     lost = ~delays.came
     delay_s = delays.delay_s[delays.came]
     apart_s, correlations = analysis.autocorrelation(delays.time_s, delays.delay_s)
@@ -219,8 +216,9 @@ def trace(delays: Delays) -> str:
         at = round(time_s - begin, 6)
         if at > last:  # of two at one instant, which a trace has no place for, the first
             last = at
-            lost = delay_s != delay_s
-            lines.append(f"{at:.6f},,1" if lost else f"{at:.6f},{max(delay_s, 0.0):.6f},0")
+            lines.append(
+                f"{at:.6f},,1" if isnan(delay_s) else f"{at:.6f},{max(delay_s, 0.0):.6f},0"
+            )
     return "\n".join(lines) + "\n"
 
 

@@ -4,8 +4,8 @@
     the last answers have had time to come
 
 Once in a while a train of packets is sent at once, for the rate of the path. It takes the place of
-as many probes as it has packets, so that a path that carries the probes has emptied its queue
-before the next one: delays are measured on an idle path.
+twice as many probes as it has packets, so that a path that carries the probes has emptied its queue
+both ways before the next one: delays are measured on an idle path.
 """
 
 from array import array
@@ -39,6 +39,8 @@ PROBES_MAX = 1_000_000
 """Largest number of probes: as many as a trace has rows."""
 TRAIN = 16
 """Number of packets of a train."""
+TRAIN_SLOTS = 2 * TRAIN
+"""Number of probes whose place a train takes."""
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 """Shortest time [ns], and smallest number of probes, from one train to the next."""
 HELLO_BYTES = 64
@@ -246,11 +248,11 @@ class Prober(Endpoint):
         if now_ns < self._zero_ns + slot * self._period_ns:
             return
         every = self._train_every
-        if slot % every == every // 2 and slot + TRAIN <= self._slots:
+        if slot % every == every // 2 and slot + TRAIN_SLOTS <= self._slots:
             for _ in range(TRAIN):
                 self._send(TRAIN, self._trains, now_ns)
             self._trains += 1
-            self._slot = slot + TRAIN
+            self._slot = slot + TRAIN_SLOTS
         elif slot < self._slots:
             self._send(0, -1, now_ns)
             self._slot = slot + 1
@@ -343,9 +345,6 @@ class Prober(Endpoint):
         came[first] = True
         train = np.array(self._train, np.int64)[np.maximum(number, 0)]
         kept = (number >= 0) & (np.arange(len(number)) < end)
-        way = Way(sent_ns[kept], came_ns[kept], came[kept], train[kept], len(answered) - len(first))
-        order = np.argsort(way.sent_ns, kind="stable")
-        return Way(
-            *(each[order] for each in (way.sent_ns, way.came_ns, way.came, way.train)),
-            copies=way.copies,
-        )
+        order = np.flatnonzero(kept)[np.argsort(sent_ns[kept], kind="stable")]
+        copies = len(answered) - len(first)
+        return Way(sent_ns[order], came_ns[order], came[order], train[order], copies)

@@ -1,0 +1,182 @@
+"""What `skytether probe` finds of networks that are known.
+
+    python -m skytether.lab.benchmarks.probing
+
+Each setting is a network of ours in virtual time, with the same impairments both ways and a
+listener whose clock is an hour ahead and drifts. What the measurement says is held against what the
+network is, and against what it did: netem records every packet.
+"""
+
+import sys
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import msgspec
+import tyro
+
+from skytether.client.link import PlainLink
+from skytether.lab.benchmarks.harness import TextTable, progress
+from skytether.netem.proxy import Proxy
+from skytether.probe.listener import Listener
+from skytether.probe.outcome import PathTold, WayTold, outcome
+from skytether.probe.prober import Measured, Prober
+from skytether.probe.wire import NONCE_BYTES
+from skytether.server.gate import PlainGate
+from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
+from skytether.shared.scenario.air.impairment import Impairment
+from skytether.shared.scenario.air.losses import GilbertElliott
+from skytether.shared.scenario.air.path import path
+from skytether.shared.scenario.air.queues import Rate
+from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, Rows, parse
+from skytether.sim.world import Clock, World
+
+SETTINGS = (
+    "constant(0.05) & loss(0.02)",
+    "uniform(0.02, 0.1) & loss(0.3)",
+    "normal(0.1, 0.015) & gilbert_elliott(0.1, 0.5)",
+    "gamma(0.02, 0.06, 0.02) & loss(0.1)",
+    "gamma(0.1, 0.13, 0.03) & gilbert_elliott(0.2, 1)",
+    "lognormal(0.02, 0.06, 0.04) & loss(0.05)",
+    "lognormal(0.1, 0.15, 0.02) & gilbert_elliott(0.05, 0.3)",
+    "paper(0.4, 0.02, 2) & loss(0.1)",
+    "gamma(0.02, 0.04, 0.01) & loss(0.05) & rate(50000)",
+    "lognormal(0.01, 0.02, 0.005) & gilbert_elliott(0.1, 0.4) & rate(12500, queue=20000)",
+)
+"""Networks, both ways alike."""
+CLOCK = Clock(3600 * SECOND_NS, 20_000)
+"""Clock of the listener: an hour ahead, and 20 ppm fast."""
+
+
+@dataclass(frozen=True)
+class ProbingOptions:
+    """How much to measure."""
+
+    seconds: float = 600.0
+    """Length of each measurement [s]."""
+    rate: float = 20.0
+    """Packets a second."""
+    bytes: int = 400
+    """UDP payload of each packet [B]."""
+    seed: int = 1
+    settings: tuple[str, ...] = SETTINGS
+    """Networks to measure."""
+    markdown: Path | None = None
+    """File for the table as Markdown."""
+
+
+def measure(
+    uplink: str,
+    downlink: str,
+    *,
+    seconds: float,
+    rate: float = 20.0,
+    size: int = 400,
+    seed: int = 1,
+    clock: Clock = CLOCK,
+) -> tuple[Measured, Rows]:
+    """Measure a network of ours in virtual time.
+
+    Args:
+        uplink, downlink: impairments.
+        seconds: length of the measurement [s].
+        rate: packets a second.
+        size: UDP payload of each packet [B].
+        seed: that of the network.
+        clock: that of the listener.
+
+    Returns:
+        What was measured, and netem's rows.
+    """
+    network = NetworkConfig(
+        uplink=DirectionConfig(impairments=uplink), downlink=DirectionConfig(impairments=downlink)
+    )
+    sink, world = BytesIO(), World()
+    listener = world.add("listener", Listener(PlainGate(), b"secret" * 5), clock=clock)
+    recorder = Recorder(PACKET_COLUMNS, sink)
+    scenario = msgspec.structs.replace(Scenario(), network=network, seed=seed)
+    netem = world.add("netem", Proxy(scenario, server=listener, recorder=recorder))
+    prober = Prober(
+        PlainLink(),
+        netem,
+        bytes(range(NONCE_BYTES)),
+        probes=round(seconds * rate),
+        period_ns=round(SECOND_NS / rate),
+        size=size,
+    )
+    world.add("prober", prober)
+    world.run(lambda: prober.finished, limit_ns=round((seconds + 120.0) * SECOND_NS))
+    return prober.measured(), parse(sink.getvalue())
+
+
+def parts(text: str) -> dict[str, Impairment]:
+    """Impairments of a direction by name."""
+    return dict(path(text).impairments)
+
+
+def row(text: str, told: PathTold, name: str) -> list[str]:
+    """What was found of a direction, beside what it is.
+
+    Args:
+        text: its impairments, those of the other direction as well.
+        told: what was found.
+        name: uplink or downlink.
+    """
+    way: WayTold = getattr(told, name)
+    is_, found = parts(text), parts(way.text)
+    rate = is_.get("rate")
+    mean_s = path(text).mean_s
+    if isinstance(rate, Rate):
+        mean_s += (told.bytes + HEADER_BYTES) / rate.bytes_per_s
+    burst = "-"
+    was, fit = is_.get("gilbert_elliott"), found.get("gilbert_elliott")
+    if isinstance(was, GilbertElliott) and isinstance(fit, GilbertElliott):
+        burst = f"{fit.burst_s:.3f} ({fit.burst_s / was.burst_s - 1:+.1%})"
+    rated = "-"
+    if isinstance(rate, Rate) and way.rate_bytes_per_s:
+        rated = f"{way.rate_bytes_per_s:.0f} ({way.rate_bytes_per_s / rate.bytes_per_s - 1:+.1%})"
+    asked = {each for each in is_ if each not in ("rate", "ordered")}
+    fitted = {each for each in found if each not in ("rate", "ordered")}
+    return [
+        f"`{text}`, {name}",
+        f"{told.round_trip_mean_s / 2 / mean_s - 1:+.2%}",
+        f"{1e3 * way.mean_s:.2f} ({way.mean_s / mean_s - 1:+.2%})",
+        f"{way.loss:.2%} ({way.loss_low:.2%} to {way.loss_high:.2%})",
+        burst,
+        rated,
+        "yes" if asked == fitted else way.text,
+    ]
+
+
+def table(options: ProbingOptions) -> TextTable:
+    """Measure every network; a row for each direction."""
+    rows = []
+    for text in progress(options.settings, "networks"):
+        measured, _ = measure(
+            text,
+            text,
+            seconds=options.seconds,
+            rate=options.rate,
+            size=options.bytes,
+            seed=options.seed,
+        )
+        told = outcome(measured, "virtual", secure=False).told
+        rows += [row(text, told, name) for name in ("downlink", "uplink")]
+    delays = ["round trip,\nmean", "one way, mean\n[ms]"]
+    losses = ["lost,\n95 % interval", "burst\n[s]", "rate\n[B/s]"]
+    return TextTable(["network", *delays, *losses, "best models\nare the true ones"], rows)
+
+
+def main() -> int:
+    """Measure as the command line says, and print what was found."""
+    options = tyro.cli(ProbingOptions, description=__doc__)
+    found = table(options)
+    found.show(f"probed for {options.seconds:g} s, {options.rate:g} packets a second")
+    if options.markdown:
+        options.markdown.write_text(found.markdown())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
