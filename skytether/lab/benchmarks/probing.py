@@ -7,6 +7,7 @@ listener whose clock is an hour ahead and drifts. What the measurement says is h
 network is, and against what it did: netem records every packet.
 """
 
+import re
 import sys
 from dataclasses import dataclass
 from io import BytesIO
@@ -24,10 +25,7 @@ from skytether.probe.prober import Measured, Prober
 from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import PlainGate
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
-from skytether.shared.scenario.air.impairment import Impairment
-from skytether.shared.scenario.air.losses import GilbertElliott
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.air.queues import Rate
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, Rows, parse
 from skytether.sim.world import Clock, World
@@ -110,9 +108,22 @@ def measure(
     return prober.measured(), parse(sink.getvalue())
 
 
-def parts(text: str) -> dict[str, Impairment]:
-    """Impairments of a direction by name."""
-    return dict(path(text).impairments)
+def number(text: str, name: str, place: int) -> float | None:
+    """An argument of an impairment in a text; None where that impairment is not in it."""
+    found = re.search(rf"\b{name}\(([^)]*)\)", text)
+    return float(found[1].split(",")[place]) if found else None
+
+
+def against(found: float | None, asked: float | None, form: str) -> str:
+    """A figure, and its error against what was asked for; a dash where there is none."""
+    if not found or not asked:
+        return "-"
+    return f"{found:{form}} ({found / asked - 1.0:+.1%})"
+
+
+def models(text: str) -> set[str]:
+    """Names of the delays and losses in a text."""
+    return {name for name, _ in path(text).impairments} - {"rate", "ordered"}
 
 
 def row(text: str, told: PathTold, name: str) -> list[str]:
@@ -124,28 +135,17 @@ def row(text: str, told: PathTold, name: str) -> list[str]:
         name: uplink or downlink.
     """
     way: WayTold = getattr(told, name)
-    is_, found = parts(text), parts(way.text)
-    rate = is_.get("rate")
-    mean_s = path(text).mean_s
-    if isinstance(rate, Rate):
-        mean_s += (told.bytes + HEADER_BYTES) / rate.bytes_per_s
-    burst = "-"
-    was, fit = is_.get("gilbert_elliott"), found.get("gilbert_elliott")
-    if isinstance(was, GilbertElliott) and isinstance(fit, GilbertElliott):
-        burst = f"{fit.burst_s:.3f} ({fit.burst_s / was.burst_s - 1:+.1%})"
-    rated = "-"
-    if isinstance(rate, Rate) and way.rate_bytes_per_s:
-        rated = f"{way.rate_bytes_per_s:.0f} ({way.rate_bytes_per_s / rate.bytes_per_s - 1:+.1%})"
-    asked = {each for each in is_ if each not in ("rate", "ordered")}
-    fitted = {each for each in found if each not in ("rate", "ordered")}
+    rate = number(text, "rate", 0)
+    mean_s = path(text).mean_s + ((told.bytes + HEADER_BYTES) / rate if rate else 0.0)
+    bursts = (number(each, "gilbert_elliott", 1) for each in (way.text, text))
     return [
         f"`{text}`, {name}",
         f"{told.round_trip_mean_s / 2 / mean_s - 1:+.2%}",
-        f"{1e3 * way.mean_s:.2f} ({way.mean_s / mean_s - 1:+.2%})",
+        against(1e3 * way.mean_s, 1e3 * mean_s, ".2f"),
         f"{way.loss:.2%} ({way.loss_low:.2%} to {way.loss_high:.2%})",
-        burst,
-        rated,
-        "yes" if asked == fitted else way.text,
+        against(*bursts, ".3f"),
+        against(way.rate_bytes_per_s, rate, ".0f"),
+        "yes" if models(text) == models(way.text) else way.text,
     ]
 
 
