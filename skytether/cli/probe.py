@@ -152,6 +152,7 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
 
         key = keys.load(options.keys).of(options.number)
         link = SecureLink(key, entropy=secrets.token_bytes)
+    command.check_sealed(listener, secure=link.secure or options.insecure)
     prober = Prober(
         link,
         listener,
@@ -164,7 +165,6 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         shell = driver.Shell(prober, None, [listener])
     except AddressError as error:
         raise CommandError(str(error)) from None
-    command.check_sealed(listener, secure=link.secure or options.insecure)
     with command.progress(f"probing {options.target}", options.seconds) as bar:
         driver.run([shell], on_event=_say, on_second=lambda: bar(prober.probed_s))
     if prober.refused:

@@ -37,7 +37,7 @@ WINDOWS = 12
 """Number of parts of a measurement whose least delays tell how sure the drift is."""
 CERTAIN = 3.5
 """Standard errors from which on a drift is no chance, told by so few parts."""
-Z95 = 1.959964
+Z95 = 1.959963984540054
 """Quantile of the standard normal distribution, of an interval of 95 %."""
 ALIKE_S = 50e-6
 """Standard deviation of values that are taken to be all alike [s]."""

@@ -45,7 +45,7 @@ class Fit:
     def text(self, correlation_s: float = 0.0) -> str:
         """The impairment as a scenario writes it."""
         shown = [f"{number:.5g}" for number in self.numbers]
-        if correlation_s:
+        if correlation_s and self.name != "constant":
             shown.append(f"correlation_s={correlation_s:.3g}")
         return f"{self.name}({', '.join(shown)})"
 

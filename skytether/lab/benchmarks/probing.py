@@ -137,13 +137,13 @@ def row(text: str, told: PathTold, name: str) -> list[str]:
     way: WayTold = getattr(told, name)
     rate = number(text, "rate", 0)
     mean_s = path(text).mean_s + ((told.bytes + HEADER_BYTES) / rate if rate else 0.0)
-    bursts = (number(each, "gilbert_elliott", 1) for each in (way.text, text))
+    found, asked = (number(each, "gilbert_elliott", 1) for each in (way.text, text))
     return [
         f"`{text}`, {name}",
         f"{told.round_trip_mean_s / 2 / mean_s - 1:+.2%}",
         against(1e3 * way.mean_s, 1e3 * mean_s, ".2f"),
         f"{way.loss:.2%} ({way.loss_low:.2%} to {way.loss_high:.2%})",
-        against(*bursts, ".3f"),
+        against(found, asked, ".3f"),
         against(way.rate_bytes_per_s, rate, ".0f"),
         "yes" if models(text) == models(way.text) else way.text,
     ]
