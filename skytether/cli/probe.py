@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 SECONDS_MAX, RATE_MAX = 86_400.0, 1000.0
 """Longest measurement [s], and largest rate [1/s]."""
 SECRET_BYTES = 32
+MODELS_SHOWN = 3
+"""Number of models of a direction's delays, and of its losses, that are shown."""
 
 
 @dataclass(frozen=True)
@@ -256,15 +258,14 @@ def _tell(options: ProbeOptions, found: Outcome) -> None:
     told = found.told
     ways = {"downlink": told.downlink, "uplink": told.uplink}
     command.show(_table(ways))
-    for name, way in ways.items():
-        models = [*way.delay_models, *way.loss_models]
-        if models:
-            shown = ", ".join(f"{model.text} {model.bic:.0f}" for model in models)
-            print(f"{name}, models and their BIC (the smaller, the better): {shown}")
+    command.show(_models(ways))
+    doubt = f"{told.drift_doubt_ppm:.1f} ppm"
+    drift = f"no drift was seen that is sure (standard error {doubt})"
+    if told.drift_ppm:
+        drift = f"the other end's gains {told.drift_ppm:+.1f} ± {doubt}"
     print(
-        f"Clocks: the other end's runs {told.drift_ppm:+.1f} ± {told.drift_doubt_ppm:.1f} ppm "
-        f"faster. The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms and "
-        f"{1e3 * told.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the "
+        f"Clocks: {drift}. The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms "
+        f"and {1e3 * told.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the "
         f"least is taken for each way, so one-way delays may be wrong by up to "
         f"{1e3 * told.offset_doubt_s:.2f} ms, one way too long and the other too short."
     )
@@ -300,6 +301,22 @@ def _figures(way: WayTold) -> dict[str, str]:
     found["rate [B/s], 95 % interval"] = rate
     found["last of a train waits [ms]"] = f"{1e3 * way.train_wait_s:.2f}"
     return found
+
+
+def _models(ways: dict[str, WayTold]) -> "Table":
+    """The best models of both directions, and by how much they are behind the best."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title="models, the best first", title_justify="left")
+    for each in ("", "model", "BIC, above the best"):
+        table.add_column(Text(each))
+    for name, way in ways.items():
+        for what, models in (("delay", way.delay_models), ("loss", way.loss_models)):
+            for model in models[:MODELS_SHOWN]:
+                behind = f"{model.bic - models[0].bic:.0f}"
+                table.add_row(Text(f"{name}, {what}"), Text(model.text), Text(behind))
+    return table
 
 
 def _table(ways: dict[str, WayTold]) -> "Table":

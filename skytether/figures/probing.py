@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from skytether.probe.outcome import Outcome
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.scenario.air.delays import Delay
 from skytether.shared.scenario.air.path import path
 
@@ -43,7 +43,9 @@ def drawn(outcome: Outcome) -> "Figure":
             _, model = path(told.delay_models[0].text).impairments[0]
             assert isinstance(model, Delay)
             passes_s = (
-                (outcome.told.bytes + 28) / told.rate_bytes_per_s if told.rate_bytes_per_s else 0.0
+                (outcome.told.bytes + HEADER_BYTES) / told.rate_bytes_per_s
+                if told.rate_bytes_per_s
+                else 0.0
             )
             grid_of = np.linspace(0.001, 0.999, 500)
             model_ms = [1e3 * (model.quantile_ns(each) / SECOND_NS + passes_s) for each in grid_of]

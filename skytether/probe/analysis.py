@@ -35,7 +35,7 @@ DRIFT_MAX = 500e-6
 """Largest drift between two clocks that is believed: as fast as clocks are slewed."""
 WINDOWS = 12
 """Number of parts of a measurement whose least delays tell how sure the drift is."""
-CERTAIN = 3.5
+CERTAIN = 5.0
 """Standard errors from which on a drift is no chance, told by so few parts."""
 Z95 = 1.959963984540054
 """Quantile of the standard normal distribution, of an interval of 95 %."""
