@@ -271,7 +271,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether keygen ",)  # by test_keys.py
     known += ("skytether torture",)  # by test_torture.py
     known += ("skytether set ", "skytether report ", "skytether export ", "skytether recover ")
-    known += ("skytether replay ", "skytether duel ")
+    known += ("skytether replay ", "skytether duel ", "skytether page ")
     known += ("skytether autopilot ",)  # by test_autopilot.py
     known += ("docker compose up",)
     # By test_observe.py and test_compose.py, as far as they can be.
@@ -280,6 +280,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether autopilot ",)  # by test_aboard_udp.py
     # By test_netem.py and test_compose.py.
     known += ("python echo.py", "python ask.py", "openssl s_", "UPLINK=")
+    known += ("skytether probe ",)  # by test_probe.py
     by_hand = ("skytether server ", "skytether netem ", "skytether client ")
     by_hand += ("skytether station ", "skytether autopilot ")
     for line in COMMANDS:

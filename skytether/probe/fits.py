@@ -161,7 +161,7 @@ def _paper(delay_s: Array) -> Found | None:
     begin = float(np.mean(delay_s - slot * places))
 
     def likelihood(before: int) -> float:
-        """Of the Poisson numbers, where the least delay has so many slots that never came."""
+        """Likelihood of the Poisson numbers, if so many slots below the least delay never came."""
         counts, times = np.unique(places + before, return_counts=True)
         mean = float(np.mean(places)) + before
         logs = [count * log(mean) - mean - lgamma(count + 1.0) for count in counts.tolist()]
