@@ -122,13 +122,14 @@ class Link:
         """UDP payload in the heap [B]."""
         self._entered = 0
         self._path = path or Path(())
+        self._is_ordered = self._path.is_ordered
         self._bottleneck = _bottleneck(self._path)
         self.counts = Counts()
 
     def change(self, path: Path, *, now_ns: int) -> None:
         """Have another order and rate; packets that wait go on to wait, if they fit."""
         self._pass(now_ns)
-        was, self._path = self._path, path
+        was, self._path, self._is_ordered = self._path, path, path.is_ordered
         if path.queue is was.queue:
             return
         before, self._bottleneck = self._bottleneck, _bottleneck(path)
@@ -196,22 +197,24 @@ class Link:
             counts.lost += 1
             self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)
             return
-        if self._path.is_ordered:
+        if self._is_ordered:
             due_ns = lane.latest_ns = max(due_ns, lane.latest_ns)
         if fate.flipped is not None and size:
             counts.corrupted += 1
             datagram = datagram._replace(payload=_flipped(datagram.payload, fate.flipped))
-        counts.duplicated += fate.copies
-        for copy in range(1 + fate.copies):
+        heap, left, is_copy = self._heap, fate.copies, False
+        counts.duplicated += left
+        while left >= 0:
+            left -= 1
             if self._is_full(size):
                 counts.overflowed += 1
                 continue
             self._bytes += size
             self._entered += 1
             delay_ns = due_ns - entered_ns
-            is_copy = copy > 0
-            heappush(self._heap, (due_ns, self._entered, datagram, lane, number, delay_ns, is_copy))
-            counts.depth_max = max(counts.depth_max, len(self._heap))
+            heappush(heap, (due_ns, self._entered, datagram, lane, number, delay_ns, is_copy))
+            counts.depth_max = max(counts.depth_max, len(heap))
+            is_copy = True
 
     def _is_full(self, size: int) -> bool:
         """Whether there is no room for another packet of this size."""
