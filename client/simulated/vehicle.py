@@ -99,4 +99,4 @@ def simulated(scenario: Scenario, number: int) -> SimulatedVehicle:
     """The vehicle of a scenario with a number, whose winds and noise are its own."""
     weather = Weather(scenario, stream(scenario.seed, "wind", number))
     sensor = Sensor(scenario, stream(scenario.seed, "sensor", number))
-    return SimulatedVehicle(scenario.dt_ns, FirstOrderPlant(scenario, weather), sensor)
+    return SimulatedVehicle(scenario.dt_ns, FirstOrderPlant(scenario, weather, number), sensor)

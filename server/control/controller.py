@@ -21,6 +21,7 @@ from skytether.server.control.desired import Desired
 from skytether.server.control.planner import Figures, Planner
 from skytether.server.control.predictive import Estimator
 from skytether.server.control.scheme import DOUBTS, Foresight, Scheme, foresight
+from skytether.server.control.together import Together
 from skytether.server.control.trajectory import Guidance
 from skytether.shared.base.kernel import B1, I1, kernel
 from skytether.shared.core.stopwatch import Stopwatch
@@ -96,9 +97,14 @@ class Controller:
         """What is known of the desired trajectories."""
         gain = feedback_gain(scenario)
         self._scheme: Scheme
-        self.planner: Planner | Guidance
+        self.planner: Planner | Guidance | Together
         """Plans of every vehicle, or what is sent in place of a plan."""
-        if terms.splines:
+        shape = scenario.reference.shape
+        if terms.splines and shape.startswith("swap") and references is not None:
+            self._scheme = self.planner = Together(
+                scenario, terms, clock, room, block, references, self.desired.number
+            )
+        elif terms.splines:
             self._scheme = self.planner = Guidance(
                 terms, control, gain, self.desired, clock, room, block
             )

@@ -135,6 +135,10 @@ class Desired:
         """Let a vehicle begin in this row."""
         self._number[row] = vehicle if self._references else 0
 
+    def number(self, row: int) -> int:
+        """Number of the trajectory of the vehicle in a row."""
+        return int(self._number[row])
+
     def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
         """Move a live point, see `LivePoint.move`; any other trajectory stays as it is.
 

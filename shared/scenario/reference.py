@@ -143,6 +143,38 @@ def hover(point_m: Array) -> Reference:
     return sample
 
 
+SWAP_AT_S = 2.0
+"""Time at which vehicles that swap places leave [s]."""
+
+
+class Swap:
+    """Places on a circle, from which each vehicle goes to the one opposite.
+
+    Args:
+        vehicles: number of places.
+        radius_m: radius of the circle [m].
+        axes: 2 or 3.
+        vehicle: number of the vehicle whose reference it is.
+    """
+
+    def __init__(self, vehicles: int, radius_m: float, axes: int, vehicle: int = 1) -> None:
+        self._all = vehicles, radius_m, axes
+        angle = 2.0 * np.pi * (vehicle - 1) / vehicles
+        self._place = np.zeros(axes)
+        self._place[:2] = radius_m * np.array([np.cos(angle), np.sin(angle)])
+
+    def of(self, vehicle: int) -> "Swap":
+        """The reference of another vehicle."""
+        return Swap(*self._all, vehicle)
+
+    def __call__(self, t: NDArray[Any]) -> Array:
+        """Goal at times [s]; see `Reference`."""
+        t = np.asarray(t, dtype=np.float64)
+        state = np.zeros((*t.shape, len(self._place), 2))
+        state[..., 0] = np.where(t < SWAP_AT_S, 1.0, -1.0)[..., None] * self._place
+        return state
+
+
 def target(
     rng: np.random.Generator,
     axes: int,

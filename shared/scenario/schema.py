@@ -135,6 +135,12 @@ class ControlConfig(Section, frozen=True):
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
     """Largest distance of a spline from the desired trajectory that the server sees [m], as far as
     16 knots reach, with the scheme "trajectory"."""
+    separation_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
+    """Smallest distance between two vehicles of a mission [m]; 0: none is kept."""
+    tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
+    """Largest distance of a vehicle of a mission from the motion that it flies [m]."""
+    may_be_flown: OfServer[bool] = True
+    """Whether motions are kept apart from all that may be flown, and not from those sent last."""
     state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: OfServer[tuple[Amount, Amount]] = (50.0, 20.0)
@@ -387,6 +393,9 @@ class LinkConfig(Section, frozen=True):
     age_max_s: Term[Annotated[float, Meta(gt=0, le=60)]] = 5.0
     """Largest age of the observation behind an input [s]; beyond it the vehicle brakes and hovers,
     or holds its last input where `vehicle.exhausted` says so."""
+    join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
+    """Time after its first knot up to which the vehicle takes a trajectory [s]; 0: at any time. It
+    tells the server for certain which one is flown."""
     timeout_s: OfEach[Interval] = 2.0
     """Time of silence after which the other end is taken for gone [s]: the vehicle brakes and says
     HELLO again; the server lets another client have the vehicle's number."""
@@ -496,6 +505,7 @@ class Scenario(Section, frozen=True):
             exhausted=vehicle.exhausted,
             brake_mps2=vehicle.brake_mps2,
             age_max_s=self.link.age_max_s,
+            join_s=self.link.join_s,
             shape=self._shape(),
             radius_m=reference.radius_m,
             period_s=reference.period_s,
@@ -514,7 +524,7 @@ class Scenario(Section, frozen=True):
             seed = int(stream(self.seed, "target", vehicle).integers(2**32))
             flown = msgspec.structs.replace(self, seed=seed)
         made: shapes.Reference = entry.make(flown, *entry.numbers(shape.values, self.reference))
-        return made
+        return made.of(vehicle) if isinstance(made, shapes.Swap) else made
 
     def entries(self) -> Iterator[Entry]:
         """Policies and shape that the scenario names."""

@@ -5,8 +5,10 @@ an entry like these.
 """
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
@@ -83,3 +85,9 @@ def live(scenario: Scenario) -> Reference:
     """Point that is moved while it flies, from the one of `points_m` or the origin on."""
     points = _points(scenario)
     return curves.hover(points[0] if len(points) else np.zeros(scenario.model.axes))
+
+
+@reference
+def swap(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
+    """Places on a circle of `radius_m`, from which each vehicle goes to the one opposite."""
+    return curves.Swap(vehicles, scenario.reference.radius_m, scenario.model.axes)

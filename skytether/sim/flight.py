@@ -309,7 +309,9 @@ def _fly(
         recorder=recorder,
         plans=plans,
         stopwatch=stopwatch,
-        references=target if scenario.reference.shape == "target" else None,
+        references=target
+        if scenario.reference.shape.partition("(")[0] in ("target", "swap")
+        else None,
     )
 
     def server_rows() -> int:
