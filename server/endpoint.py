@@ -72,7 +72,8 @@ class Server(Endpoint):
         super().__init__()
         self.changeable = TRIGGER | POINT if scenario.reference.shape == "live" else TRIGGER
         terms = scenario.terms()
-        if references is None and scenario.reference.shape.partition("(")[0] in ("target", "swap"):
+        own = scenario.is_mission or scenario.reference.shape == "target"
+        if references is None and own:
             references = lru_cache(room)(scenario.make_reference)
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, terms.dt_ns)

@@ -99,10 +99,9 @@ class Controller:
         self._scheme: Scheme
         self.planner: Planner | Guidance | Together
         """Plans of every vehicle, or what is sent in place of a plan."""
-        shape = scenario.reference.shape
-        if terms.splines and shape.startswith("swap") and references is not None:
+        if scenario.is_mission and references is not None:
             self._scheme = self.planner = Together(
-                scenario, terms, clock, room, block, references, self.desired.number
+                scenario, terms, room, block, references, self.desired.number
             )
         elif terms.splines:
             self._scheme = self.planner = Guidance(

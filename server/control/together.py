@@ -37,23 +37,20 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import osqp
-from scipy import sparse
 
-from skytether.server.control.clock import ClockMap
+from skytether.server.control.dual import DualSolver
 from skytether.server.control.planner import FIGURES, Figures
 from skytether.server.control.scheme import Foresight
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
 
-SPACING = 10
-"""Steps from one knot to the next; motions are planned and sent at multiples of it."""
-INTERVALS = 12
-"""Number N of intervals that are planned."""
+LONGEST = (INTERVALS + JOIN_MAX) * SPACING
+"""Steps that a motion takes at most."""
 SUB = 2
 """Number of times in each interval at which distances are kept."""
 MARGIN_M = 0.03
@@ -78,42 +75,6 @@ STUCK = 0.3
 """Share of the way to the goal, 2 m at most, below which a plan is taken for stuck."""
 
 
-class Motion(NamedTuple):
-    """Where a vehicle is at every time, by its own steps."""
-
-    first: int
-    """Step of the first knot, a multiple of SPACING."""
-    position: Array
-    """Position of each knot [m]; shape (knots, axes)."""
-    velocity: Array
-    """Velocity of each knot, 0 at the last [m/s]; shape (knots, axes)."""
-
-    @property
-    def last(self) -> int:
-        """Step of the last knot; it rests from there on."""
-        return self.first + (len(self.position) - 1) * SPACING
-
-    def at(self, steps: Array, dt_s: float) -> tuple[Array, Array]:
-        """Positions [m] and velocities [m/s] at some steps, which may be fractions; shape (n, axes).
-
-        Accelerations are constant between knots. Before the first knot it rests there.
-        """
-        along = np.clip((steps - self.first) / SPACING, 0.0, len(self.position) - 1)
-        knot = np.minimum(along.astype(np.int64), max(len(self.position) - 2, 0))
-        t_s = ((along - knot) * SPACING * dt_s)[:, None]
-        v0 = self.velocity[knot]
-        after = np.minimum(knot + 1, len(self.position) - 1)
-        acceleration = (self.velocity[after] - v0) / (SPACING * dt_s)
-        p = self.position[knot] + t_s * v0 + 0.5 * t_s * t_s * acceleration
-        return p, v0 + t_s * acceleration
-
-
-def resting(step: int, position: Array) -> Motion:
-    """Rest at a place [m; shape (axes,)]."""
-    at = np.array([position], dtype=np.float64)
-    return Motion(step // SPACING * SPACING, at, np.zeros_like(at))
-
-
 class Sent(NamedTuple):
     """A motion that was sent."""
 
@@ -122,7 +83,7 @@ class Sent(NamedTuple):
     motion: Motion
 
 
-class Row:
+class Known:
     """What is known of one vehicle."""
 
     def __init__(self) -> None:
@@ -134,8 +95,10 @@ class Row:
         """Motion to be sent at this step."""
         self.turned = 0.0
         """Angle by which it aims to the right of its goal [rad]."""
-        self.known = False
+        self.heard = False
         """Whether an observation has come in this session."""
+        self.unknown_until = -1
+        """Step from which on a motion is over that another server has sent."""
 
     def motions(self) -> list[Motion]:
         """All that may be flown, the one to be sent at this step included."""
@@ -150,7 +113,6 @@ class Together:
     Args:
         scenario: `control.separation_m` and `tube_m`, and the seed of directions that are drawn.
         terms: the rule of flight.
-        clock: unused but for what schemes have in common.
         capacity: number of vehicles there can be.
         block: number of vehicles that are decided on at a time.
         references: where each vehicle wants to be, by its number.
@@ -163,7 +125,6 @@ class Together:
         self,
         scenario: Scenario,
         terms: Terms,
-        clock: ClockMap,  # noqa: ARG002
         capacity: int,
         block: int,
         references: Callable[[int], Reference],
@@ -174,11 +135,11 @@ class Together:
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         self.planned = np.zeros((block, terms.axes, 2))
         self._state = np.zeros((capacity, terms.axes, 2))
-        self._rows = [Row() for _ in range(capacity)]
+        self._rows = [Known() for _ in range(capacity)]
         self._references, self._number_of = references, number_of
         control = scenario.control
         self._apart_m = control.separation_m + 2.0 * control.tube_m
-        self._dt_s, self._gain = terms.dt_s, np.array(terms.gain)
+        self._tube_m, self._dt_s = control.tube_m, terms.dt_s
         self._join = terms.join
         self._lead = -(-self._join // SPACING) * SPACING
         """Steps after the first knot from which on a motion differs from the one in force."""
@@ -186,14 +147,13 @@ class Together:
         """Steps after which a motion is sent again, before it is too old to be flown."""
         self._plan = Plan(terms)
         self._rng = stream(scenario.seed, "together")
-        self._ignores = not control.may_be_flown
         self._now, self._ahead = 0, dict[int, int]()
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
 
     def forget(self, row: int) -> None:
         """See `Scheme`; motions stay, for the vehicle goes on with them."""
         self.observed_step[row] = -1
-        self._rows[row].known = False
+        self._rows[row].heard = False
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
@@ -210,17 +170,20 @@ class Together:
                 known.sent.clear()
         elif known.in_force is None or known.in_force.step != observation.in_force:
             found = next((each for each in known.sent if each.step == observation.in_force), None)
-            if found is not None:
-                known.in_force = found
-            elif known.in_force is None:
-                self.counts["unknown"] += 1
-                known.in_force = Sent(observation.in_force, resting(k, observation.state[:, 0]))
-        assert known.in_force is not None
-        newest = known.in_force.step
+            if found is None:  # of another server, or of a vehicle that was in this row before
+                known.unknown_until = observation.in_force + LONGEST
+                found = Sent(observation.in_force, resting(k, observation.state[:, 0]))
+            known.in_force = found
+        if k <= known.unknown_until:
+            known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
+        newest, motion = known.in_force
+        p, _ = motion.at(np.array([float(k)]), self._dt_s)
+        if np.linalg.norm(p[0] - observation.state[:, 0]) > self._tube_m:
+            self.counts["left_tube"] += 1
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
-        known.known = True
+        known.heard = True
         return True
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
@@ -240,7 +203,7 @@ class Together:
             figures[name] = 0.0
         for i, (row, k) in enumerate(steps.items()):
             known = self._rows[row]
-            if known.in_force is not None and known.known and k % SPACING == 0:
+            if known.in_force is not None and known.heard and k % SPACING == 0:
                 self._decide(row, known, k)
             at = known.in_force.motion if known.in_force else resting(k, self._state[row, :, 0])
             p, v = at.at(np.array([float(k)]), self._dt_s)
@@ -273,12 +236,14 @@ class Together:
 
     # -- what is decided ---------------------------------------------------------------------------
 
-    def _decide(self, row: int, known: Row, k: int) -> None:
+    def _decide(self, row: int, known: Known, k: int) -> None:
         """Find the motion to be sent to a vehicle now, if any."""
         base = known.in_force
         assert base is not None
         if known.sent:
             return  # whether that was taken is not known yet
+        if any(each.heard and self._is_unknown(row, each) for row, each in enumerate(self._rows)):
+            return
         if base.step < 0:
             known.next = base.motion  # it has none: first of all the place where it hovers
             return
@@ -299,21 +264,22 @@ class Together:
         else:
             self.counts["refused"] += 1
 
+    def _is_unknown(self, row: int, known: Known) -> bool:
+        """Whether a vehicle still flies a motion that this server does not know."""
+        return self.observed_step[row] <= known.unknown_until
+
     def _others(self, row: int, k: int) -> list[tuple[Motion, int]]:
-        """Motions of others that may be flown, and how many steps theirs are ahead of this one's."""
+        """Motions of others that may be flown, and by how many steps they are ahead."""
         found = []
         for other, known in enumerate(self._rows):
             if other == row or known.in_force is None:
                 continue
             theirs = self._now + self._ahead.get(other, 0)
-            motions = known.motions()
-            if self._ignores:
-                motions = motions[-1:]
-            found += [(each, theirs - k) for each in motions]
+            found += [(each, theirs - k) for each in known.motions()]
         return found
 
     def _toward(
-        self, base: Motion, known: Row, k: int, goal: Array, others: list[tuple[Motion, int]]
+        self, base: Motion, known: Known, k: int, goal: Array, others: list[tuple[Motion, int]]
     ) -> Motion | None:
         """A motion from the one in force towards a goal; None where no solution is found."""
         dt_s, plan = self._dt_s, self._plan
@@ -326,7 +292,7 @@ class Together:
             q, _ = motion.at(times + shift, dt_s)
             off = held - q
             away = np.linalg.norm(off, axis=1)
-            near = np.flatnonzero(away < self._apart_m + MARGIN_M + 2.0 * plan.reach_m)
+            near = np.flatnonzero(away < self._apart_m + MARGIN_M + plan.reach_m)
             if not len(near):
                 continue
             n = off[near] / away[near, None]
@@ -390,31 +356,25 @@ class Plan:
         most = SHARE * np.array(terms.u_max) * gain
         place = np.arange(n)
         self._to_velocity = T * np.tril(np.ones((n, n)))
-        self._to_position = _positions(np.arange(1, n + 1) * 1.0, place, T)
-        self.times = np.arange(n * SUB + 1) / SUB
+        self._to_position = _positions(np.arange(1.0, n + 1.0), place, T)
+        self.times: Array = np.arange(n * SUB + 1) / SUB
         """Times at which distances are kept, in intervals from where the plan begins."""
         self._to_sample = _positions(self.times, place, T)
         self._weights = np.ones(n)
         self._weights[-1] = LAST
         hessian = self._to_position.T @ (self._weights[:, None] * self._to_position)
-        self._hessian = sparse.csc_matrix(
-            np.triu(np.kron(np.eye(axes), hessian + SMOOTH * np.eye(n)))
-        )
+        self._solver = DualSolver(np.kron(np.eye(axes), hessian + SMOOTH * np.eye(n)))
         # The input at the end of each interval, and at its begin: v ± within what it can do.
         ends = [self._to_velocity + tau_s[x] * np.eye(n) for x in range(axes)]
         before = np.vstack([np.zeros(n), self._to_velocity[:-1]])
         begins = [before + tau_s[x] * np.eye(n) for x in range(axes)]
-        self._fixed = np.vstack(
-            [
-                np.eye(n * axes),
-                _blocks(ends),
-                _blocks(begins),
-                _blocks([self._to_velocity[-1:]] * axes),
-            ]
-        )
+        both = np.vstack([np.eye(n * axes), _blocks(ends), _blocks(begins)])
+        self._fixed = np.vstack([_blocks([self._to_velocity[-1:]] * axes), both, -both])
         self._most, self._axes, self._T = most, axes, T
-        self.reach_m = float(most.max()) * n * T / 2.0
-        """How far apart two motions from one place may be [m]."""
+        passed_s = self.times * T
+        along_m = np.minimum(ACCELERATION_MPS2 * passed_s**2, 2.0 * most.max() * passed_s)
+        self.reach_m = np.sqrt(axes) * along_m
+        """How far apart two motions from one state may be at those times [m]."""
 
     def solve(
         self, p0: Array, v0: Array, goal: Array, planes: Planes | None
@@ -431,8 +391,7 @@ class Plan:
         linear = (self._to_position.T @ (self._weights[:, None] * (free - goal))).T.ravel()
         a = np.full(n * axes, ACCELERATION_MPS2)
         most, v = np.repeat(self._most, n), np.repeat(v0, n)
-        low = [-a, -most - v, -most - v, -v0]
-        high = [a, most - v, most - v, -v0]
+        low = [-v0, -a, -most - v, -most - v, -a, v - most, v - most]
         rows = [self._fixed]
         if planes is not None:
             at, normal, least = planes
@@ -441,24 +400,11 @@ class Plan:
             )
             drifting = p0 + self.times[at][:, None] * T * v0
             low.append(least - np.einsum("ij,ij->i", normal, drifting))
-            high.append(np.full(len(at), np.inf))
-        solver = osqp.OSQP()
-        solver.setup(
-            self._hessian,
-            linear,
-            sparse.csc_matrix(np.vstack(rows)),
-            np.concatenate(low),
-            np.concatenate(high),
-            verbose=False,
-            eps_abs=1e-4,
-            eps_rel=1e-4,
-            max_iter=4000,
-        )
-        result = solver.solve()
-        if result.info.status_val not in (1, 2):
+        x = self._solver.solve(-linear, np.vstack(rows), np.concatenate(low), axes)
+        if x is None:
             return None
-        a = np.asarray(result.x).reshape(axes, n).T
-        velocity = np.vstack([v0, v0 + self._to_velocity @ a])
+        found = x.reshape(axes, n).T
+        velocity = np.vstack([v0, v0 + self._to_velocity @ found])
         velocity[-1] = 0.0
         # Positions of what is flown: that velocity, whatever the solver's tolerance has left.
         steps = 0.5 * T * (velocity[1:] + velocity[:-1])
@@ -476,5 +422,9 @@ def _positions(times: Array, place: Indices, T: float) -> Array:
 
 def _blocks(parts: list[Array]) -> Array:
     """Matrix with these along its diagonal."""
-    dense: Array = sparse.block_diag(parts).toarray()
-    return dense
+    rows, columns = (sum(each.shape[axis] for each in parts) for axis in (0, 1))
+    whole, row, column = np.zeros((rows, columns)), 0, 0
+    for each in parts:
+        whole[row : row + len(each), column : column + each.shape[1]] = each
+        row, column = row + len(each), column + each.shape[1]
+    return whole

@@ -7,6 +7,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, margins
@@ -77,6 +78,7 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
         yield "control.feedback", "false", "true with control.scheme = 'trajectory'"
     if control.scheme == "none" and control.feedback:
         yield "control.feedback", "true", "false with control.scheme = 'none'"
+    yield from _no_mission(scenario)
     yield from list(_no_impairments(scenario)) or _too_late(scenario)
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
@@ -84,6 +86,27 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
         yield from _no_shape(scenario) or _no_reference(scenario)
     if scenario.fence.is_there:
         yield from list(_no_room(scenario)) or _outside(scenario)
+
+
+def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why vehicles cannot keep apart on a mission, whichever packets are lost."""
+    control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
+    if not scenario.is_mission:
+        return
+    if control.scheme != "trajectory":
+        yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
+    if control.trigger != "expected_gap":
+        yield "control.trigger", repr(control.trigger), "'expected_gap' on a mission"
+    if vehicle.exhausted != "brake":
+        yield "vehicle.exhausted", repr(vehicle.exhausted), "'brake' on a mission"
+    most_s = JOIN_MAX * SPACING * control.dt
+    if not 0.0 < link.join_s <= most_s + TINY:
+        yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
+    # A vehicle that hears nothing flies its motion to the end before it brakes.
+    longest_s = (INTERVALS + JOIN_MAX) * SPACING * control.dt
+    for key, value in (("link.timeout_s", link.timeout_s), ("link.age_max_s", link.age_max_s)):
+        if value < longest_s - TINY:
+            yield key, value, f"at least {longest_s:g} s on a mission: no motion is longer"
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:

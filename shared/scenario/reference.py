@@ -5,7 +5,7 @@ A reference is a function of time since the epoch [s; any shape] that gives the 
 """
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -147,32 +147,72 @@ SWAP_AT_S = 2.0
 """Time at which vehicles that swap places leave [s]."""
 
 
-class Swap:
-    """Places on a circle, from which each vehicle goes to the one opposite.
+class Mission:
+    """Goals of several vehicles, each from a time on: the reference of one of them.
+
+    A vehicle begins at its first goal. One that the mission does not know stays at the origin.
 
     Args:
-        vehicles: number of places.
-        radius_m: radius of the circle [m].
-        axes: 2 or 3.
-        vehicle: number of the vehicle whose reference it is.
+        goals: times, rising [s; shape (n,)], and goals from then on [m; shape (n, axes)], of each
+            vehicle by its number.
+        vehicle: number of the one whose reference it is.
     """
 
-    def __init__(self, vehicles: int, radius_m: float, axes: int, vehicle: int = 1) -> None:
-        self._all = vehicles, radius_m, axes
-        angle = 2.0 * np.pi * (vehicle - 1) / vehicles
-        self._place = np.zeros(axes)
-        self._place[:2] = radius_m * np.array([np.cos(angle), np.sin(angle)])
+    def __init__(self, goals: Mapping[int, tuple[Array, Array]], axes: int, vehicle: int) -> None:
+        self._goals, self._axes = goals, axes
+        self._times_s, self._points_m = goals.get(vehicle, (np.zeros(1), np.zeros((1, axes))))
 
-    def of(self, vehicle: int) -> "Swap":
+    @property
+    def vehicles(self) -> tuple[int, ...]:
+        """Numbers of the vehicles that have goals."""
+        return tuple(self._goals)
+
+    def of(self, vehicle: int) -> "Mission":
         """The reference of another vehicle."""
-        return Swap(*self._all, vehicle)
+        return Mission(self._goals, self._axes, vehicle)
 
     def __call__(self, t: NDArray[Any]) -> Array:
-        """Goal at times [s]; see `Reference`."""
+        """Goals at times [s]; see `Reference`."""
         t = np.asarray(t, dtype=np.float64)
-        state = np.zeros((*t.shape, len(self._place), 2))
-        state[..., 0] = np.where(t < SWAP_AT_S, 1.0, -1.0)[..., None] * self._place
+        state = np.zeros((*t.shape, self._axes, 2))
+        at = np.searchsorted(self._times_s, t, side="right") - 1
+        state[..., 0] = self._points_m[np.maximum(at, 0)]
         return state
+
+
+def swap(vehicles: int, radius_m: float, axes: int, altitude_m: float = 0.0) -> Mission:
+    """Places on a circle, from which each vehicle goes to the one opposite."""
+    goals, times_s = {}, np.array([0.0, SWAP_AT_S])
+    for number in range(1, vehicles + 1):
+        angle = 2.0 * np.pi * (number - 1) / vehicles
+        places = np.zeros((2, axes))
+        places[0, :2] = radius_m * np.array([np.cos(angle), np.sin(angle)])
+        places[1, :2] = -places[0, :2]
+        places[:, 2:] = altitude_m
+        goals[number] = times_s, places
+    return Mission(goals, axes, 1)
+
+
+def mission(path: Path, axes: int) -> Mission:
+    """Goals from a table with the columns vehicle, t [s], x, y, z [m] (as many as there are axes).
+
+    Raises:
+        OSError: see `read`.
+        ValueError: with what is wrong, and in which line.
+    """
+    rows = _table(path, ["vehicle", "t", "x", "y", "z"][: axes + 2])
+    numbers = rows[:, 0].astype(np.int64)
+    if not len(rows) or (numbers != rows[:, 0]).any() or numbers.min() < 1:
+        raise ValueError("column vehicle: expected numbers from 1")
+    goals = {}
+    for number in np.unique(numbers).tolist():
+        own = rows[numbers == number]
+        if own[0, 1] != 0.0 or (np.diff(own[:, 1]) <= 0.0).any():
+            raise ValueError(f"vehicle {number}: column t must start at 0 and rise")
+        goals[number] = own[:, 1], own[:, 2:]
+    if (np.abs(rows[:, 2:]) > FAR_M).any():
+        raise ValueError(f"expected at most {FAR_M:g} m from the origin")
+    return Mission(goals, axes, 1)
 
 
 def target(
@@ -291,9 +331,23 @@ def from_csv(path: Path, axes: int) -> Reference:
         OSError: see `read`.
         ValueError: with what is wrong, and in which line.
     """
+    data = _table(path, ["t", "x", "y", "z"][: axes + 1])
+    if len(data) < 2:
+        raise ValueError("expected at least two lines of finite numbers")
+    if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
+        raise ValueError("column t must start at 0 and rise from line to line")
+    return timed_path(data[:, 0], data[:, 1:])
+
+
+def _table(path: Path, names: list[str]) -> Array:
+    """Columns of a table; shape (rows, columns).
+
+    Raises:
+        OSError: see `read`.
+        ValueError: with what is wrong, and in which line.
+    """
     import csv  # for files alone
 
-    names = ["t", "x", "y", "z"][: axes + 1]
     text = io.StringIO(read(path).decode("utf-8-sig"), newline="")
     table = csv.DictReader(text, skipinitialspace=True)
     rows: list[list[float]] = []
@@ -303,12 +357,10 @@ def from_csv(path: Path, axes: int) -> Reference:
         rows += (_numbers([row[name] for name in names], table.line_num) for row in table)
     except csv.Error as error:
         raise ValueError(f"line {table.reader.line_num}: {error}") from None
-    data = np.array(rows).reshape(-1, axes + 1)
-    if len(data) < 2 or not np.isfinite(data).all():
+    found = np.array(rows).reshape(-1, len(names))
+    if not np.isfinite(found).all():
         raise ValueError("expected at least two lines of finite numbers")
-    if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
-        raise ValueError("column t must start at 0 and rise from line to line")
-    return timed_path(data[:, 0], data[:, 1:])
+    return found
 
 
 def _numbers(words: list[str | None], line: int) -> list[float]:

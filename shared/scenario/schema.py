@@ -135,12 +135,10 @@ class ControlConfig(Section, frozen=True):
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
     """Largest distance of a spline from the desired trajectory that the server sees [m], as far as
     16 knots reach, with the scheme "trajectory"."""
-    separation_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Smallest distance between two vehicles of a mission [m]; 0: none is kept."""
+    separation_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.5
+    """Smallest distance between two vehicles of a mission [m], see docs/together.md."""
     tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
     """Largest distance of a vehicle of a mission from the motion that it flies [m]."""
-    may_be_flown: OfServer[bool] = True
-    """Whether motions are kept apart from all that may be flown, and not from those sent last."""
     state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: OfServer[tuple[Amount, Amount]] = (50.0, 20.0)
@@ -156,6 +154,12 @@ class ControlConfig(Section, frozen=True):
     def commits(self) -> bool:
         """Whether horizons begin with committed inputs."""
         return self.scheme == "committed"
+
+
+MISSIONS = ("swap", "mission")
+"""Shapes of the desired trajectory that are goals of several vehicles, which keep apart."""
+TABLES = ("csv", "mission")
+"""Shapes that are read from `reference.file`."""
 
 
 class ReferenceConfig(Section, frozen=True):
@@ -190,7 +194,8 @@ class ReferenceConfig(Section, frozen=True):
     loop: Term[bool] = False
     """Whether the vehicle returns from the last waypoint to the first and goes round again."""
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
-    """CSV file with the columns t, x, y (and z), relative to the scenario's own folder."""
+    """CSV file with the columns t, x, y (and z), of a mission also vehicle, relative to the
+    scenario's own folder."""
 
 
 class VehicleConfig(Section, frozen=True):
@@ -491,7 +496,7 @@ class Scenario(Section, frozen=True):
     def terms(self) -> Terms:
         """Terms that both ends must agree on before a flight."""
         control, vehicle, reference = self.control, self.vehicle, self.reference
-        table = shapes.read(Path(reference.file)) if reference.shape == "csv" else b""
+        table = shapes.read(Path(reference.file)) if reference.shape in TABLES else b""
         return Terms(
             dt_ns=self.dt_ns,
             horizon=control.horizon,
@@ -524,7 +529,12 @@ class Scenario(Section, frozen=True):
             seed = int(stream(self.seed, "target", vehicle).integers(2**32))
             flown = msgspec.structs.replace(self, seed=seed)
         made: shapes.Reference = entry.make(flown, *entry.numbers(shape.values, self.reference))
-        return made.of(vehicle) if isinstance(made, shapes.Swap) else made
+        return made.of(vehicle) if isinstance(made, shapes.Mission) else made
+
+    @property
+    def is_mission(self) -> bool:
+        """Whether vehicles have goals of their own, and keep apart."""
+        return self.reference.shape.partition("(")[0].strip() in MISSIONS
 
     def entries(self) -> Iterator[Entry]:
         """Policies and shape that the scenario names."""

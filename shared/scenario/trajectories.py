@@ -89,5 +89,12 @@ def live(scenario: Scenario) -> Reference:
 
 @reference
 def swap(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
-    """Places on a circle of `radius_m`, from which each vehicle goes to the one opposite."""
-    return curves.Swap(vehicles, scenario.reference.radius_m, scenario.model.axes)
+    """Mission: places on a circle of `radius_m`, of which each vehicle goes to the one opposite."""
+    wanted = scenario.reference
+    return curves.swap(vehicles, wanted.radius_m, scenario.model.axes, wanted.altitude_m)
+
+
+@reference
+def mission(scenario: Scenario) -> Reference:
+    """Mission: goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
+    return curves.mission(Path(scenario.reference.file), scenario.model.axes)

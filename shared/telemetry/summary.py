@@ -1,6 +1,7 @@
 """The figures of a flight, from the parts of its record; their names are used everywhere."""
 
 import math
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -263,3 +264,32 @@ def _mean(values: Array) -> float | None:
 
 def _quantile(values: Array, share: float) -> float | None:
     return float(np.quantile(values, share)) if len(values) else None
+
+
+def least_separation(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> float | None:
+    """Smallest distance between two vehicles at any time at which both flew [m]; None of none.
+
+    Args:
+        each: rows of the client's part of each vehicle, by their steps.
+        began_s: time at which step 0 of each began, of one clock [s].
+        dt_s: length of a step [s].
+    """
+    tracks = [
+        (began + rows["step"] * dt_s, rows["state"][:, :, 0])
+        for rows, began in zip(each, began_s, strict=True)
+        if len(rows)
+    ]
+    if len(tracks) < 2:
+        return None
+    begin, end = min(times[0] for times, _ in tracks), max(times[-1] for times, _ in tracks)
+    grid_s = np.arange(begin, end, dt_s)
+    places = [
+        np.stack([np.interp(grid_s, times, x, np.nan, np.nan) for x in at.T], axis=1)
+        for times, at in tracks
+    ]
+    nearest = [
+        np.linalg.norm(one - other, axis=1)
+        for number, one in enumerate(places)
+        for other in places[:number]
+    ]
+    return float(np.nanmin(nearest)) if np.isfinite(nearest).any() else None

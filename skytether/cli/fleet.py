@@ -3,9 +3,9 @@
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -22,14 +22,17 @@ from skytether.figures import flights as figures
 from skytether.shared.base import kernel
 from skytether.shared.core.events import Event, NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario.reference import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
-from skytether.shared.telemetry.summary import summarise
+from skytether.shared.telemetry.summary import least_separation, summarise
 from skytether.shell import command, temporary
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 
+VEHICLES = 20
+"""Number of vehicles unless it is given."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
 """Stages of the server's work, in their order; `record`, the price of watching, is left out."""
 
@@ -40,8 +43,8 @@ class FleetOptions:
 
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
-    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 20
-    """Number of vehicles."""
+    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Number of vehicles; 0: as many as the mission has, and 20 without one."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of the server's processes, which share the vehicles."""
     secure: bool = False
@@ -77,6 +80,10 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     event_ratio: float
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
+    separation_m: float | None
+    """Smallest distance that vehicles of a mission are asked to keep [m]."""
+    least_separation_m: float | None
+    """Smallest distance between two vehicles of a mission [m]."""
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
@@ -126,6 +133,8 @@ class FleetFlight:
     """CPU time of everything together [s], in virtual time."""
     server: Rows | None = None
     """What the server recorded, in virtual time."""
+    vehicles: dict[str, Any] = field(default_factory=dict)
+    """Figures of each vehicle, by its number."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -137,6 +146,7 @@ def fleet(argv: Sequence[str]) -> None:
     what was flown.
     """
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
+    options = replace(options, vehicles=_vehicles(options))
     command.check_count("--vehicles", options.vehicles, 65_535)
     command.check_count("--workers", options.workers, 64)
     if options.virtual and options.workers > 1:
@@ -190,6 +200,7 @@ def _virtually(
         failure=flown.failure,
         cpu_s=time.process_time() - began_s,
         server=flown.server,
+        vehicles=flown.figures["client"]["by_vehicle"],
     )
 
 
@@ -235,7 +246,10 @@ def _really(
         }
         failure = next(iter(shortfalls), None)
         client = record.read(parts / "client")
-        return FleetFlight(client, servers, rest["netem"], rest, failure, machine)
+        vehicles = rest["client"]["by_vehicle"]
+        return FleetFlight(
+            client, servers, rest["netem"], rest, failure, machine, vehicles=vehicles
+        )
 
 
 class Metronome:
@@ -270,6 +284,33 @@ class Metronome:
             due_s += missed * self._dt_s
 
 
+def _vehicles(options: FleetOptions) -> int:
+    """Number of vehicles.
+
+    Raises:
+        CommandError: the mission has another.
+    """
+    if not options.config.is_mission:
+        return options.vehicles or VEHICLES
+    mission = options.config.make_reference()
+    assert isinstance(mission, Mission)
+    count = len(mission.vehicles)
+    if options.vehicles not in (0, count):
+        raise CommandError(f"--vehicles: got {options.vehicles}, expected {count} on this mission")
+    return count
+
+
+def _separation(
+    scenario: Scenario, each: Sequence[Rows], vehicles: Mapping[str, Any]
+) -> float | None:
+    """Smallest distance between two vehicles of a mission [m]; None where it is not known."""
+    numbers = [str(rows["vehicle"][0]) for rows in each]
+    if not scenario.is_mission or any("began_s" not in vehicles.get(n, {}) for n in numbers):
+        return None
+    began_s = [vehicles[number]["began_s"] for number in numbers]
+    return least_separation(each, began_s, scenario.control.dt)
+
+
 def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
     scenario, client, servers, netem = options.config, flown.client, flown.servers, flown.netem
     steps = sum(server["counts"].get("steps", 0) for server in servers)
@@ -298,6 +339,8 @@ def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
         server_steps=steps,
         event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
         rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
+        separation_m=scenario.control.separation_m if scenario.is_mission else None,
+        least_separation_m=_separation(scenario, each, flown.vehicles),
         uplink_packets_per_s=links[0]["packets"] / duration_s,
         downlink_packets_per_s=links[1]["packets"] / duration_s,
         lost=sum(link["lost"] for link in links),
@@ -327,6 +370,12 @@ def _show(summary: FleetSummary, title: str) -> None:
         ("vehicles, server's workers", f"{s.vehicles}, {s.workers}"),
         ("steps flown, planned for", f"{s.steps}, {s.server_steps} in {s.duration_s:g} s"),
         ("RMSE xy min, median, max [m]", s.rmse_xy and ", ".join(f"{x:.4f}" for x in s.rmse_xy)),
+        (
+            "least separation, asked for [m]",
+            None
+            if s.least_separation_m is None
+            else f"{s.least_separation_m:.3f}, {s.separation_m:g}",
+        ),
         ("link", "sealed" if s.secure else "plaintext"),
         ("event ratio", f"{s.event_ratio:.3f}"),
         (
