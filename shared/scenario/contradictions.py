@@ -12,7 +12,7 @@ from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, margins
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
-from skytether.shared.scenario.schema import ControlConfig, DirectionConfig, Scenario
+from skytether.shared.scenario.schema import TABLES, ControlConfig, DirectionConfig, Scenario
 from skytether.shared.scenario.triggers import make_trigger
 from skytether.shared.wire.protocol import INPUTS_MAX
 
@@ -224,13 +224,13 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
     route = ref.points_m + ref.points_m[:1] * ref.loop
     if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
         yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
-    elif ref.shape in ("waypoints", "csv"):
+    elif ref.shape in ("waypoints", *TABLES):
         try:
             scenario.make_reference()
         except OSError as error:
             yield "reference.file", repr(ref.file), f"a readable file ({error.strerror})"
         except ValueError as error:
-            if ref.shape == "csv":
+            if ref.shape in TABLES:
                 yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
             else:
                 given = [list(point) for point in route]

@@ -296,7 +296,8 @@ def _vehicles(options: FleetOptions) -> int:
     assert isinstance(mission, Mission)
     count = len(mission.vehicles)
     if options.vehicles not in (0, count):
-        raise CommandError(f"--vehicles: got {options.vehicles}, expected {count} on this mission")
+        said = f"got {options.vehicles}, expected {count} on this mission"
+        raise CommandError(f"--vehicles: {said}", command.CONFIGURATION)
     return count
 
 
