@@ -123,6 +123,7 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
         "step": 0,
         "steps": 200,
         "missed": 0,
+        "began_s": 0.0,
         "horizons": 0,
         "dropped": {"not a message": 1},
     }

@@ -167,6 +167,11 @@ class Mission:
         """Numbers of the vehicles that have goals."""
         return tuple(self._goals)
 
+    @property
+    def places(self) -> Array:
+        """All goals of all vehicles [m]; shape (n, axes)."""
+        return np.concatenate([points_m for _, points_m in self._goals.values()])
+
     def of(self, vehicle: int) -> "Mission":
         """The reference of another vehicle."""
         return Mission(self._goals, self._axes, vehicle)

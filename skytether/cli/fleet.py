@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -43,8 +43,8 @@ class FleetOptions:
 
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
-    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Number of vehicles; 0: as many as the mission has, and 20 without one."""
+    vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Number of vehicles: 20 unless given, or as many as the mission has."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of the server's processes, which share the vehicles."""
     secure: bool = False
@@ -146,8 +146,8 @@ def fleet(argv: Sequence[str]) -> None:
     what was flown.
     """
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
-    options = replace(options, vehicles=_vehicles(options))
-    command.check_count("--vehicles", options.vehicles, 65_535)
+    vehicles = _vehicles(options)
+    command.check_count("--vehicles", vehicles, 65_535)
     command.check_count("--workers", options.workers, 64)
     if options.virtual and options.workers > 1:
         raise CommandError("--workers: got --virtual as well, where there is but one", 2)
@@ -158,13 +158,15 @@ def fleet(argv: Sequence[str]) -> None:
     if options.figure:
         figures.check(options.figure)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
-    title = f"{options.vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
+    title = f"{vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
     command.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
         command.progress(f"flying {title}", options.config.duration) as on_second,
     ):
-        flown = (_virtually if options.virtual else _really)(options, on_second, interrupted)
+        flown = (_virtually if options.virtual else _really)(
+            options, vehicles, on_second, interrupted
+        )
     if not len(flown.client):
         raise CommandError("interrupted before the first step", command.INTERRUPTED)
     summary = _summarise(options, flown)
@@ -178,13 +180,16 @@ def fleet(argv: Sequence[str]) -> None:
 
 
 def _virtually(
-    options: FleetOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+    options: FleetOptions,
+    vehicles: int,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
 ) -> FleetFlight:
     kernel.load()
     began_s = time.process_time()
     flown = flight.fly(
         options.config,
-        vehicles=options.vehicles,
+        vehicles=vehicles,
         secure=options.secure,
         stopwatch=Stopwatch(time.perf_counter_ns),
         on_second=on_second,
@@ -218,7 +223,10 @@ def _paged(options: FleetOptions) -> Iterator[Path | None]:
 
 
 def _really(
-    options: FleetOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+    options: FleetOptions,
+    vehicles: int,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
 ) -> FleetFlight:
     with (
         temporary.folder() as parts,
@@ -230,7 +238,7 @@ def _really(
             parts,
             on_second=on_second,
             interrupted=interrupted,
-            vehicles=options.vehicles,
+            vehicles=vehicles,
             workers=options.workers,
             watched=False,
             secure=options.secure,
@@ -246,10 +254,8 @@ def _really(
         }
         failure = next(iter(shortfalls), None)
         client = record.read(parts / "client")
-        vehicles = rest["client"]["by_vehicle"]
-        return FleetFlight(
-            client, servers, rest["netem"], rest, failure, machine, vehicles=vehicles
-        )
+        told = rest["client"]["by_vehicle"]
+        return FleetFlight(client, servers, rest["netem"], rest, failure, machine, vehicles=told)
 
 
 class Metronome:
@@ -291,11 +297,11 @@ def _vehicles(options: FleetOptions) -> int:
         CommandError: the mission has another.
     """
     if not options.config.is_mission:
-        return options.vehicles or VEHICLES
+        return VEHICLES if options.vehicles is None else options.vehicles
     mission = options.config.make_reference()
     assert isinstance(mission, Mission)
     count = len(mission.vehicles)
-    if options.vehicles not in (0, count):
+    if options.vehicles not in (None, count):
         said = f"got {options.vehicles}, expected {count} on this mission"
         raise CommandError(f"--vehicles: {said}", command.CONFIGURATION)
     return count

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skytether.figures.colours import GREY, PALETTE, RED, Rgb
 from skytether.shared.law.model import Array
+from skytether.shared.scenario.reference import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.view.state import State, VehicleTrack
 
@@ -99,6 +100,8 @@ def _desired(scenario: Scenario) -> Array:
         reference = scenario.make_reference()
     except (OSError, ValueError):  # a table that is on another machine
         return np.zeros((2, axes))
+    if isinstance(reference, Mission):
+        return reference.places
     last_s = min(scenario.duration, ROUND_S)
     if shape in ("circle", "figure-eight", "square"):
         last_s = min(last_s, scenario.reference.period_s)
@@ -234,10 +237,10 @@ class _Flight:
         if scenario.fence.is_there:
             line("fence", FENCE_RGB, 1.5).points = fence(scenario, reach_m)
         self._trail, self._plan = line("trail", faint, 2.0), line("plan", self._rgb, 4.0)
-        if scenario.reference.shape not in ("target", "live"):
+        self._shows_goals = scenario.reference.shape in ("target", "live") or scenario.is_mission
+        if not self._shows_goals:
             line("desired", GOAL_RGB, 1.0).points = segments(_desired(scenario))
         self._goal_trail = line("goal-trail", GOAL_RGB, 1.0)
-        self._shows_goals = scenario.reference.shape in ("target", "live")
         self._goal = scene.add_icosphere(
             f"{self._name}/goal", 0.3 * self._size, GOAL_RGB, subdivisions=2, cast_shadow=False
         )
