@@ -29,6 +29,7 @@ from skytether.shared.wire.protocol import (
     NO_HORIZON,
     NO_INPUT,
     Drop,
+    Mode,
     Observation,
     ProtocolError,
     Trajectory,
@@ -360,10 +361,10 @@ def test_the_fleet_tells_how_near_they_came(
 
 def test_the_least_distance_is_of_one_time() -> None:
     """Vehicles that were at one place one after the other were not near."""
-    columns = [("step", "i8"), ("state", "f8", (2, 2))]
+    columns = [("step", "i8"), ("mode", "u1"), ("state", "f8", (2, 2))]
     one, other = (np.zeros(101, columns) for _ in range(2))
     for rows in (one, other):
-        rows["step"] = np.arange(101)
+        rows["step"], rows["mode"] = np.arange(101), Mode.TRACK
         rows["state"][:, 0, 0] = 0.1 * rows["step"]
     assert least_separation([one, other], [0.0, 0.0], DT_S) == pytest.approx(0.0)
     assert least_separation([one, other], [0.0, 1.0], DT_S) == pytest.approx(2.0)

@@ -45,7 +45,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.reference import Mission, Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
 
@@ -64,6 +64,8 @@ SMOOTH = 0.05
 """Weight r on accelerations [s⁴]."""
 LAST = 5.0
 """Weight w_N on the last position; the others are 1."""
+BEGINS_M = 2.0
+"""Distance from its first goal within which a vehicle is sent there to begin [m]."""
 ARRIVED_M = 0.02
 """Distance from the goal at which a motion ends there [m]."""
 AIM_M = 3.0
@@ -137,6 +139,11 @@ class Together:
         self._state = np.zeros((capacity, terms.axes, 2))
         self._rows = [Known() for _ in range(capacity)]
         self._references, self._number_of = references, number_of
+        mission = scenario.make_reference()
+        self._vehicles = len(mission.vehicles) if isinstance(mission, Mission) else 0
+        """Number of vehicles on the mission."""
+        self._met: set[int] = set()
+        """Numbers of those that were at rest where the mission begins."""
         control = scenario.control
         self._apart_m = control.separation_m + 2.0 * control.tube_m
         self._tube_m, self._dt_s = control.tube_m, terms.dt_s
@@ -165,7 +172,7 @@ class Together:
         known = self._rows[row]
         if observation.in_force == NO_HORIZON:
             # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
-            known.in_force = Sent(-1, resting(k, observation.state[:, 0]))
+            known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
             if not observation.takes:
                 known.sent.clear()
         elif known.in_force is None or known.in_force.step != observation.in_force:
@@ -178,13 +185,24 @@ class Together:
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
         newest, motion = known.in_force
         p, _ = motion.at(np.array([float(k)]), self._dt_s)
-        if np.linalg.norm(p[0] - observation.state[:, 0]) > self._tube_m:
+        is_within = bool(np.linalg.norm(p[0] - observation.state[:, 0]) <= self._tube_m)
+        if is_within and newest >= 0:
+            self._met.add(self._number_of(row))
+        elif not is_within and self._number_of(row) in self._met:
             self.counts["left_tube"] += 1
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
         known.heard = True
         return True
+
+    def _place(self, row: int, observed: Array) -> Array:
+        """Where a vehicle without a motion rests: where the mission begins, unless it has begun."""
+        number = self._number_of(row)
+        if number in self._met:
+            return observed
+        first: Array = self._references(number)(np.zeros(()))[:, 0]
+        return first if np.linalg.norm(first - observed) < BEGINS_M else observed
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
         """See `Scheme`: what was observed, as it is."""
@@ -242,13 +260,15 @@ class Together:
         assert base is not None
         if known.sent:
             return  # whether that was taken is not known yet
-        if any(each.heard and self._is_unknown(row, each) for row, each in enumerate(self._rows)):
-            return
         if base.step < 0:
             known.next = base.motion  # it has none: first of all the place where it hovers
             return
         if k - base.step > self._again:
             known.next = base.motion  # or it would end aboard, and the vehicle drift
+            return
+        if len(self._met) < self._vehicles:
+            return  # the mission begins once all are where it begins
+        if any(each.heard and self._is_unknown(row, each) for row, each in enumerate(self._rows)):
             return
         sample = self._references(self._number_of(row))
         goal = sample(np.array(k * self._dt_s))[:, 0]

@@ -267,18 +267,21 @@ def _quantile(values: Array, share: float) -> float | None:
 
 
 def least_separation(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> float | None:
-    """Smallest distance between two vehicles at any time at which both flew [m]; None of none.
+    """Smallest distance between two vehicles while both are on a mission [m]; None of none.
+
+    Each is from the first step on at which it follows what the server has sent.
 
     Args:
         each: rows of the client's part of each vehicle, by their steps.
         began_s: time at which step 0 of each began, of one clock [s].
         dt_s: length of a step [s].
     """
-    tracks = [
-        (began + rows["step"] * dt_s, rows["state"][:, :, 0])
-        for rows, began in zip(each, began_s, strict=True)
-        if len(rows)
-    ]
+    tracks = []
+    for rows, began in zip(each, began_s, strict=True):
+        tracking = np.flatnonzero(rows["mode"] == Mode.TRACK)
+        if len(tracking):
+            flown = rows[tracking[0] :]
+            tracks.append((began + flown["step"] * dt_s, flown["state"][:, :, 0]))
     if len(tracks) < 2:
         return None
     begin, end = min(times[0] for times, _ in tracks), max(times[-1] for times, _ in tracks)
