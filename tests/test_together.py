@@ -16,12 +16,13 @@ from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.server.control import together
 from skytether.server.control.dual import DualSolver
-from skytether.server.control.together import LONGEST, Known, Plan, Together
+from skytether.server.control.motionplan import MotionPlan
+from skytether.server.control.together import LONGEST, Known, Together
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.mission import Mission, swap
 from skytether.shared.scenario.reading import ConfigError
-from skytether.shared.scenario.reference import Mission, swap
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.telemetry.summary import least_separation
@@ -146,7 +147,7 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
 ) -> None:
     """Under inputs that leave a tenth of the bound to the regulator aboard."""
     terms = scenario(4).terms()
-    found = Plan(terms).solve(np.zeros(2), np.array(velocity), np.array(goal), None)
+    found = MotionPlan(terms, 0.6, 0.0).solve(np.zeros(2), np.array(velocity), np.array(goal))
     assert found is not None
     position, v = found
     assert len(position) == INTERVALS + 1
@@ -199,7 +200,7 @@ def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
     made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
     made.observe(1, observation(100, 70, (-4.0, 0.0)))
     made._rows[0].in_force = together.Sent(90, resting(100, np.array([4.0, 0.0])))
-    for step, plans in ((110, False), (70 + LONGEST + 10, True)):
+    for step, plans in ((111, False), (71 + LONGEST + 10, True)):
         made.observe(0, observation(step, 90, (4.0, 0.0)))
         made.observe(1, observation(step, 70, (-4.0, 0.0)))
         rows, steps = np.arange(2), np.array([step, step])

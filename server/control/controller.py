@@ -31,6 +31,7 @@ from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.triggers import Known, Situation, Verdict, make_trigger
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
@@ -99,8 +100,10 @@ class Controller:
         self._scheme: Scheme
         self.planner: Planner | Guidance | Together
         """Plans of every vehicle, or what is sent in place of a plan."""
+        self._together: Together | None = None
+        """What keeps vehicles of a mission apart."""
         if scenario.is_mission and references is not None:
-            self._scheme = self.planner = Together(
+            self._scheme = self.planner = self._together = Together(
                 scenario, terms, room, block, references, self.desired.number
             )
         elif terms.splines:
@@ -165,6 +168,19 @@ class Controller:
             owed=self.owed,
             desired=self.desired.states,
         )
+
+    def change_zones(self, zones: Zones) -> None:
+        """Keep vehicles of a mission out of other zones from now on."""
+        if self._together:
+            self._together.change_zones(zones)
+
+    def objection(self, zones: Zones) -> str:
+        """Why there cannot be these zones now, in words; empty: there can."""
+        return self._together.objection(zones) if self._together else ""
+
+    def waits(self, row: int) -> str:
+        """What a vehicle of a mission waits for, in words; empty: for nothing."""
+        return self._together.waits(row) if self._together else ""
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""

@@ -1,4 +1,4 @@
-"""Motions that keep vehicles apart, whichever packets are lost.
+"""Motions that keep vehicles apart, and out of zones, whichever packets are lost.
 
 A motion is where a vehicle is at every time: a spline that ends at rest, and rest from there on. It
 is sent as a trajectory whose knots are all of it, so a vehicle that hears nothing more flies it to
@@ -16,20 +16,12 @@ A new motion is sent only if at every time it keeps the distance
 from all motions of all other vehicles that may be flown, with `tube_m` for how far a vehicle is
 from its motion (wind, tracking, clocks). Those were apart already. So whichever of them are taken,
 and whichever packets are lost, vehicles are `separation_m` apart, as long as each stays in its tube
-(docs/together.md has the theorem). The motion in force is always a way out: it needs no packet.
+(docs/together.md has the theorem). From zones it keeps `tube_m`. The motion in force is always a
+way out: it needs no packet.
 
-Until `join_s` a new motion is the one in force, so it joins it wherever it is taken. From there on
-it is planned as a QP over the accelerations a_n between knots T apart, for n = 0 … N-1,
-
-    min  Σ w_n |p_n - g|² + r Σ |a_n|²     v_N = 0,  |v_n + τ a_n| ≤ u,  |a_n| ≤ a_max
-
-with g the goal, and a half-plane for each motion that may be flown and each time t,
-
-    n(t) · (p(t) - q(t)) ≥ D     n(t) = (p̃(t) - q(t)) / |p̃(t) - q(t)|
-
-where q is that motion and p̃ the one in force. The motion in force fulfils all of them, so there is
-always a solution. A vehicle that comes no nearer to its goal aims to the right of it instead, ever
-further round, and then in directions that are drawn: so those that meet pass each other.
+`motionplan` has the QP, `apart` the distances, `routes` the ways around zones. A vehicle that comes
+no nearer to its goal aims to the right of it instead, ever further round, and then in directions
+that are drawn: so those that meet pass each other.
 """
 
 from collections import Counter, deque
@@ -38,32 +30,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control.dual import DualSolver
+from skytether.server.control import apart
+from skytether.server.control.apart import HalfPlanes, Others
+from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.planner import FIGURES, Figures
+from skytether.server.control.routes import Routes
 from skytether.server.control.scheme import Foresight
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.reference import Mission, Reference
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Steps that a motion takes at most."""
-SUB = 2
-"""Number of times in each interval at which distances are kept."""
 MARGIN_M = 0.03
-"""By how much more than D motions are planned apart: between those times, and for the solver's
-tolerance [m]."""
-ACCELERATION_MPS2 = 0.6
-"""Largest acceleration on an axis, a_max [m/s²]."""
-SHARE = 0.9
-"""Share of the bound of the input that a motion may use."""
-SMOOTH = 0.05
-"""Weight r on accelerations [s⁴]."""
-LAST = 5.0
-"""Weight w_N on the last position; the others are 1."""
+"""By how much more than D motions are planned apart: between the times at which the plan keeps it,
+and for the solver's tolerance [m]."""
 BEGINS_M = 2.0
 """Distance from its first goal within which a vehicle is sent there to begin [m]."""
 ARRIVED_M = 0.02
@@ -75,6 +62,8 @@ TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 drawn, and by how much less once it moves [rad]."""
 STUCK = 0.3
 """Share of the way to the goal, 2 m at most, below which a plan is taken for stuck."""
+BINDS_M = 1e-4
+"""Distance from a half-plane up to which it holds a motion back [m]."""
 
 
 class Sent(NamedTuple):
@@ -101,6 +90,8 @@ class Known:
         """Whether an observation has come in this session."""
         self.unknown_until = -1
         """Step from which on a motion is over that another server has sent."""
+        self.waits = ""
+        """What it waits for, as the operator is told; empty: for nothing."""
 
     def motions(self) -> list[Motion]:
         """All that may be flown, the one to be sent at this step included."""
@@ -113,7 +104,7 @@ class Together:
     """The scheme "trajectory" for missions: motions that keep apart.
 
     Args:
-        scenario: `control.separation_m` and `tube_m`, and the seed of directions that are drawn.
+        scenario: what is asked for, as `mission` says it, and the seed of directions.
         terms: the rule of flight.
         capacity: number of vehicles there can be.
         block: number of vehicles that are decided on at a time.
@@ -137,30 +128,37 @@ class Together:
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         self.planned = np.zeros((block, terms.axes, 2))
         self._state = np.zeros((capacity, terms.axes, 2))
-        self._rows = [Known() for _ in range(capacity)]
+        self._rows: dict[int, Known] = {}
+        """What is known of vehicles, by row."""
         self._references, self._number_of = references, number_of
-        mission = scenario.make_reference()
-        self._vehicles = len(mission.vehicles) if isinstance(mission, Mission) else 0
+        goals = scenario.make_reference()
+        self._vehicles = len(goals.vehicles) if isinstance(goals, Mission) else 0
         """Number of vehicles on the mission."""
         self._met: set[int] = set()
         """Numbers of those that were at rest where the mission begins."""
-        control = scenario.control
-        self._apart_m = control.separation_m + 2.0 * control.tube_m
-        self._tube_m, self._dt_s = control.tube_m, terms.dt_s
+        mission = scenario.mission
+        self._apart_m = mission.separation_m + 2.0 * mission.tube_m
+        self._scale = np.ones(terms.axes)
+        """By what coordinates are multiplied before distances of vehicles are taken."""
+        self._scale[2:] = mission.separation_m / mission.height_m if mission.height_m else 1.0
+        bend_m = apart.bend_m(float(np.sqrt(terms.axes)) * mission.acceleration_mps2, terms.dt_s)
+        self._tube_m, self._bend_m, self._dt_s = mission.tube_m, bend_m, terms.dt_s
         self._join = terms.join
         self._lead = -(-self._join // SPACING) * SPACING
         """Steps after the first knot from which on a motion differs from the one in force."""
         self._again = terms.age_max // 3
         """Steps after which a motion is sent again, before it is too old to be flown."""
-        self._plan = Plan(terms)
+        self._plan = MotionPlan(terms, mission.acceleration_mps2, mission.speed_mps)
         self._rng = stream(scenario.seed, "together")
         self._now, self._ahead = 0, dict[int, int]()
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
+        self.change_zones(scenario.zones)
 
     def forget(self, row: int) -> None:
         """See `Scheme`; motions stay, for the vehicle goes on with them."""
         self.observed_step[row] = -1
-        self._rows[row].heard = False
+        if row in self._rows:
+            self._rows[row].heard = False
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
@@ -169,7 +167,7 @@ class Together:
         k = observation.step
         self.observed_step[row] = k
         self._state[row] = observation.state
-        known = self._rows[row]
+        known = self._rows.setdefault(row, Known())
         if observation.in_force == NO_HORIZON:
             # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
             known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
@@ -210,7 +208,7 @@ class Together:
         found.estimate[:n] = found.start[:n] = self._state[rows]
 
     def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
-        """Plan for vehicles whose step is a multiple of SPACING."""
+        """Plan for vehicles every SPACING steps, not all at the same."""
         figures = self.figures
         steps = dict(zip(rows.tolist(), step.tolist(), strict=True))
         self._meet(steps)
@@ -220,8 +218,9 @@ class Together:
         for name in ("state_gap", "expected_gap", "cost_gap", "deviation_m"):
             figures[name] = 0.0
         for i, (row, k) in enumerate(steps.items()):
-            known = self._rows[row]
-            if known.in_force is not None and known.heard and k % SPACING == 0:
+            known = self._rows.setdefault(row, Known())
+            turn = (k - self._number_of(row)) % SPACING == 0
+            if known.in_force is not None and known.heard and turn:
                 self._decide(row, known, k)
             at = known.in_force.motion if known.in_force else resting(k, self._state[row, :, 0])
             p, v = at.at(np.array([float(k)]), self._dt_s)
@@ -244,22 +243,55 @@ class Together:
             found.told.number[i], found.told.spacing[i] = count, SPACING
             known.sent.append(Sent(k, motion))
 
+    # -- zones -------------------------------------------------------------------------------------
+
+    def change_zones(self, zones: Zones) -> None:
+        """Keep out of other zones from now on, to which `objection` has nothing to say."""
+        self._zones, self._routes = zones, Routes(zones, self._tube_m)
+
+    def objection(self, zones: Zones) -> str:
+        """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
+        for row, known in self._rows.items():
+            for motion in known.motions():
+                k = self._now + self._ahead.get(row, 0)
+                points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
+                clear = zones.along(np.concatenate([points, points[-1:]]))
+                hit = clear < self._tube_m + self._bend_m
+                if not hit.any():
+                    continue
+                at = points[int(hit.argmax()) : int(hit.argmax()) + 1]
+                zone = zones.in_the_way(at, self._tube_m + 2.0 * self._bend_m)
+                left_s = max(motion.last - k, 0) * self._dt_s
+                does = f"may fly into for {left_s:.1f} s more" if left_s else "hovers in"
+                # A piece between two points may touch what neither does.
+                named = f"{zone}, which " if zone else "zones that "
+                return f"{named}vehicle {self._number_of(row)} {does}, tube included"
+        return ""
+
+    def waits(self, row: int) -> str:
+        """What a vehicle waits for; empty: for nothing."""
+        return self._rows[row].waits if row in self._rows else ""
+
+    # -- what is decided ---------------------------------------------------------------------------
+
     def _meet(self, steps: dict[int, int]) -> None:
         """Take note of how far ahead of the others the steps of vehicles are."""
         known = [k - self._ahead[row] for row, k in steps.items() if row in self._ahead]
         self._now = int(np.median(known)) if known else self._now + 1
         self._ahead |= {row: k - self._now for row, k in steps.items()}
         for row in steps:
-            self._rows[row].next = None
-
-    # -- what is decided ---------------------------------------------------------------------------
+            if row in self._rows:
+                self._rows[row].next = None
 
     def _decide(self, row: int, known: Known, k: int) -> None:
         """Find the motion to be sent to a vehicle now, if any."""
         base = known.in_force
         assert base is not None
+        known.waits = ""
         if known.sent:
-            return  # whether that was taken is not known yet
+            # Whether that was taken is not known yet.
+            known.waits = "an acknowledgement"
+            return
         if base.step < 0:
             known.next = base.motion  # it has none: first of all the place where it hovers
             return
@@ -267,184 +299,117 @@ class Together:
             known.next = base.motion  # or it would end aboard, and the vehicle drift
             return
         if len(self._met) < self._vehicles:
-            return  # the mission begins once all are where it begins
-        if any(each.heard and self._is_unknown(row, each) for row, each in enumerate(self._rows)):
+            known.waits = f"{self._vehicles - len(self._met)} vehicles to begin"
             return
+        for other, each in self._rows.items():
+            if each.heard and self.observed_step[other] <= each.unknown_until:
+                known.waits = f"vehicle {self._number_of(other)}, of another server's motion"
+                return
         sample = self._references(self._number_of(row))
         goal = sample(np.array(k * self._dt_s))[:, 0]
         if np.abs(base.motion.position[-1] - goal).max() < ARRIVED_M:
             known.turned = 0.0
             return
-        others = self._others(row, k)
-        found = self._toward(base.motion, known, k, goal, others)
+        those = self._others(row, k)
+        found = self._toward(base.motion, known, k, goal, those)
         if found is None:
             self.counts["unsolved"] += 1
-        elif self._is_apart(found, k, others):
+        elif self._is_apart(found, k, those):
             known.next = found
         else:
             self.counts["refused"] += 1
 
-    def _is_unknown(self, row: int, known: Known) -> bool:
-        """Whether a vehicle still flies a motion that this server does not know."""
-        return self.observed_step[row] <= known.unknown_until
-
-    def _others(self, row: int, k: int) -> list[tuple[Motion, int]]:
-        """Motions of others that may be flown, and by how many steps they are ahead."""
-        found = []
-        for other, known in enumerate(self._rows):
-            if other == row or known.in_force is None:
-                continue
-            theirs = self._now + self._ahead.get(other, 0)
-            found += [(each, theirs - k) for each in known.motions()]
-        return found
+    def _others(self, row: int, k: int) -> Others:
+        """Motions of others that may be flown."""
+        found = [
+            (motion, self._now + self._ahead.get(other, 0) - k, other)
+            for other, known in self._rows.items()
+            if other != row and known.in_force is not None
+            for motion in known.motions()
+        ]
+        return apart.others(found, self._state.shape[1])
 
     def _toward(
-        self, base: Motion, known: Known, k: int, goal: Array, others: list[tuple[Motion, int]]
+        self, base: Motion, known: Known, k: int, goal: Array, those: Others
     ) -> Motion | None:
         """A motion from the one in force towards a goal; None where no solution is found."""
         dt_s, plan = self._dt_s, self._plan
         due = k + self._lead
         (p0,), (v0,) = base.at(np.array([float(due)]), dt_s)
-        times = due + plan.times * SPACING
-        held, _ = base.at(times, dt_s)
-        normals, offsets, places = [], [], []
-        for motion, shift in others:
-            q, _ = motion.at(times + shift, dt_s)
-            off = held - q
-            away = np.linalg.norm(off, axis=1)
-            near = np.flatnonzero(away < self._apart_m + MARGIN_M + plan.reach_m)
-            if not len(near):
-                continue
-            n = off[near] / away[near, None]
-            least = np.minimum(self._apart_m + MARGIN_M, away[near] - 1e-4)
-            places.append(near)
-            normals.append(n)
-            offsets.append(least + np.einsum("ij,ij->i", n, q[near]))
-        aim = goal
-        way = goal - p0
-        far = float(np.linalg.norm(way))
-        if known.turned and far > 1e-9:
-            c, s = np.cos(-known.turned), np.sin(-known.turned)
-            ahead = way[:2] / max(float(np.linalg.norm(way[:2])), 1e-9)
-            aim = p0.copy()
-            aim[:2] += min(far, AIM_M) * np.array(
-                [c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]]
-            )
-        planes = (
-            (np.concatenate(places), np.concatenate(normals), np.concatenate(offsets))
-            if places
-            else None
-        )
-        solved = plan.solve(p0, v0, aim, planes)
+        before = np.arange(k, due, SPACING, dtype=np.float64)
+        kept_p, kept_v = base.at(before, dt_s)
+
+        def motion(solved: tuple[Array, Array]) -> Motion:
+            p, v = solved
+            return Motion(k, np.concatenate([kept_p, p]), np.concatenate([kept_v, v]))
+
+        aim = self._aim(known, p0, goal)
+        # Mostly nothing is near: then no constraint is needed, and the straight way is the best.
+        free = plan.solve(p0, v0, aim)
+        if free is not None and self._is_apart(motion(free), k, those):
+            known.turned = max(0.0, known.turned - TURN_BACK)
+            return motion(free)
+        planes = self._planes(base, due, those)
+        solved = plan.solve(p0, v0, aim, planes[:3])
         if solved is None:
             return None
-        p, v = solved
-        moved = float(np.linalg.norm(p[-1] - p0))
+        moved, far = float(np.linalg.norm(solved[0][-1] - p0)), float(np.linalg.norm(goal - p0))
         if moved < STUCK * min(far, 2.0):
+            known.waits = self._blocker(solved, planes)
             known.turned += TURN
             if known.turned > TURN_MAX:
                 known.turned = float(self._rng.uniform(0.3, TURN_MAX))
         else:
             known.turned = max(0.0, known.turned - TURN_BACK)
-        before = np.arange(k, due, SPACING, dtype=np.float64)
-        kept_p, kept_v = base.at(before, dt_s)
-        return Motion(k, np.concatenate([kept_p, p]), np.concatenate([kept_v, v]))
+        return motion(solved)
 
-    def _is_apart(self, motion: Motion, k: int, others: list[tuple[Motion, int]]) -> bool:
-        """Whether a motion keeps its distance from all others, for ever."""
-        for other, shift in others:
-            last = max(motion.last, other.last - shift)
-            steps = np.arange(k, last + SPACING, SPACING / (2 * SUB))
-            p, _ = motion.at(steps, self._dt_s)
-            q, _ = other.at(steps + shift, self._dt_s)
-            if np.linalg.norm(p - q, axis=1).min() < self._apart_m:
-                return False
-        return True
+    def _aim(self, known: Known, place: Array, goal: Array) -> Array:
+        """What to fly to: the goal, or the next corner on the way there, or right of it."""
+        aim = self._routes.next(place, goal)
+        way = aim - place
+        level = float(np.linalg.norm(way[:2]))
+        if known.turned and level > 1e-9:
+            c, s = np.cos(-known.turned), np.sin(-known.turned)
+            ahead = way[:2] / level
+            turned = np.array([c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]])
+            aim = place.copy()
+            aim[:2] += min(float(np.linalg.norm(way)), AIM_M) * turned
+        return aim
 
+    def _planes(self, base: Motion, due: int, those: Others) -> HalfPlanes:
+        """Half-planes of the others' motions, and of zones (of row -1, -2, …)."""
+        plan = self._plan
+        times = due + plan.times * SPACING
+        held, _ = base.at(times, self._dt_s)
+        wide_m = self._apart_m + MARGIN_M
+        found = apart.half_planes(times, held, plan.reach_m, those, self._scale, wide_m, self._dt_s)
+        if not self._zones:
+            return found
+        near = self._zones.planes(held, plan.reach_m + self._tube_m + MARGIN_M)
+        least = np.minimum(self._tube_m + MARGIN_M, near.away_m - 1e-4)
+        least += np.einsum("ij,ij->i", near.normal, near.border)
+        return HalfPlanes(
+            np.concatenate([found.at, near.at]),
+            np.concatenate([found.normal, near.normal]),
+            np.concatenate([found.least, least]),
+            np.concatenate([found.of, np.full(len(near.at), -1)]),
+        )
 
-Planes = tuple[Indices, Array, Array]
-"""Times, by index; normals; and least values of normal · position [m]."""
+    def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
+        """What holds a motion back most, in words."""
+        position = self._plan.at_times(*solved)
+        room = np.einsum("ij,ij->i", planes.normal, position[planes.at]) - planes.least
+        binding = planes.of[room < BINDS_M]
+        if not len(binding):
+            return ""
+        rows, often = np.unique(binding, return_counts=True)
+        row = int(rows[often.argmax()])
+        return "a zone" if row < 0 else f"vehicle {self._number_of(row)}"
 
-
-class Plan:
-    """The QP of one motion."""
-
-    def __init__(self, terms: Terms) -> None:
-        n, axes = INTERVALS, terms.axes
-        T = SPACING * terms.dt_s
-        tau_s, gain = np.array(terms.tau_s), np.array(terms.gain)
-        most = SHARE * np.array(terms.u_max) * gain
-        place = np.arange(n)
-        self._to_velocity = T * np.tril(np.ones((n, n)))
-        self._to_position = _positions(np.arange(1.0, n + 1.0), place, T)
-        self.times: Array = np.arange(n * SUB + 1) / SUB
-        """Times at which distances are kept, in intervals from where the plan begins."""
-        self._to_sample = _positions(self.times, place, T)
-        self._weights = np.ones(n)
-        self._weights[-1] = LAST
-        hessian = self._to_position.T @ (self._weights[:, None] * self._to_position)
-        self._solver = DualSolver(np.kron(np.eye(axes), hessian + SMOOTH * np.eye(n)))
-        # The input at the end of each interval, and at its begin: v ± within what it can do.
-        ends = [self._to_velocity + tau_s[x] * np.eye(n) for x in range(axes)]
-        before = np.vstack([np.zeros(n), self._to_velocity[:-1]])
-        begins = [before + tau_s[x] * np.eye(n) for x in range(axes)]
-        both = np.vstack([np.eye(n * axes), _blocks(ends), _blocks(begins)])
-        self._fixed = np.vstack([_blocks([self._to_velocity[-1:]] * axes), both, -both])
-        self._most, self._axes, self._T = most, axes, T
-        passed_s = self.times * T
-        along_m = np.minimum(ACCELERATION_MPS2 * passed_s**2, 2.0 * most.max() * passed_s)
-        self.reach_m = np.sqrt(axes) * along_m
-        """How far apart two motions from one state may be at those times [m]."""
-
-    def solve(
-        self, p0: Array, v0: Array, goal: Array, planes: Planes | None
-    ) -> tuple[Array, Array] | None:
-        """Positions and velocities of the knots from a state on, that state first; None of none.
-
-        Args:
-            p0, v0: where it begins [m, m/s]; shape (axes,).
-            goal: where it shall be [m]; shape (axes,).
-            planes: see there.
-        """
-        n, axes, T = INTERVALS, self._axes, self._T
-        free = p0 + np.arange(1, n + 1)[:, None] * T * v0
-        linear = (self._to_position.T @ (self._weights[:, None] * (free - goal))).T.ravel()
-        a = np.full(n * axes, ACCELERATION_MPS2)
-        most, v = np.repeat(self._most, n), np.repeat(v0, n)
-        low = [-v0, -a, -most - v, -most - v, -a, v - most, v - most]
-        rows = [self._fixed]
-        if planes is not None:
-            at, normal, least = planes
-            rows.append(
-                np.concatenate([normal[:, [x]] * self._to_sample[at] for x in range(axes)], axis=1)
-            )
-            drifting = p0 + self.times[at][:, None] * T * v0
-            low.append(least - np.einsum("ij,ij->i", normal, drifting))
-        x = self._solver.solve(-linear, np.vstack(rows), np.concatenate(low), axes)
-        if x is None:
-            return None
-        found = x.reshape(axes, n).T
-        velocity = np.vstack([v0, v0 + self._to_velocity @ found])
-        velocity[-1] = 0.0
-        # Positions of what is flown: that velocity, whatever the solver's tolerance has left.
-        steps = 0.5 * T * (velocity[1:] + velocity[:-1])
-        position = np.vstack([p0, p0 + np.cumsum(steps, axis=0)])
-        return position, velocity
-
-
-def _positions(times: Array, place: Indices, T: float) -> Array:
-    """Position by accelerations of intervals at times, in intervals [s²]; shape (times, n)."""
-    into = np.clip(times[:, None] - place, 0.0, None)
-    inside = np.minimum(into, 1.0)
-    moved: Array = T * T * (0.5 * inside**2 + inside * (into - inside))
-    return moved
-
-
-def _blocks(parts: list[Array]) -> Array:
-    """Matrix with these along its diagonal."""
-    rows, columns = (sum(each.shape[axis] for each in parts) for axis in (0, 1))
-    whole, row, column = np.zeros((rows, columns)), 0, 0
-    for each in parts:
-        whole[row : row + len(each), column : column + each.shape[1]] = each
-        row, column = row + len(each), column + each.shape[1]
-    return whole
+    def _is_apart(self, motion: Motion, k: int, those: Others) -> bool:
+        """Whether a motion keeps its distance from all others and from zones, for ever."""
+        least = apart.least_apart(motion, k, those, self._scale, self._dt_s)
+        if (least < self._apart_m + 2.0 * self._bend_m).any():
+            return False
+        points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
+        return bool((self._zones.along(points) >= self._tube_m + self._bend_m).all())

@@ -11,6 +11,7 @@ from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, margins
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
 from skytether.shared.scenario.schema import TABLES, ControlConfig, DirectionConfig, Scenario
 from skytether.shared.scenario.triggers import make_trigger
@@ -82,16 +83,32 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
     yield from list(_no_impairments(scenario)) or _too_late(scenario)
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
-    if known is None or scenario.reference != known.reference or axes != known.model.axes:
-        yield from _no_shape(scenario) or _no_reference(scenario)
+    yield from _no_way(scenario, known)
     if scenario.fence.is_there:
         yield from list(_no_room(scenario)) or _outside(scenario)
+
+
+def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
+    """Why the desired trajectory cannot be made, or a mission's places not be reached."""
+    wrong = list(_no_zones(scenario))
+    same = known and (scenario.reference, scenario.model.axes) == (
+        known.reference,
+        known.model.axes,
+    )
+    if not same:
+        wrong += _no_shape(scenario) or _no_reference(scenario)
+        if scenario.is_mission and not wrong:
+            wrong += _no_places(scenario)
+    yield from wrong
 
 
 def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
     """Why vehicles cannot keep apart on a mission, whichever packets are lost."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
     if not scenario.is_mission:
+        if scenario.mission.zones:
+            expected = "none, but on a mission: reference.shape = 'mission', or a swap"
+            yield "mission.zones", repr(scenario.mission.zones), expected
         return
     if control.scheme != "trajectory":
         yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
@@ -107,6 +124,38 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
     for key, value in (("link.timeout_s", link.timeout_s), ("link.age_max_s", link.age_max_s)):
         if value < longest_s - TINY:
             yield key, value, f"at least {longest_s:g} s on a mission: no motion is longer"
+
+
+def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why there can be no such zones."""
+    try:
+        _ = scenario.zones
+    except policies.PolicyError as error:
+        yield "mission.zones", repr(error.given), error.expected
+    except OSError as error:
+        given = repr(scenario.mission.zones)
+        yield "mission.zones", given, f"a file that can be read ({error.strerror})"
+
+
+def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why vehicles cannot be at their goals: too near to each other, or to zones."""
+    mission, goals = scenario.mission, scenario.make_reference()
+    assert isinstance(goals, Mission)
+    zones, room_m = scenario.zones, mission.tube_m
+    for vehicle in goals.vehicles if zones else ():
+        for place in goals.goals(vehicle):
+            if zone := zones.in_the_way(place[None], room_m):
+                at = ", ".join(f"{each:.3g}" for each in place)
+                expected = f"none within {room_m:g} m of the goal ({at}) of vehicle {vehicle}"
+                yield "mission.zones", zone, expected
+                return
+    apart_m = mission.separation_m + 2.0 * mission.tube_m
+    found = goals.nearest(apart_m, mission.height_m and mission.separation_m / mission.height_m)
+    if found:
+        one, other, at_s, away_m = found
+        goals_of = f"the goals of vehicles {one} and {other} at {at_s:g} s"
+        expected = f"with 2 · mission.tube_m at most {away_m:.3g} m, as {goals_of}"
+        yield "mission.separation_m", mission.separation_m, expected
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:

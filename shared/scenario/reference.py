@@ -5,7 +5,7 @@ A reference is a function of time since the epoch [s; any shape] that gives the 
 """
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -143,83 +143,6 @@ def hover(point_m: Array) -> Reference:
     return sample
 
 
-SWAP_AT_S = 2.0
-"""Time at which vehicles that swap places leave [s]."""
-
-
-class Mission:
-    """Goals of several vehicles, each from a time on: the reference of one of them.
-
-    A vehicle begins at its first goal. One that the mission does not know stays at the origin.
-
-    Args:
-        goals: times, rising [s; shape (n,)], and goals from then on [m; shape (n, axes)], of each
-            vehicle by its number.
-        vehicle: number of the one whose reference it is.
-    """
-
-    def __init__(self, goals: Mapping[int, tuple[Array, Array]], axes: int, vehicle: int) -> None:
-        self._goals, self._axes = goals, axes
-        self._times_s, self._points_m = goals.get(vehicle, (np.zeros(1), np.zeros((1, axes))))
-
-    @property
-    def vehicles(self) -> tuple[int, ...]:
-        """Numbers of the vehicles that have goals."""
-        return tuple(self._goals)
-
-    @property
-    def places(self) -> Array:
-        """All goals of all vehicles [m]; shape (n, axes)."""
-        return np.concatenate([points_m for _, points_m in self._goals.values()])
-
-    def of(self, vehicle: int) -> "Mission":
-        """The reference of another vehicle."""
-        return Mission(self._goals, self._axes, vehicle)
-
-    def __call__(self, t: NDArray[Any]) -> Array:
-        """Goals at times [s]; see `Reference`."""
-        t = np.asarray(t, dtype=np.float64)
-        state = np.zeros((*t.shape, self._axes, 2))
-        at = np.searchsorted(self._times_s, t, side="right") - 1
-        state[..., 0] = self._points_m[np.maximum(at, 0)]
-        return state
-
-
-def swap(vehicles: int, radius_m: float, axes: int, altitude_m: float = 0.0) -> Mission:
-    """Places on a circle, from which each vehicle goes to the one opposite."""
-    goals, times_s = {}, np.array([0.0, SWAP_AT_S])
-    for number in range(1, vehicles + 1):
-        angle = 2.0 * np.pi * (number - 1) / vehicles
-        places = np.zeros((2, axes))
-        places[0, :2] = radius_m * np.array([np.cos(angle), np.sin(angle)])
-        places[1, :2] = -places[0, :2]
-        places[:, 2:] = altitude_m
-        goals[number] = times_s, places
-    return Mission(goals, axes, 1)
-
-
-def mission(path: Path, axes: int) -> Mission:
-    """Goals from a table with the columns vehicle, t [s], x, y, z [m] (as many as there are axes).
-
-    Raises:
-        OSError: see `read`.
-        ValueError: with what is wrong, and in which line.
-    """
-    rows = _table(path, ["vehicle", "t", "x", "y", "z"][: axes + 2])
-    numbers = rows[:, 0].astype(np.int64)
-    if not len(rows) or (numbers != rows[:, 0]).any() or numbers.min() < 1:
-        raise ValueError("column vehicle: expected numbers from 1")
-    goals = {}
-    for number in np.unique(numbers).tolist():
-        own = rows[numbers == number]
-        if own[0, 1] != 0.0 or (np.diff(own[:, 1]) <= 0.0).any():
-            raise ValueError(f"vehicle {number}: column t must start at 0 and rise")
-        goals[number] = own[:, 1], own[:, 2:]
-    if (np.abs(rows[:, 2:]) > FAR_M).any():
-        raise ValueError(f"expected at most {FAR_M:g} m from the origin")
-    return Mission(goals, axes, 1)
-
-
 def target(
     rng: np.random.Generator,
     axes: int,
@@ -336,7 +259,7 @@ def from_csv(path: Path, axes: int) -> Reference:
         OSError: see `read`.
         ValueError: with what is wrong, and in which line.
     """
-    data = _table(path, ["t", "x", "y", "z"][: axes + 1])
+    data = read_table(path, ["t", "x", "y", "z"][: axes + 1])
     if len(data) < 2:
         raise ValueError("expected at least two lines of finite numbers")
     if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
@@ -344,7 +267,7 @@ def from_csv(path: Path, axes: int) -> Reference:
     return timed_path(data[:, 0], data[:, 1:])
 
 
-def _table(path: Path, names: list[str]) -> Array:
+def read_table(path: Path, names: list[str]) -> Array:
     """Columns of a table; shape (rows, columns).
 
     Raises:

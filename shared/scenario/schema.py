@@ -23,9 +23,10 @@ from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario import policies
+from skytether.shared.scenario import policies, zones
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.air import path as air
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.owners import (
     InFlight,
     Key,
@@ -41,6 +42,7 @@ from skytether.shared.scenario.owners import (
     Term,
 )
 from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, VEHICLES, Entry
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
 # Bounds of numbers lie far beyond any vehicle, and near enough that no time overflows its 63 bits
@@ -135,10 +137,6 @@ class ControlConfig(Section, frozen=True):
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
     """Largest distance of a spline from the desired trajectory that the server sees [m], as far as
     16 knots reach, with the scheme "trajectory"."""
-    separation_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.5
-    """Smallest distance between two vehicles of a mission [m], see docs/together.md."""
-    tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
-    """Largest distance of a vehicle of a mission from the motion that it flies [m]."""
     state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: OfServer[tuple[Amount, Amount]] = (50.0, 20.0)
@@ -269,6 +267,29 @@ class FenceConfig(Section, frozen=True):
     def is_there(self) -> bool:
         """Whether anything is fenced in."""
         return bool(self.low_m or self.high_m or self.radius_m or self.speed_mps)
+
+
+class MissionConfig(Section, frozen=True):
+    """Vehicles with goals of their own, which keep apart whichever packets are lost.
+
+    See docs/together.md.
+    """
+
+    separation_m: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
+    """Smallest distance between two vehicles [m]."""
+    height_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
+    """The same for two of which one is above the other, for downwash [m]; 0: as `separation_m`."""
+    tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
+    """Largest distance of a vehicle from the motion that it flies [m]: wind, tracking, clocks."""
+    speed_mps: OfServer[Strength] = 0.0
+    """Largest speed of a motion, over all axes [m/s]; 0: no bound but `model.u_max`."""
+    acceleration_mps2: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.6
+    """Largest acceleration of a motion on an axis [m/s²]."""
+    allocate: OfServer[bool] = False
+    """Whether goals of one time go to the vehicles that are nearest to them."""
+    zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.ZONES)] = ""
+    """Places to keep out of or to stay within, combined with &: box(x0, x1, y0, y1), cylinder(x, y,
+    radius), polygon(x, y, …), fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
 
 
 class SensorConfig(Section, frozen=True):
@@ -443,6 +464,7 @@ class Scenario(Section, frozen=True):
     reference: ReferenceConfig = ReferenceConfig()
     vehicle: VehicleConfig = VehicleConfig()
     fence: FenceConfig = FenceConfig()
+    mission: MissionConfig = MissionConfig()
     sensor: SensorConfig = SensorConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
     network: NetworkConfig = NetworkConfig()
@@ -529,12 +551,23 @@ class Scenario(Section, frozen=True):
             seed = int(stream(self.seed, "target", vehicle).integers(2**32))
             flown = msgspec.structs.replace(self, seed=seed)
         made: shapes.Reference = entry.make(flown, *entry.numbers(shape.values, self.reference))
-        return made.of(vehicle) if isinstance(made, shapes.Mission) else made
+        if not isinstance(made, Mission):
+            return made
+        return (made.allocated() if self.mission.allocate else made).of(vehicle)
 
     @property
     def is_mission(self) -> bool:
         """Whether vehicles have goals of their own, and keep apart."""
         return self.reference.shape.partition("(")[0].strip() in MISSIONS
+
+    @property
+    def zones(self) -> Zones:
+        """Zones of a mission.
+
+        Raises:
+            PolicyError, OSError: there are none such.
+        """
+        return zones.parse(self.mission.zones, self.model.axes)
 
     def entries(self) -> Iterator[Entry]:
         """Policies and shape that the scenario names."""

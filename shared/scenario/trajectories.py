@@ -12,6 +12,7 @@ from msgspec import Meta
 
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
+from skytether.shared.scenario import mission as missions
 from skytether.shared.scenario import reference as curves
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import REFERENCES
@@ -91,10 +92,10 @@ def live(scenario: Scenario) -> Reference:
 def swap(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
     """Mission: places on a circle of `radius_m`, of which each vehicle goes to the one opposite."""
     wanted = scenario.reference
-    return curves.swap(vehicles, wanted.radius_m, scenario.model.axes, wanted.altitude_m)
+    return missions.swap(vehicles, wanted.radius_m, scenario.model.axes, wanted.altitude_m)
 
 
 @reference
 def mission(scenario: Scenario) -> Reference:
     """Mission: goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
-    return curves.mission(Path(scenario.reference.file), scenario.model.axes)
+    return missions.mission(Path(scenario.reference.file), scenario.model.axes)

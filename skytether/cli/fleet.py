@@ -22,7 +22,7 @@ from skytether.figures import flights as figures
 from skytether.shared.base import kernel
 from skytether.shared.core.events import Event, NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.scenario.reference import Mission
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
@@ -346,7 +346,7 @@ def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
         server_steps=steps,
         event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
         rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
-        separation_m=scenario.control.separation_m if scenario.is_mission else None,
+        separation_m=scenario.mission.separation_m if scenario.is_mission else None,
         least_separation_m=_separation(scenario, each, flown.vehicles),
         uplink_packets_per_s=links[0]["packets"] / duration_s,
         downlink_packets_per_s=links[1]["packets"] / duration_s,

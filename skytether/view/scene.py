@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skytether.figures.colours import GREY, PALETTE, RED, Rgb
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.reference import Mission
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.view.state import State, VehicleTrack
 

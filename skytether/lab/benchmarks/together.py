@@ -26,7 +26,7 @@ from skytether.lab.benchmarks.harness import TextTable, progress
 from skytether.server.control.together import Known
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.reference import Mission
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 from skytether.shared.telemetry.summary import least_separation
 from skytether.sim import flight
@@ -142,7 +142,7 @@ def table(options: TogetherOptions) -> TextTable:
             flown = list(pool.map(partial(fly, options), cells))
             least = np.array([each.least_m for each in flown])
             arrived = np.array([each.arrived_s for each in flown])
-            asked = reading.load("swap").control.separation_m
+            asked = reading.load("swap").mission.separation_m
             done = arrived[np.isfinite(arrived)]
             rows.append(
                 [

@@ -1,0 +1,224 @@
+"""How far motions are apart, at every time, and the half-planes that keep them so.
+
+Distances along the third axis may count less than those in the plane: all are of coordinates that
+are multiplied by `scale` first. So a sphere of that metric is an ellipsoid, higher than it is wide,
+as downwash asks for.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.shared.base.kernel import F1, F2, F3, I1, kernel, part
+from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion
+
+KNOTS = INTERVALS + JOIN_MAX + 1
+"""Most knots of a motion."""
+SAMPLES = 4
+"""Number of straight pieces that an interval of a motion is taken for."""
+
+
+class Others(NamedTuple):
+    """Motions of others that may be flown, side by side."""
+
+    first: Indices
+    """Step of each one's first knot, as the vehicle counts that plans; shape (m,)."""
+    knots: Indices
+    """Number of knots; shape (m,)."""
+    position: Array
+    """Positions of knots [m]; shape (m, KNOTS, axes)."""
+    velocity: Array
+    """Velocities of knots [m/s]; shape (m, KNOTS, axes)."""
+    of: Indices
+    """Row of the vehicle; shape (m,)."""
+
+    @property
+    def last(self) -> int:
+        """Step from which on all of them rest."""
+        return int((self.first + (self.knots - 1) * SPACING).max(initial=-(2**62)))
+
+
+def others(found: Sequence[tuple[Motion, int, int]], axes: int) -> Others:
+    """Motions side by side.
+
+    Args:
+        found: each with the number of steps by which its vehicle is ahead of the one that plans,
+            and its row.
+        axes: number of axes.
+    """
+    m = len(found)
+    made = Others(
+        np.zeros(m, dtype=np.int64),
+        np.zeros(m, dtype=np.int64),
+        np.zeros((m, KNOTS, axes)),
+        np.zeros((m, KNOTS, axes)),
+        np.zeros(m, dtype=np.int64),
+    )
+    for i, (motion, ahead, row) in enumerate(found):
+        knots = len(motion.position)
+        made.first[i], made.knots[i], made.of[i] = motion.first - ahead, knots, row
+        made.position[i, :knots], made.velocity[i, :knots] = motion.position, motion.velocity
+    return made
+
+
+def least_apart(motion: Motion, begin: int, those: Others, scale: Array, dt_s: float) -> Array:
+    """Least distance of a motion from each other one, from a step on for ever [m]; shape (m,).
+
+    It is that of straight pieces, SAMPLES an interval, which `bend_m` makes up for.
+    """
+    least = np.empty(len(those.first))
+    end = max(motion.last, those.last)
+    points, _ = motion.at(pieces_of(begin, end), dt_s)
+    _least_apart(points, begin, *those[:4], scale, dt_s, least)
+    return least
+
+
+def pieces_of(begin: int, end: int) -> Array:
+    """Steps between which motions are taken for straight, until they rest; shape (n,)."""
+    count = max(-(-(end - begin) * SAMPLES // SPACING), 1)
+    return np.linspace(begin, begin + count * SPACING / SAMPLES, count + 1)
+
+
+def bend_m(acceleration_mps2: float, dt_s: float) -> float:
+    """How far a motion of at most this acceleration is from its straight pieces [m]."""
+    return acceleration_mps2 * (SPACING / SAMPLES * dt_s) ** 2 / 8.0
+
+
+class HalfPlanes(NamedTuple):
+    """Constraints normal · p ≥ least on positions at some times."""
+
+    at: Indices
+    """Index of the time; shape (n,)."""
+    normal: Array
+    """Shape (n, axes)."""
+    least: Array
+    """Shape (n,) [m]."""
+    of: Indices
+    """Row of the other vehicle; shape (n,)."""
+
+
+def half_planes(
+    times: Array,
+    held: Array,
+    reach_m: Array,
+    those: Others,
+    scale: Array,
+    apart_m: float,
+    dt_s: float,
+) -> HalfPlanes:
+    """Half-planes normal to the lines from the others' motions to the one in force.
+
+    Args:
+        times: steps; shape (n,).
+        held: positions of the one in force then [m]; shape (n, axes).
+        reach_m: distance from there within which the plan stays [m]; shape (n,).
+        those: motions of others.
+        scale: see above; shape (axes,).
+        apart_m: distance that is kept [m]; less where the one in force is nearer already.
+        dt_s: length of a step [s].
+    """
+    most = len(times) * len(those.first)
+    found = HalfPlanes(
+        np.empty(most, dtype=np.int64),
+        np.empty((most, len(scale))),
+        np.empty(most),
+        np.empty(most, dtype=np.int64),
+    )
+    n = _half_planes(times, held, reach_m, *those, scale, apart_m, dt_s, *found)
+    return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
+
+
+@part
+def _place(
+    first: int, knots: int, position: F2, velocity: F2, axis: int, step: float, dt_s: float
+) -> float:
+    """Position of a motion on an axis at a step."""
+    along = (step - first) / SPACING
+    if along <= 0.0:
+        return float(position[0, axis])
+    if along >= knots - 1:
+        return float(position[knots - 1, axis])
+    knot = int(along)
+    T = SPACING * dt_s
+    t = (along - knot) * T
+    v = velocity[knot, axis]
+    return float(position[knot, axis] + t * (v + 0.5 * t / T * (velocity[knot + 1, axis] - v)))
+
+
+@kernel
+def _least_apart(
+    points: F2,
+    begin: int,
+    first: I1,
+    knots: I1,
+    position: F3,
+    velocity: F3,
+    scale: F1,
+    dt_s: float,
+    least: F1,
+) -> None:
+    """Fill in `least_apart` of points SPACING / SAMPLES steps apart, from `begin` on."""
+    axes = points.shape[1]
+    here, there = np.empty(axes), np.empty(axes)
+    for m in range(len(first)):
+        nearest = np.inf
+        for i in range(len(points)):
+            step = begin + i * (SPACING / SAMPLES)
+            for x in range(axes):
+                q = _place(first[m], knots[m], position[m], velocity[m], x, step, dt_s)
+                here[x] = there[x]
+                there[x] = scale[x] * (points[i, x] - q)
+            if i == 0:
+                here[:] = there
+            way, off = 0.0, 0.0
+            for x in range(axes):
+                way += (there[x] - here[x]) ** 2
+                off -= here[x] * (there[x] - here[x])
+            t = min(max(off / way, 0.0), 1.0) if way > 0.0 else 0.0
+            square = 0.0
+            for x in range(axes):
+                square += (here[x] + t * (there[x] - here[x])) ** 2
+            nearest = min(nearest, square)
+        least[m] = np.sqrt(nearest)
+
+
+@kernel
+def _half_planes(
+    times: F1,
+    held: F2,
+    reach: F1,
+    first: I1,
+    knots: I1,
+    position: F3,
+    velocity: F3,
+    of: I1,
+    scale: F1,
+    apart: float,
+    dt_s: float,
+    at: I1,
+    normal: F2,
+    least: F1,
+    row: I1,
+) -> int:
+    """Fill in `half_planes`; the number of them."""
+    n, axes = 0, len(scale)
+    place, off = np.empty(axes), np.empty(axes)
+    for m in range(len(first)):
+        for i in range(len(times)):
+            square = 0.0
+            for x in range(axes):
+                place[x] = _place(first[m], knots[m], position[m], velocity[m], x, times[i], dt_s)
+                off[x] = scale[x] * (held[i, x] - place[x])
+                square += off[x] * off[x]
+            away = np.sqrt(square)
+            if away >= apart + reach[i] or away == 0.0:
+                continue
+            offset = min(apart, away - 1e-4)
+            for x in range(axes):
+                normal[n, x] = scale[x] * off[x] / away
+                offset += normal[n, x] * place[x]
+            at[n], least[n], row[n] = i, offset, of[m]
+            n += 1
+    return n

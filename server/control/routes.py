@@ -1,0 +1,106 @@
+"""Ways around zones: the shortest line from a place to a goal that keeps its distance from them.
+
+The nodes of a visibility graph stand off the corners of zones; two that see each other are joined
+by the straight line between them. Shortest ways between all of them are found once (Floyd and
+Warshall). Zones that a vehicle flies over or under are in its way as well: ways are level.
+"""
+
+import numpy as np
+
+from skytether.shared.law.model import Array, Flags
+from skytether.shared.scenario.zones import Zones
+
+NODES_MAX = 200
+"""Largest number of nodes; the corners of zones with more are left out, the sharpest last."""
+OFF = 1.1
+"""Distance of nodes from corners over that which is kept."""
+
+
+class Routes:
+    """Ways around zones.
+
+    Args:
+        zones: what is in the way.
+        room_m: distance that a way keeps from them [m].
+    """
+
+    def __init__(self, zones: Zones, room_m: float) -> None:
+        self._zones, self._room_m = zones, room_m
+        self._nodes = _nodes(zones, OFF * room_m)
+        if len(self._nodes):
+            clear = zones.clearance(self._nodes).min(axis=1) >= room_m
+            self._nodes = self._nodes[clear][:NODES_MAX]
+        n = len(self._nodes)
+        here, there = np.triu_indices(n, 1)
+        far = np.full((n, n), np.inf)
+        np.fill_diagonal(far, 0.0)
+        if n > 1:
+            seen = self._sees(self._nodes[here], self._nodes[there])
+            here, there = here[seen], there[seen]
+            far[here, there] = np.linalg.norm(self._nodes[here] - self._nodes[there], axis=1)
+            far[there, here] = far[here, there]
+            for via in range(n):
+                np.minimum(far, far[:, [via]] + far[[via]], out=far)
+        self._far = far
+        """Length of the shortest way between two nodes [m]; infinite without one."""
+
+    def next(self, place: Array, goal: Array) -> Array:
+        """The point to fly to: the goal where it is seen, or the first corner of the way there.
+
+        The goal itself where there is no way.
+
+        Args:
+            place, goal: shape (axes,).
+        """
+        here, there = place[None, :2], goal[None, :2]
+        if not len(self._nodes) or self._sees(here, there)[0]:
+            return goal
+        nodes = self._nodes
+        first = np.where(
+            self._sees(np.broadcast_to(here, nodes.shape), nodes),
+            np.linalg.norm(nodes - here, axis=1),
+            np.inf,
+        )
+        last = np.where(
+            self._sees(nodes, np.broadcast_to(there, nodes.shape)),
+            np.linalg.norm(nodes - there, axis=1),
+            np.inf,
+        )
+        long = (first[:, None] + self._far + last).min(axis=1)
+        best = int(long.argmin())
+        if not np.isfinite(long[best]):
+            return goal
+        found = goal.copy()
+        found[:2] = nodes[best]
+        return found
+
+    def reaches(self, place: Array, goal: Array) -> bool:
+        """Whether there is a way."""
+        aim = self.next(place, goal)
+        return bool((aim != goal).any()) or bool(self._sees(place[None, :2], goal[None, :2])[0])
+
+    def _sees(self, here: Array, there: Array) -> Flags:
+        """Whether straight lines keep their distance; shape (n,)."""
+        clear: Flags = self._zones.along(np.stack([here, there], axis=1)) >= self._room_m
+        return clear
+
+
+def _nodes(zones: Zones, off_m: float) -> Array:
+    """Places off the corners of zones, outward on the line that halves each [m]; shape (n, 2)."""
+    found = [np.zeros((0, 2))]
+    for zone in zones.zones:
+        corners = zone.corners
+        after, before = (
+            np.roll(corners, -1, axis=0) - corners,
+            np.roll(corners, 1, axis=0) - corners,
+        )
+        after /= np.maximum(np.linalg.norm(after, axis=1, keepdims=True), 1e-9)
+        before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-9)
+        halves = after + before
+        size = np.linalg.norm(halves, axis=1, keepdims=True)
+        straight = size[:, 0] < 1e-6
+        halves[straight] = np.stack([-after[straight, 1], after[straight, 0]], axis=1)
+        size[straight] = 1.0
+        # Both ways: one of them is where vehicles may be.
+        found += [corners - sign * off_m * halves / size for sign in (1.0, -1.0)]
+    return np.concatenate(found)
