@@ -60,6 +60,8 @@ AIM_M = 3.0
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 """By how much further round a vehicle aims that is stuck, how far at most before directions are
 drawn, and by how much less once it moves [rad]."""
+TRIES = 5
+"""Number of directions that are tried at a time."""
 STUCK = 0.3
 """Share of the way to the goal, 2 m at most, below which a plan is taken for stuck."""
 BINDS_M = 1e-4
@@ -313,7 +315,7 @@ class Together:
         those = self._others(row, k)
         found = self._toward(base.motion, known, k, goal, those)
         if found is None:
-            self.counts["unsolved"] += 1
+            self.counts["stuck"] += 1
         elif self._is_apart(found, k, those):
             known.next = found
         else:
@@ -350,18 +352,20 @@ class Together:
             known.turned = max(0.0, known.turned - TURN_BACK)
             return motion(free)
         planes = self._planes(base, due, those)
-        solved = plan.solve(p0, v0, aim, planes[:3])
-        if solved is None:
-            return None
-        moved, far = float(np.linalg.norm(solved[0][-1] - p0)), float(np.linalg.norm(goal - p0))
-        if moved < STUCK * min(far, 2.0):
-            known.waits = self._blocker(solved, planes)
+        enough_m = STUCK * min(float(np.linalg.norm(goal - p0)), 2.0)
+        for _ in range(TRIES):
+            solved = plan.solve(p0, v0, self._aim(known, p0, goal), planes[:3])
+            if solved is None:
+                return None
+            if np.linalg.norm(solved[0][-1] - p0) >= enough_m:
+                known.waits = ""
+                known.turned = max(0.0, known.turned - TURN_BACK)
+                return motion(solved)
+            known.waits = known.waits or self._blocker(solved, planes)
             known.turned += TURN
             if known.turned > TURN_MAX:
-                known.turned = float(self._rng.uniform(0.3, TURN_MAX))
-        else:
-            known.turned = max(0.0, known.turned - TURN_BACK)
-        return motion(solved)
+                known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
+        return None
 
     def _aim(self, known: Known, place: Array, goal: Array) -> Array:
         """What to fly to: the goal, or the next corner on the way there, or right of it."""
