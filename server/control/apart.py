@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.shared.base.kernel import F1, F2, F3, I1, kernel, part
-from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion
 
 KNOTS = INTERVALS + JOIN_MAX + 1
@@ -96,7 +96,12 @@ class HalfPlanes(NamedTuple):
     least: Array
     """Shape (n,) [m]."""
     of: Indices
-    """Row of the other vehicle; shape (n,)."""
+    """Index of the other motion; shape (n,)."""
+
+    def of_some(self, taken: Flags) -> "HalfPlanes":
+        """Those of some of the others."""
+        some = taken[self.of]
+        return HalfPlanes(self.at[some], self.normal[some], self.least[some], self.of[some])
 
 
 def half_planes(
@@ -126,7 +131,7 @@ def half_planes(
         np.empty(most),
         np.empty(most, dtype=np.int64),
     )
-    n = _half_planes(times, held, reach_m, *those, scale, apart_m, dt_s, *found)
+    n = _half_planes(times, held, reach_m, *those[:4], scale, apart_m, dt_s, *found)
     return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
 
 
@@ -193,14 +198,13 @@ def _half_planes(
     knots: I1,
     position: F3,
     velocity: F3,
-    of: I1,
     scale: F1,
     apart: float,
     dt_s: float,
     at: I1,
     normal: F2,
     least: F1,
-    row: I1,
+    of: I1,
 ) -> int:
     """Fill in `half_planes`; the number of them."""
     n, axes = 0, len(scale)
@@ -219,6 +223,6 @@ def _half_planes(
             for x in range(axes):
                 normal[n, x] = scale[x] * off[x] / away
                 offset += normal[n, x] * place[x]
-            at[n], least[n], row[n] = i, offset, of[m]
+            at[n], least[n], of[n] = i, offset, m
             n += 1
     return n

@@ -62,6 +62,8 @@ TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 drawn, and by how much less once it moves [rad]."""
 TRIES = 5
 """Number of directions that are tried at a time."""
+ROUNDS = 5
+"""Number of times that constraints are taken in for one of them."""
 STUCK = 0.3
 """Share of the way to the goal, 2 m at most, below which a plan is taken for stuck."""
 BINDS_M = 1e-4
@@ -313,13 +315,8 @@ class Together:
             known.turned = 0.0
             return
         those = self._others(row, k)
-        found = self._toward(base.motion, known, k, goal, those)
-        if found is None:
-            self.counts["stuck"] += 1
-        elif self._is_apart(found, k, those):
-            known.next = found
-        else:
-            self.counts["refused"] += 1
+        known.next = self._toward(base.motion, known, k, goal, those)
+        self.counts["stuck"] += known.next is None
 
     def _others(self, row: int, k: int) -> Others:
         """Motions of others that may be flown."""
@@ -334,34 +331,39 @@ class Together:
     def _toward(
         self, base: Motion, known: Known, k: int, goal: Array, those: Others
     ) -> Motion | None:
-        """A motion from the one in force towards a goal; None where no solution is found."""
+        """A motion from the one in force towards a goal, apart from all; None where none is found.
+
+        Of the constraints only those are taken in that a solution without them has violated: mostly
+        nothing is near, and the way is straight.
+        """
         dt_s, plan = self._dt_s, self._plan
         due = k + self._lead
         (p0,), (v0,) = base.at(np.array([float(due)]), dt_s)
-        before = np.arange(k, due, SPACING, dtype=np.float64)
-        kept_p, kept_v = base.at(before, dt_s)
-
-        def motion(solved: tuple[Array, Array]) -> Motion:
-            p, v = solved
-            return Motion(k, np.concatenate([kept_p, p]), np.concatenate([kept_v, v]))
-
-        aim = self._aim(known, p0, goal)
-        # Mostly nothing is near: then no constraint is needed, and the straight way is the best.
-        free = plan.solve(p0, v0, aim)
-        if free is not None and self._is_apart(motion(free), k, those):
-            known.turned = max(0.0, known.turned - TURN_BACK)
-            return motion(free)
-        planes = self._planes(base, due, those)
+        kept_p, kept_v = base.at(np.arange(k, due, SPACING, dtype=np.float64), dt_s)
         enough_m = STUCK * min(float(np.linalg.norm(goal - p0)), 2.0)
+        planes, taken = None, np.zeros(len(those.first) + 1, dtype=np.bool_)
         for _ in range(TRIES):
-            solved = plan.solve(p0, v0, self._aim(known, p0, goal), planes[:3])
-            if solved is None:
-                return None
-            if np.linalg.norm(solved[0][-1] - p0) >= enough_m:
-                known.waits = ""
-                known.turned = max(0.0, known.turned - TURN_BACK)
-                return motion(solved)
-            known.waits = known.waits or self._blocker(solved, planes)
+            aim = self._aim(known, p0, goal)
+            for _ in range(ROUNDS):
+                held = planes.of_some(taken) if planes else None
+                solved = plan.solve(p0, v0, aim, held and held[:3])
+                if solved is None:
+                    self.counts["unsolved"] += 1
+                    return None
+                p, v = solved
+                motion = Motion(k, np.concatenate([kept_p, p]), np.concatenate([kept_v, v]))
+                hit = self._hit(motion, k, those)
+                if not (hit & ~taken).any():
+                    break
+                taken |= hit
+                planes = planes or self._planes(base, due, those)
+            moved_m = float(np.linalg.norm(p[-1] - p0))
+            if moved_m >= enough_m and not hit.any():
+                known.waits, known.turned = "", max(0.0, known.turned - TURN_BACK)
+                return motion
+            if held:
+                known.waits = known.waits or self._blocker(solved, held, those)
+            self.counts["refused"] += bool(hit.any())
             known.turned += TURN
             if known.turned > TURN_MAX:
                 known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
@@ -381,14 +383,12 @@ class Together:
         return aim
 
     def _planes(self, base: Motion, due: int, those: Others) -> HalfPlanes:
-        """Half-planes of the others' motions, and of zones (of row -1, -2, …)."""
+        """Half-planes of the others' motions, and behind them those of zones."""
         plan = self._plan
         times = due + plan.times * SPACING
         held, _ = base.at(times, self._dt_s)
         wide_m = self._apart_m + MARGIN_M
         found = apart.half_planes(times, held, plan.reach_m, those, self._scale, wide_m, self._dt_s)
-        if not self._zones:
-            return found
         near = self._zones.planes(held, plan.reach_m + self._tube_m + MARGIN_M)
         least = np.minimum(self._tube_m + MARGIN_M, near.away_m - 1e-4)
         least += np.einsum("ij,ij->i", near.normal, near.border)
@@ -396,24 +396,25 @@ class Together:
             np.concatenate([found.at, near.at]),
             np.concatenate([found.normal, near.normal]),
             np.concatenate([found.least, least]),
-            np.concatenate([found.of, np.full(len(near.at), -1)]),
+            np.concatenate([found.of, np.full(len(near.at), len(those.first))]),
         )
 
-    def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
+    def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes, those: Others) -> str:
         """What holds a motion back most, in words."""
         position = self._plan.at_times(*solved)
         room = np.einsum("ij,ij->i", planes.normal, position[planes.at]) - planes.least
         binding = planes.of[room < BINDS_M]
         if not len(binding):
             return ""
-        rows, often = np.unique(binding, return_counts=True)
-        row = int(rows[often.argmax()])
-        return "a zone" if row < 0 else f"vehicle {self._number_of(row)}"
+        index, often = np.unique(binding, return_counts=True)
+        most = int(index[often.argmax()])
+        if most == len(those.first):
+            return "a zone"
+        return f"vehicle {self._number_of(int(those.of[most]))}"
 
-    def _is_apart(self, motion: Motion, k: int, those: Others) -> bool:
-        """Whether a motion keeps its distance from all others and from zones, for ever."""
+    def _hit(self, motion: Motion, k: int, those: Others) -> Flags:
+        """Which others a motion comes too near to, ever, and last whether it does to a zone."""
         least = apart.least_apart(motion, k, those, self._scale, self._dt_s)
-        if (least < self._apart_m + 2.0 * self._bend_m).any():
-            return False
         points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-        return bool((self._zones.along(points) >= self._tube_m + self._bend_m).all())
+        clear = self._zones.along(points) >= self._tube_m + self._bend_m
+        return np.append(least < self._apart_m + 2.0 * self._bend_m, not clear.all())
