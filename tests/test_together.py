@@ -105,7 +105,8 @@ def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
     rows, inside = rng.normal(size=(m, n)), rng.normal(size=n)
     least = rows @ inside - rng.uniform(0, 1, m) * (rng.random(m) < 0.8)
     least[:equal] = rows[:equal] @ inside
-    found = DualSolver(hessian).solve(linear, rows, least, equal)
+    columns = np.ascontiguousarray(rows.T)
+    found = DualSolver(hessian).solve(linear, columns, least, equal)
     assert found is not None
     assert (rows @ found - least).min() > -1e-8
     assert np.abs(rows[:equal] @ found - least[:equal]).max() < 1e-8
@@ -134,8 +135,8 @@ def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
 
 def test_what_cannot_be_has_no_solution() -> None:
     """Two constraints that contradict each other."""
-    rows = np.array([[1.0, 0.0], [-1.0, 0.0]])
-    assert DualSolver(np.eye(2)).solve(np.zeros(2), rows, np.array([1.0, 1.0]), 0) is None
+    columns = np.array([[1.0, -1.0], [0.0, 0.0]])
+    assert DualSolver(np.eye(2)).solve(np.zeros(2), columns, np.array([1.0, 1.0]), 0) is None
 
 
 @given(

@@ -5,7 +5,6 @@ are multiplied by `scale` first. So a sphere of that metric is an ellipsoid, hig
 as downwash asks for.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,58 +19,80 @@ SAMPLES = 4
 """Number of straight pieces that an interval of a motion is taken for."""
 
 
-class Others(NamedTuple):
-    """Motions of others that may be flown, side by side."""
+class Flown:
+    """Motions that may be flown, side by side, by steps that all vehicles have in common.
 
-    first: Indices
-    """Step of each one's first knot, as the vehicle counts that plans; shape (m,)."""
-    knots: Indices
-    """Number of knots; shape (m,)."""
-    position: Array
-    """Positions of knots [m]; shape (m, KNOTS, axes)."""
-    velocity: Array
-    """Velocities of knots [m/s]; shape (m, KNOTS, axes)."""
-    of: Indices
-    """Row of the vehicle; shape (m,)."""
+    Args:
+        axes: number of axes.
+    """
+
+    def __init__(self, axes: int) -> None:
+        self._axes = axes
+        self.clear(64)
+
+    def clear(self, room: int = 0) -> None:
+        """Hold none; with room for so many where that is more than there was."""
+        self.count = 0
+        if room:
+            self._first, self._knots, self._of = (np.zeros(room, dtype=np.int64) for _ in range(3))
+            self._position, self._velocity = np.zeros((2, room, KNOTS, self._axes))
+
+    def add(self, motion: Motion, ahead: int, row: int) -> None:
+        """Hold one more.
+
+        Args:
+            motion: by the steps of its vehicle.
+            ahead: number of steps by which that is ahead of those in common.
+            row: of the vehicle.
+        """
+        i, knots = self.count, len(motion.position)
+        if i == len(self._first):
+            grown = (self._first, self._knots, self._of, self._position, self._velocity)
+            both = [np.concatenate([each, np.zeros_like(each)]) for each in grown]
+            self._first, self._knots, self._of, self._position, self._velocity = both
+        self._first[i], self._knots[i], self._of[i] = motion.first - ahead, knots, row
+        self._position[i, :knots], self._velocity[i, :knots] = motion.position, motion.velocity
+        self.count += 1
+
+    @property
+    def of(self) -> Indices:
+        """Row of the vehicle of each; shape (count,)."""
+        return self._of[: self.count]
+
+    @property
+    def arrays(self) -> tuple[Indices, Indices, Array, Array, Indices]:
+        """First step, number of knots, positions and velocities of these, and row of each."""
+        n = self.count
+        return self._first[:n], self._knots[:n], self._position[:n], self._velocity[:n], self.of
 
     @property
     def last(self) -> int:
         """Step from which on all of them rest."""
-        return int((self.first + (self.knots - 1) * SPACING).max(initial=-(2**62)))
+        first, knots, *_ = self.arrays
+        return int((first + (knots - 1) * SPACING).max(initial=-(2**62)))
 
 
-def others(found: Sequence[tuple[Motion, int, int]], axes: int) -> Others:
-    """Motions side by side.
-
-    Args:
-        found: each with the number of steps by which its vehicle is ahead of the one that plans,
-            and its row.
-        axes: number of axes.
-    """
-    m = len(found)
-    made = Others(
-        np.zeros(m, dtype=np.int64),
-        np.zeros(m, dtype=np.int64),
-        np.zeros((m, KNOTS, axes)),
-        np.zeros((m, KNOTS, axes)),
-        np.zeros(m, dtype=np.int64),
-    )
-    for i, (motion, ahead, row) in enumerate(found):
-        knots = len(motion.position)
-        made.first[i], made.knots[i], made.of[i] = motion.first - ahead, knots, row
-        made.position[i, :knots], made.velocity[i, :knots] = motion.position, motion.velocity
-    return made
-
-
-def least_apart(motion: Motion, begin: int, those: Others, scale: Array, dt_s: float) -> Array:
-    """Least distance of a motion from each other one, from a step on for ever [m]; shape (m,).
+def least_apart(
+    motion: Motion, begin: int, row: int, flown: Flown, scale: Array, dt_s: float
+) -> Array:
+    """Least distance of a motion from each that may be flown, from a step on for ever [m].
 
     It is that of straight pieces, SAMPLES an interval, which `bend_m` makes up for.
+
+    Args:
+        motion: by the steps in common.
+        begin: step from which on.
+        row: the vehicle's, whose own motions do not count.
+        flown: motions of all.
+        scale: see above; shape (axes,).
+        dt_s: length of a step [s].
+
+    Returns:
+        shape (flown.count,); infinite for its own.
     """
-    least = np.empty(len(those.first))
-    end = max(motion.last, those.last)
-    points, _ = motion.at(pieces_of(begin, end), dt_s)
-    _least_apart(points, begin, *those[:4], scale, dt_s, least)
+    least = np.empty(flown.count)
+    points, _ = motion.at(pieces_of(begin, max(motion.last, flown.last)), dt_s)
+    _least_apart(points, begin, row, *flown.arrays, scale, dt_s, least)
     return least
 
 
@@ -108,7 +129,8 @@ def half_planes(
     times: Array,
     held: Array,
     reach_m: Array,
-    those: Others,
+    row: int,
+    flown: Flown,
     scale: Array,
     apart_m: float,
     dt_s: float,
@@ -116,22 +138,23 @@ def half_planes(
     """Half-planes normal to the lines from the others' motions to the one in force.
 
     Args:
-        times: steps; shape (n,).
+        times: steps in common; shape (n,).
         held: positions of the one in force then [m]; shape (n, axes).
         reach_m: distance from there within which the plan stays [m]; shape (n,).
-        those: motions of others.
+        row: the vehicle's, whose own motions do not count.
+        flown: motions of all.
         scale: see above; shape (axes,).
         apart_m: distance that is kept [m]; less where the one in force is nearer already.
         dt_s: length of a step [s].
     """
-    most = len(times) * len(those.first)
+    most = len(times) * flown.count
     found = HalfPlanes(
         np.empty(most, dtype=np.int64),
         np.empty((most, len(scale))),
         np.empty(most),
         np.empty(most, dtype=np.int64),
     )
-    n = _half_planes(times, held, reach_m, *those[:4], scale, apart_m, dt_s, *found)
+    n = _half_planes(times, held, reach_m, row, *flown.arrays, scale, apart_m, dt_s, *found)
     return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
 
 
@@ -156,10 +179,12 @@ def _place(
 def _least_apart(
     points: F2,
     begin: int,
+    row: int,
     first: I1,
     knots: I1,
     position: F3,
     velocity: F3,
+    rows: I1,
     scale: F1,
     dt_s: float,
     least: F1,
@@ -169,6 +194,9 @@ def _least_apart(
     here, there = np.empty(axes), np.empty(axes)
     for m in range(len(first)):
         nearest = np.inf
+        if rows[m] == row:
+            least[m] = nearest
+            continue
         for i in range(len(points)):
             step = begin + i * (SPACING / SAMPLES)
             for x in range(axes):
@@ -194,10 +222,12 @@ def _half_planes(
     times: F1,
     held: F2,
     reach: F1,
+    row: int,
     first: I1,
     knots: I1,
     position: F3,
     velocity: F3,
+    rows: I1,
     scale: F1,
     apart: float,
     dt_s: float,
@@ -210,6 +240,8 @@ def _half_planes(
     n, axes = 0, len(scale)
     place, off = np.empty(axes), np.empty(axes)
     for m in range(len(first)):
+        if rows[m] == row:
+            continue
         for i in range(len(times)):
             square = 0.0
             for x in range(axes):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.base.kernel import F1, F2, I1, kernel, part
+from skytether.shared.base.kernel import F1, F2, I1, R2, kernel, part
 from skytether.shared.law.model import Array
 
 SOLVED, INFEASIBLE, ENDLESS = 0, 1, 2
@@ -33,55 +33,71 @@ class DualSolver:
     """
 
     def __init__(self, hessian: NDArray[Any]) -> None:
-        self._root = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(hessian)).T)
-        """J with J Jᵀ = G⁻¹."""
+        self._root = np.linalg.inv(np.linalg.cholesky(hessian))
+        """Jᵀ with J Jᵀ = G⁻¹."""
         n = len(hessian)
         self._basis, self._triangle = np.zeros((n, n)), np.zeros((n, n))
         self._work = np.zeros((5, n + 1))
         self._active = np.zeros(n + 1, dtype=np.int64)
 
-    def solve(self, linear: Array, rows: Array, least: Array, equal: int) -> Array | None:
+    def solve(self, linear: Array, columns: Array, least: Array, equal: int) -> Array | None:
         """The minimum x; None where there is none.
 
         Args:
             linear: g; shape (n,).
-            rows: C; shape (m, n).
+            columns: Cᵀ; shape (n, m).
             least: b; shape (m,).
-            equal: number of rows, the first ones, that hold with equality.
+            equal: number of constraints, the first ones, that hold with equality.
         """
-        x = self._root @ (self._root.T @ linear)
-        scratch = self._basis, self._triangle, self._work, self._active
-        done = _solve(self._root, x, rows, least, equal, *scratch)
+        x = self._root.T @ (self._root @ linear)
+        scratch = np.empty(len(least)), self._basis, self._triangle, self._work, self._active
+        done = _solve(self._root, x, columns, least, equal, *scratch)
         return x if done == SOLVED else None
+
+
+# Loops run along what lies side by side in memory, so that the compiler makes SIMD of them: C and J
+# are kept transposed.
 
 
 @kernel
 def _solve(
-    root: F2, x: F1, rows: F2, least: F1, equal: int, J: F2, R: F2, work: F2, active: I1
+    root: F2,
+    x: F1,
+    columns: R2,
+    least: F1,
+    equal: int,
+    slack: F1,
+    J: F2,
+    R: F2,
+    work: F2,
+    active: I1,
 ) -> int:
     """Move x from the minimum without constraints to that with them.
 
     Args:
-        root: J of the beginning; shape (n, n).
+        root: Jᵀ of the beginning; shape (n, n).
         x: shape (n,).
-        rows, least, equal: see `DualSolver.solve`.
-        J: scratch: J, its first columns those of the constraints in force; shape (n, n).
+        columns, least, equal: see `DualSolver.solve`.
+        slack: scratch: how far each constraint is from being violated; shape (m,).
+        J: scratch: Jᵀ, its first rows those of the constraints in force; shape (n, n).
         R: scratch: upper triangle with the normals in force as Jᵀ sees them; shape (n, n).
         work: scratch; shape (5, n + 1).
-        active: scratch: rows in force; shape (n + 1,).
+        active: scratch: constraints in force; shape (n + 1,).
     """
     n, q = len(x), 0
     d, z, r, u, normal = work[0], work[1], work[2], work[3], work[4]
     J[:] = root
     for _ in range(ROUNDS * n):
         # The equality that comes next, or else the constraint that is violated most.
-        at = q if q < equal else _most_violated(rows, least, equal, x)
+        at = q if q < equal else _most_violated(columns, least, equal, x, slack)
         if at < 0:
             return SOLVED
-        slack = _slack(rows, least, at, x)
-        sign = -1.0 if at < equal and slack > 0.0 else 1.0
-        slack *= sign
-        normal[:n] = sign * rows[at]
+        room = -least[at]
+        for j in range(n):
+            room += columns[j, at] * x[j]
+        sign = -1.0 if at < equal and room > 0.0 else 1.0
+        room *= sign
+        normal[:n] = sign * columns[:, at]
         price = 0.0
         while True:
             length, gain = _direction(J, R, normal, d, z, r, q)
@@ -89,7 +105,7 @@ def _solve(
             for i in range(q):
                 if active[i] >= equal and r[i] > 0.0 and u[i] / r[i] < dual:
                     dual, leaves = u[i] / r[i], i
-            primal = np.inf if length <= DEPENDENT else -slack / gain
+            primal = np.inf if length <= DEPENDENT else -room / gain
             step = min(dual, primal)
             if step == np.inf:
                 return INFEASIBLE
@@ -97,7 +113,7 @@ def _solve(
             price += step
             if primal < np.inf:
                 x += step * z[:n]
-                slack += step * gain
+                room += step * gain
             if step == primal:
                 for j in range(n - 1, q, -1):
                     _turn(d, J, j)
@@ -111,22 +127,18 @@ def _solve(
 
 
 @part
-def _slack(rows: F2, least: F1, at: int, x: F1) -> float:
-    """How far a constraint is from being violated."""
-    slack = -least[at]
-    for j in range(len(x)):
-        slack += rows[at, j] * x[j]
-    return slack
-
-
-@part
-def _most_violated(rows: F2, least: F1, equal: int, x: F1) -> int:
+def _most_violated(columns: R2, least: F1, equal: int, x: F1, slack: F1) -> int:
     """The inequality that is violated most, or -1."""
+    for i in range(len(least)):
+        slack[i] = -least[i]
+    for j in range(len(x)):
+        xj = x[j]
+        for i in range(len(least)):
+            slack[i] += columns[j, i] * xj
     at, worst = -1, -VIOLATED
     for i in range(equal, len(least)):
-        slack = _slack(rows, least, i, x)
-        if slack < worst:
-            at, worst = i, slack
+        if slack[i] < worst:
+            at, worst = i, slack[i]
     return at
 
 
@@ -139,13 +151,14 @@ def _direction(J: F2, R: F2, normal: F1, d: F1, z: F1, r: F1, q: int) -> tuple[f
     """
     n, length, gain = len(J), 0.0, 0.0
     for j in range(n):
+        z[j] = 0.0
         d[j] = 0.0
         for i in range(n):
-            d[j] += J[i, j] * normal[i]
+            d[j] += J[j, i] * normal[i]
+    for j in range(q, n):
+        for i in range(n):
+            z[i] += d[j] * J[j, i]
     for i in range(n):
-        z[i] = 0.0
-        for j in range(q, n):
-            z[i] += J[i, j] * d[j]
         length += z[i] * z[i]
         gain += z[i] * normal[i]
     for i in range(q - 1, -1, -1):
@@ -172,13 +185,13 @@ def _let_go(J: F2, R: F2, u: F1, active: I1, leaves: int, q: int) -> None:
             one, other = R[i, j], R[i + 1, j]
             R[i, j], R[i + 1, j] = c * one + s * other, c * other - s * one
         for j in range(len(J)):
-            one, other = J[j, i], J[j, i + 1]
-            J[j, i], J[j, i + 1] = c * one + s * other, c * other - s * one
+            one, other = J[i, j], J[i + 1, j]
+            J[i, j], J[i + 1, j] = c * one + s * other, c * other - s * one
 
 
 @part
 def _turn(d: F1, J: F2, j: int) -> None:
-    """Turn columns j - 1 and j so that d[j] becomes 0."""
+    """Turn rows j - 1 and j so that d[j] becomes 0."""
     one, other = d[j - 1], d[j]
     size = np.hypot(one, other)
     if other == 0.0:
@@ -186,5 +199,5 @@ def _turn(d: F1, J: F2, j: int) -> None:
     c, s = one / size, other / size
     d[j - 1], d[j] = size, 0.0
     for i in range(len(J)):
-        one, other = J[i, j - 1], J[i, j]
-        J[i, j - 1], J[i, j] = c * one + s * other, c * other - s * one
+        one, other = J[j - 1, i], J[j, i]
+        J[j - 1, i], J[j, i] = c * one + s * other, c * other - s * one

@@ -62,7 +62,9 @@ class MotionPlan:
         before = np.vstack([np.zeros(n), self._to_velocity[:-1]])
         begins = [before + tau_s[x] * np.eye(n) for x in range(axes)]
         both = np.vstack([np.eye(n * axes), _blocks(ends), _blocks(begins)])
-        self._fixed = np.vstack([_blocks([self._to_velocity[-1:]] * axes), both, -both])
+        fixed = np.vstack([_blocks([self._to_velocity[-1:]] * axes), both, -both])
+        self._fixed = np.ascontiguousarray(fixed.T)
+        """Columns of the constraints that are always there."""
         self._most, self._axes, self._T = most, axes, T
         passed_s = self.times * T
         along_m = np.minimum(acceleration_mps2 * passed_s**2, 2.0 * most.max() * passed_s)
@@ -90,15 +92,15 @@ class MotionPlan:
         a = np.full(n * axes, self._acceleration)
         most, v = np.repeat(self._most, n), np.repeat(v0, n)
         low = [-v0, -a, -most - v, -most - v, -a, v - most, v - most]
-        rows = [self._fixed]
-        if planes is not None:
+        columns = self._fixed
+        if planes is not None and len(planes[0]):
             at, normal, least = planes
-            rows.append(
-                np.concatenate([normal[:, [x]] * self._to_sample[at] for x in range(axes)], axis=1)
-            )
+            sample = self._to_sample[at].T
+            near = np.concatenate([normal[:, x] * sample for x in range(axes)])
+            columns = np.concatenate([columns, near], axis=1)
             drifting = p0 + self.times[at][:, None] * T * v0
             low.append(least - np.einsum("ij,ij->i", normal, drifting))
-        x = self._solver.solve(-linear, np.vstack(rows), np.concatenate(low), axes)
+        x = self._solver.solve(-linear, columns, np.concatenate(low), axes)
         if x is None:
             return None
         found = x.reshape(axes, n).T

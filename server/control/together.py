@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.server.control import apart
-from skytether.server.control.apart import HalfPlanes, Others
+from skytether.server.control.apart import Flown, HalfPlanes
 from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.planner import FIGURES, Figures
 from skytether.server.control.routes import Routes
@@ -156,6 +156,8 @@ class Together:
         self._rng = stream(scenario.seed, "together")
         self._now, self._ahead = 0, dict[int, int]()
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
+        self._flown = Flown(terms.axes)
+        """All motions that may be flown at this tick."""
         self.change_zones(scenario.zones)
 
     def forget(self, row: int) -> None:
@@ -226,11 +228,8 @@ class Together:
             turn = (k - self._number_of(row)) % SPACING == 0
             if known.in_force is not None and known.heard and turn:
                 self._decide(row, known, k)
-            at = known.in_force.motion if known.in_force else resting(k, self._state[row, :, 0])
-            p, v = at.at(np.array([float(k)]), self._dt_s)
-            self.planned[i, :, 0], self.planned[i, :, 1] = p[0], v[0]
-            if known.next is not None:
-                figures["expected_gap"][i] = 1e9
+                figures["expected_gap"][i] = 0.0 if known.next is None else 1e9
+        self.planned[: len(rows)] = self._state[rows]
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; the knots of what is sent."""
@@ -279,13 +278,16 @@ class Together:
     # -- what is decided ---------------------------------------------------------------------------
 
     def _meet(self, steps: dict[int, int]) -> None:
-        """Take note of how far ahead of the others the steps of vehicles are."""
+        """Bring the steps of all vehicles onto one grid, and all motions that may be flown."""
         known = [k - self._ahead[row] for row, k in steps.items() if row in self._ahead]
         self._now = int(np.median(known)) if known else self._now + 1
         self._ahead |= {row: k - self._now for row, k in steps.items()}
-        for row in steps:
-            if row in self._rows:
-                self._rows[row].next = None
+        self._flown.clear()
+        for row, each in self._rows.items():
+            if row in steps:
+                each.next = None
+            for motion in each.motions():
+                self._flown.add(motion, self._ahead.get(row, 0), row)
 
     def _decide(self, row: int, known: Known, k: int) -> None:
         """Find the motion to be sent to a vehicle now, if any."""
@@ -314,34 +316,25 @@ class Together:
         if np.abs(base.motion.position[-1] - goal).max() < ARRIVED_M:
             known.turned = 0.0
             return
-        those = self._others(row, k)
-        known.next = self._toward(base.motion, known, k, goal, those)
-        self.counts["stuck"] += known.next is None
+        known.next = self._toward(row, known, k, goal)
+        if known.next is None:
+            self.counts["stuck"] += 1
+        else:
+            self._flown.add(known.next, self._ahead[row], row)
 
-    def _others(self, row: int, k: int) -> Others:
-        """Motions of others that may be flown."""
-        found = [
-            (motion, self._now + self._ahead.get(other, 0) - k, other)
-            for other, known in self._rows.items()
-            if other != row and known.in_force is not None
-            for motion in known.motions()
-        ]
-        return apart.others(found, self._state.shape[1])
-
-    def _toward(
-        self, base: Motion, known: Known, k: int, goal: Array, those: Others
-    ) -> Motion | None:
+    def _toward(self, row: int, known: Known, k: int, goal: Array) -> Motion | None:
         """A motion from the one in force towards a goal, apart from all; None where none is found.
 
         Of the constraints only those are taken in that a solution without them has violated: mostly
         nothing is near, and the way is straight.
         """
-        dt_s, plan = self._dt_s, self._plan
+        assert known.in_force is not None
+        dt_s, plan, base = self._dt_s, self._plan, known.in_force.motion
         due = k + self._lead
         (p0,), (v0,) = base.at(np.array([float(due)]), dt_s)
         kept_p, kept_v = base.at(np.arange(k, due, SPACING, dtype=np.float64), dt_s)
         enough_m = STUCK * min(float(np.linalg.norm(goal - p0)), 2.0)
-        planes, taken = None, np.zeros(len(those.first) + 1, dtype=np.bool_)
+        planes, taken = None, np.zeros(self._flown.count + 1, dtype=np.bool_)
         for _ in range(TRIES):
             aim = self._aim(known, p0, goal)
             for _ in range(ROUNDS):
@@ -352,17 +345,17 @@ class Together:
                     return None
                 p, v = solved
                 motion = Motion(k, np.concatenate([kept_p, p]), np.concatenate([kept_v, v]))
-                hit = self._hit(motion, k, those)
+                hit = self._hit(row, motion, k)
                 if not (hit & ~taken).any():
                     break
                 taken |= hit
-                planes = planes or self._planes(base, due, those)
+                planes = planes or self._planes(row, base, due)
             moved_m = float(np.linalg.norm(p[-1] - p0))
             if moved_m >= enough_m and not hit.any():
                 known.waits, known.turned = "", max(0.0, known.turned - TURN_BACK)
                 return motion
             if held:
-                known.waits = known.waits or self._blocker(solved, held, those)
+                known.waits = known.waits or self._blocker(solved, held)
             self.counts["refused"] += bool(hit.any())
             known.turned += TURN
             if known.turned > TURN_MAX:
@@ -382,13 +375,23 @@ class Together:
             aim[:2] += min(float(np.linalg.norm(way)), AIM_M) * turned
         return aim
 
-    def _planes(self, base: Motion, due: int, those: Others) -> HalfPlanes:
+    def _planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
         """Half-planes of the others' motions, and behind them those of zones."""
-        plan = self._plan
+        plan, ahead = self._plan, self._ahead[row]
         times = due + plan.times * SPACING
         held, _ = base.at(times, self._dt_s)
-        wide_m = self._apart_m + MARGIN_M
-        found = apart.half_planes(times, held, plan.reach_m, those, self._scale, wide_m, self._dt_s)
+        found = apart.half_planes(
+            times - ahead,
+            held,
+            plan.reach_m,
+            row,
+            self._flown,
+            self._scale,
+            self._apart_m + MARGIN_M,
+            self._dt_s,
+        )
+        if not self._zones:
+            return found
         near = self._zones.planes(held, plan.reach_m + self._tube_m + MARGIN_M)
         least = np.minimum(self._tube_m + MARGIN_M, near.away_m - 1e-4)
         least += np.einsum("ij,ij->i", near.normal, near.border)
@@ -396,10 +399,10 @@ class Together:
             np.concatenate([found.at, near.at]),
             np.concatenate([found.normal, near.normal]),
             np.concatenate([found.least, least]),
-            np.concatenate([found.of, np.full(len(near.at), len(those.first))]),
+            np.concatenate([found.of, np.full(len(near.at), self._flown.count)]),
         )
 
-    def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes, those: Others) -> str:
+    def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
         """What holds a motion back most, in words."""
         position = self._plan.at_times(*solved)
         room = np.einsum("ij,ij->i", planes.normal, position[planes.at]) - planes.least
@@ -408,13 +411,17 @@ class Together:
             return ""
         index, often = np.unique(binding, return_counts=True)
         most = int(index[often.argmax()])
-        if most == len(those.first):
+        if most == self._flown.count:
             return "a zone"
-        return f"vehicle {self._number_of(int(those.of[most]))}"
+        return f"vehicle {self._number_of(int(self._flown.of[most]))}"
 
-    def _hit(self, motion: Motion, k: int, those: Others) -> Flags:
-        """Which others a motion comes too near to, ever, and last whether it does to a zone."""
-        least = apart.least_apart(motion, k, those, self._scale, self._dt_s)
-        points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-        clear = self._zones.along(points) >= self._tube_m + self._bend_m
-        return np.append(least < self._apart_m + 2.0 * self._bend_m, not clear.all())
+    def _hit(self, row: int, motion: Motion, k: int) -> Flags:
+        """Which motions of others one comes too near to, ever, and last whether it does a zone."""
+        ahead, flown = self._ahead[row], self._flown
+        common = Motion(motion.first - ahead, motion.position, motion.velocity)
+        least = apart.least_apart(common, k - ahead, row, flown, self._scale, self._dt_s)
+        enters = False
+        if self._zones:
+            points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
+            enters = bool((self._zones.along(points) < self._tube_m + self._bend_m).any())
+        return np.append(least < self._apart_m + 2.0 * self._bend_m, enters)
