@@ -12,8 +12,10 @@ from skytether.shared.scenario.zones import Zones
 
 NODES_MAX = 200
 """Largest number of nodes; the corners of zones with more are left out, the sharpest last."""
-OFF = 1.1
-"""Distance of nodes from corners over that which is kept."""
+OFF_M = 0.1
+"""Distance of nodes from corners beyond that which is kept [m]."""
+TINY_M = 1e-6
+"""As much as floating point may make of that."""
 
 
 class Routes:
@@ -26,7 +28,7 @@ class Routes:
 
     def __init__(self, zones: Zones, room_m: float) -> None:
         self._zones, self._room_m = zones, room_m
-        self._nodes = _nodes(zones, OFF * room_m)
+        self._nodes = _nodes(zones, room_m + OFF_M)
         if len(self._nodes):
             clear = zones.clearance(self._nodes).min(axis=1) >= room_m
             self._nodes = self._nodes[clear][:NODES_MAX]
@@ -39,49 +41,48 @@ class Routes:
             here, there = here[seen], there[seen]
             far[here, there] = np.linalg.norm(self._nodes[here] - self._nodes[there], axis=1)
             far[there, here] = far[here, there]
-            for via in range(n):
-                np.minimum(far, far[:, [via]] + far[[via]], out=far)
-        self._far = far
-        """Length of the shortest way between two nodes [m]; infinite without one."""
+        after = np.where(np.isfinite(far), np.arange(n), -1)
+        for via in range(n):
+            longer = far > far[:, [via]] + far[[via]]
+            far = np.where(longer, far[:, [via]] + far[[via]], far)
+            after = np.where(longer, after[:, [via]], after)
+        self._far, self._after = far, after
+        """Length of the shortest way between two nodes, infinite without one [m], and the node that
+        comes next on it."""
 
-    def next(self, place: Array, goal: Array) -> Array:
-        """The point to fly to: the goal where it is seen, or the first corner of the way there.
-
-        The goal itself where there is no way.
+    def way(self, place: Array, goal: Array) -> Array:
+        """The shortest way: its corners, and the goal behind them; that alone where there is none.
 
         Args:
             place, goal: shape (axes,).
+
+        Returns:
+            shape (n, axes); n >= 1.
         """
-        here, there = place[None, :2], goal[None, :2]
-        if not len(self._nodes) or self._sees(here, there)[0]:
-            return goal
-        nodes = self._nodes
-        first = np.where(
-            self._sees(np.broadcast_to(here, nodes.shape), nodes),
-            np.linalg.norm(nodes - here, axis=1),
-            np.inf,
-        )
-        last = np.where(
-            self._sees(nodes, np.broadcast_to(there, nodes.shape)),
-            np.linalg.norm(nodes - there, axis=1),
-            np.inf,
-        )
-        long = (first[:, None] + self._far + last).min(axis=1)
-        best = int(long.argmin())
-        if not np.isfinite(long[best]):
-            return goal
-        found = goal.copy()
-        found[:2] = nodes[best]
+        here, there, nodes = place[None, :2], goal[None, :2], self._nodes
+        if not len(nodes) or self._sees(here, there)[0]:
+            return goal[None]
+        first = self._lengths(here, nodes)
+        last = self._lengths(there, nodes)
+        long = first[:, None] + self._far + last
+        via, at = np.unravel_index(int(long.argmin()), long.shape)
+        if not np.isfinite(long[via, at]):
+            return goal[None]
+        corners = [int(via)]
+        while corners[-1] != at:
+            corners.append(int(self._after[corners[-1], at]))
+        found = np.repeat(goal[None], len(corners) + 1, axis=0)
+        found[:-1, :2] = nodes[corners]
         return found
 
-    def reaches(self, place: Array, goal: Array) -> bool:
-        """Whether there is a way."""
-        aim = self.next(place, goal)
-        return bool((aim != goal).any()) or bool(self._sees(place[None, :2], goal[None, :2])[0])
+    def _lengths(self, here: Array, nodes: Array) -> Array:
+        """Distances of nodes from a place, infinite of those that it does not see; shape (n,)."""
+        seen = self._sees(np.broadcast_to(here, nodes.shape), nodes)
+        return np.where(seen, np.linalg.norm(nodes - here, axis=1), np.inf)
 
     def _sees(self, here: Array, there: Array) -> Flags:
         """Whether straight lines keep their distance; shape (n,)."""
-        clear: Flags = self._zones.along(np.stack([here, there], axis=1)) >= self._room_m
+        clear: Flags = self._zones.along(np.stack([here, there], axis=1)) > self._room_m - TINY_M
         return clear
 
 

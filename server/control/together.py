@@ -25,7 +25,7 @@ that are drawn: so those that meet pass each other.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -57,6 +57,8 @@ ARRIVED_M = 0.02
 """Distance from the goal at which a motion ends there [m]."""
 AIM_M = 3.0
 """Distance of what is aimed at in place of the goal [m]."""
+AHEAD_M = 1.5
+"""How far ahead on a way around zones a vehicle aims [m]."""
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 """By how much further round a vehicle aims that is stuck, how far at most before directions are
 drawn, and by how much less once it moves [rad]."""
@@ -65,7 +67,7 @@ TRIES = 5
 ROUNDS = 5
 """Number of times that constraints are taken in for one of them."""
 STUCK = 0.3
-"""Share of the way to the goal, 2 m at most, below which a plan is taken for stuck."""
+"""Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
 
@@ -333,10 +335,8 @@ class Together:
         due = k + self._lead
         (p0,), (v0,) = base.at(np.array([float(due)]), dt_s)
         kept_p, kept_v = base.at(np.arange(k, due, SPACING, dtype=np.float64), dt_s)
-        enough_m = STUCK * min(float(np.linalg.norm(goal - p0)), 2.0)
         planes, taken = None, np.zeros(self._flown.count + 1, dtype=np.bool_)
-        for _ in range(TRIES):
-            aim = self._aim(known, p0, goal)
+        for aim in self._aims(known, p0, goal):
             for _ in range(ROUNDS):
                 held = planes.of_some(taken) if planes else None
                 solved = plan.solve(p0, v0, aim, held and held[:3])
@@ -350,30 +350,37 @@ class Together:
                     break
                 taken |= hit
                 planes = planes or self._planes(row, base, due)
-            moved_m = float(np.linalg.norm(p[-1] - p0))
-            if moved_m >= enough_m and not hit.any():
+            moved_m, far_m = (float(np.linalg.norm(end - p0)) for end in (p[-1], aim))
+            if moved_m >= STUCK * min(far_m, 2.0) and not hit.any():
                 known.waits, known.turned = "", max(0.0, known.turned - TURN_BACK)
                 return motion
             if held:
                 known.waits = known.waits or self._blocker(solved, held)
             self.counts["refused"] += bool(hit.any())
+        return None
+
+    def _aims(self, known: Known, place: Array, goal: Array) -> Iterator[Array]:
+        """What to fly to: a point of the way to the goal, its next corner, or right of that."""
+        way = self._routes.way(place, goal)
+        if not known.turned:
+            if len(way) > 1:
+                yield _along(place, way, AHEAD_M)
+            yield way[0]
+            known.turned = TURN
+        ahead = way[0, :2] - place[:2]
+        far = float(np.linalg.norm(ahead))
+        ahead = ahead / far if far > 1e-9 else np.array([1.0, 0.0])
+        reach_m = AIM_M if len(way) > 1 else min(float(np.linalg.norm(goal - place)), AIM_M)
+        for _ in range(TRIES):
+            c, s = np.cos(-known.turned), np.sin(-known.turned)
+            aim = place.copy()
+            aim[:2] += reach_m * np.array(
+                [c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]]
+            )
+            yield aim
             known.turned += TURN
             if known.turned > TURN_MAX:
                 known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
-        return None
-
-    def _aim(self, known: Known, place: Array, goal: Array) -> Array:
-        """What to fly to: the goal, or the next corner on the way there, or right of it."""
-        aim = self._routes.next(place, goal)
-        way = aim - place
-        level = float(np.linalg.norm(way[:2]))
-        if known.turned and level > 1e-9:
-            c, s = np.cos(-known.turned), np.sin(-known.turned)
-            ahead = way[:2] / level
-            turned = np.array([c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]])
-            aim = place.copy()
-            aim[:2] += min(float(np.linalg.norm(way)), AIM_M) * turned
-        return aim
 
     def _planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
         """Half-planes of the others' motions, and behind them those of zones."""
@@ -425,3 +432,16 @@ class Together:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
             enters = bool((self._zones.along(points) < self._tube_m + self._bend_m).any())
         return np.append(least < self._apart_m + 2.0 * self._bend_m, enters)
+
+
+def _along(place: Array, way: Array, far_m: float) -> Array:
+    """Point of a way that is so far ahead on it, or its end."""
+    for corner in way:
+        step_m = float(np.linalg.norm(corner - place))
+        if step_m >= far_m:
+            break
+        place, far_m = corner, far_m - step_m
+    else:
+        return place
+    there: Array = place + far_m / step_m * (corner - place)
+    return there
