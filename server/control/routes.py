@@ -75,6 +75,10 @@ class Routes:
         found[:-1, :2] = nodes[corners]
         return found
 
+    def reaches(self, place: Array, goal: Array) -> bool:
+        """Whether there is a way; shapes (axes,)."""
+        return bool(self._sees(place[None, :2], self.way(place, goal)[:1, :2])[0])
+
     def _lengths(self, here: Array, nodes: Array) -> Array:
         """Distances of nodes from a place, infinite of those that it does not see; shape (n,)."""
         seen = self._sees(np.broadcast_to(here, nodes.shape), nodes)
