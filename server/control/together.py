@@ -138,10 +138,8 @@ class Together:
         """What is known of vehicles, by row."""
         self._references, self._number_of = references, number_of
         goals = scenario.make_reference()
-        self._vehicles = len(goals.vehicles) if isinstance(goals, Mission) else 0
-        """Number of vehicles on the mission."""
-        self._met: set[int] = set()
-        """Numbers of those that were at rest where the mission begins."""
+        self._absent = set(goals.vehicles) if isinstance(goals, Mission) else set[int]()
+        """Numbers of vehicles on the mission that were not yet at rest where it begins."""
         mission = scenario.mission
         self._apart_m = mission.separation_m + 2.0 * mission.tube_m
         self._scale = np.ones(terms.axes)
@@ -193,8 +191,8 @@ class Together:
         p, _ = motion.at(np.array([float(k)]), self._dt_s)
         is_within = bool(np.linalg.norm(p[0] - observation.state[:, 0]) <= self._tube_m)
         if is_within and newest >= 0:
-            self._met.add(self._number_of(row))
-        elif not is_within and self._number_of(row) in self._met:
+            self._absent.discard(self._number_of(row))
+        elif not is_within and self._number_of(row) not in self._absent:
             self.counts["left_tube"] += 1
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
             gone = known.sent.popleft()
@@ -205,7 +203,7 @@ class Together:
     def _place(self, row: int, observed: Array) -> Array:
         """Where a vehicle without a motion rests: where the mission begins, unless it has begun."""
         number = self._number_of(row)
-        if number in self._met:
+        if number not in self._absent:
             return observed
         first: Array = self._references(number)(np.zeros(()))[:, 0]
         return first if np.linalg.norm(first - observed) < BEGINS_M else observed
@@ -306,8 +304,8 @@ class Together:
         if k - base.step > self._again:
             known.next = base.motion  # or it would end aboard, and the vehicle drift
             return
-        if len(self._met) < self._vehicles:
-            known.waits = f"{self._vehicles - len(self._met)} vehicles to begin"
+        if self._absent:
+            known.waits = f"vehicle {min(self._absent)} to begin"
             return
         for other, each in self._rows.items():
             if each.heard and self.observed_step[other] <= each.unknown_until:

@@ -93,6 +93,7 @@ def mission(options: MissionsOptions, seed: int, folder: Path) -> Scenario:
     table |= {"seed": seed, "duration": options.duration, "settle": 1.0}
     table["reference"] |= {"shape": "mission", "file": str(file)}
     table["mission"]["zones"] = text
+    table["link"]["connect_s"] = 60.0
     way = _network(rng)
     table["network"] |= {"uplink": way, "downlink": way}
     return reading.check(table, f"mission {seed}")
