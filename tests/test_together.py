@@ -1,6 +1,7 @@
 """Vehicles that keep apart: motions, the solver behind them, and flights over bad networks."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,14 @@ from skytether.server.control import together
 from skytether.server.control.dual import DualSolver
 from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.together import LONGEST, Known, Together
+from skytether.shared.core.events import ChangeRefused
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
-from skytether.shared.scenario import reading
+from skytether.shared.scenario import reading, zones
 from skytether.shared.scenario.mission import Mission, swap
 from skytether.shared.scenario.reading import ConfigError
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import (
@@ -286,7 +289,107 @@ def test_taken_late_a_motion_is_another_one(monkeypatch: pytest.MonkeyPatch) -> 
     assert flown.figures["server"]["counts"]["left_tube"] > 0
 
 
+# -- zones -----------------------------------------------------------------------------------------
+
+
+def clear_m(flown: Record, kept: Zones) -> float:
+    """Smallest distance of a vehicle from a zone, from its first motion on [m]."""
+    least = np.inf
+    for rows in each_of(flown):
+        begins = int(np.argmax(rows["mode"] == Mode.TRACK))
+        least = min(least, kept.clearance(rows["state"][begins:, :, 0]).min())
+    return float(least)
+
+
+@pytest.mark.parametrize("name", ["corridor", "rings", "warehouse"])
+def test_missions_that_come_with_it(name: str) -> None:
+    """All arrive, apart from each other and from what is in their way."""
+    flown = flight.fly(reading.load(name), vehicles=len(mission_of(name).vehicles))
+    assert separation_m(flown) > 0.5
+    assert clear_m(flown, reading.load(name).zones) > 0.0
+    for rows in each_of(flown):
+        goal = mission_of(name).of(int(rows["vehicle"][0]))(np.array(1e3))[:, 0]
+        assert np.linalg.norm(rows["state"][-1, :, 0] - goal) < 0.3
+    assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
+
+
+def mission_of(name: str) -> Mission:
+    """Goals of a scenario."""
+    found = reading.load(name).make_reference()
+    assert isinstance(found, Mission)
+    return found
+
+
+def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) -> None:
+    """For downwash; a zone is flown around at its own heights alone."""
+    rows = "1,0,-3,0,1\n1,2,3,0,1\n2,0,3,0,2.2\n2,2,-3,0,2.2\n"
+    (tmp_path / "goals.csv").write_text(f"vehicle,t,x,y,z\n{rows}")
+    table = reading.to_table(reading.load("swap"))
+    table |= {"duration": 30.0}
+    table["model"]["axes"] = 3
+    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
+    table["mission"] |= {"height_m": 1.0, "zones": "box(-1, 1, -4, 1, 1.8, 3)"}
+    high = reading.check(table, "high")
+    flown = flight.fly(high, vehicles=2)
+    one, other = (rows["state"][:, :, 0] for rows in each_of(flown))
+    steps = min(len(one), len(other))
+    off = np.abs(one[:steps] - other[:steps])
+    assert np.linalg.norm(off * [1.0, 1.0, 0.5], axis=1).min() > 0.5
+    assert clear_m(flown, high.zones) > 0.0
+    assert np.abs(one[-1] - [3.0, 0.0, 1.0]).max() < 0.3
+    assert np.abs(other[-1] - [-3.0, 0.0, 2.2]).max() < 0.3
+    assert np.abs(one[:, 1]).max() < 0.8  # below the box: it goes straight, but for the other
+    assert np.abs(other[:, 1]).max() > 1.0
+
+
+def test_a_zone_that_is_drawn_in_flight() -> None:
+    """Vehicles go round it from then on; one that a vehicle may be in is refused, with its name."""
+    swaps, zone = scenario(2, duration=30.0), "box(-0.5, 0.5, -1.5, 1.5)"
+    drawn = [(0.5, {"mission.zones": zone})]
+    flown = flight.fly(swaps, vehicles=2, changes=drawn)
+    assert clear_m(flown, zones.parse(zone, 2)) > 0.0
+    assert max(left_m(flown, 2)) < 0.3
+    over = [
+        (1.0, {"mission.zones": "cylinder(4, 0, 1)"}),
+        (5.0, {"mission.zones": zone}),
+        (29.0, {"mission.zones": "cylinder(-4, 0, 1)"}),
+    ]
+    flown = flight.fly(swaps, vehicles=2, changes=over)
+    reasons = [each.event.reason for each in flown.events if isinstance(each.event, ChangeRefused)]
+    got, whole = "mission.zones: got", "tube included; nothing was changed"
+    assert reasons[0] == f"{got} cylinder(4, 0, 1), in which vehicle 1 is to begin, {whole}"
+    assert re.fullmatch(
+        rf"{got} {re.escape(zone)}, which vehicle . may fly into for .* s more, {whole}", reasons[1]
+    )
+    assert reasons[2] == f"{got} cylinder(-4, 0, 1), which vehicle 1 hovers in, {whole}"
+
+
+def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation: aimed straight at their goals, they stay where they are, and apart from it."""
+    keys = scenario(2, duration=40.0)
+    table = reading.to_table(keys)
+    table["mission"]["zones"] = "box(-0.5, 0.5, -4, 4)"
+    walled = reading.check(table, "walled")
+    assert max(left_m(flight.fly(walled, vehicles=2), 2)) < 0.3
+    monkeypatch.setattr(together.Routes, "way", lambda _, __, goal: goal[None])
+    flown = flight.fly(walled, vehicles=2)
+    assert max(left_m(flown, 2)) > 3.0
+    assert clear_m(flown, walled.zones) > 0.0
+
+
 # -- missions --------------------------------------------------------------------------------------
+
+
+def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
+    """With `mission.allocate`; where each begins stays as it is."""
+    file = tmp_path / "goals.csv"
+    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n2,5,0,1\n3,0,5,5\n")
+    table = reading.to_table(reading.load("swap"))
+    table["reference"] |= {"shape": "mission", "file": str(file)}
+    table["mission"]["allocate"] = True
+    found = reading.check(table, "mission")
+    ends = [found.make_reference(number)(np.array(9.0))[:, 0].tolist() for number in (1, 2, 3)]
+    assert ends == [[0.0, 1.0], [9.0, 1.0], [5.0, 5.0]]
 
 
 def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:

@@ -254,21 +254,18 @@ class Together:
 
     def objection(self, zones: Zones) -> str:
         """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
+        for number in sorted(self._absent):
+            first = self._references(number)(np.zeros(1))[:, :, 0]
+            if zone := zones.in_the_way(first, self._tube_m):
+                return f"{zone}, in which vehicle {number} is to begin, tube included"
         for row, known in self._rows.items():
             for motion in known.motions():
                 k = self._now + self._ahead.get(row, 0)
                 points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-                clear = zones.along(np.concatenate([points, points[-1:]]))
-                hit = clear < self._tube_m + self._bend_m
-                if not hit.any():
-                    continue
-                at = points[int(hit.argmax()) : int(hit.argmax()) + 1]
-                zone = zones.in_the_way(at, self._tube_m + 2.0 * self._bend_m)
-                left_s = max(motion.last - k, 0) * self._dt_s
-                does = f"may fly into for {left_s:.1f} s more" if left_s else "hovers in"
-                # A piece between two points may touch what neither does.
-                named = f"{zone}, which " if zone else "zones that "
-                return f"{named}vehicle {self._number_of(row)} {does}, tube included"
+                if zone := zones.in_the_way(points, self._tube_m + self._bend_m):
+                    left_s = max(motion.last - k, 0) * self._dt_s
+                    does = f"may fly into for {left_s:.1f} s more" if left_s else "hovers in"
+                    return f"{zone}, which vehicle {self._number_of(row)} {does}, tube included"
         return ""
 
     def waits(self, row: int) -> str:

@@ -117,6 +117,19 @@ class Zones:
         pieces = points if points.ndim == 3 else np.stack([points[:-1], points[1:]], axis=1)
         if not self.zones:
             return np.full(len(pieces), np.inf)
+        found: Array = self._least(pieces).min(axis=1)
+        return found
+
+    def in_the_way(self, points: Array, room_m: float) -> str:
+        """Name of a zone that a way through points is nearer to than room_m; empty of none."""
+        if not self.zones:
+            return ""
+        pieces = np.stack([points, np.concatenate([points[1:], points[-1:]])], axis=1)
+        near = (self._least(pieces) < room_m).any(axis=0)
+        return next((self.zones[i].name for i in np.flatnonzero(near)), "")
+
+    def _least(self, pieces: Array) -> Array:
+        """See `along`, by zone; shape (n, zones)."""
         here, there = pieces[:, 0, :2], pieces[:, 1, :2]
         _, away = self._nearest(here)
         _, after = self._nearest(there)
@@ -129,11 +142,10 @@ class Zones:
         each = np.minimum.reduceat(least, self._starts, axis=1)
         within = (self._signed(here, away) <= 0.0) | (self._signed(there, after) <= 0.0)
         each[within] = 0.0
-        if points.shape[-1] > 2:
+        if pieces.shape[2] > 2:
             height = pieces[:, :, 2]
             each = self._with_height(each, height.min(axis=1)[:, None], height.max(axis=1)[:, None])
-        found: Array = each.min(axis=1)
-        return found
+        return each
 
     def planes(self, points: Array, reach_m: Array) -> Planes:
         """Half-planes between points and the zones that are near them.
@@ -174,11 +186,6 @@ class Zones:
             np.concatenate([part.border for part in found]),
             np.concatenate([part.away_m for part in found]),
         )
-
-    def in_the_way(self, points: Array, room_m: float) -> str:
-        """Name of a zone that some point is nearer to than room_m; empty of none."""
-        near = (self.clearance(points) < room_m).any(axis=0) if self.zones else np.zeros(0)
-        return next((self.zones[i].name for i in np.flatnonzero(near)), "")
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
         """Nearest point of each edge, and the distance; shapes (n, edges, 2), (n, edges)."""
