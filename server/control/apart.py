@@ -35,22 +35,25 @@ class Flown:
         self.count = 0
         if room:
             self._first, self._knots, self._of = (np.zeros(room, dtype=np.int64) for _ in range(3))
+            self._wide = np.zeros(room)
             self._position, self._velocity = np.zeros((2, room, KNOTS, self._axes))
 
-    def add(self, motion: Motion, ahead: int, row: int) -> None:
+    def add(self, motion: Motion, ahead: int, row: int, wide_m: float = 0.0) -> None:
         """Hold one more.
 
         Args:
             motion: by the steps of its vehicle.
             ahead: number of steps by which that is ahead of those in common.
             row: of the vehicle.
+            wide_m: distance to be kept from it beyond that from others [m].
         """
         i, knots = self.count, len(motion.position)
         if i == len(self._first):
-            grown = (self._first, self._knots, self._of, self._position, self._velocity)
-            both = [np.concatenate([each, np.zeros_like(each)]) for each in grown]
-            self._first, self._knots, self._of, self._position, self._velocity = both
+            for name in ("_first", "_knots", "_of", "_wide", "_position", "_velocity"):
+                held = getattr(self, name)
+                setattr(self, name, np.concatenate([held, np.zeros_like(held)]))
         self._first[i], self._knots[i], self._of[i] = motion.first - ahead, knots, row
+        self._wide[i] = wide_m
         self._position[i, :knots], self._velocity[i, :knots] = motion.position, motion.velocity
         self.count += 1
 
@@ -58,6 +61,11 @@ class Flown:
     def of(self) -> Indices:
         """Row of the vehicle of each; shape (count,)."""
         return self._of[: self.count]
+
+    @property
+    def wide_m(self) -> Array:
+        """Distance to be kept from each beyond that from others [m]; shape (count,)."""
+        return self._wide[: self.count]
 
     @property
     def arrays(self) -> tuple[Indices, Indices, Array, Array, Indices]:
@@ -154,7 +162,8 @@ def half_planes(
         np.empty(most),
         np.empty(most, dtype=np.int64),
     )
-    n = _half_planes(times, held, reach_m, row, *flown.arrays, scale, apart_m, dt_s, *found)
+    those = (*flown.arrays, flown.wide_m + apart_m)
+    n = _half_planes(times, held, reach_m, row, *those, scale, dt_s, *found)
     return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
 
 
@@ -228,8 +237,8 @@ def _half_planes(
     position: F3,
     velocity: F3,
     rows: I1,
+    apart: F1,
     scale: F1,
-    apart: float,
     dt_s: float,
     at: I1,
     normal: F2,
@@ -249,9 +258,9 @@ def _half_planes(
                 off[x] = scale[x] * (held[i, x] - place[x])
                 square += off[x] * off[x]
             away = np.sqrt(square)
-            if away >= apart + reach[i] or away == 0.0:
+            if away >= apart[m] + reach[i] or away == 0.0:
                 continue
-            offset = min(apart, away - 1e-4)
+            offset = min(apart[m], away - 1e-4)
             for x in range(axes):
                 normal[n, x] = scale[x] * off[x] / away
                 offset += normal[n, x] * place[x]

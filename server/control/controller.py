@@ -178,6 +178,11 @@ class Controller:
         """Why there cannot be these zones now, in words; empty: there can."""
         return self._together.objection(zones) if self._together else ""
 
+    @property
+    def left(self) -> list[tuple[int, float]]:
+        """Vehicles of a mission that have left their tube, and by how much [m]; to be emptied."""
+        return self._together.left if self._together else []
+
     def waits(self, row: int) -> str:
         """What a vehicle of a mission waits for, in words; empty: for nothing."""
         return self._together.waits(row) if self._together else ""

@@ -14,7 +14,8 @@ A new motion is sent only if at every time it keeps the distance
     D = separation_m + 2 tube_m
 
 from all motions of all other vehicles that may be flown, with `tube_m` for how far a vehicle is
-from its motion (wind, tracking, clocks). Those were apart already. So whichever of them are taken,
+from its motion (wind, tracking, clocks); from one that was seen outside its tube, as much more as
+it was. Those were apart already. So whichever of them are taken,
 and whichever packets are lost, vehicles are `separation_m` apart, as long as each stays in its tube
 (docs/together.md has the theorem). From zones it keeps `tube_m`. The motion in force is always a
 way out: it needs no packet.
@@ -96,6 +97,8 @@ class Known:
         """Whether an observation has come in this session."""
         self.unknown_until = -1
         """Step from which on a motion is over that another server has sent."""
+        self.off_m = 0.0
+        """How far it was outside its tube when it was seen last [m]."""
         self.waits = ""
         """What it waits for, as the operator is told; empty: for nothing."""
 
@@ -130,6 +133,9 @@ class Together:
         number_of: Callable[[int], int],
     ) -> None:
         self.counts: Counter[str] = Counter()
+        self.left: list[tuple[int, float]] = []
+        """Vehicles that have left their tube since this was emptied, and how far outside they were
+        [m]."""
         self.observed_step: Indices = np.full(capacity, -1, dtype=np.int64)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         self.planned = np.zeros((block, terms.axes, 2))
@@ -189,11 +195,15 @@ class Together:
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
         newest, motion = known.in_force
         p, _ = motion.at(np.array([float(k)]), self._dt_s)
-        is_within = bool(np.linalg.norm(p[0] - observation.state[:, 0]) <= self._tube_m)
-        if is_within and newest >= 0:
-            self._absent.discard(self._number_of(row))
-        elif not is_within and self._number_of(row) not in self._absent:
+        off_m = float(np.linalg.norm(p[0] - observation.state[:, 0])) - self._tube_m
+        number = self._number_of(row)
+        if off_m <= 0.0 and newest >= 0:
+            self._absent.discard(number)
+        elif off_m > 0.0 and number not in self._absent:
             self.counts["left_tube"] += 1
+            if not known.off_m:
+                self.left.append((number, off_m))
+        known.off_m = 0.0 if number in self._absent else max(off_m, 0.0)
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
@@ -284,7 +294,7 @@ class Together:
             if row in steps:
                 each.next = None
             for motion in each.motions():
-                self._flown.add(motion, self._ahead.get(row, 0), row)
+                self._flown.add(motion, self._ahead.get(row, 0), row, each.off_m)
 
     def _decide(self, row: int, known: Known, k: int) -> None:
         """Find the motion to be sent to a vehicle now, if any."""
@@ -317,7 +327,7 @@ class Together:
         if known.next is None:
             self.counts["stuck"] += 1
         else:
-            self._flown.add(known.next, self._ahead[row], row)
+            self._flown.add(known.next, self._ahead[row], row, known.off_m)
 
     def _toward(self, row: int, known: Known, k: int, goal: Array) -> Motion | None:
         """A motion from the one in force towards a goal, apart from all; None where none is found.
@@ -389,7 +399,7 @@ class Together:
             row,
             self._flown,
             self._scale,
-            self._apart_m + MARGIN_M,
+            self._apart_m + MARGIN_M + self._rows[row].off_m,
             self._dt_s,
         )
         if not self._zones:
@@ -426,7 +436,8 @@ class Together:
         if self._zones:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
             enters = bool((self._zones.along(points) < self._tube_m + self._bend_m).any())
-        return np.append(least < self._apart_m + 2.0 * self._bend_m, enters)
+        kept_m = self._apart_m + 2.0 * self._bend_m + self._rows[row].off_m
+        return np.append(least < kept_m + flown.wide_m, enters)
 
 
 def _along(place: Array, way: Array, far_m: float) -> Array:

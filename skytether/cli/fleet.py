@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from skytether.shared.base import kernel
 from skytether.shared.core.events import Event, NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
@@ -33,6 +35,8 @@ from skytether.sim import flight
 
 VEHICLES = 20
 """Number of vehicles unless it is given."""
+AFTER_S = 30.0
+"""Time that is flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
 """Stages of the server's work, in their order; `record`, the price of watching, is left out."""
 
@@ -43,6 +47,9 @@ class FleetOptions:
 
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
+    mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Mission in place of a scenario: swap, rings, corridor, warehouse, or a CSV file with the
+    columns vehicle, t, x, y (and z), as light shows have them."""
     vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Number of vehicles: 20 unless given, or as many as the mission has."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
@@ -145,6 +152,7 @@ def fleet(argv: Sequence[str]) -> None:
     the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight and still shows
     what was flown.
     """
+    argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
     vehicles = _vehicles(options)
     command.check_count("--vehicles", vehicles, 65_535)
@@ -177,6 +185,36 @@ def fleet(argv: Sequence[str]) -> None:
         figures.fleet(options.figure, title, options.config, flown.client, flown.server)
     if flown.failure:
         raise CommandError(str(flown.failure))
+
+
+def _with_mission(argv: Sequence[str]) -> list[str]:
+    """A command line in which `--mission` is the scenario, with the flags of a table of goals.
+
+    Raises:
+        CommandError: there is a scenario as well, or the table is none.
+    """
+    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--mission")
+    try:
+        found, rest = parser.parse_known_args(list(argv))
+    except ArgumentError:
+        raise CommandError("--mission: expected a name or a file", command.CONFIGURATION) from None
+    if found.mission is None:
+        return rest
+    if rest and not rest[0].startswith("-"):
+        said = f"--mission: got the scenario {rest[0]} as well, expected one of the two"
+        raise CommandError(said, command.CONFIGURATION)
+    if not found.mission.endswith(".csv"):
+        return [found.mission, *rest]
+    try:
+        with Path(found.mission).open(encoding="utf-8") as table:
+            axes = 3 if "z" in table.readline().strip().split(",") else 2
+        lasts_s = read_mission(Path(found.mission), axes).lasts_s
+    except (OSError, ValueError) as error:
+        raise CommandError(f"--mission: {found.mission}: {error}", command.CONFIGURATION) from None
+    shape = ["--reference.shape", "mission", "--reference.file", found.mission]
+    flown = ["--model.axes", str(axes), "--duration", f"{lasts_s + AFTER_S:g}"]
+    return ["swap", *shape, *flown, *rest]
 
 
 def _virtually(
