@@ -54,6 +54,8 @@ MARGIN_M = 0.03
 and for the solver's tolerance [m]."""
 BEGINS_M = 2.0
 """Distance from its first goal within which a vehicle is sent there to begin [m]."""
+RESTS_MPS = 0.2
+"""Measured speed up to which a vehicle rests [m/s]."""
 ARRIVED_M = 0.02
 """Distance from the goal at which a motion ends there [m]."""
 AIM_M = 3.0
@@ -98,7 +100,9 @@ class Known:
         self.unknown_until = -1
         """Step from which on a motion is over that another server has sent."""
         self.off_m = 0.0
-        """How far it was outside its tube when it was seen last [m]."""
+        """How far outside its tube it may be, as it was seen last [m]."""
+        self.speed_mps = 0.0
+        """How fast it was then [m/s]."""
         self.waits = ""
         """What it waits for, as the operator is told; empty: for nothing."""
 
@@ -158,6 +162,8 @@ class Together:
         """Steps after the first knot from which on a motion differs from the one in force."""
         self._again = terms.age_max // 3
         """Steps after which a motion is sent again, before it is too old to be flown."""
+        self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
+        """How fast it comes to rest without a motion [s, m/s²]."""
         self._plan = MotionPlan(terms, mission.acceleration_mps2, mission.speed_mps)
         self._rng = stream(scenario.seed, "together")
         self._now, self._ahead = 0, dict[int, int]()
@@ -194,21 +200,28 @@ class Together:
         if k <= known.unknown_until:
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
         newest, motion = known.in_force
-        p, _ = motion.at(np.array([float(k)]), self._dt_s)
-        off_m = float(np.linalg.norm(p[0] - observation.state[:, 0])) - self._tube_m
-        number = self._number_of(row)
-        if off_m <= 0.0 and newest >= 0:
-            self._absent.discard(number)
-        elif off_m > 0.0 and number not in self._absent:
-            self.counts["left_tube"] += 1
-            if not known.off_m:
-                self.left.append((number, off_m))
-        known.off_m = 0.0 if number in self._absent else max(off_m, 0.0)
+        self._measure(row, known, motion.at(np.array([float(k)]), self._dt_s)[0][0])
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
         known.heard = True
         return True
+
+    def _measure(self, row: int, known: Known, expected: Array) -> None:
+        """Take note of how far a vehicle may be from where its motion has it."""
+        number, state = self._number_of(row), self._state[row]
+        assert known.in_force is not None
+        off_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
+        known.speed_mps = float(np.linalg.norm(state[:, 1]))
+        if known.in_force.step < 0:  # it brakes, and rests further on than where it was seen
+            off_m = max(off_m, known.speed_mps * (self._tau_s + known.speed_mps / self._braking))
+        elif off_m <= 0.0:
+            self._absent.discard(number)
+        elif number not in self._absent:
+            self.counts["left_tube"] += 1
+            if not known.off_m:
+                self.left.append((number, off_m))
+        known.off_m = 0.0 if number in self._absent else max(off_m, 0.0)
 
     def _place(self, row: int, observed: Array) -> Array:
         """Where a vehicle without a motion rests: where the mission begins, unless it has begun."""
@@ -306,7 +319,10 @@ class Together:
             known.waits = "an acknowledgement"
             return
         if base.step < 0:
-            known.next = base.motion  # it has none: first of all the place where it hovers
+            if known.speed_mps > RESTS_MPS:
+                known.waits = "coming to rest"
+            else:
+                known.next = base.motion  # it has none: first of all the place where it hovers
             return
         if k - base.step > self._again:
             known.next = base.motion  # or it would end aboard, and the vehicle drift
