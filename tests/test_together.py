@@ -383,13 +383,17 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
 def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
     """With `mission.allocate`; where each begins stays as it is."""
     file = tmp_path / "goals.csv"
-    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n2,5,0,1\n3,0,5,5\n")
+    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n2,5,0,1\n")
     table = reading.to_table(reading.load("swap"))
     table["reference"] |= {"shape": "mission", "file": str(file)}
     table["mission"]["allocate"] = True
     found = reading.check(table, "mission")
-    ends = [found.make_reference(number)(np.array(9.0))[:, 0].tolist() for number in (1, 2, 3)]
-    assert ends == [[0.0, 1.0], [9.0, 1.0], [5.0, 5.0]]
+    ends = [found.make_reference(number)(np.array(9.0))[:, 0].tolist() for number in (1, 2)]
+    assert ends == [[0.0, 1.0], [9.0, 1.0]]
+    assert found.start_m(2).tolist() == [9.0, 0.0]
+    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n")
+    with pytest.raises(ConfigError, match=r"mission\.allocate: .* a goal of each vehicle at each"):
+        reading.check(table, "mission")
 
 
 def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ def test_a_straight_piece_is_no_nearer_than_it_says(
 
 @given(place, place, st.floats(0.05, 0.3), st.sampled_from([BOX, U, FENCE, f"{BOX} & {FENCE}"]))
 def test_a_point_fulfils_its_own_half_planes(x: float, y: float, room_m: float, text: str) -> None:
-    """And a convex zone lies wholly on their other side."""
+    """A point outside does, and a convex zone lies wholly on their other side."""
     kept, point = zones.parse(text, 2), np.array([[x, y]])
     if kept.clearance(point).min() < room_m:
         return

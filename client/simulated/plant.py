@@ -34,8 +34,7 @@ class FirstOrderPlant:
         self._inputs = OnTheirWay(self._model, self._late) if any(late_s) else None
         """Inputs on their way; None where each acts at once."""
         self.weather = weather
-        start = scenario.vehicle.start_m or scenario.make_reference(number)(np.zeros(()))[:, 0]
-        self.x = [(float(position), 0.0) for position in start]
+        self.x = [(position, 0.0) for position in scenario.start_m(number).tolist()]
         """Position [m] and velocity [m/s] now, in the world frame, of each axis."""
 
     def state(self) -> Array:

@@ -223,7 +223,7 @@ class Desired:
 def _live(scenario: Scenario) -> LivePoint:
     """The live point of a scenario, where it is at first."""
     velocity = scenario.reference.velocity_mps
-    start = scenario.make_reference()(np.zeros(()))[:, 0]
+    start = scenario.given_reference()(np.zeros(()))[:, 0]
     return LivePoint(start, np.array(velocity) if velocity else None, scenario.u_max)
 
 

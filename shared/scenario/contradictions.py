@@ -7,6 +7,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 
+from skytether.shared.law.model import Array
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
@@ -139,8 +140,12 @@ def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
 
 def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
     """Why vehicles cannot be at their goals: too near to each other, or to zones."""
-    mission, goals = scenario.mission, scenario.make_reference()
+    mission, goals = scenario.mission, scenario.given_reference()
     assert isinstance(goals, Mission)
+    if mission.allocate and not goals.in_step:
+        expected = "false, or a goal of each vehicle at each time that one of them has one"
+        yield "mission.allocate", "true", expected
+        return
     zones, room_m = scenario.zones, mission.tube_m
     for vehicle in goals.vehicles if zones else ():
         for place in goals.goals(vehicle):
@@ -275,7 +280,7 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
         yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
     elif ref.shape in ("waypoints", *TABLES):
         try:
-            scenario.make_reference()
+            scenario.given_reference()
         except OSError as error:
             yield "reference.file", repr(ref.file), f"a readable file ({error.strerror})"
         except ValueError as error:
@@ -304,11 +309,21 @@ def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
 
 def _outside(scenario: Scenario) -> Iterator[Contradiction]:
     """Where the desired trajectory leads over the fence, or faster than it allows."""
-    fence, steps = scenario.fence, min(scenario.steps, FENCED_STEPS_MAX)
-    states = scenario.make_reference()(np.arange(steps + 1) * scenario.control.dt)
+    steps = min(scenario.steps, FENCED_STEPS_MAX)
+    given, times_s = scenario.given_reference(), np.arange(steps + 1) * scenario.control.dt
+    for vehicle in given.vehicles if isinstance(given, Mission) else (1,):
+        flown = scenario.given_reference(vehicle)(times_s)
+        wrong = list(_over_fence(scenario, scenario.start_m(vehicle), flown))
+        yield from wrong
+        if wrong:
+            return
+
+
+def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Contradiction]:
+    """Where states at the steps of a flight that begins at home are outside the fence."""
+    fence = scenario.fence
     position, speed = states[..., 0], np.linalg.norm(states[..., 1], axis=1)
     low, high, radius = inner(scenario)
-    home = np.array(scenario.vehicle.start_m or position[0])
     far = np.linalg.norm(position - home, axis=1)
     checks = (
         ("fence.low_m", list(fence.low_m), (position < low).any(axis=1), "lower"),
@@ -332,7 +347,7 @@ def _no_shape(scenario: Scenario) -> list[Contradiction]:
     try:
         shape = policies.shape(ref.shape, REFERENCES)
         if not REFERENCES[shape.name].is_ours:
-            shapes.sampled(scenario.make_reference(), scenario.model.axes)
+            shapes.sampled(scenario.given_reference(), scenario.model.axes)
     except policies.PolicyError as error:
         return [("reference.shape", repr(error.given), error.expected)]
     except Exception as error:

@@ -45,6 +45,12 @@ class Mission:
         return np.concatenate([points_m for _, points_m in self._goals.values()])
 
     @property
+    def in_step(self) -> bool:
+        """Whether all vehicles have goals at the same times."""
+        times_s = [times_s for times_s, _ in self._goals.values()]
+        return all(np.array_equal(each, times_s[0]) for each in times_s)
+
+    @property
     def lasts_s(self) -> float:
         """Time of the last goal [s]."""
         return max(float(times_s[-1]) for times_s, _ in self._goals.values())
@@ -90,29 +96,20 @@ class Mission:
         return None
 
     def allocated(self) -> "Mission":
-        """The same goals, those of one time given to whichever vehicles are nearest to them.
+        """A mission whose goals of one time are given to the vehicles that are nearest to them.
 
-        At each time those vehicles that get a goal share out these goals among them, so that the
-        sum of the squares of their distances is the least (linear assignment). So ways cross less.
+        At each time the sum of the squares of all distances is the least (linear assignment), so
+        ways cross less. The mission must be `in_step`.
         """
-        from scipy.optimize import linear_sum_assignment
+        from scipy.optimize import linear_sum_assignment  # a client does without scipy
 
-        goals = {vehicle: [points_m[0]] for vehicle, (_, points_m) in self._goals.items()}
-        given: dict[float, list[int]] = {}
-        for vehicle, (times_s, _) in self._goals.items():
-            for at_s in times_s[1:].tolist():
-                given.setdefault(at_s, []).append(vehicle)
-        for at_s, those in sorted(given.items()):
-            at = np.array(at_s)
-            wanted = np.stack([self.of(vehicle)(at)[:, 0] for vehicle in those])
-            here = np.stack([goals[vehicle][-1] for vehicle in those])
-            cost = ((here[:, None] - wanted[None]) ** 2).sum(axis=2)
-            for i, j in zip(*linear_sum_assignment(cost), strict=True):
-                goals[those[i]].append(wanted[j])
-        shared = {
-            vehicle: (times_s, np.array(goals[vehicle]))
-            for vehicle, (times_s, _) in self._goals.items()
-        }
+        times_s = next(iter(self._goals.values()))[0]
+        wanted = np.stack([points_m for _, points_m in self._goals.values()], axis=1)
+        given = wanted[:1]
+        for goals in wanted[1:]:
+            cost = ((given[-1][:, None] - goals[None]) ** 2).sum(axis=2)
+            given = np.append(given, goals[None, linear_sum_assignment(cost)[1]], axis=0)
+        shared = {vehicle: (times_s, given[:, i]) for i, vehicle in enumerate(self._goals)}
         return Mission(shared, self._axes, 1)
 
 

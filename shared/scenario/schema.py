@@ -278,7 +278,7 @@ class MissionConfig(Section, frozen=True):
     separation_m: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
     """Smallest distance between two vehicles [m]."""
     height_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """The same for two of which one is above the other, for downwash [m]; 0: as `separation_m`."""
+    """Smallest distance of two that are one above the other [m], for downwash; 0: the same."""
     tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
     """Largest distance of a vehicle from the motion that it flies [m]: wind, tracking, clocks."""
     speed_mps: OfServer[Strength] = 0.0
@@ -286,7 +286,7 @@ class MissionConfig(Section, frozen=True):
     acceleration_mps2: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.6
     """Largest acceleration of a motion on an axis [m/s²]."""
     allocate: OfServer[bool] = False
-    """Whether goals of one time go to the vehicles that are nearest to them."""
+    """Whether goals of one time go to the vehicles that are nearest to them; all have one then."""
     zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.ZONES)] = ""
     """Places to keep out of or to stay within, combined with &: box(x0, x1, y0, y1), cylinder(x, y,
     radius), polygon(x, y, …), fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
@@ -545,15 +545,26 @@ class Scenario(Section, frozen=True):
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
         """The desired trajectory of a vehicle, by its number; each has a target of its own."""
+        made = self.given_reference(vehicle)
+        if isinstance(made, Mission) and self.mission.allocate:
+            return made.allocated().of(vehicle)
+        return made
+
+    def given_reference(self, vehicle: int = 1) -> shapes.Reference:
+        """The desired trajectory of a vehicle; on a mission, before goals are allocated."""
         shape = policies.shape(self.reference.shape, REFERENCES)
         entry, flown = REFERENCES[shape.name], self
         if shape.name == "target" and vehicle != 1:
             seed = int(stream(self.seed, "target", vehicle).integers(2**32))
             flown = msgspec.structs.replace(self, seed=seed)
         made: shapes.Reference = entry.make(flown, *entry.numbers(shape.values, self.reference))
-        if not isinstance(made, Mission):
-            return made
-        return (made.allocated() if self.mission.allocate else made).of(vehicle)
+        return made.of(vehicle) if isinstance(made, Mission) else made
+
+    def start_m(self, vehicle: int = 1) -> Array:
+        """Position where a vehicle begins [m]; shape (axes,)."""
+        if self.vehicle.start_m:
+            return np.array(self.vehicle.start_m)
+        return self.given_reference(vehicle)(np.zeros(()))[:, 0]
 
     @property
     def is_mission(self) -> bool:
@@ -583,7 +594,7 @@ class Scenario(Section, frozen=True):
         shape = policies.shape(self.reference.shape, REFERENCES)
         if REFERENCES[shape.name].is_ours:
             return shape.name
-        given = shapes.sampled(self.make_reference(), self.model.axes)
+        given = shapes.sampled(self.given_reference(), self.model.axes)
         return f"{str(shape)[:SHAPE_TOLD]} {_digest(f'{shape}'.encode() + given)}"
 
 

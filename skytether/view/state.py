@@ -473,7 +473,7 @@ class State:
 
     @property
     def kept(self) -> Zones:
-        """The same, or none where a file of theirs is on another machine."""
+        """Zones of a mission; none where a file of theirs is on another machine."""
         try:
             return zones.parse(self.zones, self.scenario.model.axes)
         except (OSError, PolicyError):
