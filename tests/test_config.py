@@ -29,7 +29,8 @@ WRONG = {
         '"x` - at `$.file" = 1',
         (
             "x` - at `$.file: no such key; there are title, duration, settle, seed, armed, model,"
-            " control, reference, vehicle, fence, mission, sensor, mavlink, network, link, simulation"
+            " control, reference, vehicle, fence, mission, sensor, mavlink, network, link,"
+            " simulation"
         ),
     ),
     "such a key in a table": (

@@ -336,7 +336,7 @@ def _vehicles(options: FleetOptions) -> int:
     """
     if not options.config.is_mission:
         return VEHICLES if options.vehicles is None else options.vehicles
-    mission = options.config.make_reference()
+    mission = options.config.given_reference()
     assert isinstance(mission, Mission)
     count = len(mission.vehicles)
     if options.vehicles not in (None, count):

@@ -369,7 +369,7 @@ class _Zones:
         self._state, self._known = flights[0].state, flights[0].state.zones
         gui = client.gui
         with gui.add_folder("Zones"):
-            self._text = gui.add_text("Zones", self._known, hint=ZONES)
+            self._text = gui.add_text("As text", self._known, hint=ZONES)
             apply = gui.add_button("Change the zones")
             draw = gui.add_checkbox("Draw one", False, hint="Click two corners of a box.")
         corners: list[NDArray[Any]] = []
