@@ -53,7 +53,7 @@ class Compensator:
         self._indexed = terms.indexed
         self._commits, self._dt_s = terms.commits, terms.dt_s
         self._late_max = late_max(terms.horizon)
-        self._brake = terms.brake
+        self._brake, self._join = terms.brake, terms.join
         self._bounds = terms.u_max
         self._model = terms.model.axes()
         self._begins = 0
@@ -116,7 +116,8 @@ class Compensator:
             raise ProtocolError(Drop.OBSERVATION)
         if length < 1:
             raise ProtocolError(Drop.TOO_OLD)
-        if self._comes_too_late(step - horizon.step, given - self._H, length):
+        is_late = bool(self._join) and step - horizon.step > self._join
+        if is_late or self._comes_too_late(step - horizon.step, given - self._H, length):
             raise ProtocolError(Drop.TOO_LATE)
         self.in_force = self.newest = horizon.step
         self._new = True

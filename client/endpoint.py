@@ -270,6 +270,7 @@ class Client(Endpoint):
             "step": pilot.step,
             "steps": pilot.steps,
             "missed": pilot.missed,
+            "began_s": pilot.began_ns / SECOND_NS,
             "horizons": self.horizons,
             "dropped": by_name(self.dropped),
         }

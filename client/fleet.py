@@ -77,6 +77,11 @@ class Fleet(Endpoint):
             self._clients[n].wake(now_ns=now_ns)
             self._after(n)
 
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
+        """See `Endpoint`; that of the first vehicle that has one."""
+        said = (client.objection(scenario, keys) for client in self._clients)
+        return next(filter(None, said), "")
+
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """Let every vehicle fly the other scenario."""
         for client in self._clients:

@@ -118,6 +118,11 @@ class Pilot:
         """Disturbance ŵ that its filter has found on each axis [m/s]; 0 without a filter."""
         return self._navigation.disturbance
 
+    @property
+    def began_ns(self) -> int:
+        """Time at which step 0 began [ns], or 0 before any."""
+        return self._epoch_ns or 0
+
     def starts_ns(self, step: int) -> int:
         """Time at which a step begins; the flight must have begun."""
         assert self._epoch_ns is not None

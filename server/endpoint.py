@@ -35,6 +35,8 @@ TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 
 TRIGGER = keys_of(InFlight.TRIGGER)
 """Keys of when horizons are sent."""
+ZONES = keys_of(InFlight.ZONES)
+"""Keys of where vehicles of a mission must not be."""
 POINT = keys_of(InFlight.POINT)
 """Keys of a point that is led by hand."""
 
@@ -70,9 +72,14 @@ class Server(Endpoint):
         references: Callable[[int], Reference] | None = None,
     ) -> None:
         super().__init__()
-        self.changeable = TRIGGER | POINT if scenario.reference.shape == "live" else TRIGGER
+        self.changeable = TRIGGER
+        if scenario.reference.shape == "live":
+            self.changeable |= POINT
+        if scenario.is_mission:
+            self.changeable |= ZONES
         terms = scenario.terms()
-        if references is None and scenario.reference.shape == "target":
+        own = scenario.is_mission or scenario.reference.shape == "target"
+        if references is None and own:
             references = lru_cache(room)(scenario.make_reference)
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, terms.dt_ns)
@@ -145,11 +152,18 @@ class Server(Endpoint):
         """See `Endpoint`; the terms of the flight stay as they were agreed upon."""
         if keys & TRIGGER:
             self.controller.change_trigger(scenario.control)
+        if keys & ZONES:
+            self.controller.change_zones(scenario.zones)
         if keys & POINT:
             moved = "reference.points_m" in keys
             position = scenario.make_reference()(np.zeros(()))[:, 0] if moved else None
             velocity = np.array(scenario.reference.velocity_mps)
             self.controller.desired.move(position, velocity if velocity.size else None, now_ns)
+
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
+        """See `Endpoint`: nobody may fly into a new zone."""
+        found = self.controller.objection(scenario.zones) if keys & ZONES else ""
+        return f"mission.zones: got {found}; nothing was changed" if found else ""
 
     @property
     def missed(self) -> int:
@@ -173,6 +187,7 @@ class Server(Endpoint):
             str(session.vehicle): {
                 "step": int(self.controller.last_step[session.row]),
                 "clock_bound_ms": self._clock.bound_ns(session.row) / MILLISECOND_NS,
+                **({"waits": said} if (said := self.controller.waits(session.row)) else {}),
             }
             for session in self.sessions.first(VEHICLES_TOLD_MAX)
         }

@@ -19,7 +19,7 @@ from skytether.server.control.scheme import in_a_row
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
-from skytether.shared.core.events import Degraded, Fault, PlanningResumed, PlanningStopped
+from skytether.shared.core.events import Degraded, Fault, LeftTube, PlanningResumed, PlanningStopped
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
@@ -168,6 +168,10 @@ class Ticker:
         self._tell_idle()
         self._events += [Fault(traceback=said) for said in self._controller.faults]
         self._controller.faults.clear()
+        self._events += [
+            LeftTube(vehicle=each, off_m=off_m) for each, off_m in self._controller.left
+        ]
+        self._controller.left.clear()
         self._send_heartbeats(owed, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.spent_ns.total() - before_ns)

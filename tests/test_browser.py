@@ -158,6 +158,21 @@ def test_a_network_is_written_and_measured_on_a_page_of_its_own(
             process.wait(timeout=30)
 
 
+def test_zones_of_a_mission_are_changed_and_refused_in_words(browser: "sync_api.Browser") -> None:
+    """One that a vehicle is in is not taken; another is, and is what the page shows."""
+    argv = ("fleet", "--mission", "warehouse", "--duration", "300", "--page", "127.0.0.1:0")
+    with served(*argv) as address, opened(browser, address) as page:
+        until(lambda: "nearest other vehicle" in status(page), "the mission is shown")
+        until(lambda: flown_s(page) > 12, "the mission begins")
+        put(page, "As text", "box(-20, 20, -20, 20)")
+        page.get_by_role("button", name="Change the zones").click()
+        until(lambda: page.get_by_text("nothing was changed").count(), "it is refused")
+        put(page, "As text", "fence(-9, 9, -9, 9)")
+        page.get_by_role("button", name="Change the zones").click()
+        until(lambda: page.get_by_text("mission.zones").count(), "it is said")
+        picture(page, PICTURES / "mission-dark-wide.png")
+
+
 def test_it_is_light_and_dark_wide_and_narrow(browser: "sync_api.Browser", flight: str) -> None:
     """Pictures are taken; and the page is as light as it is asked to be."""
     pictures(browser, flight, PICTURES)

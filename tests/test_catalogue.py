@@ -44,7 +44,7 @@ def test_the_documented_keys_change_in_flight() -> None:
     text = (DOCS / "control.md").read_text()
     rows = re.findall(r"^\| (server|netem|client) \| (.*) \|$", text, re.MULTILINE)
     named = {socket: set(re.findall("`([a-z_.0-9]+)`", keys)) for socket, keys in rows}
-    assert named["server"] == TRIGGER | POINT
+    assert named["server"] == TRIGGER | POINT | keys_of(InFlight.ZONES)
     assert named["client"] == SimulatedVehicle.changeable | keys_of(InFlight.ARMED)
     assert named["netem"] == {"network.uplink", "network.downlink"}
     assert Proxy.changeable == {

@@ -29,7 +29,8 @@ WRONG = {
         '"x` - at `$.file" = 1',
         (
             "x` - at `$.file: no such key; there are title, duration, settle, seed, armed, model,"
-            " control, reference, vehicle, fence, sensor, mavlink, network, link, simulation"
+            " control, reference, vehicle, fence, mission, sensor, mavlink, network, link,"
+            " simulation"
         ),
     ),
     "such a key in a table": (
@@ -201,7 +202,7 @@ WRONG = {
         'reference.shape = "ring"',
         (
             "reference.shape: got 'ring', expected a shape; there are circle, figure-eight, "
-            "square, waypoints, hover, csv, target, live"
+            "square, waypoints, hover, csv, target, live, swap, mission"
         ),
     ),
     "a fourth dimension": ("model.axes = 4", "model.axes: got 4, expected 2 or 3"),
@@ -714,7 +715,7 @@ def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
     assert terms[:5] == (50_000_000, 80, 2, (0.84, 0.84), (1.0, 1.0))
     assert terms[5:7] == ((0.0, 0.0), (1.6, 1.6))
     assert terms[7:11] == ("committed", True, "brake", 2.0)
-    assert terms[11:] == (5.0, "circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
+    assert terms[11:] == (5.0, 0.0, "circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
 
 
 @pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])

@@ -39,6 +39,7 @@ from skytether.shared.core.events import (
     Finished,
     FlowOpened,
     Flying,
+    LeftTube,
     Listening,
     Measured,
     ModeChanged,
@@ -179,6 +180,10 @@ SENTENCES = [
     (
         FenceHolds(vehicle=1),
         "vehicle 1 is held back by its fence",
+    ),
+    (
+        LeftTube(vehicle=1, off_m=0.123),
+        "vehicle 1 is 0.12 m outside its tube (mission.tube_m): the others keep further away",
     ),
     (
         StateDoubted(vehicle=1),

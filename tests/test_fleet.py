@@ -123,6 +123,7 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
         "step": 0,
         "steps": 200,
         "missed": 0,
+        "began_s": 0.0,
         "horizons": 0,
         "dropped": {"not a message": 1},
     }
@@ -160,6 +161,36 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
     assert summary["machine_missed"] is None
     assert summary["vehicle_steps_per_core_s"] > 0
     assert figure.stat().st_size > 10_000
+
+
+def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None:
+    """As many vehicles as it has; how near they came stands beside what they are asked to keep."""
+    swap = fleet_command(tmp_path, "--mission", "swap", "--virtual", "--reference.shape", "swap(4)")
+    assert (swap["vehicles"], swap["separation_m"]) == (4, 0.5)
+    assert swap["least_separation_m"] > 0.5
+    show = tmp_path / "show.csv"
+    show.write_text("vehicle,t,x,y,z\n1,0,0,0,2\n1,5,0,0,4\n2,0,3,0,2\n")
+    shown = fleet_command(tmp_path, "--mission", str(show), "--virtual")
+    assert shown["vehicles"] == 2
+    assert shown["least_separation_m"] == pytest.approx(3.0, abs=0.3)
+
+
+def test_a_mission_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path) -> None:
+    """With the file, and what is wrong in it."""
+    show = tmp_path / "show.csv"
+    show.write_text("vehicle,t,x,y\n1,3,0,0\n")
+    there, told = str(show), f"fleet: --mission: {show}: vehicle 1: column t must start at 0 and"
+    both = "fleet: --mission: got the scenario demo as well, expected one of the two"
+    many = "fleet: --vehicles: got 3, expected 16 on this mission"
+    for argv, line in (
+        (["--mission", there], told),
+        (["demo", "--mission", "swap"], both),
+        (["--mission", "swap", "--vehicles", "3"], many),
+    ):
+        done = skytether("fleet", *argv)
+        assert done.returncode == 2
+        assert done.stderr.startswith(line)
+        assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.long

@@ -23,7 +23,7 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
-from skytether.view import plots, words
+from skytether.view import plots, scene, words
 from skytether.view.frames import of_flight
 from skytether.view.network import BINS, DELAY_BINS, SPAN_S
 from skytether.view.rows import planned
@@ -208,6 +208,28 @@ def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() ->
         state.take("client", Figures(time_ns=shown.now_ns, figures=figures))
         page = words.status(state, number, shown.now_ns)
         assert all(each in page for each in said)
+
+
+def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
+    """Zones as they were changed last, drawn around their corners; the nearest of the others."""
+    scenario = reading.load("swap")
+    shape = msgspec.structs.replace(scenario.reference, shape="swap(4)")
+    scenario = msgspec.structs.replace(scenario, duration=25.0, reference=shape)
+    zone = "cylinder(6, 6, 1) & fence(-9, 9, -9, 9)"
+    flown = flight.fly(scenario, vehicles=4, changes=[(9.0, {"mission.zones": zone})])
+    state = state_of(tuple(of_flight(scenario, "swap", flown)))
+    assert state.zones == zone
+    assert len(state.kept.zones) == 2
+    drawn = scene.zones(state.kept, 5.0)
+    assert np.abs(drawn).max() == pytest.approx(9.0)
+    last = np.stack([track.row["state"][:, 0] for track in state.vehicles.values()])
+    away = np.linalg.norm(last[1:] - last[0], axis=1).min()
+    first = next(iter(state.vehicles))
+    assert state.nearest_m(first) == pytest.approx(away)
+    page = words.status(state, first, state.newest_ns)
+    assert f"{away:.2f} m, at least 0.5 m" in page
+    state.take("server", Figures(time_ns=0, figures={"by_vehicle": {"1": {"waits": "vehicle 3"}}}))
+    assert "vehicle 3" in words.status(state, 1, state.newest_ns)
 
 
 def test_what_comes_again_counts_once() -> None:

@@ -418,7 +418,7 @@ def test_a_plant_in_the_plane_keeps_its_altitude() -> None:
             },
             "test",
         )
-        plant = QuadrotorPlant(scenario, np.random.default_rng(0))
+        plant = QuadrotorPlant(scenario, np.random.default_rng(0), 1)
         assert plant.state().tolist() == [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]][:axes]
         for _ in range(100):
             plant.advance(command[:axes])

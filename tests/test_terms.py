@@ -76,6 +76,20 @@ OTHER: dict[str, Any] = {
 """Another value of the keys that are no numbers, or that not every number may be."""
 
 
+ON_MISSION = reading.load("swap")
+"""A scenario in which vehicles keep apart."""
+MISSION: dict[str, Any] = {
+    "mission.separation_m": 0.6,
+    "mission.height_m": 1.0,
+    "mission.tube_m": 0.1,
+    "mission.speed_mps": 0.5,
+    "mission.acceleration_mps2": 0.4,
+    "mission.allocate": True,
+    "mission.zones": "fence(-9, 9, -9, 9)",
+}
+"""Another value of each key of its own."""
+
+
 ALL = dict(flat(reading.to_table(HERE)))
 """Every key of a scenario with dots, and its value."""
 
@@ -104,6 +118,10 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
         return msgspec.structs.replace(
             HERE, reference=msgspec.structs.replace(HERE.reference, points_m=())
         ), with_(key, 3)
+    if key.startswith("mission."):
+        table = reading.to_table(ON_MISSION)
+        lay({key: MISSION[key]}, table)
+        return ON_MISSION, reading.check(table, "there")
     value = OTHER.get(key)
     if value is None:
         here = ALL[key]

@@ -23,7 +23,7 @@ class FirstOrderPlant:
         weather: what it flies in.
     """
 
-    def __init__(self, scenario: Scenario, weather: Weather) -> None:
+    def __init__(self, scenario: Scenario, weather: Weather, number: int = 1) -> None:
         tau, late_s = scenario.true_tau_s, scenario.true_dead_time_s.tolist()
         # Plain numbers, of each axis: numpy costs more than it saves on so few.
         self._model = discretise(tau, scenario.control.dt).axes()
@@ -34,8 +34,7 @@ class FirstOrderPlant:
         self._inputs = OnTheirWay(self._model, self._late) if any(late_s) else None
         """Inputs on their way; None where each acts at once."""
         self.weather = weather
-        start = scenario.vehicle.start_m or scenario.make_reference()(np.zeros(()))[:, 0]
-        self.x = [(float(position), 0.0) for position in start]
+        self.x = [(position, 0.0) for position in scenario.start_m(number).tolist()]
         """Position [m] and velocity [m/s] now, in the world frame, of each axis."""
 
     def state(self) -> Array:

@@ -22,13 +22,14 @@ class QuadrotorPlant:
 
     Args:
         rng: chance of its gusts, for this vehicle alone.
+        number: number of the vehicle.
     """
 
-    def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
+    def __init__(self, scenario: Scenario, rng: np.random.Generator, number: int) -> None:
         vehicle, self._dt_ns = scenario.vehicle, scenario.dt_ns
         self._axes = scenario.model.axes
         frame = "1.5kg" if vehicle.frame == "auto" else vehicle.frame
-        start = np.array(vehicle.start_m or scenario.make_reference()(np.zeros(()))[:, 0])
+        start = scenario.start_m(number)
         if self._axes == 2:
             start = np.append(start, ALTITUDE_M)
         self._quadrotor = Quadrotor(

@@ -90,7 +90,7 @@ def quadrotor(scenario: Scenario, number: int) -> SimulatedVehicle:
     """The quadrotor of a scenario with a number, whose gusts and noise are its own."""
     from skytether.client.simulated.quadrotor import QuadrotorPlant  # numba takes a second
 
-    plant = QuadrotorPlant(scenario, stream(scenario.seed, "turbulence", number))
+    plant = QuadrotorPlant(scenario, stream(scenario.seed, "turbulence", number), number)
     sensor = Sensor(scenario, stream(scenario.seed, "sensor", number))
     return SimulatedVehicle(scenario.dt_ns, plant, sensor)
 
@@ -99,4 +99,4 @@ def simulated(scenario: Scenario, number: int) -> SimulatedVehicle:
     """The vehicle of a scenario with a number, whose winds and noise are its own."""
     weather = Weather(scenario, stream(scenario.seed, "wind", number))
     sensor = Sensor(scenario, stream(scenario.seed, "sensor", number))
-    return SimulatedVehicle(scenario.dt_ns, FirstOrderPlant(scenario, weather), sensor)
+    return SimulatedVehicle(scenario.dt_ns, FirstOrderPlant(scenario, weather, number), sensor)

@@ -21,6 +21,7 @@ from skytether.server.control.desired import Desired
 from skytether.server.control.planner import Figures, Planner
 from skytether.server.control.predictive import Estimator
 from skytether.server.control.scheme import DOUBTS, Foresight, Scheme, foresight
+from skytether.server.control.together import Together
 from skytether.server.control.trajectory import Guidance
 from skytether.shared.base.kernel import B1, I1, kernel
 from skytether.shared.core.stopwatch import Stopwatch
@@ -30,6 +31,7 @@ from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.triggers import Known, Situation, Verdict, make_trigger
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
@@ -96,9 +98,15 @@ class Controller:
         """What is known of the desired trajectories."""
         gain = feedback_gain(scenario)
         self._scheme: Scheme
-        self.planner: Planner | Guidance
+        self.planner: Planner | Guidance | Together
         """Plans of every vehicle, or what is sent in place of a plan."""
-        if terms.splines:
+        self._together: Together | None = None
+        """What keeps vehicles of a mission apart."""
+        if scenario.is_mission and references is not None:
+            self._scheme = self.planner = self._together = Together(
+                scenario, terms, room, block, references, self.desired.number
+            )
+        elif terms.splines:
             self._scheme = self.planner = Guidance(
                 terms, control, gain, self.desired, clock, room, block
             )
@@ -160,6 +168,24 @@ class Controller:
             owed=self.owed,
             desired=self.desired.states,
         )
+
+    def change_zones(self, zones: Zones) -> None:
+        """Keep vehicles of a mission out of other zones from now on."""
+        if self._together:
+            self._together.change_zones(zones)
+
+    def objection(self, zones: Zones) -> str:
+        """Why there cannot be these zones now, in words; empty: there can."""
+        return self._together.objection(zones) if self._together else ""
+
+    @property
+    def left(self) -> list[tuple[int, float]]:
+        """Vehicles of a mission that have left their tube, and by how much [m]; to be emptied."""
+        return self._together.left if self._together else []
+
+    def waits(self, row: int) -> str:
+        """What a vehicle of a mission waits for, in words; empty: for nothing."""
+        return self._together.waits(row) if self._together else ""
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""

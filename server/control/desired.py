@@ -135,6 +135,10 @@ class Desired:
         """Let a vehicle begin in this row."""
         self._number[row] = vehicle if self._references else 0
 
+    def number(self, row: int) -> int:
+        """Number of the trajectory of the vehicle in a row."""
+        return int(self._number[row])
+
     def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
         """Move a live point, see `LivePoint.move`; any other trajectory stays as it is.
 
@@ -219,7 +223,7 @@ class Desired:
 def _live(scenario: Scenario) -> LivePoint:
     """The live point of a scenario, where it is at first."""
     velocity = scenario.reference.velocity_mps
-    start = scenario.make_reference()(np.zeros(()))[:, 0]
+    start = scenario.given_reference()(np.zeros(()))[:, 0]
     return LivePoint(start, np.array(velocity) if velocity else None, scenario.u_max)
 
 

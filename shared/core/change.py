@@ -77,6 +77,8 @@ class Running:
         before = reading.to_table(self._scenario)
         try:
             scenario = self._checked(values, before)
+            if said := self._endpoint.objection(scenario, frozenset(values)):
+                raise ConfigError(said)
         except ConfigError as error:
             self.refuse(str(error))
             raise

@@ -105,6 +105,15 @@ class Endpoint(ABC):
     def close(self, *, now_ns: int) -> None:  # noqa: B027 - most have nothing to say
         """Say what peers must know before the driver ends; nothing else is called after it."""
 
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
+        """Why a change cannot be made just now, in words; empty: it can.
+
+        Args:
+            scenario: what would be flown, checked.
+            keys: keys that would get a value, all of them `changeable`.
+        """
+        return ""
+
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
         """Fly another scenario from now on; called between two steps. Never fails.
 

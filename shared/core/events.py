@@ -358,6 +358,17 @@ class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} reports a state that it cannot have come to: not believed"
 
 
+class LeftTube(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle of a mission is further from its motion than the others reckon with."""
+
+    off_m: float
+    """How far it is outside its tube [m]."""
+
+    def __str__(self) -> str:
+        off = f"{self.off_m:.2g} m outside its tube (mission.tube_m)"
+        return f"vehicle {self.vehicle} is {off}: the others keep further away"
+
+
 class FenceHolds(VehicleEvent, frozen=True, kw_only=True):
     """The fence lets less pass than the vehicle was told to fly."""
 
@@ -433,6 +444,7 @@ Event = (
     | ModeChanged
     | PlanningStopped
     | StateDoubted
+    | LeftTube
     | FenceHolds
     | PlanningResumed
     | NotFlown

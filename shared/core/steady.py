@@ -73,6 +73,10 @@ class Steady(Endpoint):
         """See `Endpoint`."""
         self._inner.close(now_ns=self._steady(now_ns))
 
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
+        """See `Endpoint`."""
+        return self._inner.objection(scenario, keys)
+
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """See `Endpoint`."""
         self._inner.change(scenario, keys, now_ns=self._steady(now_ns))

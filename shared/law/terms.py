@@ -52,6 +52,8 @@ class Terms(NamedTuple):
     """How fast braking takes the desired velocity to zero [m/s²]."""
     age_max_s: float
     """Largest age of the observation behind an input [s]."""
+    join_s: float
+    """Time after its first knot up to which a trajectory is taken [s]; 0: at any time."""
     shape: str
     """Shape of the desired trajectory."""
     radius_m: float
@@ -114,6 +116,11 @@ class Terms(NamedTuple):
     def age_max(self) -> int:
         """Largest age of the observation behind an input [steps]."""
         return seconds_to_ns(self.age_max_s) // self.dt_ns
+
+    @property
+    def join(self) -> int:
+        """Steps after its first knot up to which a trajectory is taken; 0: at any time."""
+        return seconds_to_ns(self.join_s) // self.dt_ns
 
     @property
     def brake(self) -> float:

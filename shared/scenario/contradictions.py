@@ -7,11 +7,14 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 
+from skytether.shared.law.model import Array
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, margins
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
-from skytether.shared.scenario.schema import ControlConfig, DirectionConfig, Scenario
+from skytether.shared.scenario.schema import TABLES, ControlConfig, DirectionConfig, Scenario
 from skytether.shared.scenario.triggers import make_trigger
 from skytether.shared.wire.protocol import INPUTS_MAX
 
@@ -77,13 +80,87 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
         yield "control.feedback", "false", "true with control.scheme = 'trajectory'"
     if control.scheme == "none" and control.feedback:
         yield "control.feedback", "true", "false with control.scheme = 'none'"
+    yield from _no_mission(scenario)
     yield from list(_no_impairments(scenario)) or _too_late(scenario)
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
-    if known is None or scenario.reference != known.reference or axes != known.model.axes:
-        yield from _no_shape(scenario) or _no_reference(scenario)
+    yield from _no_way(scenario, known)
     if scenario.fence.is_there:
         yield from list(_no_room(scenario)) or _outside(scenario)
+
+
+def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
+    """Why the desired trajectory cannot be made, or a mission's places not be reached."""
+    wrong = list(_no_zones(scenario))
+    same = known and (scenario.reference, scenario.model.axes) == (
+        known.reference,
+        known.model.axes,
+    )
+    if not same:
+        wrong += _no_shape(scenario) or _no_reference(scenario)
+        if scenario.is_mission and not wrong:
+            wrong += _no_places(scenario)
+    yield from wrong
+
+
+def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why vehicles cannot keep apart on a mission, whichever packets are lost."""
+    control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
+    if not scenario.is_mission:
+        if scenario.mission.zones:
+            expected = "none, but on a mission: reference.shape = 'mission', or a swap"
+            yield "mission.zones", repr(scenario.mission.zones), expected
+        return
+    if control.scheme != "trajectory":
+        yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
+    if control.trigger != "expected_gap":
+        yield "control.trigger", repr(control.trigger), "'expected_gap' on a mission"
+    if vehicle.exhausted != "brake":
+        yield "vehicle.exhausted", repr(vehicle.exhausted), "'brake' on a mission"
+    most_s = JOIN_MAX * SPACING * control.dt
+    if not 0.0 < link.join_s <= most_s + TINY:
+        yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
+    # A vehicle that hears nothing flies its motion to the end before it brakes.
+    longest_s = (INTERVALS + JOIN_MAX) * SPACING * control.dt
+    for key, value in (("link.timeout_s", link.timeout_s), ("link.age_max_s", link.age_max_s)):
+        if value < longest_s - TINY:
+            yield key, value, f"at least {longest_s:g} s on a mission: no motion is longer"
+
+
+def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why there can be no such zones."""
+    try:
+        _ = scenario.zones
+    except policies.PolicyError as error:
+        yield "mission.zones", repr(error.given), error.expected
+    except OSError as error:
+        given = repr(scenario.mission.zones)
+        yield "mission.zones", given, f"a file that can be read ({error.strerror})"
+
+
+def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why vehicles cannot be at their goals: too near to each other, or to zones."""
+    mission, goals = scenario.mission, scenario.given_reference()
+    assert isinstance(goals, Mission)
+    if mission.allocate and not goals.in_step:
+        expected = "false, or a goal of each vehicle at each time that one of them has one"
+        yield "mission.allocate", "true", expected
+        return
+    zones, room_m = scenario.zones, mission.tube_m
+    for vehicle in goals.vehicles if zones else ():
+        for place in goals.goals(vehicle):
+            if zone := zones.in_the_way(place[None], room_m):
+                at = ", ".join(f"{each:.3g}" for each in place)
+                expected = f"none within {room_m:g} m of the goal ({at}) of vehicle {vehicle}"
+                yield "mission.zones", zone, expected
+                return
+    apart_m = mission.separation_m + 2.0 * mission.tube_m
+    found = goals.nearest(apart_m, mission.height_m and mission.separation_m / mission.height_m)
+    if found:
+        one, other, at_s, away_m = found
+        goals_of = f"the goals of vehicles {one} and {other} at {at_s:g} s"
+        expected = f"with 2 · mission.tube_m at most {away_m:.3g} m, as {goals_of}"
+        yield "mission.separation_m", mission.separation_m, expected
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
@@ -201,13 +278,13 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
     route = ref.points_m + ref.points_m[:1] * ref.loop
     if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
         yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
-    elif ref.shape in ("waypoints", "csv"):
+    elif ref.shape in ("waypoints", *TABLES):
         try:
-            scenario.make_reference()
+            scenario.given_reference()
         except OSError as error:
             yield "reference.file", repr(ref.file), f"a readable file ({error.strerror})"
         except ValueError as error:
-            if ref.shape == "csv":
+            if ref.shape in TABLES:
                 yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
             else:
                 given = [list(point) for point in route]
@@ -232,11 +309,21 @@ def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
 
 def _outside(scenario: Scenario) -> Iterator[Contradiction]:
     """Where the desired trajectory leads over the fence, or faster than it allows."""
-    fence, steps = scenario.fence, min(scenario.steps, FENCED_STEPS_MAX)
-    states = scenario.make_reference()(np.arange(steps + 1) * scenario.control.dt)
+    steps = min(scenario.steps, FENCED_STEPS_MAX)
+    given, times_s = scenario.given_reference(), np.arange(steps + 1) * scenario.control.dt
+    for vehicle in given.vehicles if isinstance(given, Mission) else (1,):
+        flown = scenario.given_reference(vehicle)(times_s)
+        wrong = list(_over_fence(scenario, scenario.start_m(vehicle), flown))
+        yield from wrong
+        if wrong:
+            return
+
+
+def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Contradiction]:
+    """Where states at the steps of a flight that begins at home are outside the fence."""
+    fence = scenario.fence
     position, speed = states[..., 0], np.linalg.norm(states[..., 1], axis=1)
     low, high, radius = inner(scenario)
-    home = np.array(scenario.vehicle.start_m or position[0])
     far = np.linalg.norm(position - home, axis=1)
     checks = (
         ("fence.low_m", list(fence.low_m), (position < low).any(axis=1), "lower"),
@@ -260,7 +347,7 @@ def _no_shape(scenario: Scenario) -> list[Contradiction]:
     try:
         shape = policies.shape(ref.shape, REFERENCES)
         if not REFERENCES[shape.name].is_ours:
-            shapes.sampled(scenario.make_reference(), scenario.model.axes)
+            shapes.sampled(scenario.given_reference(), scenario.model.axes)
     except policies.PolicyError as error:
         return [("reference.shape", repr(error.given), error.expected)]
     except Exception as error:

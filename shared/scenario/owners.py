@@ -40,6 +40,8 @@ class InFlight(Enum):
     """Wind and gusts."""
     IMPAIRMENT = auto()
     """Delay and loss of packets."""
+    ZONES = auto()
+    """Zones of a mission."""
 
 
 class Key(msgspec.Struct, frozen=True):

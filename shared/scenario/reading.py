@@ -21,6 +21,7 @@ from skytether import scenarios
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
+from skytether.shared.scenario import zones
 from skytether.shared.scenario.air import path as air
 from skytether.shared.scenario.contradictions import contradictions
 from skytether.shared.scenario.policies import PolicyError
@@ -138,6 +139,11 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
     table = raw.get("reference")
     if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
         table["file"] = str((path.parent / table["file"]).absolute())
+    mission = raw.get("mission")
+    if isinstance(mission, dict) and isinstance(mission.get("zones"), str):
+        with suppress(PolicyError):  # said by `check`
+            folder = path.parent.absolute()
+            mission["zones"] = zones.with_files(mission["zones"], lambda file: str(folder / file))
     raw = _with_directions(raw, path.parent)
     base = raw.pop("extends", None)
     if base is None:

@@ -259,9 +259,23 @@ def from_csv(path: Path, axes: int) -> Reference:
         OSError: see `read`.
         ValueError: with what is wrong, and in which line.
     """
+    data = read_table(path, ["t", "x", "y", "z"][: axes + 1])
+    if len(data) < 2:
+        raise ValueError("expected at least two lines of finite numbers")
+    if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
+        raise ValueError("column t must start at 0 and rise from line to line")
+    return timed_path(data[:, 0], data[:, 1:])
+
+
+def read_table(path: Path, names: list[str]) -> Array:
+    """Columns of a table; shape (rows, columns).
+
+    Raises:
+        OSError: see `read`.
+        ValueError: with what is wrong, and in which line.
+    """
     import csv  # for files alone
 
-    names = ["t", "x", "y", "z"][: axes + 1]
     text = io.StringIO(read(path).decode("utf-8-sig"), newline="")
     table = csv.DictReader(text, skipinitialspace=True)
     rows: list[list[float]] = []
@@ -271,12 +285,10 @@ def from_csv(path: Path, axes: int) -> Reference:
         rows += (_numbers([row[name] for name in names], table.line_num) for row in table)
     except csv.Error as error:
         raise ValueError(f"line {table.reader.line_num}: {error}") from None
-    data = np.array(rows).reshape(-1, axes + 1)
-    if len(data) < 2 or not np.isfinite(data).all():
+    found = np.array(rows).reshape(-1, len(names))
+    if not np.isfinite(found).all():
         raise ValueError("expected at least two lines of finite numbers")
-    if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
-        raise ValueError("column t must start at 0 and rise from line to line")
-    return timed_path(data[:, 0], data[:, 1:])
+    return found
 
 
 def _numbers(words: list[str | None], line: int) -> list[float]:

@@ -23,9 +23,10 @@ from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario import policies
+from skytether.shared.scenario import policies, zones
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.air import path as air
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.owners import (
     InFlight,
     Key,
@@ -41,6 +42,7 @@ from skytether.shared.scenario.owners import (
     Term,
 )
 from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, VEHICLES, Entry
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
 # Bounds of numbers lie far beyond any vehicle, and near enough that no time overflows its 63 bits
@@ -152,6 +154,12 @@ class ControlConfig(Section, frozen=True):
         return self.scheme == "committed"
 
 
+MISSIONS = ("swap", "mission")
+"""Shapes of the desired trajectory that are goals of several vehicles, which keep apart."""
+TABLES = ("csv", "mission")
+"""Shapes that are read from `reference.file`."""
+
+
 class ReferenceConfig(Section, frozen=True):
     """Desired trajectory."""
 
@@ -184,7 +192,8 @@ class ReferenceConfig(Section, frozen=True):
     loop: Term[bool] = False
     """Whether the vehicle returns from the last waypoint to the first and goes round again."""
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
-    """CSV file with the columns t, x, y (and z), relative to the scenario's own folder."""
+    """CSV file with the columns t, x, y (and z), of a mission also vehicle, relative to the
+    scenario's own folder."""
 
 
 class VehicleConfig(Section, frozen=True):
@@ -258,6 +267,29 @@ class FenceConfig(Section, frozen=True):
     def is_there(self) -> bool:
         """Whether anything is fenced in."""
         return bool(self.low_m or self.high_m or self.radius_m or self.speed_mps)
+
+
+class MissionConfig(Section, frozen=True):
+    """Vehicles with goals of their own, which keep apart whichever packets are lost.
+
+    See docs/together.md.
+    """
+
+    separation_m: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
+    """Smallest distance between two vehicles [m]."""
+    height_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
+    """Smallest distance of two that are one above the other [m], for downwash; 0: the same."""
+    tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
+    """Largest distance of a vehicle from the motion that it flies [m]: wind, tracking, clocks."""
+    speed_mps: OfServer[Strength] = 0.0
+    """Largest speed of a motion, over all axes [m/s]; 0: no bound but `model.u_max`."""
+    acceleration_mps2: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.6
+    """Largest acceleration of a motion on an axis [m/s²]."""
+    allocate: OfServer[bool] = False
+    """Whether goals of one time go to the vehicles that are nearest to them; all have one then."""
+    zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.ZONES)] = ""
+    """Places to keep out of or to stay within, combined with &: box(x0, x1, y0, y1), cylinder(x, y,
+    radius), polygon(x, y, …), fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
 
 
 class SensorConfig(Section, frozen=True):
@@ -387,6 +419,9 @@ class LinkConfig(Section, frozen=True):
     age_max_s: Term[Annotated[float, Meta(gt=0, le=60)]] = 5.0
     """Largest age of the observation behind an input [s]; beyond it the vehicle brakes and hovers,
     or holds its last input where `vehicle.exhausted` says so."""
+    join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
+    """Time after its first knot up to which the vehicle takes a trajectory [s]; 0: at any time. It
+    tells the server for certain which one is flown."""
     timeout_s: OfEach[Interval] = 2.0
     """Time of silence after which the other end is taken for gone [s]: the vehicle brakes and says
     HELLO again; the server lets another client have the vehicle's number."""
@@ -429,6 +464,7 @@ class Scenario(Section, frozen=True):
     reference: ReferenceConfig = ReferenceConfig()
     vehicle: VehicleConfig = VehicleConfig()
     fence: FenceConfig = FenceConfig()
+    mission: MissionConfig = MissionConfig()
     sensor: SensorConfig = SensorConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
     network: NetworkConfig = NetworkConfig()
@@ -482,7 +518,7 @@ class Scenario(Section, frozen=True):
     def terms(self) -> Terms:
         """Terms that both ends must agree on before a flight."""
         control, vehicle, reference = self.control, self.vehicle, self.reference
-        table = shapes.read(Path(reference.file)) if reference.shape == "csv" else b""
+        table = shapes.read(Path(reference.file)) if reference.shape in TABLES else b""
         return Terms(
             dt_ns=self.dt_ns,
             horizon=control.horizon,
@@ -496,6 +532,7 @@ class Scenario(Section, frozen=True):
             exhausted=vehicle.exhausted,
             brake_mps2=vehicle.brake_mps2,
             age_max_s=self.link.age_max_s,
+            join_s=self.link.join_s,
             shape=self._shape(),
             radius_m=reference.radius_m,
             period_s=reference.period_s,
@@ -508,13 +545,40 @@ class Scenario(Section, frozen=True):
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
         """The desired trajectory of a vehicle, by its number; each has a target of its own."""
+        made = self.given_reference(vehicle)
+        if isinstance(made, Mission) and self.mission.allocate:
+            return made.allocated().of(vehicle)
+        return made
+
+    def given_reference(self, vehicle: int = 1) -> shapes.Reference:
+        """The desired trajectory of a vehicle; on a mission, before goals are allocated."""
         shape = policies.shape(self.reference.shape, REFERENCES)
         entry, flown = REFERENCES[shape.name], self
         if shape.name == "target" and vehicle != 1:
             seed = int(stream(self.seed, "target", vehicle).integers(2**32))
             flown = msgspec.structs.replace(self, seed=seed)
         made: shapes.Reference = entry.make(flown, *entry.numbers(shape.values, self.reference))
-        return made
+        return made.of(vehicle) if isinstance(made, Mission) else made
+
+    def start_m(self, vehicle: int = 1) -> Array:
+        """Position where a vehicle begins [m]; shape (axes,)."""
+        if self.vehicle.start_m:
+            return np.array(self.vehicle.start_m)
+        return self.given_reference(vehicle)(np.zeros(()))[:, 0]
+
+    @property
+    def is_mission(self) -> bool:
+        """Whether vehicles have goals of their own, and keep apart."""
+        return self.reference.shape.partition("(")[0].strip() in MISSIONS
+
+    @property
+    def zones(self) -> Zones:
+        """Zones of a mission.
+
+        Raises:
+            PolicyError, OSError: there are none such.
+        """
+        return zones.parse(self.mission.zones, self.model.axes)
 
     def entries(self) -> Iterator[Entry]:
         """Policies and shape that the scenario names."""
@@ -530,7 +594,7 @@ class Scenario(Section, frozen=True):
         shape = policies.shape(self.reference.shape, REFERENCES)
         if REFERENCES[shape.name].is_ours:
             return shape.name
-        given = shapes.sampled(self.make_reference(), self.model.axes)
+        given = shapes.sampled(self.given_reference(), self.model.axes)
         return f"{str(shape)[:SHAPE_TOLD]} {_digest(f'{shape}'.encode() + given)}"
 
 

@@ -5,11 +5,14 @@ an entry like these.
 """
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
+from skytether.shared.scenario import mission as missions
 from skytether.shared.scenario import reference as curves
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import REFERENCES
@@ -83,3 +86,16 @@ def live(scenario: Scenario) -> Reference:
     """Point that is moved while it flies, from the one of `points_m` or the origin on."""
     points = _points(scenario)
     return curves.hover(points[0] if len(points) else np.zeros(scenario.model.axes))
+
+
+@reference
+def swap(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
+    """Mission: places on a circle of `radius_m`, of which each vehicle goes to the one opposite."""
+    wanted = scenario.reference
+    return missions.swap(vehicles, wanted.radius_m, scenario.model.axes, wanted.altitude_m)
+
+
+@reference
+def mission(scenario: Scenario) -> Reference:
+    """Mission: goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
+    return missions.mission(Path(scenario.reference.file), scenario.model.axes)

@@ -1,6 +1,7 @@
 """The figures of a flight, from the parts of its record; their names are used everywhere."""
 
 import math
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -182,14 +183,15 @@ def summarise(
 def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
-    Where a live point was, only the server knows: at a step that it has no row of, the point is
-    where it was before. What nobody knows is NaN.
+    Where a live point was, and which goal a vehicle was given of a mission that allocates them,
+    only the server knows: at a step that it has no row of, it is what it was before. What nobody
+    knows is NaN.
 
     Args:
         client: rows of the vehicle.
         server: rows of the server, of any vehicles.
     """
-    if scenario.reference.shape != "live":
+    if scenario.reference.shape != "live" and not scenario.mission.allocate:
         times_s, vehicles = client["step"] * scenario.control.dt, client["vehicle"][:1].tolist()
         return scenario.make_reference(*vehicles)(times_s)[..., 0]
     known = client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]
@@ -263,3 +265,35 @@ def _mean(values: Array) -> float | None:
 
 def _quantile(values: Array, share: float) -> float | None:
     return float(np.quantile(values, share)) if len(values) else None
+
+
+def least_separation(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> float | None:
+    """Smallest distance between two vehicles while both are on a mission [m]; None of none.
+
+    Each is from the first step on at which it follows what the server has sent.
+
+    Args:
+        each: rows of the client's part of each vehicle, by their steps.
+        began_s: time at which step 0 of each began, of one clock [s].
+        dt_s: length of a step [s].
+    """
+    tracks = []
+    for rows, began in zip(each, began_s, strict=True):
+        tracking = np.flatnonzero(rows["mode"] == Mode.TRACK)
+        if len(tracking):
+            flown = rows[tracking[0] :]
+            tracks.append((began + flown["step"] * dt_s, flown["state"][:, :, 0]))
+    if len(tracks) < 2:
+        return None
+    begin, end = min(times[0] for times, _ in tracks), max(times[-1] for times, _ in tracks)
+    grid_s = np.arange(begin, end, dt_s)
+    places = [
+        np.stack([np.interp(grid_s, times, x, np.nan, np.nan) for x in at.T], axis=1)
+        for times, at in tracks
+    ]
+    nearest = [
+        np.linalg.norm(one - other, axis=1)
+        for number, one in enumerate(places)
+        for other in places[:number]
+    ]
+    return float(np.nanmin(nearest)) if np.isfinite(nearest).any() else None

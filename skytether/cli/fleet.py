@@ -3,9 +3,10 @@
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from argparse import ArgumentError, ArgumentParser
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -22,14 +23,20 @@ from skytether.figures import flights as figures
 from skytether.shared.base import kernel
 from skytether.shared.core.events import Event, NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
-from skytether.shared.telemetry.summary import summarise
+from skytether.shared.telemetry.summary import least_separation, summarise
 from skytether.shell import command, temporary
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 
+VEHICLES = 20
+"""Number of vehicles unless it is given."""
+AFTER_S = 30.0
+"""Time that is flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
 """Stages of the server's work, in their order; `record`, the price of watching, is left out."""
 
@@ -40,8 +47,11 @@ class FleetOptions:
 
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
-    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 20
-    """Number of vehicles."""
+    mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Mission in place of a scenario: swap, rings, corridor, warehouse, or a CSV file with the
+    columns vehicle, t, x, y (and z), as light shows have them."""
+    vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Number of vehicles: 20 unless given, or as many as the mission has."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of the server's processes, which share the vehicles."""
     secure: bool = False
@@ -77,6 +87,10 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     event_ratio: float
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
+    separation_m: float | None
+    """Smallest distance that vehicles of a mission are asked to keep [m]."""
+    least_separation_m: float | None
+    """Smallest distance between two vehicles of a mission [m]."""
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
@@ -126,6 +140,8 @@ class FleetFlight:
     """CPU time of everything together [s], in virtual time."""
     server: Rows | None = None
     """What the server recorded, in virtual time."""
+    vehicles: dict[str, Any] = field(default_factory=dict)
+    """Figures of each vehicle, by its number."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -136,8 +152,10 @@ def fleet(argv: Sequence[str]) -> None:
     the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight and still shows
     what was flown.
     """
+    argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
-    command.check_count("--vehicles", options.vehicles, 65_535)
+    vehicles = _vehicles(options)
+    command.check_count("--vehicles", vehicles, 65_535)
     command.check_count("--workers", options.workers, 64)
     if options.virtual and options.workers > 1:
         raise CommandError("--workers: got --virtual as well, where there is but one", 2)
@@ -148,13 +166,15 @@ def fleet(argv: Sequence[str]) -> None:
     if options.figure:
         figures.check(options.figure)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
-    title = f"{options.vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
+    title = f"{vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
     command.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
         command.progress(f"flying {title}", options.config.duration) as on_second,
     ):
-        flown = (_virtually if options.virtual else _really)(options, on_second, interrupted)
+        flown = (_virtually if options.virtual else _really)(
+            options, vehicles, on_second, interrupted
+        )
     if not len(flown.client):
         raise CommandError("interrupted before the first step", command.INTERRUPTED)
     summary = _summarise(options, flown)
@@ -167,14 +187,47 @@ def fleet(argv: Sequence[str]) -> None:
         raise CommandError(str(flown.failure))
 
 
+def _with_mission(argv: Sequence[str]) -> list[str]:
+    """A command line in which `--mission` is the scenario, with the flags of a table of goals.
+
+    Raises:
+        CommandError: there is a scenario as well, or the table is none.
+    """
+    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--mission")
+    try:
+        found, rest = parser.parse_known_args(list(argv))
+    except ArgumentError:
+        raise CommandError("--mission: expected a name or a file", command.CONFIGURATION) from None
+    if found.mission is None:
+        return rest
+    if rest and not rest[0].startswith("-"):
+        said = f"--mission: got the scenario {rest[0]} as well, expected one of the two"
+        raise CommandError(said, command.CONFIGURATION)
+    if not found.mission.endswith(".csv"):
+        return [found.mission, *rest]
+    try:
+        with Path(found.mission).open(encoding="utf-8") as table:
+            axes = 3 if "z" in table.readline().strip().split(",") else 2
+        lasts_s = read_mission(Path(found.mission), axes).lasts_s
+    except (OSError, ValueError) as error:
+        raise CommandError(f"--mission: {found.mission}: {error}", command.CONFIGURATION) from None
+    shape = ["--reference.shape", "mission", "--reference.file", found.mission]
+    flown = ["--model.axes", str(axes), "--duration", f"{lasts_s + AFTER_S:g}"]
+    return ["swap", *shape, *flown, *rest]
+
+
 def _virtually(
-    options: FleetOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+    options: FleetOptions,
+    vehicles: int,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
 ) -> FleetFlight:
     kernel.load()
     began_s = time.process_time()
     flown = flight.fly(
         options.config,
-        vehicles=options.vehicles,
+        vehicles=vehicles,
         secure=options.secure,
         stopwatch=Stopwatch(time.perf_counter_ns),
         on_second=on_second,
@@ -190,6 +243,7 @@ def _virtually(
         failure=flown.failure,
         cpu_s=time.process_time() - began_s,
         server=flown.server,
+        vehicles=flown.figures["client"]["by_vehicle"],
     )
 
 
@@ -207,7 +261,10 @@ def _paged(options: FleetOptions) -> Iterator[Path | None]:
 
 
 def _really(
-    options: FleetOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
+    options: FleetOptions,
+    vehicles: int,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
 ) -> FleetFlight:
     with (
         temporary.folder() as parts,
@@ -219,7 +276,7 @@ def _really(
             parts,
             on_second=on_second,
             interrupted=interrupted,
-            vehicles=options.vehicles,
+            vehicles=vehicles,
             workers=options.workers,
             watched=False,
             secure=options.secure,
@@ -235,7 +292,8 @@ def _really(
         }
         failure = next(iter(shortfalls), None)
         client = record.read(parts / "client")
-        return FleetFlight(client, servers, rest["netem"], rest, failure, machine)
+        told = rest["client"]["by_vehicle"]
+        return FleetFlight(client, servers, rest["netem"], rest, failure, machine, vehicles=told)
 
 
 class Metronome:
@@ -270,6 +328,34 @@ class Metronome:
             due_s += missed * self._dt_s
 
 
+def _vehicles(options: FleetOptions) -> int:
+    """Number of vehicles.
+
+    Raises:
+        CommandError: the mission has another.
+    """
+    if not options.config.is_mission:
+        return VEHICLES if options.vehicles is None else options.vehicles
+    mission = options.config.given_reference()
+    assert isinstance(mission, Mission)
+    count = len(mission.vehicles)
+    if options.vehicles not in (None, count):
+        said = f"got {options.vehicles}, expected {count} on this mission"
+        raise CommandError(f"--vehicles: {said}", command.CONFIGURATION)
+    return count
+
+
+def _separation(
+    scenario: Scenario, each: Sequence[Rows], vehicles: Mapping[str, Any]
+) -> float | None:
+    """Smallest distance between two vehicles of a mission [m]; None where it is not known."""
+    numbers = [str(rows["vehicle"][0]) for rows in each]
+    if not scenario.is_mission or any("began_s" not in vehicles.get(n, {}) for n in numbers):
+        return None
+    began_s = [vehicles[number]["began_s"] for number in numbers]
+    return least_separation(each, began_s, scenario.control.dt)
+
+
 def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
     scenario, client, servers, netem = options.config, flown.client, flown.servers, flown.netem
     steps = sum(server["counts"].get("steps", 0) for server in servers)
@@ -298,6 +384,8 @@ def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
         server_steps=steps,
         event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
         rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
+        separation_m=scenario.mission.separation_m if scenario.is_mission else None,
+        least_separation_m=_separation(scenario, each, flown.vehicles),
         uplink_packets_per_s=links[0]["packets"] / duration_s,
         downlink_packets_per_s=links[1]["packets"] / duration_s,
         lost=sum(link["lost"] for link in links),
@@ -327,6 +415,12 @@ def _show(summary: FleetSummary, title: str) -> None:
         ("vehicles, server's workers", f"{s.vehicles}, {s.workers}"),
         ("steps flown, planned for", f"{s.steps}, {s.server_steps} in {s.duration_s:g} s"),
         ("RMSE xy min, median, max [m]", s.rmse_xy and ", ".join(f"{x:.4f}" for x in s.rmse_xy)),
+        (
+            "least separation, asked for [m]",
+            None
+            if s.least_separation_m is None
+            else f"{s.least_separation_m:.3f}, {s.separation_m:g}",
+        ),
         ("link", "sealed" if s.secure else "plaintext"),
         ("event ratio", f"{s.event_ratio:.3f}"),
         (

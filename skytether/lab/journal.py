@@ -21,7 +21,7 @@ import msgspec
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.dotted import flat
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.schema import TABLES, Scenario
 
 SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
 
@@ -132,7 +132,7 @@ def write(path: Path, content: bytes) -> None:
 
 def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
     """Digest of every file and plug-in that some scenarios name: a part of their settings."""
-    files = {each.reference.file for each in scenarios if each.reference.shape == "csv"}
+    files = {each.reference.file for each in scenarios if each.reference.shape in TABLES}
     entries = (entry for each in scenarios for entry in each.entries())
     plugged = {entry.source: entry.version for entry in entries if not entry.is_ours}
     return plugged | {file: digest(Path(file).read_bytes()) for file in sorted(files)}

@@ -357,6 +357,7 @@ LEFT_OUT: dict[str, tuple[Path, ...]] = {
     "client": (
         ("vehicles",),  # it never changes
         (*_VEHICLE, "missed"),  # told of all of them
+        (*_VEHICLE, "began_s"),  # of no clock that a gatherer knows
         (*_AUTOPILOT, "mode"),  # its number is told
     ),
 }

@@ -136,7 +136,8 @@ def fly_batch(
         ConfigError: a plug-in makes mistakes; a batch is to be measured, and this would be nothing.
     """
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
-    alone = not in_time or scenario.control.shared_bytes_per_s  # which a server's vehicles share
+    # Vehicles of one server share a budget, and keep apart on a mission.
+    alone = not in_time or scenario.is_mission or scenario.control.shared_bytes_per_s
     company = 1 if alone else COMPANY_MAX
     groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
     flights = [flight for group in groups for flight in _fly(scenario, group, on_second, stopped)]
@@ -245,7 +246,12 @@ class Run:
         failure = next((client.failure for client in self._clients if client.failure), None)
         if failure:
             failure = msgspec.structs.replace(failure, vehicle=failure.vehicle - self._before)
-        figures = {"server": self._server.figures(), "netem": self.netem.figures()}
+        told = {str(each.vehicle - self._before): each.told() for each in self._clients}
+        figures = {
+            "server": self._server.figures(),
+            "netem": self.netem.figures(),
+            "client": {"by_vehicle": told},
+        }
         return Record(client, server, netem, failure, figures, tuple(self._events))
 
 
@@ -298,6 +304,7 @@ def _fly(
         run, number = divmod(vehicle - 1, vehicles)
         return each[run].make_reference(number + 1)
 
+    has_own = scenario.is_mission or scenario.reference.shape == "target"
     recorder = Recorder(server_columns(scenario.model.axes, scenario.control.scheme), sink)
     header_bytes, row_bytes = sink.tell(), recorder.columns.itemsize
     server = own_server or Server(
@@ -309,7 +316,7 @@ def _fly(
         recorder=recorder,
         plans=plans,
         stopwatch=stopwatch,
-        references=target if scenario.reference.shape == "target" else None,
+        references=target if has_own else None,
     )
 
     def server_rows() -> int:

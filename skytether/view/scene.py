@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from skytether.figures.colours import GREY, PALETTE, RED, Rgb
 from skytether.shared.law.model import Array
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
 from skytether.view.state import State, VehicleTrack
 
 FLIGHT_RGB: tuple[Rgb, ...] = ((56, 132, 255), (255, 140, 40), (160, 90, 220), (20, 170, 150))
@@ -96,9 +98,11 @@ def _desired(scenario: Scenario) -> Array:
             middle = np.array(points[0])
         return np.array([middle - corner, middle + corner])
     try:
-        reference = scenario.make_reference()
+        reference = scenario.given_reference()
     except (OSError, ValueError):  # a table that is on another machine
         return np.zeros((2, axes))
+    if isinstance(reference, Mission):
+        return reference.places
     last_s = min(scenario.duration, ROUND_S)
     if shape in ("circle", "figure-eight", "square"):
         last_s = min(last_s, scenario.reference.period_s)
@@ -140,6 +144,28 @@ def fence(scenario: Scenario, reach_m: float) -> NDArray[np.float32]:
         angle = np.linspace(0.0, 2 * np.pi, 97)
         around = begin[:2] + fenced.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         pieces.append(segments(around))
+    return np.concatenate(pieces)
+
+
+def zones(kept: Zones, reach_m: float) -> NDArray[np.float32]:
+    """Lines around the zones of a mission; shape (pieces, 2, 3).
+
+    Args:
+        kept: the zones.
+        reach_m: height at which one is drawn that has no upper bound in space [m].
+    """
+    pieces = [np.zeros((0, 2, 3), np.float32)]
+    for zone in kept.zones:
+        around = np.concatenate([zone.corners, zone.corners[:1]])
+        flat = np.isinf(zone.low_m) and np.isinf(zone.high_m)
+        heights = [0.0] if flat else [max(zone.low_m, 0.0), min(zone.high_m, reach_m)]
+        rings = [
+            np.concatenate([around, np.full((len(around), 1), height)], axis=1)
+            for height in heights
+        ]
+        pieces += [segments(ring) for ring in rings]
+        if len(rings) == 2:
+            pieces.append(np.stack(rings, axis=1).astype(np.float32))
     return np.concatenate(pieces)
 
 
@@ -233,11 +259,13 @@ class _Flight:
         line("home", GOAL_RGB, 2.0).points = begin + cross
         if scenario.fence.is_there:
             line("fence", FENCE_RGB, 1.5).points = fence(scenario, reach_m)
+        self._zones, self._zoned = line("zones", FENCE_RGB, 2.5), ""
+        self._reach_m = reach_m
         self._trail, self._plan = line("trail", faint, 2.0), line("plan", self._rgb, 4.0)
-        if scenario.reference.shape not in ("target", "live"):
+        self._shows_goals = scenario.reference.shape in ("target", "live") or scenario.is_mission
+        if not self._shows_goals:
             line("desired", GOAL_RGB, 1.0).points = segments(_desired(scenario))
         self._goal_trail = line("goal-trail", GOAL_RGB, 1.0)
-        self._shows_goals = scenario.reference.shape in ("target", "live")
         self._goal = scene.add_icosphere(
             f"{self._name}/goal", 0.3 * self._size, GOAL_RGB, subdivisions=2, cast_shadow=False
         )
@@ -257,7 +285,10 @@ class _Flight:
             vehicle.show(track, title)
 
     def draw(self, state: State) -> None:
-        """Draw where they were and want to."""
+        """Draw where they were and want to, and where they must not be."""
+        if state.zones != self._zoned:
+            self._zoned = state.zones
+            self._set(self._zones, [zones(state.kept, self._reach_m)])
         tracks = list(state.vehicles.values())
         most = max(2, min(TRAIL_POINTS, TRAIL_POINTS_ALL // max(1, len(tracks))))
         trails = [each.trail(TRAIL_S) for each in tracks]

@@ -19,7 +19,10 @@ from skytether.figures.colours import AMBER, GREEN, GREY, MODE_COLOURS, RED
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
 from skytether.shared.law.model import Array
+from skytether.shared.scenario import zones
+from skytether.shared.scenario.policies import PolicyError
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.feed import (
     FeedError,
     Figures,
@@ -40,6 +43,8 @@ SLOTS_MAX = 1200
 """Most steps that are kept of a vehicle; where a minute has more, every second or third is."""
 VEHICLES_MAX = 64
 """Most vehicles of a flight that are shown."""
+ZONED = "mission.zones"
+"""Key of the zones of a mission."""
 SAID_MAX = 50
 """Most events that are kept."""
 LED = "reference.points_m"
@@ -334,6 +339,8 @@ class State:
         """Vehicles by number."""
         self.omitted = 0
         """Rows of vehicles beyond the VEHICLES_MAX that are shown."""
+        self._zones: str | None = None
+        """Zones as they were changed in flight; None before that."""
         self.network = Network(0)
         self.said: deque[tuple[float, str]] = deque(maxlen=SAID_MAX)
         """Newest events, oldest first: time of flight [s] and sentence."""
@@ -433,6 +440,8 @@ class State:
         return track
 
     def _said(self, event: Event, time_ns: int) -> None:
+        if isinstance(event, Changed) and event.key == ZONED:
+            self._zones = msgspec.json.decode(event.after)
         moves = isinstance(event, Changed) and event.key == LED
         if moves or isinstance(event, Counted | Listening | Plaintext):
             return
@@ -456,6 +465,33 @@ class State:
     def title(self) -> str:
         """What the scenario shows, or else its name."""
         return self.scenario.title or self.name
+
+    @property
+    def zones(self) -> str:
+        """Zones of a mission, as they are written."""
+        return self.scenario.mission.zones if self._zones is None else self._zones
+
+    @property
+    def kept(self) -> Zones:
+        """Zones of a mission; none where a file of theirs is on another machine."""
+        try:
+            return zones.parse(self.zones, self.scenario.model.axes)
+        except (OSError, PolicyError):
+            return Zones()
+
+    def waits(self, number: int) -> str:
+        """What a vehicle of a mission waits for; empty for nothing."""
+        said = group(self.figures("server"), "by_vehicle", str(number)).get("waits", "")
+        return said if isinstance(said, str) else ""
+
+    def nearest_m(self, number: int) -> float:
+        """Distance from a vehicle to the nearest other one now [m]; NaN without another."""
+        rows = {each: track.row for each, track in self.vehicles.items() if track.row is not None}
+        own = rows.pop(number, None)
+        if own is None or not rows:
+            return float("nan")
+        off = [row["state"][:, 0] - own["state"][:, 0] for row in rows.values()]
+        return float(np.linalg.norm(off, axis=1).min())
 
     @property
     def lost(self) -> tuple[str, ...]:

@@ -61,7 +61,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     rows.append(("off the reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
     rows.append(("age of what is flown by", number(track.age_s, ".2f", " s")))
     rows.append(("age of what the server knows", number(track.known_s, ".2f", " s")))
-    rows += _autopilot(state, vehicle)
+    rows += _mission(state, vehicle) + _autopilot(state, vehicle)
     rows += _network(state, now_ns)
     curves_ms = track.curves(60).solve_ms
     solved = curves_ms[~np.isnan(curves_ms)]
@@ -122,6 +122,17 @@ def _newest(state: State) -> str:
 def _link(state: State, vehicle: int, now_ns: int) -> Word:
     word = state.link(vehicle, now_ns)
     return Word(f"link {word.word.lower()}", word.text, word.colour)
+
+
+def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
+    """Rows of a vehicle on a mission; none without one."""
+    if not state.scenario.is_mission:
+        return []
+    asked = f"at least {state.scenario.mission.separation_m:g} m"
+    return [
+        ("nearest other vehicle", f"{number(state.nearest_m(vehicle), '.2f', ' m')}, {asked}"),
+        ("waits for", state.waits(vehicle) or "–"),
+    ]
 
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:

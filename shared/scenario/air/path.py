@@ -10,7 +10,7 @@ with the time at which it has entered: delays add up, and what one impairment lo
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from skytether.shared.base.hint import hint
 from skytether.shared.scenario.air import delays, losses, queues, traces  # noqa: F401 - the table
 from skytether.shared.scenario.air.impairment import Impairment
 from skytether.shared.scenario.air.queues import Ordered, Queued
+from skytether.shared.scenario.calls import QUOTED, calls
 from skytether.shared.scenario.policies import PolicyError
 from skytether.shared.scenario.registry import IMPAIRMENTS, Entry
 
@@ -26,12 +27,8 @@ TEXT_MAX = 1000
 PARTS_MAX = 16
 """Largest number of impairments of a direction."""
 
-_QUOTED = r'"[^"]*"'
-_PART = re.compile(
-    rf"\s*([a-z_]\w*(?:-\w+)*)\s*(?:\(((?:{_QUOTED}|[^()\"])*)\))?\s*", re.IGNORECASE | re.ASCII
-)
 _ARGUMENT = re.compile(
-    rf"\s*(?:([a-z_]\w*)\s*=\s*)?({_QUOTED}|[^,=\"]+?)\s*", re.IGNORECASE | re.ASCII
+    rf"\s*(?:([a-z_]\w*)\s*=\s*)?({QUOTED}|[^,=\"]+?)\s*", re.IGNORECASE | re.ASCII
 )
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 
@@ -89,7 +86,7 @@ def parse(text: str) -> tuple[Part, ...]:
         return ()
     if len(text) > TEXT_MAX:
         raise PolicyError(f"{text[:40]}…", f"at most {TEXT_MAX} characters")
-    parts = tuple(_part(name, arguments) for name, arguments in _split(text))
+    parts = tuple(_part(name, arguments) for name, arguments in calls(text, IMPAIRMENTS.form))
     if len(parts) > PARTS_MAX:
         raise PolicyError(text, f"at most {PARTS_MAX} impairments")
     return parts
@@ -128,19 +125,6 @@ def _path(parts: tuple[Part, ...], _: tuple[Entry, ...]) -> Path:
     return Path(parts)
 
 
-def _split(text: str) -> Iterator[tuple[str, str | None]]:
-    """Names of impairments, and what stands in their parentheses."""
-    at = 0
-    while True:
-        found = _PART.match(text, at)
-        if not found or (found.end() < len(text) and text[found.end()] != "&"):
-            raise PolicyError(text, IMPAIRMENTS.form)
-        yield found[1], found[2]
-        at = found.end() + 1
-        if at > len(text):
-            return
-
-
 def _part(name: str, arguments: str | None) -> Part:
     entry = IMPAIRMENTS.get(name)
     written = name if arguments is None else f"{name}({arguments})"
@@ -164,7 +148,7 @@ def _part(name: str, arguments: str | None) -> Part:
 
 def _arguments(text: str) -> list[str]:
     """Arguments between commas that stand in no quotes."""
-    return re.findall(rf"(?:{_QUOTED}|[^,])+", text) if text.strip() else []
+    return re.findall(rf"(?:{QUOTED}|[^,])+", text) if text.strip() else []
 
 
 def _value(word: str) -> float | str:

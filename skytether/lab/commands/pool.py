@@ -31,7 +31,7 @@ from skytether.lab.search import Generation, Search, SearchPoint, Values, best
 from skytether.lab.sweep import Done, FlightTask, Results, Sweep
 from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.schema import TABLES, Scenario
 from skytether.shell import command, plugins, temporary
 from skytether.shell.command import Bar, CommandError
 from skytether.shell.plugins import Plugin
@@ -293,7 +293,7 @@ def pinned(scenario: Scenario, files: Mapping[str, str]) -> Iterator[Scenario]:
         ConfigError: the file has changed since the work began, or is another one on this machine.
     """
     reference = scenario.reference
-    if reference.shape != "csv" or reference.file not in files:
+    if reference.shape not in TABLES or reference.file not in files:
         yield scenario
         return
     content, expected = Path(reference.file).read_bytes(), files[reference.file]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from skytether.view import words
 from skytether.view.browser.flight import PageFlight
@@ -26,11 +27,12 @@ from skytether.view.controls import (
 )
 from skytether.view.plots import POINTS, Look, Plots, of_flight, of_link, of_network
 from skytether.view.scene import GROUND_RGB, WIDE, Scene, in_space
-from skytether.view.state import LED, VehicleTrack
+from skytether.view.state import LED, ZONED, VehicleTrack
 
 HELD_S = 1.5
 """Time for which a slider that was moved is left where it is [s]."""
 IMPAIRMENTS = 'Impairments joined by &, as in "constant(0.05) & loss(0.1)", see docs/network.md'
+ZONES = "Zones joined by &, as in 'box(-1, 1, 2, 3) & cylinder(0, -2, 0.5)', see docs/together.md"
 FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
@@ -268,6 +270,7 @@ class Controls:
         self._network = _Network(gui, partial(self._all, "netem"), flies=flies)
         self._thresholds: list[_Slider] = []
         self._lead: _Lead | None = None
+        self._zones: _Zones | None = None
         if flies:
             self._let_fly()
 
@@ -295,6 +298,8 @@ class Controls:
         gui.add_text("Scheme", scenario.control.scheme, disabled=True, hint=FIXED)
         if scenario.reference.shape == "live":
             self._lead = _Lead(self._client, self._flights)
+        if scenario.is_mission:
+            self._zones = _Zones(self._client, self._flights, partial(self._all, "server"))
 
         @self._trigger.on_update
         async def _(event: Any) -> None:
@@ -348,6 +353,52 @@ class Controls:
             assign(self._armed, armed)
         if self._lead:
             self._lead.show()
+        if self._zones:
+            self._zones.show()
+
+
+class _Zones:
+    """Zones of a mission: a text, and boxes between two places that are clicked."""
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        flights: Sequence[PageFlight],
+        ask: Callable[[dict[str, Any]], None],
+    ) -> None:
+        self._state, self._known = flights[0].state, flights[0].state.zones
+        gui = client.gui
+        with gui.add_folder("Zones"):
+            self._text = gui.add_text("As text", self._known, hint=ZONES)
+            apply = gui.add_button("Change the zones")
+            draw = gui.add_checkbox("Draw one", False, hint="Click two corners of a box.")
+        corners: list[NDArray[Any]] = []
+
+        @apply.on_click
+        async def _(_: Any) -> None:
+            ask({ZONED: self._text.value})
+
+        @draw.on_update
+        async def _(_: Any) -> None:
+            corners.clear()
+
+        @client.scene.on_click()
+        def _(event: viser.SceneClickEvent) -> None:
+            origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            if not draw.value or direction[2] * origin[2] >= 0:  # it is the sky that was clicked
+                return
+            corners.append((origin - direction * origin[2] / direction[2])[:2])
+            if len(corners) == 2:
+                (x0, y0), (x1, y1) = np.sort(np.round(corners, 2), axis=0)
+                corners.clear()
+                box = f"box({x0}, {x1}, {y0}, {y1})"
+                ask({ZONED: " & ".join(filter(None, (self._state.zones, box)))})
+
+    def show(self) -> None:
+        """Show the zones once they are others than before."""
+        if self._state.zones != self._known:
+            self._known = self._state.zones
+            assign(self._text, self._known)
 
 
 class _Lead:

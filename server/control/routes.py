@@ -1,0 +1,151 @@
+"""Ways around zones: the shortest line from a place to a goal that keeps its distance from them.
+
+The nodes of a visibility graph stand off the corners of zones; two that see each other are joined
+by the straight line between them. Shortest ways between all of them are found once (Floyd and
+Warshall). Ways are level: zones wholly above or below a vehicle and its goal are in no way.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+
+from skytether.shared.law.model import Array, Flags
+from skytether.shared.scenario.zones import Zones
+
+NODES_MAX = 200
+"""Largest number of nodes; the corners of zones with more are left out, the sharpest last."""
+OFF_M = 0.1
+"""Distance of nodes from corners beyond that which is kept [m]."""
+GRAPHS_MAX = 64
+"""Largest number of graphs that are kept, each of the zones at some heights."""
+TINY_M = 1e-6
+"""As much as floating point may make of that."""
+
+
+class Routes:
+    """Ways around zones.
+
+    Args:
+        zones: what is in the way.
+        room_m: distance that a way keeps from them [m].
+    """
+
+    def __init__(self, zones: Zones, room_m: float) -> None:
+        self._zones, self._room_m = zones, room_m
+        self._graph = lru_cache(GRAPHS_MAX)(self._make)
+
+    def way(self, place: Array, goal: Array) -> Array:
+        """The shortest way: its corners, and the goal behind them; that alone where there is none.
+
+        Args:
+            place, goal: shape (axes,).
+
+        Returns:
+            shape (n, axes); n >= 1.
+        """
+        corners = self._graph(self._heights(place, goal)).corners(place[:2], goal[:2])
+        found = np.repeat(goal[None], len(corners) + 1, axis=0)
+        found[:-1, :2] = corners
+        return found
+
+    def reaches(self, place: Array, goal: Array) -> bool:
+        """Whether there is a way; shapes (axes,)."""
+        graph = self._graph(self._heights(place, goal))
+        return bool(graph.sees(place[None, :2], self.way(place, goal)[:1, :2])[0])
+
+    def _heights(self, place: Array, goal: Array) -> tuple[bool, ...]:
+        """Which zones are at heights between those of two places."""
+        if len(place) < 3:
+            return (True,) * len(self._zones.zones)
+        low, high = sorted((float(place[2]), float(goal[2])))
+        room_m = self._room_m
+        return tuple(
+            zone.is_fence or (zone.low_m - room_m < high and low < zone.high_m + room_m)
+            for zone in self._zones.zones
+        )
+
+    def _make(self, heights: tuple[bool, ...]) -> "Graph":
+        there = zip(self._zones.zones, heights, strict=True)
+        level = [
+            zone._replace(low_m=-np.inf, high_m=np.inf) for zone, is_there in there if is_there
+        ]
+        return Graph(Zones(level), self._room_m)
+
+
+class Graph:
+    """Visibility graph in the plane.
+
+    Args:
+        zones: what is in the way, of any height.
+        room_m: distance that a way keeps from them [m].
+    """
+
+    def __init__(self, zones: Zones, room_m: float) -> None:
+        self._zones, self._room_m = zones, room_m
+        self._nodes = _nodes(zones, room_m + OFF_M)
+        if len(self._nodes):
+            clear = zones.clearance(self._nodes).min(axis=1) >= room_m
+            self._nodes = self._nodes[clear][:NODES_MAX]
+        n = len(self._nodes)
+        here, there = np.triu_indices(n, 1)
+        far = np.full((n, n), np.inf)
+        np.fill_diagonal(far, 0.0)
+        if n > 1:
+            seen = self.sees(self._nodes[here], self._nodes[there])
+            here, there = here[seen], there[seen]
+            far[here, there] = np.linalg.norm(self._nodes[here] - self._nodes[there], axis=1)
+            far[there, here] = far[here, there]
+        after = np.where(np.isfinite(far), np.arange(n), -1)
+        for via in range(n):
+            longer = far > far[:, [via]] + far[[via]]
+            far = np.where(longer, far[:, [via]] + far[[via]], far)
+            after = np.where(longer, after[:, [via]], after)
+        self._far, self._after = far, after
+        """Length of the shortest way between two nodes, infinite without one [m], and the node that
+        comes next on it."""
+
+    def corners(self, place: Array, goal: Array) -> Array:
+        """Corners of the shortest way between two places; none where there is no way."""
+        here, there, nodes = place[None], goal[None], self._nodes
+        if not len(nodes) or self.sees(here, there)[0]:
+            return nodes[:0]
+        long = self._lengths(here)[:, None] + self._far + self._lengths(there)
+        via, at = np.unravel_index(int(long.argmin()), long.shape)
+        if not np.isfinite(long[via, at]):
+            return nodes[:0]
+        found = [int(via)]
+        while found[-1] != at:
+            found.append(int(self._after[found[-1], at]))
+        return nodes[found]
+
+    def sees(self, here: Array, there: Array) -> Flags:
+        """Whether straight lines keep their distance; shape (n,), of two of shape (n, 2)."""
+        clear: Flags = self._zones.along(np.stack([here, there], axis=1)) > self._room_m - TINY_M
+        return clear
+
+    def _lengths(self, here: Array) -> Array:
+        """Distances of nodes from a place, infinite of those that it does not see; shape (n,)."""
+        nodes = self._nodes
+        seen = self.sees(np.broadcast_to(here, nodes.shape), nodes)
+        return np.where(seen, np.linalg.norm(nodes - here, axis=1), np.inf)
+
+
+def _nodes(zones: Zones, off_m: float) -> Array:
+    """Places off the corners of zones, outward on the line that halves each [m]; shape (n, 2)."""
+    found = [np.zeros((0, 2))]
+    for zone in zones.zones:
+        corners = zone.corners
+        after, before = (
+            np.roll(corners, -1, axis=0) - corners,
+            np.roll(corners, 1, axis=0) - corners,
+        )
+        after /= np.maximum(np.linalg.norm(after, axis=1, keepdims=True), 1e-9)
+        before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-9)
+        halves = after + before
+        size = np.linalg.norm(halves, axis=1, keepdims=True)
+        straight = size[:, 0] < 1e-6
+        halves[straight] = np.stack([-after[straight, 1], after[straight, 0]], axis=1)
+        size[straight] = 1.0
+        # Both ways: one of them is where vehicles may be.
+        found += [corners - sign * off_m * halves / size for sign in (1.0, -1.0)]
+    return np.concatenate(found)

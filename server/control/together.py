@@ -1,0 +1,469 @@
+"""Motions that keep vehicles apart, and out of zones, whichever packets are lost.
+
+A motion is where a vehicle is at every time: a spline that ends at rest, and rest from there on. It
+is sent as a trajectory whose knots are all of it, so a vehicle that hears nothing more flies it to
+its end and hovers there. For each vehicle the server keeps every motion that may be flown:
+
+- the one in force at its newest observation, which acknowledges it; and
+- each that was sent since, as long as a packet may still be taken. Aboard a trajectory is taken no
+  later than `link.join_s` after its first knot, so an observation made later says for certain
+  whether it was.
+
+A new motion is sent only if at every time it keeps the distance
+
+    D = separation_m + 2 tube_m
+
+from all motions of all other vehicles that may be flown, with `tube_m` for how far a vehicle is
+from its motion (wind, tracking, clocks); from one that was seen outside its tube, as much more as
+it was. Those were apart already. So whichever of them are taken,
+and whichever packets are lost, vehicles are `separation_m` apart, as long as each stays in its tube
+(docs/together.md has the theorem). From zones it keeps `tube_m`. The motion in force is always a
+way out: it needs no packet.
+
+`motionplan` has the QP, `apart` the distances, `routes` the ways around zones. A vehicle that comes
+no nearer to its goal aims to the right of it instead, ever further round, and then in directions
+that are drawn: so those that meet pass each other.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.server.control import apart
+from skytether.server.control.apart import Flown, HalfPlanes
+from skytether.server.control.motionplan import MotionPlan
+from skytether.server.control.planner import FIGURES, Figures
+from skytether.server.control.routes import Routes
+from skytether.server.control.scheme import Foresight
+from skytether.shared.base.chance import stream
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
+from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
+
+LONGEST = (INTERVALS + JOIN_MAX) * SPACING
+"""Steps that a motion takes at most."""
+MARGIN_M = 0.03
+"""By how much more than D motions are planned apart: between the times at which the plan keeps it,
+and for the solver's tolerance [m]."""
+BEGINS_M = 2.0
+"""Distance from its first goal within which a vehicle is sent there to begin [m]."""
+RESTS_MPS = 0.2
+"""Measured speed up to which a vehicle rests [m/s]."""
+ARRIVED_M = 0.02
+"""Distance from the goal at which a motion ends there [m]."""
+AIM_M = 3.0
+"""Distance of what is aimed at in place of the goal [m]."""
+AHEAD_M = 1.5
+"""How far ahead on a way around zones a vehicle aims [m]."""
+TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
+"""By how much further round a vehicle aims that is stuck, how far at most before directions are
+drawn, and by how much less once it moves [rad]."""
+TRIES = 5
+"""Number of directions that are tried at a time."""
+ROUNDS = 5
+"""Number of times that constraints are taken in for one of them."""
+STUCK = 0.3
+"""Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
+BINDS_M = 1e-4
+"""Distance from a half-plane up to which it holds a motion back [m]."""
+
+
+class Sent(NamedTuple):
+    """A motion that was sent."""
+
+    step: int
+    """Step of its packet."""
+    motion: Motion
+
+
+class Known:
+    """What is known of one vehicle."""
+
+    def __init__(self) -> None:
+        self.in_force: Sent | None = None
+        """Motion that it flies, with its packet's step; None before the first observation."""
+        self.sent: deque[Sent] = deque(maxlen=64)
+        """Motions sent after that, oldest first, that may still be taken."""
+        self.next: Motion | None = None
+        """Motion to be sent at this step."""
+        self.turned = 0.0
+        """Angle by which it aims to the right of its goal [rad]."""
+        self.heard = False
+        """Whether an observation has come in this session."""
+        self.unknown_until = -1
+        """Step from which on a motion is over that another server has sent."""
+        self.off_m = 0.0
+        """How far outside its tube it may be, as it was seen last [m]."""
+        self.speed_mps = 0.0
+        """How fast it was then [m/s]."""
+        self.waits = ""
+        """What it waits for, as the operator is told; empty: for nothing."""
+
+    def motions(self) -> list[Motion]:
+        """All that may be flown, the one to be sent at this step included."""
+        flown = [self.in_force.motion] if self.in_force else []
+        flown += [each.motion for each in self.sent]
+        return [*flown, self.next] if self.next else flown
+
+
+class Together:
+    """The scheme "trajectory" for missions: motions that keep apart.
+
+    Args:
+        scenario: what is asked for, as `mission` says it, and the seed of directions.
+        terms: the rule of flight.
+        capacity: number of vehicles there can be.
+        block: number of vehicles that are decided on at a time.
+        references: where each vehicle wants to be, by its number.
+        number_of: number of the vehicle in a row.
+    """
+
+    solve_ns = -1
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        terms: Terms,
+        capacity: int,
+        block: int,
+        references: Callable[[int], Reference],
+        number_of: Callable[[int], int],
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self.left: list[tuple[int, float]] = []
+        """Vehicles that have left their tube since this was emptied, and how far outside they were
+        [m]."""
+        self.observed_step: Indices = np.full(capacity, -1, dtype=np.int64)
+        self.figures: Figures = np.zeros(block, dtype=FIGURES)
+        self.planned = np.zeros((block, terms.axes, 2))
+        self._state = np.zeros((capacity, terms.axes, 2))
+        self._rows: dict[int, Known] = {}
+        """What is known of vehicles, by row."""
+        self._references, self._number_of = references, number_of
+        goals = scenario.make_reference()
+        self._absent = set(goals.vehicles) if isinstance(goals, Mission) else set[int]()
+        """Numbers of vehicles on the mission that were not yet at rest where it begins."""
+        mission = scenario.mission
+        self._apart_m = mission.separation_m + 2.0 * mission.tube_m
+        self._scale = np.ones(terms.axes)
+        """By what coordinates are multiplied before distances of vehicles are taken."""
+        self._scale[2:] = mission.separation_m / mission.height_m if mission.height_m else 1.0
+        bend_m = apart.bend_m(float(np.sqrt(terms.axes)) * mission.acceleration_mps2, terms.dt_s)
+        self._tube_m, self._bend_m, self._dt_s = mission.tube_m, bend_m, terms.dt_s
+        self._join = terms.join
+        self._lead = -(-self._join // SPACING) * SPACING
+        """Steps after the first knot from which on a motion differs from the one in force."""
+        self._again = terms.age_max // 3
+        """Steps after which a motion is sent again, before it is too old to be flown."""
+        self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
+        """How fast it comes to rest without a motion [s, m/s²]."""
+        self._plan = MotionPlan(terms, mission.acceleration_mps2, mission.speed_mps)
+        self._rng = stream(scenario.seed, "together")
+        self._now, self._ahead = 0, dict[int, int]()
+        """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
+        self._flown = Flown(terms.axes)
+        """All motions that may be flown at this tick."""
+        self.change_zones(scenario.zones)
+
+    def forget(self, row: int) -> None:
+        """See `Scheme`; motions stay, for the vehicle goes on with them."""
+        self.observed_step[row] = -1
+        if row in self._rows:
+            self._rows[row].heard = False
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """See `Scheme`."""
+        if observation.step <= self.observed_step[row]:
+            return False
+        k = observation.step
+        self.observed_step[row] = k
+        self._state[row] = observation.state
+        known = self._rows.setdefault(row, Known())
+        if observation.in_force == NO_HORIZON:
+            # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
+            known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
+            if not observation.takes:
+                known.sent.clear()
+        elif known.in_force is None or known.in_force.step != observation.in_force:
+            found = next((each for each in known.sent if each.step == observation.in_force), None)
+            if found is None:  # of another server, or of a vehicle that was in this row before
+                known.unknown_until = observation.in_force + LONGEST
+                found = Sent(observation.in_force, resting(k, observation.state[:, 0]))
+            known.in_force = found
+        if k <= known.unknown_until:
+            known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
+        newest, motion = known.in_force
+        self._measure(row, known, motion.at(np.array([float(k)]), self._dt_s)[0][0])
+        while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
+            gone = known.sent.popleft()
+            self.counts["horizons_lost"] += gone.step > newest
+        known.heard = True
+        return True
+
+    def _measure(self, row: int, known: Known, expected: Array) -> None:
+        """Take note of how far a vehicle may be from where its motion has it."""
+        number, state = self._number_of(row), self._state[row]
+        assert known.in_force is not None
+        off_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
+        known.speed_mps = float(np.linalg.norm(state[:, 1]))
+        if known.in_force.step < 0:  # it brakes, and rests further on than where it was seen
+            off_m = max(off_m, known.speed_mps * (self._tau_s + known.speed_mps / self._braking))
+        elif off_m <= 0.0:
+            self._absent.discard(number)
+        elif number not in self._absent:
+            self.counts["left_tube"] += 1
+            if not known.off_m:
+                self.left.append((number, off_m))
+        known.off_m = 0.0 if number in self._absent else max(off_m, 0.0)
+
+    def _place(self, row: int, observed: Array) -> Array:
+        """Where a vehicle without a motion rests: where the mission begins, unless it has begun."""
+        number = self._number_of(row)
+        if number not in self._absent:
+            return observed
+        first: Array = self._references(number)(np.zeros(()))[:, 0]
+        return first if np.linalg.norm(first - observed) < BEGINS_M else observed
+
+    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+        """See `Scheme`: what was observed, as it is."""
+        n = len(rows)
+        found.estimate[:n] = found.start[:n] = self._state[rows]
+
+    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+        """Plan for vehicles every SPACING steps, not all at the same."""
+        figures = self.figures
+        steps = dict(zip(rows.tolist(), step.tolist(), strict=True))
+        self._meet(steps)
+        figures["row"][: len(rows)], figures["step"][: len(rows)] = rows, step
+        figures["start"][: len(rows)], figures["gap"][: len(rows)] = step, 1
+        figures["solved"], figures["fresh"] = True, False
+        for name in ("state_gap", "expected_gap", "cost_gap", "deviation_m"):
+            figures[name] = 0.0
+        for i, (row, k) in enumerate(steps.items()):
+            known = self._rows.setdefault(row, Known())
+            turn = (k - self._number_of(row)) % SPACING == 0
+            if known.in_force is not None and known.heard and turn:
+                self._decide(row, known, k)
+                figures["expected_gap"][i] = 0.0 if known.next is None else 1e9
+        self.planned[: len(rows)] = self._state[rows]
+
+    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
+        """See `Scheme`; the knots of what is sent."""
+        for i in event.nonzero()[0].tolist():
+            known, k = self._rows[int(rows[i])], int(step[i])
+            motion = known.next
+            if motion is None:
+                assert known.in_force is not None
+                motion = known.in_force.motion
+            count = min(max((motion.last - k) // SPACING, 0) + 1, KNOTS_MAX)
+            p, v = motion.at(k + SPACING * np.arange(count, dtype=np.float64), self._dt_s)
+            knots = np.stack([p, v], axis=-1).transpose(1, 0, 2).reshape(p.shape[1], -1)
+            found.told.knots[i, :, : 2 * count] = knots
+            found.told.number[i], found.told.spacing[i] = count, SPACING
+            known.sent.append(Sent(k, motion))
+
+    # -- zones -------------------------------------------------------------------------------------
+
+    def change_zones(self, zones: Zones) -> None:
+        """Keep out of other zones from now on, to which `objection` has nothing to say."""
+        self._zones, self._routes = zones, Routes(zones, self._tube_m)
+
+    def objection(self, zones: Zones) -> str:
+        """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
+        for number in sorted(self._absent):
+            first = self._references(number)(np.zeros(1))[:, :, 0]
+            if zone := zones.in_the_way(first, self._tube_m):
+                return f"{zone}, in which vehicle {number} is to begin, tube included"
+        for row, known in self._rows.items():
+            for motion in known.motions():
+                k = self._now + self._ahead.get(row, 0)
+                points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
+                if zone := zones.in_the_way(points, self._tube_m + self._bend_m):
+                    left_s = max(motion.last - k, 0) * self._dt_s
+                    does = f"may fly into for {left_s:.1f} s more" if left_s else "hovers in"
+                    return f"{zone}, which vehicle {self._number_of(row)} {does}, tube included"
+        return ""
+
+    def waits(self, row: int) -> str:
+        """What a vehicle waits for; empty: for nothing."""
+        return self._rows[row].waits if row in self._rows else ""
+
+    # -- what is decided ---------------------------------------------------------------------------
+
+    def _meet(self, steps: dict[int, int]) -> None:
+        """Bring the steps of all vehicles onto one grid, and all motions that may be flown."""
+        known = [k - self._ahead[row] for row, k in steps.items() if row in self._ahead]
+        self._now = int(np.median(known)) if known else self._now + 1
+        self._ahead |= {row: k - self._now for row, k in steps.items()}
+        self._flown.clear()
+        for row, each in self._rows.items():
+            if row in steps:
+                each.next = None
+            for motion in each.motions():
+                self._flown.add(motion, self._ahead.get(row, 0), row, each.off_m)
+
+    def _decide(self, row: int, known: Known, k: int) -> None:
+        """Find the motion to be sent to a vehicle now, if any."""
+        base = known.in_force
+        assert base is not None
+        known.waits = ""
+        if known.sent:
+            # Whether that was taken is not known yet.
+            known.waits = "an acknowledgement"
+            return
+        if base.step < 0:
+            if known.speed_mps > RESTS_MPS:
+                known.waits = "coming to rest"
+            else:
+                known.next = base.motion  # it has none: first of all the place where it hovers
+            return
+        if k - base.step > self._again:
+            known.next = base.motion  # or it would end aboard, and the vehicle drift
+            return
+        if self._absent:
+            known.waits = f"vehicle {min(self._absent)} to begin"
+            return
+        for other, each in self._rows.items():
+            if each.heard and self.observed_step[other] <= each.unknown_until:
+                known.waits = f"vehicle {self._number_of(other)}, of another server's motion"
+                return
+        sample = self._references(self._number_of(row))
+        goal = sample(np.array(k * self._dt_s))[:, 0]
+        if np.abs(base.motion.position[-1] - goal).max() < ARRIVED_M:
+            known.turned = 0.0
+            return
+        known.next = self._toward(row, known, k, goal)
+        if known.next is None:
+            self.counts["stuck"] += 1
+        else:
+            self._flown.add(known.next, self._ahead[row], row, known.off_m)
+
+    def _toward(self, row: int, known: Known, k: int, goal: Array) -> Motion | None:
+        """A motion from the one in force towards a goal, apart from all; None where none is found.
+
+        Of the constraints only those are taken in that a solution without them has violated: mostly
+        nothing is near, and the way is straight.
+        """
+        assert known.in_force is not None
+        dt_s, plan, base = self._dt_s, self._plan, known.in_force.motion
+        due = k + self._lead
+        (p0,), (v0,) = base.at(np.array([float(due)]), dt_s)
+        kept_p, kept_v = base.at(np.arange(k, due, SPACING, dtype=np.float64), dt_s)
+        planes, taken = None, np.zeros(self._flown.count + 1, dtype=np.bool_)
+        for aim in self._aims(known, p0, goal):
+            for _ in range(ROUNDS):
+                held = planes.of_some(taken) if planes else None
+                solved = plan.solve(p0, v0, aim, held and held[:3])
+                if solved is None:
+                    self.counts["unsolved"] += 1
+                    return None
+                p, v = solved
+                motion = Motion(k, np.concatenate([kept_p, p]), np.concatenate([kept_v, v]))
+                hit = self._hit(row, motion, k)
+                if not (hit & ~taken).any():
+                    break
+                taken |= hit
+                planes = planes or self._planes(row, base, due)
+            moved_m, far_m = (float(np.linalg.norm(end - p0)) for end in (p[-1], aim))
+            if moved_m >= STUCK * min(far_m, 2.0) and not hit.any():
+                known.waits, known.turned = "", max(0.0, known.turned - TURN_BACK)
+                return motion
+            if held:
+                known.waits = known.waits or self._blocker(solved, held)
+            self.counts["refused"] += bool(hit.any())
+        return None
+
+    def _aims(self, known: Known, place: Array, goal: Array) -> Iterator[Array]:
+        """What to fly to: a point of the way to the goal, its next corner, or right of that."""
+        way = self._routes.way(place, goal)
+        if not known.turned:
+            if len(way) > 1:
+                yield _along(place, way, AHEAD_M)
+            yield way[0]
+            known.turned = TURN
+        ahead = way[0, :2] - place[:2]
+        far = float(np.linalg.norm(ahead))
+        ahead = ahead / far if far > 1e-9 else np.array([1.0, 0.0])
+        reach_m = AIM_M if len(way) > 1 else min(float(np.linalg.norm(goal - place)), AIM_M)
+        for _ in range(TRIES):
+            c, s = np.cos(-known.turned), np.sin(-known.turned)
+            aim = place.copy()
+            aim[:2] += reach_m * np.array(
+                [c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]]
+            )
+            yield aim
+            known.turned += TURN
+            if known.turned > TURN_MAX:
+                known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
+
+    def _planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
+        """Half-planes of the others' motions, and behind them those of zones."""
+        plan, ahead = self._plan, self._ahead[row]
+        times = due + plan.times * SPACING
+        held, _ = base.at(times, self._dt_s)
+        found = apart.half_planes(
+            times - ahead,
+            held,
+            plan.reach_m,
+            row,
+            self._flown,
+            self._scale,
+            self._apart_m + MARGIN_M + self._rows[row].off_m,
+            self._dt_s,
+        )
+        if not self._zones:
+            return found
+        near = self._zones.planes(held, plan.reach_m + self._tube_m + MARGIN_M)
+        least = np.minimum(self._tube_m + MARGIN_M, near.away_m - 1e-4)
+        least += np.einsum("ij,ij->i", near.normal, near.border)
+        return HalfPlanes(
+            np.concatenate([found.at, near.at]),
+            np.concatenate([found.normal, near.normal]),
+            np.concatenate([found.least, least]),
+            np.concatenate([found.of, np.full(len(near.at), self._flown.count)]),
+        )
+
+    def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
+        """What holds a motion back most, in words."""
+        position = self._plan.at_times(*solved)
+        room = np.einsum("ij,ij->i", planes.normal, position[planes.at]) - planes.least
+        binding = planes.of[room < BINDS_M]
+        if not len(binding):
+            return ""
+        index, often = np.unique(binding, return_counts=True)
+        most = int(index[often.argmax()])
+        if most == self._flown.count:
+            return "a zone"
+        return f"vehicle {self._number_of(int(self._flown.of[most]))}"
+
+    def _hit(self, row: int, motion: Motion, k: int) -> Flags:
+        """Which motions of others one comes too near to, ever, and last whether it does a zone."""
+        ahead, flown = self._ahead[row], self._flown
+        common = Motion(motion.first - ahead, motion.position, motion.velocity)
+        least = apart.least_apart(common, k - ahead, row, flown, self._scale, self._dt_s)
+        enters = False
+        if self._zones:
+            points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
+            enters = bool((self._zones.along(points) < self._tube_m + self._bend_m).any())
+        kept_m = self._apart_m + 2.0 * self._bend_m + self._rows[row].off_m
+        return np.append(least < kept_m + flown.wide_m, enters)
+
+
+def _along(place: Array, way: Array, far_m: float) -> Array:
+    """Point of a way that is so far ahead on it, or its end."""
+    for corner in way:
+        step_m = float(np.linalg.norm(corner - place))
+        if step_m >= far_m:
+            break
+        place, far_m = corner, far_m - step_m
+    else:
+        return place
+    there: Array = place + far_m / step_m * (corner - place)
+    return there

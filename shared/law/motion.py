@@ -1,0 +1,64 @@
+"""Motions of vehicles that keep apart: where one is at every time.
+
+A motion has knots SPACING steps apart, at multiples of SPACING of the vehicle's own steps, with
+constant acceleration between them, and rests from the last one on. It is sent as a trajectory of as
+many knots (`shared.law.spline`): the cubic between two of them is that very motion.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.shared.law.model import Array
+
+SPACING = 10
+"""Steps from one knot to the next."""
+INTERVALS = 12
+"""Number of intervals that are planned."""
+JOIN_MAX = 3
+"""Largest number of intervals before these, in which a motion is the one that is flown already."""
+
+
+class Motion(NamedTuple):
+    """Where a vehicle is at every time, by its own steps."""
+
+    first: int
+    """Step of the first knot, a multiple of SPACING."""
+    position: Array
+    """Position of each knot [m]; shape (knots, axes)."""
+    velocity: Array
+    """Velocity of each knot, 0 at the last [m/s]; shape (knots, axes)."""
+
+    @property
+    def last(self) -> int:
+        """Step of the last knot; it rests from there on."""
+        return self.first + (len(self.position) - 1) * SPACING
+
+    def at(self, steps: Array, dt_s: float) -> tuple[Array, Array]:
+        """Positions [m] and velocities [m/s] at steps, of which there may be fractions.
+
+        Before the first knot it rests there.
+
+        Args:
+            steps: shape (n,).
+            dt_s: length of a step [s].
+
+        Returns:
+            two arrays of shape (n, axes).
+        """
+        knots = len(self.position)
+        along = np.clip((steps - self.first) / SPACING, 0.0, knots - 1)
+        knot = np.minimum(along.astype(np.int64), max(knots - 2, 0))
+        t_s = ((along - knot) * SPACING * dt_s)[:, None]
+        v0, v1 = self.velocity[knot], self.velocity[np.minimum(knot + 1, knots - 1)]
+        acceleration = (v1 - v0) / (SPACING * dt_s)
+        return (
+            self.position[knot] + t_s * v0 + 0.5 * t_s * t_s * acceleration,
+            v0 + t_s * acceleration,
+        )
+
+
+def resting(step: int, position: Array) -> Motion:
+    """Rest at a place [m; shape (axes,)], known at a step."""
+    at = np.array([position], dtype=np.float64)
+    return Motion(step // SPACING * SPACING, at, np.zeros_like(at))

@@ -1,0 +1,148 @@
+"""Missions: goals of several vehicles, which the server keeps apart on their ways.
+
+A mission is the reference of each of its vehicles: the goal from each time on, at rest.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.reference import FAR_M, read_table
+
+SWAP_AT_S = 2.0
+"""Time at which vehicles that swap places leave [s]."""
+TIMES_MAX = 500
+"""Most times at which goals are looked at for being too near to each other."""
+
+
+class Mission:
+    """Goals of several vehicles, each from a time on: the reference of one of them.
+
+    A vehicle begins at its first goal. One that the mission does not know stays at the origin.
+
+    Args:
+        goals: times, rising [s; shape (n,)], and goals from then on [m; shape (n, axes)], of each
+            vehicle by its number.
+        vehicle: number of the one whose reference it is.
+    """
+
+    def __init__(self, goals: Mapping[int, tuple[Array, Array]], axes: int, vehicle: int) -> None:
+        self._goals, self._axes = goals, axes
+        self._times_s, self._points_m = goals.get(vehicle, (np.zeros(1), np.zeros((1, axes))))
+
+    @property
+    def vehicles(self) -> tuple[int, ...]:
+        """Numbers of the vehicles that have goals."""
+        return tuple(self._goals)
+
+    @property
+    def places(self) -> Array:
+        """All goals of all vehicles [m]; shape (n, axes)."""
+        return np.concatenate([points_m for _, points_m in self._goals.values()])
+
+    @property
+    def in_step(self) -> bool:
+        """Whether all vehicles have goals at the same times."""
+        times_s = [times_s for times_s, _ in self._goals.values()]
+        return all(np.array_equal(each, times_s[0]) for each in times_s)
+
+    @property
+    def lasts_s(self) -> float:
+        """Time of the last goal [s]."""
+        return max(float(times_s[-1]) for times_s, _ in self._goals.values())
+
+    def of(self, vehicle: int) -> "Mission":
+        """The reference of another vehicle."""
+        return Mission(self._goals, self._axes, vehicle)
+
+    def goals(self, vehicle: int) -> Array:
+        """Goals of a vehicle [m]; shape (n, axes)."""
+        return self._goals[vehicle][1]
+
+    def __call__(self, t: NDArray[Any]) -> Array:
+        """Goals at times [s]; see `Reference`."""
+        t = np.asarray(t, dtype=np.float64)
+        state = np.zeros((*t.shape, self._axes, 2))
+        at = np.searchsorted(self._times_s, t, side="right") - 1
+        state[..., 0] = self._points_m[np.maximum(at, 0)]
+        return state
+
+    def nearest(self, apart_m: float, height: float) -> tuple[int, int, float, float] | None:
+        """Two vehicles whose goals are nearer than apart_m at one time; None where none are.
+
+        Args:
+            apart_m: distance [m].
+            height: by what distances along the third axis are multiplied.
+
+        Returns:
+            their numbers, when that is [s], and the distance [m].
+        """
+        times_s = np.unique(np.concatenate([times_s for times_s, _ in self._goals.values()]))
+        times_s = times_s[:: -(-len(times_s) // TIMES_MAX)]
+        places = np.stack([self.of(each)(times_s)[..., 0] for each in self._goals])
+        places[..., 2:] *= height
+        for i, at_s in enumerate(times_s):
+            here = places[:, i]
+            away = np.linalg.norm(here[:, None] - here[None], axis=2)
+            np.fill_diagonal(away, np.inf)
+            one, other = np.unravel_index(int(away.argmin()), away.shape)
+            if away[one, other] < apart_m:
+                numbers = self.vehicles
+                return numbers[one], numbers[other], float(at_s), float(away[one, other])
+        return None
+
+    def allocated(self) -> "Mission":
+        """A mission whose goals of one time are given to the vehicles that are nearest to them.
+
+        At each time the sum of the squares of all distances is the least (linear assignment), so
+        ways cross less. The mission must be `in_step`.
+        """
+        from scipy.optimize import linear_sum_assignment  # a client does without scipy
+
+        times_s = next(iter(self._goals.values()))[0]
+        wanted = np.stack([points_m for _, points_m in self._goals.values()], axis=1)
+        given = wanted[:1]
+        for goals in wanted[1:]:
+            cost = ((given[-1][:, None] - goals[None]) ** 2).sum(axis=2)
+            given = np.append(given, goals[None, linear_sum_assignment(cost)[1]], axis=0)
+        shared = {vehicle: (times_s, given[:, i]) for i, vehicle in enumerate(self._goals)}
+        return Mission(shared, self._axes, 1)
+
+
+def swap(vehicles: int, radius_m: float, axes: int, altitude_m: float = 0.0) -> Mission:
+    """Places on a circle, from which each vehicle goes to the one opposite."""
+    goals, times_s = {}, np.array([0.0, SWAP_AT_S])
+    for number in range(1, vehicles + 1):
+        angle = 2.0 * np.pi * (number - 1) / vehicles
+        places = np.zeros((2, axes))
+        places[0, :2] = radius_m * np.array([np.cos(angle), np.sin(angle)])
+        places[1, :2] = -places[0, :2]
+        places[:, 2:] = altitude_m
+        goals[number] = times_s, places
+    return Mission(goals, axes, 1)
+
+
+def mission(path: Path, axes: int) -> Mission:
+    """Goals from a table with the columns vehicle, t [s], x, y, z [m] (as many as there are axes).
+
+    Raises:
+        OSError: see `reference.read`.
+        ValueError: with what is wrong, and in which line.
+    """
+    rows = read_table(path, ["vehicle", "t", "x", "y", "z"][: axes + 2])
+    numbers = rows[:, 0].astype(np.int64)
+    if not len(rows) or (numbers != rows[:, 0]).any() or numbers.min() < 1:
+        raise ValueError("column vehicle: expected numbers from 1")
+    goals = {}
+    for number in np.unique(numbers).tolist():
+        own = rows[numbers == number]
+        if own[0, 1] != 0.0 or (np.diff(own[:, 1]) <= 0.0).any():
+            raise ValueError(f"vehicle {number}: column t must start at 0 and rise")
+        goals[number] = own[:, 1], own[:, 2:]
+    if (np.abs(rows[:, 2:]) > FAR_M).any():
+        raise ValueError(f"expected at most {FAR_M:g} m from the origin")
+    return Mission(goals, axes, 1)

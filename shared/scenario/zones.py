@@ -1,0 +1,449 @@
+"""Zones that vehicles of a mission keep out of, or stay within.
+
+    zones := zone | zone & zones
+    zone  := box(x0, x1, y0, y1) | cylinder(x, y, radius) | polygon(x, y, x, y, x, y, …)
+           | fence(x0, x1, y0, y1) | fence(x, y, x, y, x, y, …) | corridor(width, x, y, x, y, …)
+           | geojson(file)
+
+Metres. `box` and `cylinder` take two heights more, the lowest and the highest; without them they
+reach from the ground to the sky. A vehicle keeps out of `box`, `cylinder` and `polygon`, and
+stays within every `fence` and `corridor`. Every zone is a polygon between two heights; a cylinder
+is one of 24 corners around it.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skytether.shared.base.hint import hint
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.scenario.calls import calls
+from skytether.shared.scenario.policies import PolicyError
+
+FORM = "zones such as 'box(1, 2, -1, 1) & fence(-6, 6, -6, 6)'"
+ROUND = 24
+"""Corners of a cylinder."""
+CORNERS_MAX = 1000
+"""Largest number of corners of all zones."""
+FILE_BYTES_MAX = 4_000_000
+"""Size of the largest GeoJSON file [B]."""
+EARTH_M = 6_378_137.0
+"""Radius of the earth at the equator, WGS 84 [m]."""
+
+
+class Zone(NamedTuple):
+    """A polygon between two heights."""
+
+    name: str
+    """The zone as it is written."""
+    corners: Array
+    """Corners in a row [m]; shape (n, 2)."""
+    low_m: float = -math.inf
+    high_m: float = math.inf
+    is_fence: bool = False
+    """Whether vehicles stay within it, and do not keep out of it."""
+
+
+class Planes(NamedTuple):
+    """Half-planes that keep points out of zones: normal · x ≥ normal · border + distance."""
+
+    at: Indices
+    """Index of the point of each; shape (n,)."""
+    normal: Array
+    """Unit vector from the zone's border to the point; shape (n, axes)."""
+    border: Array
+    """Nearest point of the border [m]; shape (n, axes)."""
+    away_m: Array
+    """Distance of the point from there [m]; shape (n,)."""
+
+
+class Zones:
+    """All zones of a mission, for points in the plane or in space.
+
+    Args:
+        zones: may be none.
+    """
+
+    def __init__(self, zones: Sequence[Zone] = ()) -> None:
+        self.zones = tuple(zones)
+        sizes = [len(zone.corners) for zone in zones]
+        self._starts = np.concatenate([[0], np.cumsum(sizes)])[:-1].astype(np.int64)
+        nothing = np.zeros((0, 2))
+        self._begin = np.concatenate([nothing, *(zone.corners for zone in zones)])
+        """Where each edge begins; shape (edges, 2)."""
+        ends = [np.roll(zone.corners, -1, axis=0) for zone in zones]
+        self._along = np.concatenate([nothing, *ends]) - self._begin
+        self._square = np.maximum((self._along**2).sum(axis=1), 1e-18)
+        self._sign = np.array([1.0 if zone.is_fence else -1.0 for zone in zones])
+        """Sign of the distance from the border of a point inside."""
+        self._low = np.array([zone.low_m for zone in zones])
+        self._high = np.array([zone.high_m for zone in zones])
+        self._of = np.repeat(np.arange(len(zones)), sizes)
+        """Zone of each edge."""
+
+    def __bool__(self) -> bool:
+        return bool(self.zones)
+
+    def clearance(self, points: Array) -> Array:
+        """Distance of points from what is forbidden, negative within it [m].
+
+        Args:
+            points: shape (n, axes).
+
+        Returns:
+            shape (n, zones).
+        """
+        _, away = self._nearest(points[:, :2])
+        signed = self._signed(points[:, :2], away)
+        if points.shape[1] < 3:
+            return signed
+        return self._with_height(signed, points[:, 2:], points[:, 2:])
+
+    def along(self, points: Array) -> Array:
+        """Least distance from what is forbidden on each straight piece between points [m].
+
+        It is never more than the true one, and 0 or less on a piece that touches a zone.
+
+        Args:
+            points: shape (n, axes), or pieces of shape (n, 2, axes).
+
+        Returns:
+            shape (n - 1,) or (n,); infinite without zones.
+        """
+        pieces = points if points.ndim == 3 else np.stack([points[:-1], points[1:]], axis=1)
+        if not self.zones:
+            return np.full(len(pieces), np.inf)
+        found: Array = self._least(pieces).min(axis=1)
+        return found
+
+    def in_the_way(self, points: Array, room_m: float) -> str:
+        """Name of a zone that a way through points is nearer to than room_m; empty of none."""
+        if not self.zones:
+            return ""
+        pieces = np.stack([points, np.concatenate([points[1:], points[-1:]])], axis=1)
+        near = (self._least(pieces) < room_m).any(axis=0)
+        return next((self.zones[i].name for i in np.flatnonzero(near)), "")
+
+    def _least(self, pieces: Array) -> Array:
+        """See `along`, by zone; shape (n, zones)."""
+        here, there = pieces[:, 0, :2], pieces[:, 1, :2]
+        _, away = self._nearest(here)
+        _, after = self._nearest(there)
+        way = there - here
+        off = self._begin[None] - here[:, None]
+        t = np.einsum("ijk,ik->ij", off, way) / np.maximum((way**2).sum(axis=1), 1e-18)[:, None]
+        off -= np.clip(t, 0.0, 1.0)[:, :, None] * way[:, None]
+        least = np.minimum(np.minimum(away, after), np.linalg.norm(off, axis=2))
+        least[self._crosses(here, there)] = 0.0
+        each = np.minimum.reduceat(least, self._starts, axis=1)
+        within = (self._signed(here, away) <= 0.0) | (self._signed(there, after) <= 0.0)
+        each[within] = 0.0
+        if pieces.shape[2] > 2:
+            height = pieces[:, :, 2]
+            each = self._with_height(each, height.min(axis=1)[:, None], height.max(axis=1)[:, None])
+        return each
+
+    def planes(self, points: Array, reach_m: Array) -> Planes:
+        """Half-planes between points and the zones that are near them.
+
+        Args:
+            points: outside of what is forbidden; shape (n, axes).
+            reach_m: distance from each point up to which zones matter [m]; shape (n,).
+        """
+        axes, each = points.shape[1], np.arange(len(points))
+        if not self.zones:
+            return _facing(points[:0], points[:0], each[:0])
+        found = []
+        nearest, away = self._nearest(points[:, :2])
+        inside = self._inside(points[:, :2])
+        for i, zone in enumerate(self.zones):
+            own = slice(self._starts[i], self._starts[i] + len(zone.corners))
+            if zone.is_fence:  # each of its edges by itself
+                n, edge = np.nonzero(away[:, own] < reach_m[:, None])
+                places = points[n]
+                places[:, :2] = nearest[n, edge + self._starts[i]]
+                found.append(_facing(points[n], places, n))
+                for bound in (zone.low_m, zone.high_m) if axes > 2 else ():
+                    n = np.flatnonzero(np.abs(points[:, 2] - bound) < reach_m)
+                    places = points[n]
+                    places[:, 2] = bound
+                    found.append(_facing(points[n], places, n))
+                continue
+            edge = away[:, own].argmin(axis=1) + self._starts[i]
+            places = points.copy()
+            places[:, :2] = np.where(inside[:, [i]], points[:, :2], nearest[each, edge])
+            if axes > 2:
+                places[:, 2] = np.clip(points[:, 2], zone.low_m, zone.high_m)
+            n = np.flatnonzero(np.linalg.norm(points - places, axis=1) < reach_m)
+            found.append(_facing(points[n], places[n], n))
+        return Planes(
+            np.concatenate([part.at for part in found]),
+            np.concatenate([part.normal for part in found]),
+            np.concatenate([part.border for part in found]),
+            np.concatenate([part.away_m for part in found]),
+        )
+
+    def _nearest(self, points: Array) -> tuple[Array, Array]:
+        """Nearest point of each edge, and the distance; shapes (n, edges, 2), (n, edges)."""
+        off = points[:, None] - self._begin[None]
+        t = np.clip(np.einsum("ijk,jk->ij", off, self._along) / self._square, 0.0, 1.0)
+        nearest = self._begin + t[:, :, None] * self._along
+        return nearest, np.linalg.norm(points[:, None] - nearest, axis=2)
+
+    def _inside(self, points: Array) -> Flags:
+        """Whether points are within each polygon, by the even-odd rule; shape (n, zones)."""
+        x, y = points[:, :1], points[:, 1:2]
+        begin, end = self._begin, self._begin + self._along
+        spans = (begin[:, 1] > y) != (end[:, 1] > y)
+        rise = np.where(self._along[:, 1] == 0.0, 1.0, self._along[:, 1])
+        left = x < begin[:, 0] + (y - begin[:, 1]) / rise * self._along[:, 0]
+        crossed = np.add.reduceat((spans & left).astype(np.int64), self._starts, axis=1)
+        found: Flags = crossed % 2 == 1
+        return found
+
+    def _signed(self, points: Array, away: Array) -> Array:
+        least = np.minimum.reduceat(away, self._starts, axis=1)
+        return least * np.where(self._inside(points), self._sign, -self._sign)
+
+    def _crosses(self, here: Array, there: Array) -> Flags:
+        """Whether straight pieces cross edges; shape (n, edges)."""
+        begin, end = self._begin[None], (self._begin + self._along)[None]
+        here, there = here[:, None], there[:, None]
+
+        def side(a: Array, b: Array, c: Array) -> Array:
+            left, right = b - a, c - a
+            turned: Array = left[..., 0] * right[..., 1] - left[..., 1] * right[..., 0]
+            return turned
+
+        found: Flags = (side(here, there, begin) * side(here, there, end) < 0.0) & (
+            side(begin, end, here) * side(begin, end, there) < 0.0
+        )
+        return found
+
+    def _with_height(self, signed: Array, low: Array, high: Array) -> Array:
+        """Distances in space of what reaches from one height to another, by those in the plane."""
+        off = np.maximum(self._low - high, low - self._high)
+        apart = np.where(off > 0.0, np.hypot(off, np.maximum(signed, 0.0)), np.maximum(signed, off))
+        # Within a fence: as far as from its nearest side, its floor and its ceiling.
+        within = np.minimum(signed, np.minimum(low - self._low, self._high - high))
+        return np.where(self._sign > 0.0, within, apart)
+
+
+def _facing(points: Array, places: Array, at: Indices) -> Planes:
+    """Half-planes from places to points, of those that are not the same."""
+    off = points - places
+    away: Array = np.linalg.norm(off, axis=1)
+    there = away > 1e-9
+    return Planes(at[there], off[there] / away[there, None], places[there], away[there])
+
+
+# -- as a scenario writes them -----------------------------------------------------------------
+
+
+def parse(text: str, axes: int) -> Zones:
+    """Zones that a text names; none of an empty one.
+
+    Raises:
+        PolicyError: with the part of it that is wrong.
+        OSError: a file cannot be read.
+    """
+    zones: list[Zone] = []
+    for name, arguments in calls(text, FORM):
+        written = name if arguments is None else f"{name}({arguments})"
+        make = _KINDS.get(name)
+        if make is None:
+            raise PolicyError(written, f"a zone; {hint(name, _KINDS)}")
+        try:
+            zones += make(written, arguments or "")
+        except ValueError as error:
+            raise PolicyError(written, str(error)) from None
+    if sum(len(zone.corners) for zone in zones) > CORNERS_MAX:
+        raise PolicyError(f"{text[:40]}…", f"at most {CORNERS_MAX} corners of all zones")
+    for zone in zones:
+        if axes < 3 and (zone.low_m, zone.high_m) != (-math.inf, math.inf):
+            raise PolicyError(zone.name, "no heights with model.axes = 2")
+    return Zones(zones)
+
+
+def with_files(text: str, change: Callable[[str], str]) -> str:
+    """The text with other names of its files.
+
+    Raises:
+        PolicyError: it is no list of zones.
+    """
+    return " & ".join(
+        f'{name}("{change(_file(arguments or ""))}")'
+        if name == "geojson"
+        else f"{name}({arguments or ''})"
+        for name, arguments in calls(text, FORM)
+    )
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        found = [float(word) for word in text.split(",")]
+    except ValueError:
+        raise ValueError("numbers between commas") from None
+    if not all(math.isfinite(each) and abs(each) <= 1e6 for each in found):
+        raise ValueError("numbers of at most 1e6 m")
+    return found
+
+
+def _box(written: str, text: str) -> list[Zone]:
+    given = _numbers(text)
+    if len(given) not in (4, 6) or not all(map(float.__lt__, given[::2], given[1::2])):
+        raise ValueError("box(x0, x1, y0, y1), or with z0, z1: from less to more")
+    return [_between(written, _corners(*given[:4]), given[4:])]
+
+
+def _cylinder(written: str, text: str) -> list[Zone]:
+    given = _numbers(text)
+    if len(given) not in (3, 5) or given[2] <= 0.0 or given[3:] != sorted(given[3:]):
+        raise ValueError("cylinder(x, y, radius), or with z0, z1 from less to more")
+    return [_between(written, _around(*given[:3]), given[3:])]
+
+
+def _between(written: str, corners: Array, heights: list[float]) -> Zone:
+    low, high = heights or (-math.inf, math.inf)
+    return Zone(written, corners, low, high)
+
+
+def _polygon(written: str, text: str) -> list[Zone]:
+    return [Zone(written, _points(_numbers(text), 3, "polygon"))]
+
+
+def _fence(written: str, text: str) -> list[Zone]:
+    given = _numbers(text)
+    if len(given) == 4:
+        if not (given[0] < given[1] and given[2] < given[3]):
+            raise ValueError("fence(x0, x1, y0, y1) from less to more, or at least 3 corners")
+        return [Zone(written, _corners(*given), is_fence=True)]
+    return [Zone(written, _points(given, 3, "fence"), is_fence=True)]
+
+
+def _corridor(written: str, text: str) -> list[Zone]:
+    width, *rest = _numbers(text)
+    middle = _points(rest, 2, "corridor")
+    way = np.diff(middle, axis=0)
+    long = np.linalg.norm(way, axis=1, keepdims=True)
+    if width <= 0.0 or (long < 1e-6).any():
+        raise ValueError("corridor(width, x, y, x, y, …): a width, and no point twice in a row")
+    across = np.stack([-way[:, 1], way[:, 0]], axis=1) / long
+    # The sides meet where two pieces do, on the line that halves their angle.
+    ends = np.concatenate([across[:1], across[:-1] + across[1:], across[-1:]])
+    square = (ends**2).sum(axis=1, keepdims=True)
+    if (square[1:-1] < 0.1).any():
+        raise ValueError("a corridor without a turn back")
+    ends[1:-1] *= 2.0 / square[1:-1]
+    sides = [middle + sign * width / 2.0 * ends for sign in (1.0, -1.0)]
+    return [Zone(written, np.concatenate([sides[0], sides[1][::-1]]), is_fence=True)]
+
+
+def _geojson(written: str, text: str) -> list[Zone]:
+    file = _file(text)
+    with Path(file).open("rb") as source:
+        content = source.read(FILE_BYTES_MAX + 1)
+    if len(content) > FILE_BYTES_MAX:
+        raise ValueError(f"a file of at most {FILE_BYTES_MAX} B")
+    try:
+        told = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"a GeoJSON file ({error})") from None
+    return list(_features(f"{Path(file).name}", told)) or _none(written)
+
+
+def _none(written: str) -> list[Zone]:
+    raise ValueError(f"a feature with a Polygon, a MultiPolygon or a Point in {written}")
+
+
+def _features(file: str, told: Any) -> Iterator[Zone]:
+    """Zones of a FeatureCollection.
+
+    Its `origin` is longitude and latitude of the scenario's origin; without one coordinates are
+    metres. A feature's properties may be `kind` ("keep_out" or "fence"), `low_m`, `high_m`, and
+    `radius_m` of a Point.
+
+    Raises:
+        ValueError: with what is wrong.
+    """
+    if not isinstance(told, dict) or not isinstance(told.get("features"), list):
+        raise ValueError("a GeoJSON file with a FeatureCollection")
+    origin = told.get("origin")
+    for i, feature in enumerate(told["features"]):
+        name = f"{file}: feature {i + 1}"
+        try:
+            properties = feature.get("properties") or {}
+            geometry = feature["geometry"]
+            kind, coordinates = geometry["type"], geometry["coordinates"]
+            low = float(properties.get("low_m", -math.inf))
+            high = float(properties.get("high_m", math.inf))
+            is_fence = {"keep_out": False, "fence": True}[properties.get("kind", "keep_out")]
+            label = f"{file}: {properties.get('name', f'feature {i + 1}')}"
+            if kind == "Point":
+                (place,) = _local([coordinates], origin)
+                radius = float(properties["radius_m"])
+                if not radius > 0.0:
+                    raise ValueError(f"{name} with radius_m above 0")
+                yield Zone(label, _around(place[0], place[1], radius), low, high, is_fence)
+                continue
+            parts = {"Polygon": [coordinates], "MultiPolygon": coordinates}[kind]
+            for rings in parts:
+                for ring, points in enumerate(rings):
+                    places = _local(points, origin)
+                    if len(places) > 3 and (places[0] == places[-1]).all():
+                        places = places[:-1]
+                    if len(places) < 3:
+                        raise ValueError(f"{name} with at least 3 corners")
+                    # A hole in a fence is kept out of; in what is kept out of it changes nothing.
+                    if ring == 0 or is_fence:
+                        yield Zone(label, places, low, high, is_fence and ring == 0)
+        except (KeyError, TypeError, AttributeError, IndexError) as error:
+            raise ValueError(
+                f"{name} as RFC 7946 has it, {type(error).__name__}: {error}"
+            ) from None
+
+
+def _local(points: Any, origin: Any) -> Array:
+    """East and north of the origin [m]; shape (n, 2)."""
+    places = np.array([[float(point[0]), float(point[1])] for point in points])
+    if origin is not None:
+        east, north = float(origin[0]), float(origin[1])
+        degree = math.radians(1.0) * EARTH_M
+        places = (places - [east, north]) * [degree * math.cos(math.radians(north)), degree]
+    if not (np.abs(places) <= 1e6).all():
+        raise ValueError("coordinates of at most 1e6 m from the origin")
+    return places
+
+
+def _file(text: str) -> str:
+    return text.strip().strip('"')
+
+
+def _corners(x0: float, x1: float, y0: float, y1: float) -> Array:
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+
+
+def _around(x: float, y: float, radius: float) -> Array:
+    angle = 2.0 * np.pi * np.arange(ROUND) / ROUND
+    out = radius / math.cos(math.pi / ROUND)
+    return np.array([x, y]) + out * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _points(given: list[float], least: int, name: str) -> Array:
+    if len(given) % 2 or len(given) < 2 * least:
+        raise ValueError(f"{name} with at least {least} points: x, y, x, y, …")
+    return np.array(given).reshape(-1, 2)
+
+
+_KINDS: dict[str, Callable[[str, str], list[Zone]]] = {
+    "box": _box,
+    "cylinder": _cylinder,
+    "polygon": _polygon,
+    "fence": _fence,
+    "corridor": _corridor,
+    "geojson": _geojson,
+}

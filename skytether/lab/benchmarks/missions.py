@@ -1,0 +1,247 @@
+"""Random missions over random networks: how near vehicles come to each other and to zones.
+
+    python -m skytether.lab.benchmarks.missions --missions 1000
+
+Each mission has 2 to 32 vehicles in a fence, up to six boxes, cylinders and triangles in their way,
+and a network with losses up to one half, bursts up to two seconds and delays up to half a second.
+Goals are such that each vehicle has a way to its own. All that went wrong is told by its seed:
+`--first 17 --missions 1` flies that one again.
+"""
+
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import tyro
+
+from skytether.lab.benchmarks.harness import TextTable, progress
+from skytether.lab.benchmarks.together import ARRIVED_M
+from skytether.server.control.routes import Routes
+from skytether.shared.base.chance import stream
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
+from skytether.shared.telemetry.summary import least_separation
+from skytether.shared.wire.protocol import Mode
+from skytether.sim import flight
+
+ROOM_M2 = 12.0
+"""Area for each vehicle and zone [m²]."""
+GOAL_AT_S = 2.0
+"""Time from which on all want to be at their goals [s]."""
+
+
+@dataclass(frozen=True)
+class MissionsOptions:
+    """How much to fly."""
+
+    missions: int = 100
+    first: int = 1
+    """Seed of the first."""
+    duration: float = 120.0
+    """Length of a flight [s]."""
+    workers: int = 2
+    """Number of processes."""
+    markdown: Path | None = None
+    """File for the table as Markdown."""
+
+
+class Flown(NamedTuple):
+    """What came of a mission."""
+
+    seed: int
+    vehicles: int
+    network: str
+    least_m: float
+    """Smallest distance between two vehicles [m]."""
+    clear_m: float
+    """Smallest distance of a vehicle from a zone [m]; infinite without zones."""
+    late: int
+    """Number of vehicles that have not arrived."""
+    arrived_s: float
+    """Time from the goals to the last arrival [s]; NaN if one has not."""
+    left: int
+    """Observations of a vehicle outside its tube."""
+
+
+def mission(options: MissionsOptions, seed: int, folder: Path) -> Scenario:
+    """A random mission; its table of goals is put into a folder."""
+    rng = stream(seed, "mission")
+    vehicles = int(rng.integers(2, 33))
+    obstacles = int(rng.integers(0, 7))
+    half_m = 0.5 * float(np.sqrt(ROOM_M2 * (vehicles + 2 * obstacles))) + 1.0
+    text = " & ".join(_zones(rng, obstacles, half_m))
+    file = folder / f"mission{seed}.csv"
+    kept = reading.load("swap").mission
+    apart_m = kept.separation_m + 2.0 * kept.tube_m
+    begins, ends = _places(rng, vehicles, half_m, zones.parse(text, 2), apart_m)
+    rows = [
+        f"{number},{at_s},{x:.4f},{y:.4f}\n"
+        for number, both in enumerate(zip(begins, ends, strict=True), start=1)
+        for at_s, (x, y) in zip((0.0, GOAL_AT_S), both, strict=True)
+    ]
+    file.write_text("vehicle,t,x,y\n" + "".join(rows))
+    table = reading.to_table(reading.load("swap"))
+    table |= {"seed": seed, "duration": options.duration, "settle": 1.0}
+    table["reference"] |= {"shape": "mission", "file": str(file)}
+    table["mission"]["zones"] = text
+    table["link"]["connect_s"] = 60.0
+    way = _network(rng)
+    table["network"] |= {"uplink": way, "downlink": way}
+    return reading.check(table, f"mission {seed}")
+
+
+def _zones(rng: np.random.Generator, count: int, half_m: float) -> Iterator[str]:
+    yield f"fence({-half_m:.2f}, {half_m:.2f}, {-half_m:.2f}, {half_m:.2f})"
+    for _ in range(count):
+        x, y = rng.uniform(-0.8 * half_m, 0.8 * half_m, 2)
+        wide, deep = rng.uniform(0.3, 2.0, 2)
+        match int(rng.integers(3)):
+            case 0:
+                yield f"box({x:.2f}, {x + wide:.2f}, {y:.2f}, {y + deep:.2f})"
+            case 1:
+                yield f"cylinder({x:.2f}, {y:.2f}, {wide / 2:.2f})"
+            case _:
+                turn = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(3) / 3
+                corners = np.stack([x + wide * np.cos(turn), y + wide * np.sin(turn)], axis=1)
+                yield f"polygon({', '.join(f'{each:.2f}' for each in corners.ravel())})"
+
+
+def _places(
+    rng: np.random.Generator, vehicles: int, half_m: float, kept: Zones, apart_m: float
+) -> tuple[Array, Array]:
+    """Where vehicles begin and where they go [m]; two of shape (vehicles, 2)."""
+    room_m = 0.75 * apart_m  # from zones: past a vehicle at its goal there is a way
+    routes, found = Routes(kept, room_m), list[Array]()
+    while len(found) < 2:
+        places = np.zeros((0, 2))
+        for _ in range(20_000):
+            place = rng.uniform(-half_m, half_m, (1, 2))
+            near = np.linalg.norm(places - place, axis=1) < 1.6 * apart_m
+            if near.any() or kept.clearance(place).min() < room_m + 0.05:
+                continue
+            if found and not routes.reaches(found[0][len(places)], place[0]):
+                continue
+            places = np.concatenate([places, place])
+            if len(places) == vehicles:
+                found.append(places)
+                break
+        else:
+            found.clear()  # too full: begin anew
+    return found[0], found[1]
+
+
+def _network(rng: np.random.Generator) -> str:
+    loss = rng.uniform(0.0, 0.5)
+    late = (
+        "paper(0.4, 0.02, 2)",
+        f"constant({rng.uniform(0.0, 0.4):.3f})",
+        f"gamma(0.02, {rng.uniform(0.15, 0.5):.3f}, {rng.uniform(0.02, 0.3):.3f})",
+    )[int(rng.integers(3))]
+    lost = (
+        f"loss({loss:.3f})",
+        f"gilbert_elliott({0.6 * loss + 0.01:.3f}, {rng.uniform(0.1, 2.0):.2f})",
+    )[int(rng.integers(2))]
+    return f"{late} & {lost}"
+
+
+def fly(options: MissionsOptions, seed: int) -> Flown:
+    """Fly one."""
+    with tempfile.TemporaryDirectory() as folder:
+        scenario = mission(options, seed, Path(folder))
+        goals, kept = scenario.make_reference(), scenario.zones
+        assert isinstance(goals, Mission)
+        record = flight.fly(scenario, vehicles=len(goals.vehicles))
+    told, client = record.figures["client"]["by_vehicle"], record.client
+    each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
+    began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each]
+    least = least_separation(each, began_s, scenario.control.dt)
+    assert least is not None
+    arrived_s, clear_m = [], []
+    for rows in each:
+        goal = goals.of(int(rows["vehicle"][0]))(np.array(options.duration))[:, 0]
+        away = np.flatnonzero(np.linalg.norm(rows["state"][:, :, 0] - goal, axis=1) > ARRIVED_M)
+        last = int(away.max(initial=-1)) + 1
+        arrived_s.append(last * scenario.control.dt - GOAL_AT_S if last < len(rows) else np.nan)
+        begins = int(np.argmax(rows["mode"] == Mode.TRACK))
+        flown = rows["state"][begins:, :, 0]
+        clear_m.append(float(kept.clearance(flown).min(initial=np.inf)))
+    return Flown(
+        seed,
+        len(each),
+        scenario.network.uplink.text,
+        least,
+        min(clear_m),
+        int(np.isnan(arrived_s).sum()),
+        float(np.max(arrived_s)),
+        record.figures["server"]["counts"].get("left_tube", 0),
+    )
+
+
+def table(options: MissionsOptions) -> tuple[TextTable, list[Flown]]:
+    """Fly all; what was seen, and those of which something is to be told."""
+    seeds = range(options.first, options.first + options.missions)
+    batch, flown = 4 * options.workers, list[Flown]()
+    with ProcessPoolExecutor(options.workers) as pool:
+        for first in progress(range(0, len(seeds), batch), "missions"):
+            flown += pool.map(partial(fly, options), seeds[first : first + batch])
+    asked_m = reading.load("swap").mission.separation_m
+    rows = []
+    for low, high in ((2, 8), (9, 16), (17, 24), (25, 32)):
+        those = [each for each in flown if low <= each.vehicles <= high]
+        if not those:
+            continue
+        done = [each.arrived_s for each in those if not each.late]
+        rows.append(
+            [
+                f"{low} to {high}",
+                str(len(those)),
+                f"{min(each.least_m for each in those):.3f}",
+                str(sum(each.least_m < asked_m for each in those)),
+                f"{min(each.clear_m for each in those):.3f}",
+                str(sum(each.clear_m < 0.0 for each in those)),
+                str(sum(each.left for each in those)),
+                str(len(those) - len(done)),
+                f"{np.median(done):.0f}, {max(done):.0f}" if done else "-",
+            ]
+        )
+    headings = [
+        "vehicles",
+        "missions",
+        "least separation\n[m]",
+        "nearer than\nasked",
+        "least distance\nfrom a zone [m]",
+        "in a zone",
+        "out of a tube",
+        "not all\narrived",
+        "last arrival\np50, max [s]",
+    ]
+    told = [each for each in flown if each.least_m < asked_m or each.clear_m < 0.0 or each.late]
+    return TextTable(headings, rows), told
+
+
+def main() -> int:
+    """Fly as the command line says, and print a table."""
+    options = tyro.cli(MissionsOptions, description=__doc__)
+    found, told = table(options)
+    found.show(f"{options.missions} random missions of {options.duration:g} s")
+    for each in told:
+        print(
+            f"seed {each.seed}: {each.vehicles} vehicles, {each.network}: {each.least_m:.3f} m, "
+            f"zones {each.clear_m:.3f} m, {each.late} not arrived"
+        )
+    if options.markdown:
+        options.markdown.write_text(found.markdown())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

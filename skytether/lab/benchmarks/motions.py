@@ -1,0 +1,195 @@
+"""What it costs to keep vehicles apart: a motion's QP beside OSQP, and whole ticks of the server.
+
+    python -m skytether.lab.benchmarks.motions
+
+The QPs are those of a flight of the scenario `swap`, with the constraints that were taken in. Both
+solvers get them one after the other, in turns. OSQP is set up once for each shape of problem and
+given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing.
+Ticks are of swaps in virtual time: all vehicles are heard and planned for by one thread.
+"""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import osqp
+import tyro
+from scipy import sparse
+
+from skytether.lab.benchmarks.harness import TextTable, progress
+from skytether.server.control.dual import DualSolver
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.sim import flight
+
+SWAPS = ((16, 4.0), (16, 40.0), (64, 16.0), (64, 160.0), (200, 50.0), (200, 500.0))
+"""Numbers of vehicles, and the radius of their circle [m]: in each other's way, and far apart."""
+CACHED = 64
+"""Shapes of problems that OSQP is kept set up for."""
+
+
+@dataclass(frozen=True)
+class MotionsOptions:
+    """How much to measure."""
+
+    problems: int = 2000
+    duration: float = 30.0
+    """Length of a flight [s]."""
+    markdown: Path | None = None
+    """File for the tables as Markdown."""
+
+
+class Problem(NamedTuple):
+    """A QP, as `DualSolver` takes it."""
+
+    solver: DualSolver
+    linear: Array
+    columns: Array
+    least: Array
+    equal: int
+
+
+@contextmanager
+def kept(problems: list[Problem]) -> Iterator[None]:
+    """Keep every QP that is solved."""
+    real = DualSolver.solve
+
+    def solve(self: DualSolver, linear: Array, columns: Array, least: Array, equal: int) -> Any:
+        problems.append(Problem(self, linear.copy(), columns.copy(), least.copy(), equal))
+        return real(self, linear, columns, least, equal)
+
+    DualSolver.solve = solve  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        DualSolver.solve = real  # type: ignore[method-assign]
+
+
+class Osqp:
+    """OSQP for problems with one Hessian."""
+
+    def __init__(self, hessian: Array) -> None:
+        self._hessian = sparse.csc_matrix(np.triu(hessian))
+        self._made: dict[int, Any] = {}
+
+    def solve(self, problem: Problem) -> Array:
+        """The minimum, at its tolerance."""
+        least, most = problem.least, np.full(len(problem.least), np.inf)
+        most[: problem.equal] = least[: problem.equal]
+        dense = sparse.csc_matrix(np.ones(problem.columns.T.shape))
+        dense.data = problem.columns.ravel()  # every entry, so that the pattern stays the same
+        solver = self._made.get(len(least))
+        if solver is None:
+            if len(self._made) == CACHED:
+                self._made.clear()
+            solver = self._made[len(least)] = osqp.OSQP()
+            solver.setup(
+                self._hessian,
+                -problem.linear,
+                dense,
+                least,
+                most,
+                verbose=False,
+                eps_abs=1e-4,
+                eps_rel=1e-4,
+                polishing=False,
+                max_iter=4000,
+            )
+        else:
+            solver.update(q=-problem.linear, l=least, u=most, Ax=dense.data)
+        found: Array = np.asarray(solver.solve().x)
+        return found
+
+
+def swap(vehicles: int, radius_m: float, duration: float) -> Scenario:
+    """Vehicles that swap places on a circle."""
+    made = reading.load("swap")
+    reference = msgspec.structs.replace(
+        made.reference, shape=f"swap({vehicles})", radius_m=radius_m
+    )
+    return msgspec.structs.replace(made, duration=duration, settle=1.0, reference=reference)
+
+
+def solvers(options: MotionsOptions) -> TextTable:
+    """Both solvers on the QPs of a flight."""
+    problems: list[Problem] = []
+    with kept(problems):
+        flight.fly(swap(16, 4.0, options.duration), vehicles=16)
+    step = max(1, len(problems) // options.problems)
+    problems = problems[::step][: options.problems]
+    root = problems[0].solver._root
+    other = Osqp(np.linalg.inv(root.T @ root).astype(np.float64))
+    spent: dict[str, list[float]] = {"dual active set": [], "OSQP": []}
+    off = []
+    for _ in range(2):  # the first time warms up
+        for each in spent.values():
+            each.clear()
+        for problem in progress(problems, "QPs"):
+            began = time.perf_counter_ns()
+            ours = problem.solver.solve(*problem[1:])
+            middle = time.perf_counter_ns()
+            theirs = other.solve(problem)
+            spent["dual active set"].append((middle - began) / 1e3)
+            spent["OSQP"].append((time.perf_counter_ns() - middle) / 1e3)
+            if ours is not None:
+                off.append(float(np.abs(ours - theirs).max()))
+    p50, p99 = ({n: float(np.quantile(x, q)) for n, x in spent.items()} for q in (0.5, 0.99))
+    rows = [
+        [
+            name,
+            f"{p50[name]:.0f}, {p99[name]:.0f}",
+            f"{p50['OSQP'] / p50[name]:.1f}, {p99['OSQP'] / p99[name]:.1f}",
+        ]
+        for name in spent
+    ]
+    constraints = np.median([len(problem.least) for problem in problems])
+    title = f"solver; {len(problems)} QPs, 24 variables, {constraints:.0f} constraints (median)"
+    return TextTable([title, "p50, p99 [µs]", "OSQP over it"], rows)
+
+
+def ticks(options: MotionsOptions) -> TextTable:
+    """Whole ticks, with vehicles in each other's way and without."""
+    rows = []
+    for vehicles, radius_m in progress(SWAPS, "swaps"):
+        flown = swap(vehicles, radius_m, options.duration)
+        stopwatch = Stopwatch(time.perf_counter_ns)
+        record = flight.fly(flown, vehicles=vehicles, stopwatch=stopwatch)
+        told = record.figures["server"]
+        rows.append(
+            [
+                str(vehicles),
+                f"{radius_m:g}",
+                f"{told['tick_ms_p50']:.1f}, {told['tick_ms_p99']:.1f}",
+                f"{told['counts']['events'] / (vehicles * options.duration):.2f}",
+            ]
+        )
+    headings = [
+        "vehicles",
+        "radius of the circle\n[m]",
+        "tick p50, p99 [ms]",
+        "motions/s\na vehicle",
+    ]
+    return TextTable(headings, rows)
+
+
+def main() -> int:
+    """Measure, and print tables."""
+    options = tyro.cli(MotionsOptions, description=__doc__)
+    found = [solvers(options), ticks(options)]
+    for each, title in zip(found, ("one QP", f"swaps of {options.duration:g} s"), strict=True):
+        each.show(title)
+    if options.markdown:
+        options.markdown.write_text("\n".join(each.markdown() for each in found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,490 @@
+"""Vehicles that keep apart: motions, the solver behind them, and flights over bad networks."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import osqp
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import sparse
+
+from skytether.__main__ import main
+from skytether.client.compensator import Compensator
+from skytether.server.control import together
+from skytether.server.control.dual import DualSolver
+from skytether.server.control.motionplan import MotionPlan
+from skytether.server.control.together import LONGEST, Known, Together
+from skytether.shared.core.events import ChangeRefused
+from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
+from skytether.shared.law.spline import spline_at
+from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario.mission import Mission, swap
+from skytether.shared.scenario.reading import ConfigError
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
+from skytether.shared.telemetry.record import Record, Rows
+from skytether.shared.telemetry.summary import least_separation
+from skytether.shared.wire.protocol import (
+    NO_HORIZON,
+    NO_INPUT,
+    Drop,
+    Mode,
+    Observation,
+    ProtocolError,
+    Trajectory,
+)
+from skytether.sim import flight
+
+DT_S = 0.05
+LOST = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
+
+
+def scenario(vehicles: int, loss: float = 0.1, duration: float = 60.0, **keys: Any) -> Scenario:
+    """Vehicles that swap places."""
+    table = reading.to_table(reading.load("swap"))
+    table |= {"duration": duration, "seed": keys.pop("seed", 1)}
+    table["reference"]["shape"] = f"swap({vehicles})"
+    for way in ("uplink", "downlink"):
+        table["network"][way] |= {"loss": loss, **keys}
+    return reading.check(table, "swap")
+
+
+def each_of(flown: Record) -> list[Rows]:
+    """What each vehicle recorded."""
+    numbers = np.unique(flown.client["vehicle"])
+    return [flown.client[flown.client["vehicle"] == number] for number in numbers]
+
+
+def separation_m(flown: Record) -> float:
+    """Smallest distance between two vehicles [m]."""
+    told = flown.figures["client"]["by_vehicle"]
+    began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each_of(flown)]
+    least = least_separation(each_of(flown), began_s, DT_S)
+    assert least is not None
+    return least
+
+
+def left_m(flown: Record, vehicles: int) -> list[float]:
+    """Distance of each vehicle from its goal at the end [m]."""
+    goals = swap(vehicles, 4.0, 2)
+    return [
+        float(np.linalg.norm(rows["state"][-1, :, 0] - goals.of(number)(np.array(1e3))[:, 0]))
+        for number, rows in enumerate(each_of(flown), start=1)
+    ]
+
+
+# -- motions and their QP -------------------------------------------------------------------------
+
+
+@given(st.integers(1, 15), st.integers(0, 2**31), st.integers(-5, 200))
+def test_a_motion_is_the_spline_that_is_sent(knots: int, seed: int, step: int) -> None:
+    """Aboard the cubic through its knots is that very motion, and rests behind the last."""
+    rng = np.random.default_rng(seed)
+    velocity = np.vstack([rng.uniform(-1, 1, (knots - 1, 1)), np.zeros((1, 1))])
+    T = SPACING * DT_S
+    moved = 0.5 * T * (velocity[1:] + velocity[:-1])
+    position = np.vstack([np.zeros((1, 1)), np.cumsum(moved, axis=0)])
+    motion = Motion(0, position, velocity)
+    told = np.stack([position[:, 0], velocity[:, 0]], axis=1).ravel()
+    p, v = motion.at(np.array([float(max(step, 0))]), DT_S)
+    assert spline_at(told, SPACING, DT_S, max(step, 0)) == pytest.approx((p[0, 0], v[0, 0]))
+    assert motion.last == (knots - 1) * SPACING
+    if step >= motion.last:
+        assert p[0, 0] == pytest.approx(position[-1, 0])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
+    """At its finest tolerance, with equalities, many constraints and few variables."""
+    rng = np.random.default_rng(seed)
+    n, m, equal = 24, 300, 2
+    root = rng.normal(size=(n, n))
+    hessian, linear = root @ root.T + 0.1 * np.eye(n), 5.0 * rng.normal(size=n)
+    rows, inside = rng.normal(size=(m, n)), rng.normal(size=n)
+    least = rows @ inside - rng.uniform(0, 1, m) * (rng.random(m) < 0.8)
+    least[:equal] = rows[:equal] @ inside
+    columns = np.ascontiguousarray(rows.T)
+    found = DualSolver(hessian).solve(linear, columns, least, equal)
+    assert found is not None
+    assert (rows @ found - least).min() > -1e-8
+    assert np.abs(rows[:equal] @ found - least[:equal]).max() < 1e-8
+    most = np.full(m, np.inf)
+    most[:equal] = least[:equal]
+    reference = osqp.OSQP()
+    reference.setup(
+        sparse.csc_matrix(np.triu(hessian)),
+        -linear,
+        sparse.csc_matrix(rows),
+        least,
+        most,
+        verbose=False,
+        eps_abs=1e-9,
+        eps_rel=1e-9,
+        max_iter=100_000,
+        polishing=True,
+    )
+    known = np.asarray(reference.solve(raise_error=True).x)
+
+    def cost(x: Any) -> float:
+        return float(0.5 * x @ hessian @ x - linear @ x)
+
+    assert cost(found) <= cost(known) + 1e-6 * abs(cost(known))
+
+
+def test_what_cannot_be_has_no_solution() -> None:
+    """Two constraints that contradict each other."""
+    columns = np.array([[1.0, -1.0], [0.0, 0.0]])
+    assert DualSolver(np.eye(2)).solve(np.zeros(2), columns, np.array([1.0, 1.0]), 0) is None
+
+
+@given(
+    st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+    st.tuples(st.floats(-9, 9), st.floats(-9, 9)),
+)
+def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
+    velocity: tuple[float, float], goal: tuple[float, float]
+) -> None:
+    """Under inputs that leave a tenth of the bound to the regulator aboard."""
+    terms = scenario(4).terms()
+    found = MotionPlan(terms, 0.6, 0.0).solve(np.zeros(2), np.array(velocity), np.array(goal))
+    assert found is not None
+    position, v = found
+    assert len(position) == INTERVALS + 1
+    assert v[-1] == pytest.approx(0.0)
+    a = np.diff(v, axis=0) / (SPACING * DT_S)
+    for ends in (v[1:], v[:-1]):
+        assert np.abs(ends + terms.tau_s[0] * a).max() < 0.9 * terms.u_max[0] + 1e-6
+    nearer = np.linalg.norm(position[-1] - goal) <= np.linalg.norm(position[0] - goal) + 1.0
+    assert nearer
+
+
+# -- what may be flown -----------------------------------------------------------------------------
+
+
+def observation(step: int, in_force: int, place: tuple[float, float]) -> Observation:
+    """An observation of a vehicle at rest."""
+    state = np.array([[place[0], 0.0], [place[1], 0.0]])
+    return Observation(1, 1, step, in_force, max(in_force, 0), 0, 0, 3, 1, state, NO_INPUT)
+
+
+def alone() -> Together:
+    """What decides for two vehicles that swap places."""
+    flown = scenario(2)
+    goals = swap(2, 4.0, 2)
+    return Together(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1)
+
+
+def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
+    """It is in force, may still be taken, or is known to be lost."""
+    made, known = alone(), Known()
+    made._rows[0] = known
+    assert made.observe(0, observation(5, NO_HORIZON, (4.0, 0.0)))
+    first, second = resting(10, np.array([4.0, 0.0])), resting(40, np.array([3.0, 0.0]))
+    known.sent.append(together.Sent(10, first))
+    assert len(known.motions()) == 2
+    made.observe(0, observation(20, 10, (4.0, 0.0)))
+    assert known.motions() == [first]
+    known.sent.append(together.Sent(40, second))
+    made.observe(0, observation(40 + made._join, 10, (4.0, 0.0)))
+    assert len(known.motions()) == 2  # it may have been taken at the very step of the observation
+    made.observe(0, observation(41 + made._join, 10, (4.0, 0.0)))
+    assert known.motions() == [first]
+    assert made.counts["horizons_lost"] == 1
+    assert not made.observe(0, observation(30, 10, (4.0, 0.0)))
+
+
+def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
+    """Until that motion is over, however long it may be."""
+    made = alone()
+    made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
+    made.observe(1, observation(100, 70, (-4.0, 0.0)))
+    made._rows[0].in_force = together.Sent(90, resting(100, np.array([4.0, 0.0])))
+    for step, plans in ((111, False), (71 + LONGEST + 10, True)):
+        made.observe(0, observation(step, 90, (4.0, 0.0)))
+        made.observe(1, observation(step, 70, (-4.0, 0.0)))
+        rows, steps = np.arange(2), np.array([step, step])
+        made.plan(rows, steps, None)  # type: ignore[arg-type]
+        assert (made._rows[0].next is not None) == plans
+
+
+def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
+    """One step later than `link.join_s` it is refused."""
+    terms = scenario(2).terms()
+    knots = np.zeros((2, 1, 2), np.float32)
+    told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
+    assert Compensator(terms).offer(told, 100 + terms.join, 90)
+    with pytest.raises(ProtocolError) as refused:
+        Compensator(terms).offer(told, 101 + terms.join, 90)
+    assert refused.value.reason is Drop.TOO_LATE
+
+
+# -- flights ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_vehicles_swap_places_and_keep_apart(loss: float) -> None:
+    """Eight of them, in wind; all arrive, and nobody leaves its tube."""
+    flown = flight.fly(scenario(8, loss, duration=75.0), vehicles=8)
+    assert separation_m(flown) > 0.5
+    assert max(left_m(flown, 8)) < 0.3
+    assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
+
+
+def test_a_link_that_is_cut_leaves_them_apart() -> None:
+    """Whenever it is: each flies its motion to the end."""
+    for cut_s in (4.0, 6.3):
+        swaps = scenario(6, duration=25.0)
+        flown = flight.fly(swaps, vehicles=6, changes=[(cut_s, LOST)])
+        assert separation_m(flown) > 0.5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("keys", [{}, {"loss": 0.5}, {"loss": 0.3, "burst_s": 2.0}], ids=str)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_sixteen_swap_places_over_the_worst_networks(keys: dict[str, float], seed: int) -> None:
+    """Half of all packets lost, or bursts of two seconds: nobody comes too near."""
+    flown = flight.fly(scenario(16, duration=60.0, seed=seed, **keys), vehicles=16)
+    assert separation_m(flown) > 0.5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("forgets", ["what was sent before", "what may be lost"])
+def test_without_what_may_be_flown_they_meet(forgets: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation: apart from the newest motion alone, or from those that are acknowledged alone."""
+    real = Known.motions
+    newest = forgets == "what was sent before"
+
+    def some(known: Known) -> list[Motion]:
+        motions = real(known)
+        return motions[-1:] if newest else motions[:1]
+
+    monkeypatch.setattr(Known, "motions", some)
+    least = [
+        separation_m(flight.fly(scenario(16, 0.5, duration=60.0, seed=seed), vehicles=16))
+        for seed in (1, 2)
+    ]
+    assert min(least) < 0.4
+
+
+@pytest.mark.long
+def test_taken_late_a_motion_is_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation: a vehicle that takes trajectories at any time leaves its tube."""
+    real = Compensator.__init__
+
+    def careless(self: Compensator, *args: Any) -> None:
+        real(self, *args)
+        self._join = 0
+
+    monkeypatch.setattr(Compensator, "__init__", careless)
+    late = scenario(16, duration=60.0)
+    ways = [f"gamma(0.2, {0.9:g}, 0.5) & loss(0.1)"] * 2
+    table = reading.to_table(late)
+    table["network"] |= dict(zip(("uplink", "downlink"), ways, strict=True))
+    flown = flight.fly(reading.check(table, "late"), vehicles=16)
+    assert flown.figures["server"]["counts"]["left_tube"] > 0
+
+
+# -- zones -----------------------------------------------------------------------------------------
+
+
+def clear_m(flown: Record, kept: Zones) -> float:
+    """Smallest distance of a vehicle from a zone, from its first motion on [m]."""
+    least = np.inf
+    for rows in each_of(flown):
+        begins = int(np.argmax(rows["mode"] == Mode.TRACK))
+        least = min(least, kept.clearance(rows["state"][begins:, :, 0]).min())
+    return float(least)
+
+
+@pytest.mark.parametrize("name", ["corridor", "rings", "warehouse"])
+def test_missions_that_come_with_it(name: str) -> None:
+    """All arrive, apart from each other and from what is in their way."""
+    flown = flight.fly(reading.load(name), vehicles=len(mission_of(name).vehicles))
+    assert separation_m(flown) > 0.5
+    assert clear_m(flown, reading.load(name).zones) > 0.0
+    for rows in each_of(flown):
+        goal = mission_of(name).of(int(rows["vehicle"][0]))(np.array(1e3))[:, 0]
+        assert np.linalg.norm(rows["state"][-1, :, 0] - goal) < 0.3
+    assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
+
+
+def mission_of(name: str) -> Mission:
+    """Goals of a scenario."""
+    found = reading.load(name).make_reference()
+    assert isinstance(found, Mission)
+    return found
+
+
+def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) -> None:
+    """For downwash; a zone is flown around at its own heights alone."""
+    rows = "1,0,-3,0,1\n1,2,3,0,1\n2,0,3,0,2.2\n2,2,-3,0,2.2\n"
+    (tmp_path / "goals.csv").write_text(f"vehicle,t,x,y,z\n{rows}")
+    table = reading.to_table(reading.load("swap"))
+    table |= {"duration": 30.0}
+    table["model"]["axes"] = 3
+    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
+    table["mission"] |= {"height_m": 1.0, "zones": "box(-1, 1, -4, 1, 1.8, 3)"}
+    high = reading.check(table, "high")
+    flown = flight.fly(high, vehicles=2)
+    one, other = (rows["state"][:, :, 0] for rows in each_of(flown))
+    steps = min(len(one), len(other))
+    off = np.abs(one[:steps] - other[:steps])
+    assert np.linalg.norm(off * [1.0, 1.0, 0.5], axis=1).min() > 0.5
+    assert clear_m(flown, high.zones) > 0.0
+    assert np.abs(one[-1] - [3.0, 0.0, 1.0]).max() < 0.3
+    assert np.abs(other[-1] - [-3.0, 0.0, 2.2]).max() < 0.3
+    assert np.abs(one[:, 1]).max() < 0.8  # below the box: it goes straight, but for the other
+    assert np.abs(other[:, 1]).max() > 1.0
+
+
+def test_a_zone_that_is_drawn_in_flight() -> None:
+    """Vehicles go round it from then on; one that a vehicle may be in is refused, with its name."""
+    swaps, zone = scenario(2, duration=30.0), "box(-0.5, 0.5, -1.5, 1.5)"
+    drawn = [(0.5, {"mission.zones": zone})]
+    flown = flight.fly(swaps, vehicles=2, changes=drawn)
+    assert clear_m(flown, zones.parse(zone, 2)) > 0.0
+    assert max(left_m(flown, 2)) < 0.3
+    over = [
+        (1.0, {"mission.zones": "cylinder(4, 0, 1)"}),
+        (5.0, {"mission.zones": zone}),
+        (29.0, {"mission.zones": "cylinder(-4, 0, 1)"}),
+    ]
+    flown = flight.fly(swaps, vehicles=2, changes=over)
+    reasons = [each.event.reason for each in flown.events if isinstance(each.event, ChangeRefused)]
+    got, whole = "mission.zones: got", "tube included; nothing was changed"
+    assert reasons[0] == f"{got} cylinder(4, 0, 1), in which vehicle 1 is to begin, {whole}"
+    assert re.fullmatch(
+        rf"{got} {re.escape(zone)}, which vehicle . may fly into for .* s more, {whole}", reasons[1]
+    )
+    assert reasons[2] == f"{got} cylinder(-4, 0, 1), which vehicle 1 hovers in, {whole}"
+
+
+def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation: aimed straight at their goals, they stay where they are, and apart from it."""
+    keys = scenario(2, duration=40.0)
+    table = reading.to_table(keys)
+    table["mission"]["zones"] = "box(-0.5, 0.5, -4, 4)"
+    walled = reading.check(table, "walled")
+    assert max(left_m(flight.fly(walled, vehicles=2), 2)) < 0.3
+    monkeypatch.setattr(together.Routes, "way", lambda _, __, goal: goal[None])
+    flown = flight.fly(walled, vehicles=2)
+    assert max(left_m(flown, 2)) > 3.0
+    assert clear_m(flown, walled.zones) > 0.0
+
+
+# -- missions --------------------------------------------------------------------------------------
+
+
+def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
+    """With `mission.allocate`; where each begins stays as it is."""
+    file = tmp_path / "goals.csv"
+    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n2,5,0,1\n")
+    table = reading.to_table(reading.load("swap"))
+    table["reference"] |= {"shape": "mission", "file": str(file)}
+    table["mission"]["allocate"] = True
+    found = reading.check(table, "mission")
+    ends = [found.make_reference(number)(np.array(9.0))[:, 0].tolist() for number in (1, 2)]
+    assert ends == [[0.0, 1.0], [9.0, 1.0]]
+    assert found.start_m(2).tolist() == [9.0, 0.0]
+    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n")
+    with pytest.raises(ConfigError, match=r"mission\.allocate: .* a goal of each vehicle at each"):
+        reading.check(table, "mission")
+
+
+def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:
+    """Each vehicle is at its own goal at any time, and begins at its first."""
+    file = tmp_path / "goals.csv"
+    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,3,1\n2,0,4,0\n")
+    table = reading.to_table(reading.load("swap"))
+    table["reference"] |= {"shape": "mission", "file": str(file)}
+    mission = reading.check(table, "mission").make_reference(1)
+    assert isinstance(mission, Mission)
+    assert mission.vehicles == (1, 2)
+    times_s = np.array([0.0, 4.9, 5.0, 99.0])
+    assert mission(times_s)[:, 0, 0].tolist() == [0.0, 0.0, 3.0, 3.0]
+    assert mission.of(2)(times_s)[:, 0, 0].tolist() == [4.0] * 4
+    assert not mission.of(3)(times_s).any()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("vehicle,x,y\n1,0,0\n", "expected the columns vehicle, t, x, y"),
+        ("vehicle,t,x,y\n1,1,0,0\n", "vehicle 1: column t must start at 0 and rise"),
+        ("vehicle,t,x,y\n0,0,0,0\n", "column vehicle: expected numbers from 1"),
+        ("vehicle,t,x,y\n1,0,nan,0\n", "finite numbers"),
+        ("vehicle,t,x,y\n1,0,1e9,0\n", "from the origin"),
+    ],
+)
+def test_a_wrong_mission_is_told(text: str, said: str, tmp_path: Path) -> None:
+    """In a line that names the key."""
+    file = tmp_path / "goals.csv"
+    file.write_text(text)
+    table = reading.to_table(reading.load("swap"))
+    table["reference"] |= {"shape": "mission", "file": str(file)}
+    with pytest.raises(ConfigError, match=said):
+        reading.check(table, "mission")
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "said"),
+    [
+        ("link", "join_s", 0.0, "link.join_s: got 0.0, expected more than 0, and at most 1.5 s"),
+        ("link", "join_s", 2.0, "link.join_s: got 2.0, expected more than 0, and at most 1.5 s"),
+        ("link", "timeout_s", 2.0, "link.timeout_s: got 2.0, expected at least 7.5 s on a mission"),
+        ("control", "trigger", "always", "control.trigger: got 'always', expected 'expected_gap'"),
+        ("vehicle", "exhausted", "hold", "vehicle.exhausted: got 'hold', expected 'brake'"),
+    ],
+)
+def test_what_would_end_the_guarantee_is_refused(
+    section: str, key: str, value: Any, said: str
+) -> None:
+    """Before anything flies."""
+    table = reading.to_table(reading.load("swap"))
+    table[section][key] = value
+    with pytest.raises(ConfigError) as refused:
+        reading.check(table, "swap")
+    assert said in str(refused.value)
+
+
+def test_the_fleet_tells_how_near_they_came(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside what was asked for; and a mission says how many fly."""
+    file = tmp_path / "s.json"
+    shape = ["--reference.shape", "swap(4)", "--duration", "12", "--settle", "1"]
+    assert main(["fleet", "swap", "--virtual", *shape, "--json", str(file)]) == 0
+    told = json.loads(file.read_text())
+    assert told["vehicles"] == 4
+    assert told["separation_m"] == 0.5
+    assert 0.5 < told["least_separation_m"] < 8.0
+    capsys.readouterr()
+    assert main(["fleet", "swap", "--virtual", "--vehicles", "5", *shape]) == 2
+    assert "--vehicles: got 5, expected 4 on this mission" in capsys.readouterr().err
+
+
+def test_the_least_distance_is_of_one_time() -> None:
+    """Vehicles that were at one place one after the other were not near."""
+    columns = [("step", "i8"), ("mode", "u1"), ("state", "f8", (2, 2))]
+    one, other = (np.zeros(101, columns) for _ in range(2))
+    for rows in (one, other):
+        rows["step"], rows["mode"] = np.arange(101), Mode.TRACK
+        rows["state"][:, 0, 0] = 0.1 * rows["step"]
+    assert least_separation([one, other], [0.0, 0.0], DT_S) == pytest.approx(0.0)
+    assert least_separation([one, other], [0.0, 1.0], DT_S) == pytest.approx(2.0)
+    assert least_separation([one, other], [0.0, 100.0], DT_S) is None
+    assert least_separation([one], [0.0], DT_S) is None
+
+
+def test_a_batch_flies_each_mission_alone() -> None:
+    """Runs of a batch share a server, and must not keep apart from each other."""
+    swaps = scenario(2, duration=8.0)
+    one = flight.fly(msgspec.structs.replace(swaps, seed=2), vehicles=2)
+    batch = flight.fly_batch(swaps, [1, 2])
+    assert len(batch) == 2
+    assert len(np.unique(one.client["vehicle"])) == 2

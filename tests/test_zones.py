@@ -1,0 +1,251 @@
+"""Zones: what a scenario writes, how far points are from them, and ways around."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skytether.server.control.routes import Routes
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.reading import ConfigError
+from skytether.shared.scenario.zones import Zones
+
+BOX = "box(1, 2, -1, 1)"
+U = "polygon(0, 0, 4, 0, 4, 3, 3, 3, 3, 1, 1, 1, 1, 3, 0, 3)"
+"""A polygon that is open above, between x = 1 and 3."""
+FENCE = "fence(-5, 5, -5, 5)"
+place = st.floats(-6.0, 6.0)
+
+
+def away_m(text: str, *points: tuple[float, ...]) -> list[float]:
+    """Distance of points from what is forbidden [m]."""
+    given = np.array(points)
+    kept = zones.parse(text, given.shape[1])
+    found: list[float] = kept.clearance(given).min(axis=1).tolist()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("text", "point", "distance_m"),
+    [
+        (BOX, (0.0, 0.0), 1.0),
+        (BOX, (1.5, 0.0), -0.5),
+        (BOX, (0.0, 2.0), 2.0**0.5),
+        (U, (2.0, 2.0), 1.0),
+        (U, (2.0, 0.5), -0.5),
+        (FENCE, (0.0, 0.0), 5.0),
+        (FENCE, (6.0, 0.0), -1.0),
+        (f"{FENCE} & {BOX}", (4.0, 0.0), 1.0),
+        ("fence(0, 0, 4, 0, 0, 4)", (1.0, 1.0), 1.0),
+        ("corridor(2, -5, 0, 0, 0, 0, 5)", (-3.0, 0.0), 1.0),
+        ("corridor(2, -5, 0, 0, 0, 0, 5)", (-3.0, 1.5), -0.5),
+        ("corridor(2, -5, 0, 0, 0, 0, 5)", (0.5, 4.0), 0.5),
+        ("box(1, 2, -1, 1, 0, 3)", (1.5, 0.0, 4.0), 1.0),
+        ("box(1, 2, -1, 1, 0, 3)", (0.0, 0.0, 4.0), 2.0**0.5),
+        ("box(1, 2, -1, 1, 0, 3)", (1.5, 0.0, 2.8), -0.2),
+        ("cylinder(0, 0, 1, 0, 3)", (3.0, 0.0, 1.0), 2.0),
+    ],
+)
+def test_distances(text: str, point: tuple[float, ...], distance_m: float) -> None:
+    """Outside they are positive, within negative."""
+    assert away_m(text, point)[0] == pytest.approx(distance_m, abs=0.01)
+
+
+def test_a_cylinder_lies_within_its_corners() -> None:
+    """Nobody is nearer to it than the polygon says."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 100)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert max(away_m("cylinder(0, 0, 1)", *map(tuple, around))) < 1e-9
+
+
+@given(place, place, place, place, st.sampled_from([BOX, U, FENCE, f"{U} & {FENCE}"]))
+def test_a_straight_piece_is_no_nearer_than_it_says(
+    x0: float, y0: float, x1: float, y1: float, text: str
+) -> None:
+    """Held against many points of it, and never off by more than there can be between them."""
+    kept, ends = zones.parse(text, 2), np.array([[x0, y0], [x1, y1]])
+    share = np.linspace(0.0, 1.0, 201)[:, None]
+    points = ends[0] + share * (ends[1] - ends[0])
+    least = float(kept.clearance(points).min())
+    said = float(kept.along(ends)[0])
+    assert said <= max(least, 0.0) + 1e-9
+    gap_m = float(np.linalg.norm(ends[1] - ends[0])) / 200.0
+    if least > gap_m:
+        assert said >= least - gap_m
+
+
+@given(place, place, st.floats(0.05, 0.3), st.sampled_from([BOX, U, FENCE, f"{BOX} & {FENCE}"]))
+def test_a_point_fulfils_its_own_half_planes(x: float, y: float, room_m: float, text: str) -> None:
+    """A point outside does, and a convex zone lies wholly on their other side."""
+    kept, point = zones.parse(text, 2), np.array([[x, y]])
+    if kept.clearance(point).min() < room_m:
+        return
+    planes = kept.planes(point, np.array([20.0]))
+    rise = np.einsum("ij,ij->i", planes.normal, point[planes.at] - planes.border)
+    assert rise == pytest.approx(planes.away_m)
+    assert np.linalg.norm(planes.normal, axis=1) == pytest.approx(1.0)
+    if text == BOX:
+        corners = kept.zones[0].corners
+        assert ((corners - planes.border[0]) @ planes.normal[0]).max() < 1e-9
+
+
+# -- what is written -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("bix(0, 1, 0, 1)", "did you mean box"),
+        ("box(1, 0, 0, 1)", "from less to more"),
+        ("box(0, 1)", "box(x0, x1, y0, y1)"),
+        ("box(0, 1, 0, nan)", "numbers of at most 1e6 m"),
+        ("box(0, 1, 0, one)", "numbers between commas"),
+        ("cylinder(0, 0, 0)", "cylinder(x, y, radius)"),
+        ("polygon(0, 0, 1, 1)", "at least 3 points"),
+        ("corridor(0, 0, 0, 1, 0)", "corridor(width"),
+        ("corridor(1, 0, 0, 1, 0, 0, 0)", "without a turn back"),
+        ("box(0, 1, 0, 1, 0, 3)", "no heights with model.axes = 2"),
+        ("box(0, 1, 0, 1) cylinder(0, 0, 1)", "zones such as"),
+    ],
+)
+def test_what_is_no_zone_is_told(text: str, said: str) -> None:
+    """With the part of it that is wrong."""
+    with pytest.raises(PolicyError) as refused:
+        zones.parse(text, 2)
+    assert said in str(refused.value)
+
+
+def geojson(features: Any, **more: Any) -> str:
+    """A file's content."""
+    return json.dumps({"type": "FeatureCollection", "features": features, **more})
+
+
+def polygon(points: Any, **properties: Any) -> dict[str, Any]:
+    """A feature."""
+    shape = {"type": "Polygon", "coordinates": [points]}
+    return {"type": "Feature", "properties": properties, "geometry": shape}
+
+
+def test_zones_from_a_map(tmp_path: Path) -> None:
+    """Degrees become metres east and north of the origin; a hole in a fence is kept out of."""
+    file = tmp_path / "map.geojson"
+    degree_m = 111_319.5
+    square = [[10.0, 50.0], [10.001, 50.0], [10.001, 50.001], [10.0, 50.001], [10.0, 50.0]]
+    field = [[-100, -100], [100, -100], [100, 100], [-100, 100]]
+    hole = [[-10, -10], [10, -10], [10, 10], [-10, 10]]
+    file.write_text(geojson([polygon(square, low_m=0, high_m=30)], origin=[10.0, 50.0]))
+    kept = zones.parse(f'geojson("{file}")', 3)
+    (zone,) = kept.zones
+    assert zone.corners[2] == pytest.approx([degree_m * 1e-3 * np.cos(np.radians(50.0)), 111.3195])
+    assert (zone.low_m, zone.high_m, zone.is_fence) == (0.0, 30.0, False)
+    fence = polygon(field, kind="fence", name="field")
+    fence["geometry"]["coordinates"].append(hole)
+    mast = {"type": "Point", "coordinates": [50, 50]}
+    file.write_text(geojson([fence, {"geometry": mast, "properties": {"radius_m": 5}}]))
+    points = np.array([[0.0, 0.0], [20.0, 0.0], [50.0, 52.0], [200.0, 0.0]])
+    inside = zones.parse(f"geojson({file})", 2).clearance(points).min(axis=1)
+    assert (inside > 0.0).tolist() == [False, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "a GeoJSON file"),
+        ("[]", "FeatureCollection"),
+        (geojson([]), "a feature with a Polygon"),
+        (geojson([{"geometry": None}]), "feature 1 as RFC 7946 has it"),
+        (geojson([polygon([[0, 0], [1, 1]])]), "feature 1 with at least 3 corners"),
+        (geojson([polygon([[0, 0], [1e9, 1], [0, 1]])]), "at most 1e6 m"),
+        (geojson([polygon([[0, 0], [1, 1], [0, 1]], kind="danger")]), "KeyError: 'danger'"),
+    ],
+)
+def test_a_wrong_map_is_told(content: str, said: str, tmp_path: Path) -> None:
+    """In one line."""
+    file = tmp_path / "map.geojson"
+    file.write_text(content)
+    with pytest.raises(PolicyError) as refused:
+        zones.parse(f'geojson("{file}")', 2)
+    assert said in str(refused.value)
+
+
+def mission(tmp_path: Path, text: str, goals: str = "1,0,0,0\n1,2,4,0\n2,0,0,4\n") -> Any:
+    """The table of a mission with these zones."""
+    (tmp_path / "goals.csv").write_text(f"vehicle,t,x,y\n{goals}")
+    table = reading.to_table(reading.load("swap"))
+    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
+    table["mission"]["zones"] = text
+    return table
+
+
+@pytest.mark.parametrize(
+    ("text", "goals", "said"),
+    [
+        ("box(3, 5, -1, 1)", "", "none within 0.2 m of the goal (4, 0) of vehicle 1"),
+        ("fence(-1, 3, -1, 5)", "", "of the goal (4, 0) of vehicle 1"),
+        ("geojson(missing.json)", "", "a file that can be read"),
+        ("", "1,0,0,0\n2,0,0.5,0\n", "at most 0.5 m, as the goals of vehicles 1 and 2 at 0 s"),
+    ],
+)
+def test_goals_that_cannot_be_reached(text: str, goals: str, said: str, tmp_path: Path) -> None:
+    """Before anything flies."""
+    table = mission(tmp_path, text, *([goals] if goals else []))
+    with pytest.raises(ConfigError) as refused:
+        reading.check(table, "mission")
+    assert said in str(refused.value)
+
+
+def test_zones_are_of_missions_alone() -> None:
+    """Elsewhere nobody would keep out of them."""
+    table = reading.to_table(reading.load("target"))
+    table["mission"]["zones"] = BOX
+    with pytest.raises(ConfigError, match=r"mission\.zones: .* on a mission"):
+        reading.check(table, "target")
+
+
+def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
+    """As that of a trajectory does."""
+    (tmp_path / "map.json").write_text(geojson([polygon([[9, 9], [10, 9], [9, 10]])]))
+    file = tmp_path / "mine.toml"
+    file.write_text('extends = "swap"\n[mission]\nzones = "geojson(map.json)"\n')
+    assert len(reading.load(str(file)).zones.zones) == 1
+
+
+# -- ways around -----------------------------------------------------------------------------------
+
+
+def length_m(way: Array) -> float:
+    """Length of a way."""
+    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize(
+    ("text", "goal", "least_m"),
+    [
+        (BOX, (3.0, 0.0), 2 * 2**0.5 + 1),
+        (U, (2.0, 2.0), 4.0 + 2**0.5 + 1),
+        (f"{BOX} & {FENCE}", (3.0, 0.0), 2 * 2**0.5 + 1),
+    ],
+)
+def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) -> None:
+    """It keeps its distance, and is hardly longer than the shortest that there is."""
+    kept, begin = zones.parse(text, 2), np.array([0.0, -1.0 if text == U else 0.0])
+    way = np.vstack([begin, Routes(kept, 0.2).way(begin, np.array(goal))])
+    assert len(way) > 2
+    assert kept.along(way).min() >= 0.2 - 1e-6
+    assert least_m < length_m(way) < 1.5 * least_m + 1.0
+
+
+def test_where_there_is_no_way() -> None:
+    """The goal itself is aimed at, and that there is none can be asked."""
+    kept = zones.parse("fence(-5, 5, -5, 5) & box(-0.5, 0.5, -5, 5)", 2)
+    routes = Routes(kept, 0.2)
+    begin, goal = np.array([-3.0, 0.0]), np.array([3.0, 0.0])
+    assert routes.way(begin, goal).tolist() == [[3.0, 0.0]]
+    assert not routes.reaches(begin, goal)
+    assert Routes(Zones(), 0.2).reaches(begin, goal)
