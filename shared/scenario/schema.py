@@ -343,7 +343,8 @@ class MavlinkConfig(Section, frozen=True):
     the plane."""
     origin: OfVehicle[Literal["takeoff", "autopilot"]] = "takeoff"
     """Origin of the flight: the point where we arm the vehicle, or the autopilot's own local
-    origin; that is taken as well where the vehicle is in the air already."""
+    origin; that is taken as well where the vehicle is in the air already. On a mission a vehicle is
+    armed where it begins: that point is its first goal, on the ground."""
     patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
     """Time that the autopilot may take until it is heard, and for each step on its way into the
     air [s]."""
