@@ -112,7 +112,9 @@ class Panel:
         """Stands for a vehicle where netem is alone."""
         if flies:
             with panel.add_tab("Flight"):
-                self._plots.append(Plots(gui, titles, of_flight(axes)))
+                self._plots.append(
+                    Plots(gui, titles, of_flight(axes, mission=scenarios[0].is_mission))
+                )
         with panel.add_tab("Network"):
             of_air = of_network(solves=solves) if flies else of_link()
             self._plots.append(Plots(gui, titles, of_air))
@@ -176,7 +178,7 @@ class Panel:
         if len(known) == len(tracks):
             end_s = max(track.time_s for track in known)
             looks = [
-                Look(flight.state, track.curves(POINTS, end_s), now_ns)
+                Look(flight.state, track.curves(POINTS, end_s), now_ns, vehicle)
                 for flight, track in zip(self._flights, known, strict=True)
             ]
             for plots in self._plots:
