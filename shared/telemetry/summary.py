@@ -183,15 +183,14 @@ def summarise(
 def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
-    Where a live point was, and which goal a vehicle was given of a mission that allocates them,
-    only the server knows: at a step that it has no row of, it is what it was before. What nobody
-    knows is NaN.
+    Where a live point was, and which goal a vehicle of a mission had, only the server knows: at a
+    step that it has no row of, it is what it was before. What nobody knows is NaN.
 
     Args:
         client: rows of the vehicle.
         server: rows of the server, of any vehicles.
     """
-    if scenario.reference.shape != "live" and not scenario.mission.allocate:
+    if scenario.reference.shape != "live" and not scenario.is_mission:
         times_s, vehicles = client["step"] * scenario.control.dt, client["vehicle"][:1].tolist()
         return scenario.make_reference(*vehicles)(times_s)[..., 0]
     known = client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]

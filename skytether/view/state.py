@@ -43,8 +43,8 @@ SLOTS_MAX = 1200
 """Most steps that are kept of a vehicle; where a minute has more, every second or third is."""
 VEHICLES_MAX = 64
 """Most vehicles of a flight that are shown."""
-ZONED = "mission.zones"
-"""Key of the zones of a mission."""
+ZONED, GUIDED = "mission.zones", "mission.goals"
+"""Keys of the zones of a mission, and of the goals that are given."""
 SAID_MAX = 50
 """Most events that are kept."""
 LED = "reference.points_m"
