@@ -22,6 +22,7 @@ from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint
 from skytether.shared.core.events import SessionEnded
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.mission import Guided, given
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
@@ -36,6 +37,7 @@ TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 TRIGGER = keys_of(InFlight.TRIGGER)
 """Keys of when horizons are sent."""
 ZONES = keys_of(InFlight.ZONES)
+GOALS = keys_of(InFlight.GOALS)
 """Keys of where vehicles of a mission must not be."""
 POINT = keys_of(InFlight.POINT)
 """Keys of a point that is led by hand."""
@@ -76,11 +78,17 @@ class Server(Endpoint):
         if scenario.reference.shape == "live":
             self.changeable |= POINT
         if scenario.is_mission:
-            self.changeable |= ZONES
+            self.changeable |= ZONES | GOALS
         terms = scenario.terms()
         own = scenario.is_mission or scenario.reference.shape == "target"
         if references is None and own:
             references = lru_cache(room)(scenario.make_reference)
+        self._guided: Guided | None = None
+        """Goals of a mission; None without one."""
+        if scenario.is_mission and references:
+            goals = given(scenario.mission.goals, scenario.model.axes)
+            self._guided = Guided(references, goals)
+            references = lru_cache(room)(self._guided.of)
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, terms.dt_ns)
         self.controller = Controller(scenario, terms, room, self._clock, self.stopwatch, references)
@@ -152,6 +160,8 @@ class Server(Endpoint):
         """See `Endpoint`; the terms of the flight stay as they were agreed upon."""
         if keys & TRIGGER:
             self.controller.change_trigger(scenario.control)
+        if keys & GOALS and self._guided:
+            self._guided.goals = given(scenario.mission.goals, scenario.model.axes)
         if keys & ZONES:
             self.controller.change_zones(scenario.zones)
         if keys & POINT:

@@ -164,12 +164,16 @@ def test_zones_of_a_mission_are_changed_and_refused_in_words(browser: "sync_api.
     with served(*argv) as address, opened(browser, address) as page:
         until(lambda: "nearest other vehicle" in status(page), "the mission is shown")
         until(lambda: flown_s(page) > 12, "the mission begins")
-        put(page, "As text", "box(-20, 20, -20, 20)")
+        put(page, "Zones", "box(-20, 20, -20, 20)")
         page.get_by_role("button", name="Change the zones").click()
         until(lambda: page.get_by_text("nothing was changed").count(), "it is refused")
-        put(page, "As text", "fence(-9, 9, -9, 9)")
+        put(page, "Zones", "fence(-9, 9, -9, 9)")
         page.get_by_role("button", name="Change the zones").click()
         until(lambda: page.get_by_text("mission.zones").count(), "it is said")
+        page.get_by_label("A click").click()
+        page.get_by_role("option", name="sends the vehicle").click()
+        page.mouse.click(720, 250)
+        until(lambda: "goal(1, " in page.content(), "the vehicle is sent there")
         picture(page, PICTURES / "mission-dark-wide.png")
 
 

@@ -11,7 +11,7 @@ from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.lab import keys_document
 from skytether.netem.__main__ import emulate
 from skytether.netem.proxy import Proxy
-from skytether.server.endpoint import POINT, TRIGGER
+from skytether.server.endpoint import GOALS, POINT, TRIGGER, ZONES
 from skytether.shared.scenario.catalogue import KEYS, keys, keys_of
 from skytether.shared.scenario.owners import InFlight, Key, OfServer, Owner
 from skytether.shared.scenario.schema import Scenario, Section, Strength
@@ -44,7 +44,7 @@ def test_the_documented_keys_change_in_flight() -> None:
     text = (DOCS / "control.md").read_text()
     rows = re.findall(r"^\| (server|netem|client) \| (.*) \|$", text, re.MULTILINE)
     named = {socket: set(re.findall("`([a-z_.0-9]+)`", keys)) for socket, keys in rows}
-    assert named["server"] == TRIGGER | POINT | keys_of(InFlight.ZONES)
+    assert named["server"] == TRIGGER | POINT | ZONES | GOALS
     assert named["client"] == SimulatedVehicle.changeable | keys_of(InFlight.ARMED)
     assert named["netem"] == {"network.uplink", "network.downlink"}
     assert Proxy.changeable == {

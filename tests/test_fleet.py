@@ -165,7 +165,9 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
 
 def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None:
     """As many vehicles as it has; how near they came stands beside what they are asked to keep."""
-    swap = fleet_command(tmp_path, "--mission", "swap", "--virtual", "--reference.shape", "swap(4)")
+    flown = ("--virtual", "--reference.shape", "swap(4)", "--figure", str(tmp_path / "swap.png"))
+    swap = fleet_command(tmp_path, "--mission", "swap", *flown)
+    assert (tmp_path / "swap.png").stat().st_size > 10_000
     assert (swap["vehicles"], swap["separation_m"]) == (4, 0.5)
     assert swap["least_separation_m"] > 0.5
     show = tmp_path / "show.csv"

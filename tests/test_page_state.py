@@ -226,6 +226,9 @@ def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
     away = np.linalg.norm(last[1:] - last[0], axis=1).min()
     first = next(iter(state.vehicles))
     assert state.nearest_m(first) == pytest.approx(away)
+    assert state.nearest_m(first, 400)[-1] == pytest.approx(away)
+    assert np.nanmin(state.nearest_m(first, 400)) > scenario.mission.separation_m
+    assert np.isnan(state.nearest_m(9)).all()
     page = words.status(state, first, state.newest_ns)
     assert f"{away:.2f} m, at least 0.5 m" in page
     state.take("server", Figures(time_ns=0, figures={"by_vehicle": {"1": {"waits": "vehicle 3"}}}))

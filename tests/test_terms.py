@@ -85,6 +85,7 @@ MISSION: dict[str, Any] = {
     "mission.speed_mps": 0.5,
     "mission.acceleration_mps2": 0.4,
     "mission.allocate": True,
+    "mission.goals": "goal(2, 5.5, 1)",
     "mission.zones": "fence(-9, 9, -9, 9)",
 }
 """Another value of each key of its own."""

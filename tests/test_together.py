@@ -396,6 +396,43 @@ def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
         reading.check(table, "mission")
 
 
+def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
+    """It goes on with the mission once that is taken back."""
+    swaps, elsewhere = scenario(2, duration=40.0), "goal(1, 0, 3)"
+    sent = [(0.5, {"mission.goals": elsewhere})]
+    flown = flight.fly(swaps, vehicles=2, changes=sent)
+    ends = [rows["state"][-1, :, 0] for rows in each_of(flown)]
+    assert np.linalg.norm(ends[0] - [0.0, 3.0]) < 0.3
+    assert max(left_m(flown, 2)[1:]) < 0.3
+    assert flown.server is not None
+    of_one = flown.server[flown.server["vehicle"] == 1]
+    assert of_one["reference"][-1, :, 0].tolist() == [0.0, 3.0]
+    flown = flight.fly(swaps, vehicles=2, changes=[*sent, (15.0, {"mission.goals": ""})])
+    assert max(left_m(flown, 2)) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("goals", "said"),
+    [
+        ("goal(3, 0, 1)", "mission.goals: got goal(3, 0, 1), expected vehicles 1, 2"),
+        ("goal(1, 0)", "mission.goals: got 'goal(1, 0)', expected goal(vehicle, x, y)"),
+        ("place(1, 0, 0)", "mission.goals: got 'place(1, 0, 0)', expected goal(vehicle, x, y)"),
+        ("goal(1, nan, 0)", "mission.goals: got 'goal(1, nan, 0)', expected a place within"),
+        (
+            "goal(1, 7, 7) & goal(2, 7, 7.5)",
+            "mission.goals: got goal(2, 7, 7.5), expected a place 0.9 m from the goal of vehicle 1",
+        ),
+        ("goal(1, 1.1, 0)", "expected a place 0.2 m from box(-1, 1, -1, 1)"),
+    ],
+)
+def test_a_goal_that_cannot_be_is_refused(goals: str, said: str) -> None:
+    """With the one that is wrong, and what is expected."""
+    table = reading.to_table(scenario(2))
+    table["mission"] |= {"goals": goals, "zones": "box(-1, 1, -1, 1)"}
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        reading.check(table, "mission")
+
+
 def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:
     """Each vehicle is at its own goal at any time, and begins at its first."""
     file = tmp_path / "goals.csv"

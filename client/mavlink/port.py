@@ -12,7 +12,7 @@ from skytether.client.mavlink.clock import BootClock
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import ARDUPILOT, FLAVOURS, Flavour, unfit
 from skytether.client.mavlink.launch import Launch, Phase
-from skytether.client.mavlink.positions import Positions
+from skytether.client.mavlink.positions import Positions, Vector
 from skytether.client.mavlink.setup import Setup
 from skytether.client.mavlink.streams import SET_INTERVAL, Streams
 from skytether.mavlink.codec import Codec, Message
@@ -69,6 +69,14 @@ RATES = {
 """Rates that are asked for [Hz], beside those of positions and of the estimate's health."""
 
 
+def _start(scenario: Scenario, vehicle: int) -> Vector:
+    """Where a vehicle takes off, in our axes [m]: on a mission, below where it begins."""
+    if not scenario.is_mission:
+        return 0.0, 0.0, 0.0
+    x, y = scenario.start_m(vehicle)[:2].tolist()
+    return x, y, 0.0
+
+
 class Port(Endpoint):
     """Line to one autopilot.
 
@@ -87,7 +95,9 @@ class Port(Endpoint):
         self._codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
         self._clock = BootClock()
         self._condition = Condition(keys.battery_min, keys.battery_min_v)
-        self.positions = Positions(scenario.model.axes, self._clock)
+        self.positions = Positions(
+            scenario.model.axes, self._clock, start=_start(scenario, vehicle)
+        )
         """What is measured."""
         self._texts = Texts()
         self._told_ns: dict[str, int] = {}

@@ -30,10 +30,17 @@ class Positions:
         axes: number of axes that are flown, 2 or 3.
         clock: the autopilot's clock.
         old_ns: age of a measurement above which it is not taken [ns].
+        start: where in our axes it takes off, once `begin` is called [m].
     """
 
-    def __init__(self, axes: int, clock: BootClock, old_ns: int = OLD_NS) -> None:
-        self._axes, self._clock, self._old_ns = axes, clock, old_ns
+    def __init__(
+        self,
+        axes: int,
+        clock: BootClock,
+        old_ns: int = OLD_NS,
+        start: Vector = (0.0, 0.0, 0.0),
+    ) -> None:
+        self._axes, self._clock, self._old_ns, self._start = axes, clock, old_ns, start
         self._waiting: deque[Measurement] = deque(maxlen=WAITING_MAX)
         self._newest_boot_ms = -1
         self._newest_ns: int | None = None
@@ -107,9 +114,10 @@ class Positions:
         return "late" if boot_ms < self._newest_boot_ms else ""
 
     def begin(self) -> None:
-        """Let our origin be where the vehicle is."""
+        """Let our origin be where the vehicle is, less where it starts."""
         if self.position is not None:
-            self.origin = self.position
+            x, y, z = (at - start for at, start in zip(self.position, self._start, strict=True))
+            self.origin = x, y, z
             self._waiting.clear()
 
     def take(self, *, now_ns: int) -> list[Measurement]:

@@ -37,7 +37,7 @@ class MavlinkVehicle(Vehicle):
     def __init__(self, scenario: Scenario, number: int) -> None:
         line = parse_line("vehicle.address", scenario.vehicle.address)
         self._may_arm = scenario.armed
-        self._port = self.port = Port(scenario, number, line, altitude(scenario))
+        self._port = self.port = Port(scenario, number, line, altitude(scenario, number))
 
     @property
     def failure(self) -> AboardFailure | None:  # type: ignore[override] # it comes of itself
@@ -86,8 +86,8 @@ class MavlinkVehicle(Vehicle):
         self._may_arm = scenario.armed
 
 
-def altitude(scenario: Scenario) -> float:
-    """Altitude to take off to [m].
+def altitude(scenario: Scenario, number: int = 1) -> float:
+    """Altitude to take off to, of the vehicle with this number [m].
 
     Raises:
         ConfigError: the flight would begin on the ground.
@@ -97,7 +97,7 @@ def altitude(scenario: Scenario) -> float:
         return float(given)
     if scenario.model.axes == 2:
         return PLANE_ALTITUDE_M
-    start = float(scenario.make_reference()(np.zeros(()))[2, 0])
+    start = float(scenario.given_reference(number)(np.zeros(()))[2, 0])
     if start < ALTITUDE_MIN_M:
         expected = f"a desired trajectory that begins {ALTITUDE_MIN_M:g} m or more above the ground"
         raise ConfigError(f"mavlink.takeoff_m: got 'auto' at altitude {start:g} m, {expected}")

@@ -12,7 +12,7 @@ from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, margins
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.mission import Mission, given, written
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
 from skytether.shared.scenario.schema import TABLES, ControlConfig, DirectionConfig, Scenario
 from skytether.shared.scenario.triggers import make_trigger
@@ -91,7 +91,7 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
 
 def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
     """Why the desired trajectory cannot be made, or a mission's places not be reached."""
-    wrong = list(_no_zones(scenario))
+    wrong = list(_no_zones(scenario)) or list(_no_goals(scenario))
     same = known and (scenario.reference, scenario.model.axes) == (
         known.reference,
         known.model.axes,
@@ -110,6 +110,9 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
         if scenario.mission.zones:
             expected = "none, but on a mission: reference.shape = 'mission', or a swap"
             yield "mission.zones", repr(scenario.mission.zones), expected
+        if scenario.mission.goals:
+            expected = "none, but on a mission: reference.shape = 'mission', or a swap"
+            yield "mission.goals", repr(scenario.mission.goals), expected
         return
     if control.scheme != "trajectory":
         yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
@@ -136,6 +139,36 @@ def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
     except OSError as error:
         given = repr(scenario.mission.zones)
         yield "mission.zones", given, f"a file that can be read ({error.strerror})"
+
+
+def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why goals cannot be given: to nobody, in a zone, or too near to each other."""
+    mission = scenario.mission
+    if not (mission.goals and scenario.is_mission):
+        return
+    try:
+        goals = given(mission.goals, scenario.model.axes)
+        flown = scenario.given_reference()
+    except policies.PolicyError as error:
+        yield "mission.goals", repr(error.given), error.expected
+        return
+    except (OSError, ValueError):  # which `_no_reference` tells
+        return
+    assert isinstance(flown, Mission)
+    apart_m = mission.separation_m + 2.0 * mission.tube_m
+    for vehicle, place in goals.items():
+        named = written({vehicle: place})
+        near = [each for each, at in goals.items() if np.linalg.norm(at - place) < apart_m]
+        if vehicle not in flown.vehicles:
+            yield "mission.goals", named, f"vehicles {', '.join(map(str, flown.vehicles))}"
+        elif zone := scenario.zones.in_the_way(place[None], mission.tube_m):
+            yield "mission.goals", named, f"a place {mission.tube_m:g} m from {zone}"
+        elif near[0] != vehicle:
+            yield (
+                "mission.goals",
+                named,
+                f"a place {apart_m:g} m from the goal of vehicle {near[0]}",
+            )
 
 
 def _no_places(scenario: Scenario) -> Iterator[Contradiction]:

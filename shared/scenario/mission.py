@@ -3,7 +3,7 @@
 A mission is the reference of each of its vehicles: the goal from each time on, at rest.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.reference import FAR_M, read_table
+from skytether.shared.scenario.calls import calls
+from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.reference import FAR_M, Reference, read_table
 
 SWAP_AT_S = 2.0
 """Time at which vehicles that swap places leave [s]."""
@@ -111,6 +113,60 @@ class Mission:
             given = np.append(given, goals[None, linear_sum_assignment(cost)[1]], axis=0)
         shared = {vehicle: (times_s, given[:, i]) for i, vehicle in enumerate(self._goals)}
         return Mission(shared, self._axes, 1)
+
+
+class Guided:
+    """References of a mission's vehicles, whose goals can be given in flight.
+
+    Args:
+        references: the reference of a vehicle, by its number.
+        goals: goals that are given [m], by vehicle.
+    """
+
+    def __init__(self, references: Callable[[int], Reference], goals: Mapping[int, Array]) -> None:
+        self._references, self.goals = references, goals
+
+    def of(self, vehicle: int) -> Reference:
+        """The reference of a vehicle, whose goal may change; where it begins it does not."""
+        made = self._references(vehicle)
+
+        def reference(t: NDArray[Any]) -> Array:
+            state = made(t)
+            if vehicle in self.goals:
+                state[np.asarray(t) > 0.0, :, 0] = self.goals[vehicle]
+            return state
+
+        return reference
+
+
+def given(text: str, axes: int) -> dict[int, Array]:
+    """Goals [m] by vehicle that a text names.
+
+    Raises:
+        PolicyError: with the part of it that is wrong.
+    """
+    goals = {}
+    form = "goal(vehicle, x, y)" if axes == 2 else "goal(vehicle, x, y, z)"
+    for name, arguments in calls(text, f"goals such as {form!r}"):
+        written = name if arguments is None else f"{name}({arguments})"
+        try:
+            vehicle, *place = map(float, (arguments or "").split(","))
+        except ValueError:
+            raise PolicyError(written, form) from None
+        if name != "goal" or len(place) != axes or not vehicle.is_integer():
+            raise PolicyError(written, form)
+        if not max(map(abs, place)) <= FAR_M:
+            raise PolicyError(written, f"a place within {FAR_M:g} m of the origin")
+        goals[int(vehicle)] = np.array(place)
+    return goals
+
+
+def written(goals: Mapping[int, Array]) -> str:
+    """The text that names these goals."""
+    return " & ".join(
+        f"goal({vehicle}, {', '.join(f'{at:.6g}' for at in place)})"
+        for vehicle, place in goals.items()
+    )
 
 
 def swap(vehicles: int, radius_m: float, axes: int, altitude_m: float = 0.0) -> Mission:

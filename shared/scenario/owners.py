@@ -42,6 +42,8 @@ class InFlight(Enum):
     """Delay and loss of packets."""
     ZONES = auto()
     """Zones of a mission."""
+    GOALS = auto()
+    """Goals of a mission that are given in flight."""
 
 
 class Key(msgspec.Struct, frozen=True):

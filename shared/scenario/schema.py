@@ -287,6 +287,9 @@ class MissionConfig(Section, frozen=True):
     """Largest acceleration of a motion on an axis [m/s²]."""
     allocate: OfServer[bool] = False
     """Whether goals of one time go to the vehicles that are nearest to them; all have one then."""
+    goals: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.GOALS)] = ""
+    """Goals of vehicles in place of those of the mission, as they are given in flight:
+    goal(vehicle, x, y), or with z in space, combined with &."""
     zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.ZONES)] = ""
     """Places to keep out of or to stay within, combined with &: box(x0, x1, y0, y1), cylinder(x, y,
     radius), polygon(x, y, …), fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
@@ -343,7 +346,8 @@ class MavlinkConfig(Section, frozen=True):
     the plane."""
     origin: OfVehicle[Literal["takeoff", "autopilot"]] = "takeoff"
     """Origin of the flight: the point where we arm the vehicle, or the autopilot's own local
-    origin; that is taken as well where the vehicle is in the air already."""
+    origin; that is taken as well where the vehicle is in the air already. On a mission a vehicle is
+    armed where it begins: that point is its first goal, on the ground."""
     patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
     """Time that the autopilot may take until it is heard, and for each step on its way into the
     air [s]."""

@@ -183,15 +183,14 @@ def summarise(
 def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
-    Where a live point was, and which goal a vehicle was given of a mission that allocates them,
-    only the server knows: at a step that it has no row of, it is what it was before. What nobody
-    knows is NaN.
+    Where a live point was, and which goal a vehicle of a mission had, only the server knows: at a
+    step that it has no row of, it is what it was before. What nobody knows is NaN.
 
     Args:
         client: rows of the vehicle.
         server: rows of the server, of any vehicles.
     """
-    if scenario.reference.shape != "live" and not scenario.mission.allocate:
+    if scenario.reference.shape != "live" and not scenario.is_mission:
         times_s, vehicles = client["step"] * scenario.control.dt, client["vehicle"][:1].tolist()
         return scenario.make_reference(*vehicles)(times_s)[..., 0]
     known = client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]
@@ -270,12 +269,25 @@ def _quantile(values: Array, share: float) -> float | None:
 def least_separation(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> float | None:
     """Smallest distance between two vehicles while both are on a mission [m]; None of none.
 
-    Each is from the first step on at which it follows what the server has sent.
+    See `separations`.
+    """
+    _, nearest = separations(each, began_s, dt_s)
+    return float(np.nanmin(nearest)) if np.isfinite(nearest).any() else None
+
+
+def separations(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> tuple[Array, Array]:
+    """Distance between the two vehicles on a mission that are nearest to each other, over time.
+
+    Each vehicle is on it from the first step on at which it follows what the server has sent.
 
     Args:
         each: rows of the client's part of each vehicle, by their steps.
         began_s: time at which step 0 of each began, of one clock [s].
         dt_s: length of a step [s].
+
+    Returns:
+        times of that clock [s; shape (n,)], none of fewer than two vehicles, and distances [m],
+        NaN where fewer fly.
     """
     tracks = []
     for rows, began in zip(each, began_s, strict=True):
@@ -284,16 +296,15 @@ def least_separation(each: Sequence[Rows], began_s: Sequence[float], dt_s: float
             flown = rows[tracking[0] :]
             tracks.append((began + flown["step"] * dt_s, flown["state"][:, :, 0]))
     if len(tracks) < 2:
-        return None
+        return np.zeros(0), np.zeros(0)
     begin, end = min(times[0] for times, _ in tracks), max(times[-1] for times, _ in tracks)
     grid_s = np.arange(begin, end, dt_s)
     places = [
         np.stack([np.interp(grid_s, times, x, np.nan, np.nan) for x in at.T], axis=1)
         for times, at in tracks
     ]
-    nearest = [
-        np.linalg.norm(one - other, axis=1)
-        for number, one in enumerate(places)
-        for other in places[:number]
-    ]
-    return float(np.nanmin(nearest)) if np.isfinite(nearest).any() else None
+    nearest = np.full(len(grid_s), np.nan)
+    for number, one in enumerate(places):
+        for other in places[:number]:
+            np.fmin(nearest, np.linalg.norm(one - other, axis=1), out=nearest)
+    return grid_s, nearest

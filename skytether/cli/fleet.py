@@ -23,12 +23,13 @@ from skytether.figures import flights as figures
 from skytether.shared.base import kernel
 from skytether.shared.core.events import Event, NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.model import Array
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
-from skytether.shared.telemetry.summary import least_separation, summarise
+from skytether.shared.telemetry.summary import separations, summarise
 from skytether.shell import command, temporary
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
@@ -177,12 +178,14 @@ def fleet(argv: Sequence[str]) -> None:
         )
     if not len(flown.client):
         raise CommandError("interrupted before the first step", command.INTERRUPTED)
-    summary = _summarise(options, flown)
+    apart = _separations(options.config, flown.client, flown.vehicles)
+    summary = _summarise(options, flown, apart and float(np.nanmin(apart[1])))
     _show(summary, title)
     if options.json:
         command.write(options.json, msgspec.json.encode(summary))
     if options.figure:
-        figures.fleet(options.figure, title, options.config, flown.client, flown.server)
+        told = flown.client, flown.server, apart
+        figures.fleet(options.figure, title, options.config, *told)
     if flown.failure:
         raise CommandError(str(flown.failure))
 
@@ -345,18 +348,20 @@ def _vehicles(options: FleetOptions) -> int:
     return count
 
 
-def _separation(
-    scenario: Scenario, each: Sequence[Rows], vehicles: Mapping[str, Any]
-) -> float | None:
-    """Smallest distance between two vehicles of a mission [m]; None where it is not known."""
-    numbers = [str(rows["vehicle"][0]) for rows in each]
-    if not scenario.is_mission or any("began_s" not in vehicles.get(n, {}) for n in numbers):
+def _separations(
+    scenario: Scenario, client: Rows, vehicles: Mapping[str, Any]
+) -> tuple[Array, Array] | None:
+    """Distances of a mission over time, see `separations`; None where they are not known."""
+    numbers = np.unique(client["vehicle"]).tolist()
+    if not scenario.is_mission or any("began_s" not in vehicles.get(str(n), {}) for n in numbers):
         return None
-    began_s = [vehicles[number]["began_s"] for number in numbers]
-    return least_separation(each, began_s, scenario.control.dt)
+    each = [client[client["vehicle"] == number] for number in numbers]
+    began_s = [vehicles[str(number)]["began_s"] for number in numbers]
+    times_s, nearest_m = separations(each, began_s, scenario.control.dt)
+    return (times_s, nearest_m) if np.isfinite(nearest_m).any() else None
 
 
-def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
+def _summarise(options: FleetOptions, flown: FleetFlight, least_m: float | None) -> FleetSummary:
     scenario, client, servers, netem = options.config, flown.client, flown.servers, flown.netem
     steps = sum(server["counts"].get("steps", 0) for server in servers)
     spent_us = {
@@ -385,7 +390,7 @@ def _summarise(options: FleetOptions, flown: FleetFlight) -> FleetSummary:
         event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
         rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
         separation_m=scenario.mission.separation_m if scenario.is_mission else None,
-        least_separation_m=_separation(scenario, each, flown.vehicles),
+        least_separation_m=least_m,
         uplink_packets_per_s=links[0]["packets"] / duration_s,
         downlink_packets_per_s=links[1]["packets"] / duration_s,
         lost=sum(link["lost"] for link in links),

@@ -1,6 +1,6 @@
 """Pictures of flights, and of a fleet."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,11 +9,13 @@ import numpy as np
 
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.telemetry.summary import desired, position_error
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -99,14 +101,22 @@ def draw_reference(
 
 
 def fleet(
-    path: Path, title: str, scenario: Scenario, client: Rows, server: Rows | None = None
+    path: Path,
+    title: str,
+    scenario: Scenario,
+    client: Rows,
+    server: Rows | None = None,
+    separations: tuple[Array, Array] | None = None,
 ) -> None:
     """Draw a fleet: all paths over the reference, and how the tracking error spreads.
+
+    Of a mission it is paths among zones, and how near two vehicles came over time.
 
     Args:
         path: file to write, in one of FORMATS.
         client: rows of all vehicles' records.
         server: rows of the server, which alone knows where a live point was.
+        separations: times and distances of a mission, see `summary.separations`.
     """
     from matplotlib.figure import Figure
 
@@ -115,12 +125,46 @@ def fleet(
     flights = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
     for rows in flights:
         x, y = rows["state"][:, :2, 0].T
-        plane.plot(x, y, "k-", linewidth=0.6, alpha=max(0.05, 1 / len(flights)))
-    draw_reference(plane, scenario, max(flights, key=len), server)
+        faint = 0.5 if separations else max(0.05, 1 / len(flights))
+        plane.plot(x, y, "k-", linewidth=0.6, alpha=faint)
+    if separations:
+        for number, zone in enumerate(scenario.zones.zones):
+            label = "" if number else "zones"
+            plane.fill(*zone.corners.T, facecolor="none", edgecolor="tab:red", label=label)
+        for rows in flights:
+            plane.plot(*rows["state"][-1, :2, 0], "k.", markersize=4)
+    else:
+        draw_reference(plane, scenario, max(flights, key=len), server)
     plane.set_aspect("equal", adjustable="datalim")
     plane.set_xlabel("x [m]")
     plane.set_ylabel("y [m]")
-    plane.legend(loc="upper right", fontsize=8)
+    if plane.get_legend_handles_labels()[0]:
+        plane.legend(loc="upper right", fontsize=8)
+    if separations:
+        _draw_separations(spread, scenario, *separations)
+    else:
+        _draw_errors(spread, scenario, flights, server)
+    for axes in (plane, spread):
+        axes.grid(alpha=0.3)
+    figure.suptitle(title, fontsize=10)
+    save(figure, path, dpi=130)
+
+
+def _draw_separations(axes: "Axes", scenario: Scenario, times_s: Array, nearest_m: Array) -> None:
+    """Draw how near two vehicles came, beside what was asked for."""
+    axes.plot(times_s - times_s[:1], nearest_m, "k-", linewidth=0.8, label="nearest two vehicles")
+    asked_m = scenario.mission.separation_m
+    axes.axhline(asked_m, color="tab:red", linestyle="--", label=f"asked for: {asked_m:g} m")
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("distance [m]")
+    axes.legend(loc="upper right", fontsize=8)
+
+
+def _draw_errors(
+    spread: "Axes", scenario: Scenario, flights: Sequence[Rows], server: Rows | None
+) -> None:
+    """Draw how the tracking error spreads over the vehicles."""
     settled = [rows[rows["step"] * scenario.control.dt >= scenario.settled_s] for rows in flights]
     errors = [
         np.sqrt((position_error(scenario, rows, server)[:, :2] ** 2).sum(axis=1).mean())
@@ -131,7 +175,3 @@ def fleet(
     spread.hist(known, bins=max(5, round(np.sqrt(len(known)))), color="0.4")
     spread.set_xlabel("RMSE xy of a vehicle [m]")
     spread.set_ylabel("vehicles")
-    for axes in (plane, spread):
-        axes.grid(alpha=0.3)
-    figure.suptitle(title, fontsize=10)
-    save(figure, path, dpi=130)

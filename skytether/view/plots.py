@@ -36,6 +36,8 @@ class Look:
     state: State
     curves: Curves
     now_ns: int
+    vehicle: int = 0
+    """Number of the vehicle."""
 
 
 Values = Callable[[Look], Array]
@@ -136,9 +138,26 @@ BY_DELAY = Plot(
 """Plot of how many packets took how long."""
 
 
-def of_flight(axes: int) -> tuple[Plot, ...]:
-    """Plots of a vehicle with so many axes."""
+APART = Plot(
+    "Nearest other vehicle [m]",
+    (
+        PlotLine(
+            "asked for",
+            lambda look: np.full(POINTS, look.state.scenario.mission.separation_m),
+            GREY,
+            dash=(4, 4),
+            once=True,
+        ),
+        PlotLine("nearest", lambda look: look.state.nearest_m(look.vehicle, POINTS)),
+    ),
+)
+"""Plot of how near a vehicle of a mission came to another."""
+
+
+def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
+    """Plots of a vehicle with so many axes, alone or on a mission."""
     return (
+        *((APART,) if mission else ()),
         *(Plot(f"{name} [m]", _axis(axis)) for axis, name in enumerate("xyz"[:axes])),
         Plot(
             "What the trigger compares, and packets",

@@ -43,8 +43,8 @@ SLOTS_MAX = 1200
 """Most steps that are kept of a vehicle; where a minute has more, every second or third is."""
 VEHICLES_MAX = 64
 """Most vehicles of a flight that are shown."""
-ZONED = "mission.zones"
-"""Key of the zones of a mission."""
+ZONED, GUIDED = "mission.zones", "mission.goals"
+"""Keys of the zones of a mission, and of the goals that are given."""
 SAID_MAX = 50
 """Most events that are kept."""
 LED = "reference.points_m"
@@ -250,6 +250,17 @@ class VehicleTrack:
         positions = planned(self._scenario, self._plan)
         flown = 0 if self.row is None else int(self.row["step"] - self._plan["begins"])
         return positions[min(max(flown, 0), len(positions)) :]
+
+    def path(self, points: int) -> Array:
+        """Positions at so many times of the last minute [m]; shape (points, axes).
+
+        The last of them is the newest that is known; where none is, there is NaN.
+        """
+        flown = ~np.isnan(self._ring["position"][:, 0])
+        last = int(self._ring["slot"].max(where=flown, initial=-1))
+        slots = last - np.arange(points)[::-1] * (self._slots / points)
+        position: Array = self._at_slots(np.maximum(slots, -1).astype(np.int64))["position"]
+        return position
 
     def curves(self, points: int, end_s: float | None = None) -> Curves:
         """The last minute on a grid of so many times.
@@ -484,14 +495,22 @@ class State:
         said = group(self.figures("server"), "by_vehicle", str(number)).get("waits", "")
         return said if isinstance(said, str) else ""
 
-    def nearest_m(self, number: int) -> float:
-        """Distance from a vehicle to the nearest other one now [m]; NaN without another."""
-        rows = {each: track.row for each, track in self.vehicles.items() if track.row is not None}
-        own = rows.pop(number, None)
-        if own is None or not rows:
-            return float("nan")
-        off = [row["state"][:, 0] - own["state"][:, 0] for row in rows.values()]
-        return float(np.linalg.norm(off, axis=1).min())
+    def nearest_m(self, number: int, points: int = 1) -> Array:
+        """Distance from a vehicle to the nearest other one in the last minute [m].
+
+        Args:
+            number: number of the vehicle.
+            points: number of times, the last of them now.
+
+        Returns:
+            distances, NaN where nothing is known; shape (points,).
+        """
+        nearest = np.full(points, np.nan)
+        own = self.vehicles[number].path(points) if number in self.vehicles else None
+        for other, track in self.vehicles.items():
+            if own is not None and other != number:
+                np.fmin(nearest, np.linalg.norm(track.path(points) - own, axis=1), out=nearest)
+        return nearest
 
     @property
     def lost(self) -> tuple[str, ...]:

@@ -129,8 +129,12 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
     if not state.scenario.is_mission:
         return []
     asked = f"at least {state.scenario.mission.separation_m:g} m"
+    nearest = number(float(state.nearest_m(vehicle)[-1]), ".2f", " m")
     return [
-        ("nearest other vehicle", f"{number(state.nearest_m(vehicle), '.2f', ' m')}, {asked}"),
+        (
+            "nearest other vehicle",
+            f"{nearest}, {asked}",
+        ),
         ("waits for", state.waits(vehicle) or "–"),
     ]
 

@@ -12,6 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from skytether.shared.scenario.mission import given, written
 from skytether.view import words
 from skytether.view.browser.flight import PageFlight
 from skytether.view.controls import (
@@ -27,12 +28,17 @@ from skytether.view.controls import (
 )
 from skytether.view.plots import POINTS, Look, Plots, of_flight, of_link, of_network
 from skytether.view.scene import GROUND_RGB, WIDE, Scene, in_space
-from skytether.view.state import LED, ZONED, VehicleTrack
+from skytether.view.state import GUIDED, LED, ZONED, VehicleTrack
 
 HELD_S = 1.5
 """Time for which a slider that was moved is left where it is [s]."""
 IMPAIRMENTS = 'Impairments joined by &, as in "constant(0.05) & loss(0.1)", see docs/network.md'
 ZONES = "Zones joined by &, as in 'box(-1, 1, 2, 3) & cylinder(0, -2, 0.5)', see docs/together.md"
+GUIDES, DRAWS = "sends the vehicle", "draws a zone"
+CLICKS = ("looks", GUIDES, DRAWS)
+CLICKED = "What a click on the map does: the chosen vehicle's goal, or two corners of a box."
+GOAL_S = 60.0
+"""Age up to which a goal is known [s]."""
 FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
@@ -112,7 +118,9 @@ class Panel:
         """Stands for a vehicle where netem is alone."""
         if flies:
             with panel.add_tab("Flight"):
-                self._plots.append(Plots(gui, titles, of_flight(axes)))
+                self._plots.append(
+                    Plots(gui, titles, of_flight(axes, mission=scenarios[0].is_mission))
+                )
         with panel.add_tab("Network"):
             of_air = of_network(solves=solves) if flies else of_link()
             self._plots.append(Plots(gui, titles, of_air))
@@ -149,7 +157,9 @@ class Panel:
 
     def _let_play(self) -> None:
         with self._play:
-            self._controls = [Controls(self._client, self._flights)]
+            self._controls = [
+                Controls(self._client, self._flights, lambda: int(self._vehicle.value))
+            ]
 
     def _aim(self) -> None:
         """Show all there is in a window that changes, unless somebody has moved the camera."""
@@ -176,7 +186,7 @@ class Panel:
         if len(known) == len(tracks):
             end_s = max(track.time_s for track in known)
             looks = [
-                Look(flight.state, track.curves(POINTS, end_s), now_ns)
+                Look(flight.state, track.curves(POINTS, end_s), now_ns, vehicle)
                 for flight, track in zip(self._flights, known, strict=True)
             ]
             for plots in self._plots:
@@ -255,10 +265,21 @@ class _Network:
 
 
 class Controls:
-    """What one browser can change: the same of all flights on the page."""
+    """What one browser can change: the same of all flights on the page.
 
-    def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
-        self._client = client
+    Args:
+        client: the browser.
+        flights: what is flown.
+        vehicle: tells the number of the vehicle that is chosen.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        flights: Sequence[PageFlight],
+        vehicle: Callable[[], int],
+    ) -> None:
+        self._client, self._vehicle = client, vehicle
         self._flights = [each for each in flights if each.operator]
         gui = client.gui
         scenario = self._flights[0].state.scenario
@@ -270,7 +291,7 @@ class Controls:
         self._network = _Network(gui, partial(self._all, "netem"), flies=flies)
         self._thresholds: list[_Slider] = []
         self._lead: _Lead | None = None
-        self._zones: _Zones | None = None
+        self._mission: _Mission | None = None
         if flies:
             self._let_fly()
 
@@ -299,7 +320,8 @@ class Controls:
         if scenario.reference.shape == "live":
             self._lead = _Lead(self._client, self._flights)
         if scenario.is_mission:
-            self._zones = _Zones(self._client, self._flights, partial(self._all, "server"))
+            ask = partial(self._all, "server")
+            self._mission = _Mission(self._client, self._flights, ask, self._vehicle)
 
         @self._trigger.on_update
         async def _(event: Any) -> None:
@@ -353,46 +375,66 @@ class Controls:
             assign(self._armed, armed)
         if self._lead:
             self._lead.show()
-        if self._zones:
-            self._zones.show()
+        if self._mission:
+            self._mission.show()
 
 
-class _Zones:
-    """Zones of a mission: a text, and boxes between two places that are clicked."""
+class _Mission:
+    """What can be changed of a mission: zones as a text or drawn, and the chosen vehicle's goal."""
 
     def __init__(
         self,
         client: viser.ClientHandle,
         flights: Sequence[PageFlight],
         ask: Callable[[dict[str, Any]], None],
+        vehicle: Callable[[], int],
     ) -> None:
-        self._state, self._known = flights[0].state, flights[0].state.zones
+        self._flight, self._state, self._ask = flights[0], flights[0].state, ask
+        self._known, self._vehicle = self._state.zones, vehicle
+        self._corners: list[NDArray[Any]] = []
+        """Corners of a box that were clicked."""
         gui = client.gui
-        with gui.add_folder("Zones"):
-            self._text = gui.add_text("As text", self._known, hint=ZONES)
+        with gui.add_folder("Mission"):
+            self._text = gui.add_text("Zones", self._known, hint=ZONES)
             apply = gui.add_button("Change the zones")
-            draw = gui.add_checkbox("Draw one", False, hint="Click two corners of a box.")
-        corners: list[NDArray[Any]] = []
+            self._clicks = gui.add_dropdown("A click", CLICKS, hint=CLICKED)
 
         @apply.on_click
         async def _(_: Any) -> None:
             ask({ZONED: self._text.value})
 
-        @draw.on_update
+        @self._clicks.on_update
         async def _(_: Any) -> None:
-            corners.clear()
+            self._corners.clear()
 
         @client.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            if not draw.value or direction[2] * origin[2] >= 0:  # it is the sky that was clicked
-                return
-            corners.append((origin - direction * origin[2] / direction[2])[:2])
-            if len(corners) == 2:
-                (x0, y0), (x1, y1) = np.sort(np.round(corners, 2), axis=0)
-                corners.clear()
-                box = f"box({x0}, {x1}, {y0}, {y1})"
-                ask({ZONED: " & ".join(filter(None, (self._state.zones, box)))})
+            if direction[2] * origin[2] < 0:  # else it is the sky that was clicked
+                at = (origin - direction * origin[2] / direction[2])[:2]
+                if self._clicks.value == GUIDES:
+                    self._guide(at)
+                elif self._clicks.value == DRAWS:
+                    self._draw(at)
+
+    def _guide(self, at: NDArray[Any]) -> None:
+        """Send the chosen vehicle to a place, in space at the height of its goal."""
+        number, axes = self._vehicle(), self._state.scenario.model.axes
+        track = self._state.vehicles.get(number)
+        here = track.goal(GOAL_S) if track else None
+        values = self._flight.values.get("server", {})
+        goals = given(values.get(GUIDED, ""), axes)
+        goals[number] = np.append(np.round(at, 2), here[2:] if here is not None else [0.0])[:axes]
+        self._ask({GUIDED: written(goals)})
+
+    def _draw(self, at: NDArray[Any]) -> None:
+        """Take a corner of a box; the second one makes it."""
+        self._corners.append(at)
+        if len(self._corners) == 2:
+            (x0, y0), (x1, y1) = np.sort(np.round(self._corners, 2), axis=0)
+            self._corners.clear()
+            box = f"box({x0}, {x1}, {y0}, {y1})"
+            self._ask({ZONED: " & ".join(filter(None, (self._state.zones, box)))})
 
     def show(self) -> None:
         """Show the zones once they are others than before."""
