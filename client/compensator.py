@@ -33,6 +33,8 @@ from skytether.shared.wire.protocol import (
     Trajectory,
 )
 
+FOREVER = 2**30
+"""Stages for which a place is held: none come after."""
 NO_WIND = (0.0,) * AXES_MAX
 """Disturbance of each axis where none is known [m/s]."""
 
@@ -124,7 +126,8 @@ class Compensator:
         self.observed = observed
         self._begins = horizon.step
         if isinstance(horizon, Trajectory):
-            self._guide(horizon, length)
+            knots = horizon.knots.reshape(len(horizon.knots), -1).tolist()
+            self._guide(knots, horizon.spacing, length)
             return True
         self._hold(
             horizon.inputs.tolist(),
@@ -182,11 +185,25 @@ class Compensator:
         self._lead = [(columns[LED_P], columns[LED_V]) for columns in told]
         self._lead_stage = 0
 
-    def _guide(self, told: Trajectory, length: int) -> None:
+    def rest(self, step: int, state: Sequence[tuple[float, float]]) -> None:
+        """Hold the present place until a horizon comes, or what is held is dropped.
+
+        Args:
+            step: k, the step whose input is chosen next.
+            state: position [m] and velocity [m/s] of each axis.
+        """
+        self._begins = step
+        self._guide([[position, 0.0] for position, _ in state], 1, FOREVER)
+
+    @property
+    def rests(self) -> bool:
+        """Whether a place is held."""
+        return bool(self._guides) and self.in_force == NO_HORIZON
+
+    def _guide(self, knots: list[list[float]], spacing: int, length: int) -> None:
         """Fly along a spline from now on, for so many stages."""
-        knots = told.knots.reshape(len(told.knots), -1).tolist()
         last = [
-            bounded(along(model, each, told.spacing, self._dt_s, length - 1), bound)
+            bounded(along(model, each, spacing, self._dt_s, length - 1), bound)
             for model, each, bound in zip(self._model, knots, self._bounds, strict=True)
         ]
         speed = math.hypot(*last)
@@ -194,7 +211,7 @@ class Compensator:
             Guide(
                 model=model,
                 knots=each,
-                spacing=told.spacing,
+                spacing=spacing,
                 dt_s=self._dt_s,
                 length=length,
                 last=u,

@@ -43,6 +43,8 @@ ALTITUDE = 2
 """Axis of the altitude, where there is one."""
 STOPPED = (Mode.FAULT, Mode.MANUAL)
 """Modes in which nothing but zero is flown, at once."""
+HOVERING = frozenset({Mode.INIT, Mode.SYNC, Mode.READY, Mode.HOVER, Mode.LAND})
+"""Modes in which a vehicle stays where it is, or above that place."""
 IMPOSSIBLE = frozenset({Drop.FROM_THE_FUTURE, Drop.OBSERVATION})
 """Reasons for which a horizon is dropped that is made for an impossible time."""
 
@@ -212,9 +214,10 @@ class Pilot:
         if self._navigation.leapt:
             failsafe.leapt(now_ns=now_ns)
         had_plan = compensator.covered
+        self._rest()
         wanted = compensator.choose(self.step, known.predicted, known.disturbance)
         if failsafe.mode is Mode.LAND:
-            wanted = [0.0] * self._terms.axes
+            wanted = wanted if compensator.rests else [0.0] * self._terms.axes
             if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE][0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
         told = compensator.told if compensator.feeds_back else wanted
@@ -242,6 +245,13 @@ class Pilot:
         if not self._speed:
             failsafe.meet(Reason.STILL, now_ns=now_ns)
         return np.array(flown)
+
+    def _rest(self) -> None:
+        """On a mission, hold the place where it hovers: others reckon with it."""
+        compensator, known = self.compensator, self._navigation
+        hovers = self._terms.join and self._failsafe.mode in HOVERING and known.is_known
+        if hovers and compensator.in_force == NO_HORIZON and not compensator.rests:
+            compensator.rest(self.step, known.predicted)
 
     def _fenced(self, fence: Fence, flown: list[float]) -> list[float]:
         """Input that the fence lets pass; down to the ground it lets a vehicle that lands."""

@@ -15,6 +15,7 @@ from scipy import sparse
 
 from skytether.__main__ import main
 from skytether.client.compensator import Compensator
+from skytether.lab.benchmarks.together import MortalServer
 from skytether.server.control import together
 from skytether.server.control.dual import DualSolver
 from skytether.server.control.motionplan import MotionPlan
@@ -287,6 +288,37 @@ def test_taken_late_a_motion_is_another_one(monkeypatch: pytest.MonkeyPatch) -> 
     table["network"] |= dict(zip(("uplink", "downlink"), ways, strict=True))
     flown = flight.fly(reading.check(table, "late"), vehicles=16)
     assert flown.figures["server"]["counts"]["left_tube"] > 0
+
+
+def impatient(swaps: Scenario) -> Scenario:
+    """A scenario with a failsafe that brakes after 8 s of silence, and lands after a minute."""
+    link = msgspec.structs.replace(swaps.link, timeout_s=8.0)
+    vehicle = msgspec.structs.replace(swaps.vehicle, land_after_s=60.0)
+    return msgspec.structs.replace(swaps, link=link, vehicle=vehicle)
+
+
+def test_a_server_begins_anew_in_the_midst_of_a_mission() -> None:
+    """It reckons with motions that it does not know, and with vehicles that hover meanwhile."""
+    swaps = impatient(scenario(8, duration=90.0))
+    server = MortalServer(swaps, 8, [(6.0, 7.5), (14.0, 30.0), (36.0, 38.0)])
+    flown = flight.fly(swaps, vehicles=8, server=server)
+    assert separation_m(flown) > 0.5
+    assert max(left_m(flown, 8)) < 0.3
+
+
+def test_who_hovers_on_a_mission_holds_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ablation: without that, wind takes it out of its tube while the server is gone."""
+    swaps = impatient(scenario(2, duration=60.0))
+
+    def drift_m() -> float:
+        flown = flight.fly(swaps, vehicles=2, server=MortalServer(swaps, 2, [(4.0, 58.0)]))
+        hovering = [rows[rows["mode"] == Mode.HOVER]["state"][:, :, 0] for rows in each_of(flown)]
+        assert min(map(len, hovering)) > 700
+        return max(float(np.linalg.norm(at - at[0], axis=1).max()) for at in hovering)
+
+    assert drift_m() < swaps.mission.tube_m
+    monkeypatch.setattr(Compensator, "rest", lambda *_: None)
+    assert drift_m() > swaps.mission.tube_m
 
 
 # -- zones -----------------------------------------------------------------------------------------

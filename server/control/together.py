@@ -52,8 +52,6 @@ LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 MARGIN_M = 0.03
 """By how much more than D motions are planned apart: between the times at which the plan keeps it,
 and for the solver's tolerance [m]."""
-BEGINS_M = 2.0
-"""Distance from its first goal within which a vehicle is sent there to begin [m]."""
 RESTS_MPS = 0.2
 """Measured speed up to which a vehicle rests [m/s]."""
 ARRIVED_M = 0.02
@@ -71,6 +69,8 @@ ROUNDS = 5
 """Number of times that constraints are taken in for one of them."""
 STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
+NEARER_M = 1e-3
+"""By how much motions may come nearer that are too near already [m]: a solver's tolerance."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
 
@@ -229,7 +229,7 @@ class Together:
         if number not in self._absent:
             return observed
         first: Array = self._references(number)(np.zeros(()))[:, 0]
-        return first if np.linalg.norm(first - observed) < BEGINS_M else observed
+        return first if np.linalg.norm(first - observed) < self._tube_m else observed
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
         """See `Scheme`: what was observed, as it is."""
@@ -445,15 +445,23 @@ class Together:
 
     def _hit(self, row: int, motion: Motion, k: int) -> Flags:
         """Which motions of others one comes too near to, ever, and last whether it does a zone."""
-        ahead, flown = self._ahead[row], self._flown
-        common = Motion(motion.first - ahead, motion.position, motion.velocity)
-        least = apart.least_apart(common, k - ahead, row, flown, self._scale, self._dt_s)
+        least = self._least(row, motion, k)
         enters = False
         if self._zones:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
             enters = bool((self._zones.along(points) < self._tube_m + self._bend_m).any())
-        kept_m = self._apart_m + 2.0 * self._bend_m + self._rows[row].off_m
-        return np.append(least < kept_m + flown.wide_m, enters)
+        kept_m = self._apart_m + 2.0 * self._bend_m + self._rows[row].off_m + self._flown.wide_m
+        base = self._rows[row].in_force
+        if base and (least < kept_m).any():
+            # Where they are nearer already, it need only come no nearer: it may always fly away.
+            kept_m = np.minimum(kept_m, self._least(row, base.motion, k) - NEARER_M)
+        return np.append(least < kept_m, enters)
+
+    def _least(self, row: int, motion: Motion, k: int) -> Array:
+        """Smallest distance of a vehicle's motion from each motion of all, from step k on [m]."""
+        ahead = self._ahead[row]
+        common = Motion(motion.first - ahead, motion.position, motion.velocity)
+        return apart.least_apart(common, k - ahead, row, self._flown, self._scale, self._dt_s)
 
 
 def _along(place: Array, way: Array, far_m: float) -> Array:

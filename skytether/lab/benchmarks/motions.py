@@ -1,21 +1,24 @@
-"""What it costs to keep vehicles apart: a motion's QP beside OSQP, and whole ticks of the server.
+"""What it costs to keep vehicles apart: a motion's QP beside other solvers, and whole ticks.
 
     python -m skytether.lab.benchmarks.motions
 
-The QPs are those of a flight of the scenario `swap`, with the constraints that were taken in. Both
+The QPs are those of a flight of the scenario `swap`, with the constraints that were taken in. All
 solvers get them one after the other, in turns. OSQP is set up once for each shape of problem and
-given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing.
+given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing. quadprog is
+given the Hessian's factor, DAQP and PIQP the dense problem; those that are installed take part.
 Ticks are of swaps in virtual time: all vehicles are heard and planned for by one thread.
 """
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import daqp
 import msgspec
 import numpy as np
 import osqp
@@ -109,6 +112,47 @@ class Osqp:
         return found
 
 
+def rivals(hessian: Array) -> dict[str, Callable[[Problem], Array]]:
+    """Solvers by name, each of problems with this Hessian."""
+    found: dict[str, Callable[[Problem], Array]] = {"OSQP": Osqp(hessian).solve}
+
+    def of_daqp(problem: Problem) -> Array:
+        least, free = problem.least, np.full(len(problem.least), 1e30)
+        most = np.where(np.arange(len(least)) < problem.equal, least, free)
+        kind = np.where(np.arange(len(least)) < problem.equal, 5, 0).astype(np.int32)
+        rows = np.ascontiguousarray(problem.columns.T)
+        result: Array = daqp.solve(hessian, -problem.linear, rows, most, least, kind)[0]
+        return result
+
+    found["DAQP"] = of_daqp
+    if find_spec("quadprog"):
+        import quadprog
+
+        factor = np.linalg.inv(np.linalg.cholesky(hessian).T)
+
+        def of_quadprog(problem: Problem) -> Array:
+            given = factor, problem.linear, problem.columns, problem.least, problem.equal, True
+            result: Array = quadprog.solve_qp(*given)[0]
+            return result
+
+        found["quadprog"] = of_quadprog
+    if find_spec("piqp"):
+        import piqp
+
+        def of_piqp(problem: Problem) -> Array:
+            solver, rows = piqp.DenseSolver(), np.ascontiguousarray(problem.columns.T)
+            solver.settings.compute_timings = False
+            n = problem.equal
+            solver.setup(
+                hessian, -problem.linear, rows[:n], problem.least[:n], rows[n:], problem.least[n:]
+            )
+            solver.solve()
+            return np.asarray(solver.result.x)
+
+        found["PIQP"] = of_piqp
+    return found
+
+
 def swap(vehicles: int, radius_m: float, duration: float) -> Scenario:
     """Vehicles that swap places on a circle."""
     made = reading.load("swap")
@@ -119,40 +163,45 @@ def swap(vehicles: int, radius_m: float, duration: float) -> Scenario:
 
 
 def solvers(options: MotionsOptions) -> TextTable:
-    """Both solvers on the QPs of a flight."""
+    """All solvers on the QPs of a flight."""
     problems: list[Problem] = []
     with kept(problems):
         flight.fly(swap(16, 4.0, options.duration), vehicles=16)
     step = max(1, len(problems) // options.problems)
     problems = problems[::step][: options.problems]
     root = problems[0].solver._root
-    other = Osqp(np.linalg.inv(root.T @ root).astype(np.float64))
-    spent: dict[str, list[float]] = {"dual active set": [], "OSQP": []}
-    off = []
+    hessian = np.linalg.inv(root.T @ root).astype(np.float64)
+    solve: dict[str, Callable[[Problem], Any]] = {
+        "ours, dual active set": lambda problem: problem.solver.solve(*problem[1:]),
+        **rivals(hessian),
+    }
+    spent: dict[str, list[float]] = {name: [] for name in solve}
+    off: dict[str, float] = dict.fromkeys(solve, 0.0)
     for _ in range(2):  # the first time warms up
         for each in spent.values():
             each.clear()
         for problem in progress(problems, "QPs"):
-            began = time.perf_counter_ns()
-            ours = problem.solver.solve(*problem[1:])
-            middle = time.perf_counter_ns()
-            theirs = other.solve(problem)
-            spent["dual active set"].append((middle - began) / 1e3)
-            spent["OSQP"].append((time.perf_counter_ns() - middle) / 1e3)
-            if ours is not None:
-                off.append(float(np.abs(ours - theirs).max()))
+            ours = None
+            for name, solver in solve.items():
+                began = time.perf_counter_ns()
+                found = solver(problem)
+                spent[name].append((time.perf_counter_ns() - began) / 1e3)
+                ours = found if ours is None else ours
+                off[name] = max(off[name], float(np.abs(found - ours).max()))
     p50, p99 = ({n: float(np.quantile(x, q)) for n, x in spent.items()} for q in (0.5, 0.99))
     rows = [
         [
             name,
             f"{p50[name]:.0f}, {p99[name]:.0f}",
             f"{p50['OSQP'] / p50[name]:.1f}, {p99['OSQP'] / p99[name]:.1f}",
+            f"{off[name]:.1e}",
         ]
         for name in spent
     ]
     constraints = np.median([len(problem.least) for problem in problems])
     title = f"solver; {len(problems)} QPs, 24 variables, {constraints:.0f} constraints (median)"
-    return TextTable([title, "p50, p99 [µs]", "OSQP over it"], rows)
+    headings = [title, "p50, p99 [µs]", "OSQP over it", "largest difference\n[m/s²]"]
+    return TextTable(headings, rows)
 
 
 def ticks(options: MotionsOptions) -> TextTable:

@@ -3,20 +3,21 @@
     python -m skytether.lab.benchmarks.together
 
 Each cell is so many flights of the scenario `swap` in virtual time: how near two vehicles came, how
-often nearer than asked for, and when the last arrived. Beside it fly two planners that forget what
-may be flown: one keeps apart from the newest motion of each vehicle, as if every packet arrived,
-and one from nothing, as vehicles do that fly to their goals by themselves.
+often nearer than asked for, and when the last arrived. In one the server dies three times a flight,
+for 0.5 to 20 s, and begins anew without memory. Beside it fly two planners that forget what may be
+flown: one keeps apart from the newest motion of each vehicle, as if every packet arrived, and one
+from nothing, as vehicles do that fly to their goals by themselves.
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,6 +25,11 @@ import tyro
 
 from skytether.lab.benchmarks.harness import TextTable, progress
 from skytether.server.control.together import Known
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.events import Event
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
@@ -37,8 +43,14 @@ NETWORKS = {
     "30 %": "paper(0.4, 0.02, 2) & loss(0.3)",
     "50 %": "paper(0.4, 0.02, 2) & loss(0.5)",
     "30 %, bursts of 2 s": "paper(0.4, 0.02, 2) & gilbert_elliott(0.3, 2)",
+    "10 %, all links cut for 5 s every 20 s": "paper(0.4, 0.02, 2) & loss(0.1) & outages(20, 5)",
+    "10 %, a server that dies": "paper(0.4, 0.02, 2) & loss(0.1)",
 }
 """Networks, both ways alike."""
+MORTAL = "10 %, a server that dies"
+"""The one of which the server dies."""
+DEATHS, DOWN_S = 3, (0.5, 20.0)
+"""How often it does so, and for how long at least and at most [s]."""
 PLANNERS: dict[str, Callable[[list[Motion]], list[Motion]]] = {
     "all that may be flown": lambda motions: motions,
     "the newest alone": lambda motions: motions[-1:],
@@ -55,6 +67,8 @@ class TogetherOptions:
 
     flights: int = 30
     """Flights of each cell."""
+    guaranteed: bool = False
+    """Whether to fly only what keeps apart from all that may be flown."""
     vehicles: int = 16
     duration: float = 120.0
     """Length of a flight [s]."""
@@ -75,6 +89,88 @@ class Swap(NamedTuple):
     """Packets a second both ways, of a vehicle."""
     left: int
     """Observations of a vehicle outside its tube."""
+
+
+class MortalServer(Endpoint):
+    """A server that is not there at some times, and begins anew after each without its memory.
+
+    Args:
+        scenario: what is flown.
+        room: number of vehicles.
+        deaths: when it dies and begins anew, since it began [s], in order.
+    """
+
+    def __init__(
+        self, scenario: Scenario, room: int, deaths: Sequence[tuple[float, float]]
+    ) -> None:
+        super().__init__()
+        self._scenario, self._room = scenario, room
+        self._deaths = [(seconds_to_ns(from_s), seconds_to_ns(to_s)) for from_s, to_s in deaths]
+        self._epoch_ns: int | None = None
+        self._lives = 0
+        self._left = 0
+        """Observations outside a tube in lives that are over."""
+        self._server: Server | None = self._begin()
+
+    def _begin(self) -> Server:
+        self._lives += 1
+        entropy = stream(self._scenario.seed, "mortal", self._lives).bytes
+        return Server(self._scenario, boot_id=self._lives, entropy=entropy, room=self._room)
+
+    def _alive(self, now_ns: int) -> Server | None:
+        """The server that lives now; None while there is none."""
+        if self._epoch_ns is None:
+            self._epoch_ns = now_ns
+        while self._deaths and now_ns >= self._epoch_ns + self._deaths[0][0]:
+            if self._server:
+                self._left += self._server.figures()["counts"].get("left_tube", 0)
+            self._server = None
+            if now_ns < self._epoch_ns + self._deaths[0][1]:
+                return None
+            self._deaths.pop(0)
+            self._server = self._begin()
+        return self._server
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        if server := self._alive(now_ns):
+            server.receive(datagram, now_ns=now_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        if server := self._alive(now_ns):
+            server.wake(now_ns=now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """See `Endpoint`."""
+        due_ns = self._server.next_wake_ns() if self._server else None
+        if not self._deaths or self._epoch_ns is None:
+            return due_ns
+        changes_ns = self._epoch_ns + self._deaths[0][self._server is None]
+        return changes_ns if due_ns is None else min(due_ns, changes_ns)
+
+    def outbox(self) -> list[Datagram]:
+        """See `Endpoint`."""
+        return self._server.outbox() if self._server else []
+
+    def events(self) -> Sequence[Event]:
+        """See `Endpoint`."""
+        return self._server.events() if self._server else ()
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`; observations outside a tube are those of all lives."""
+        told = self._server.figures() if self._server else {"counts": {}}
+        told["counts"]["left_tube"] = self._left + told["counts"].get("left_tube", 0)
+        return told
+
+
+def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
+    """When a server dies and begins anew, drawn from a seed [s]."""
+    rng = stream(seed, "deaths")
+    begins = rng.uniform(np.arange(DEATHS), np.arange(DEATHS) + 1.0) * duration / DEATHS
+    for_s = rng.uniform(*DOWN_S, DEATHS)
+    ends = np.minimum(begins + for_s, np.append(begins[1:], np.inf) - 1.0)
+    return [(b, e) for b, e in zip(begins.tolist(), ends.tolist(), strict=True) if e > b]
 
 
 @contextmanager
@@ -111,7 +207,10 @@ def fly(options: TogetherOptions, cell: tuple[str, str, int]) -> Swap:
     network, planner, seed = cell
     flown = scenario(network, options, seed)
     with planning(planner):
-        record = flight.fly(flown, vehicles=options.vehicles)
+        server = None
+        if network == MORTAL:
+            server = MortalServer(flown, options.vehicles, deaths(seed, options.duration))
+        record = flight.fly(flown, vehicles=options.vehicles, server=server)
     told = record.figures["client"]["by_vehicle"]
     client, dt_s = record.client, flown.control.dt
     each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
@@ -134,7 +233,8 @@ def fly(options: TogetherOptions, cell: tuple[str, str, int]) -> Swap:
 
 def table(options: TogetherOptions) -> TextTable:
     """Fly every cell."""
-    kinds = list(product(PLANNERS, NETWORKS))
+    planners = list(PLANNERS)[: 1 if options.guaranteed else None]
+    kinds = list(product(planners, NETWORKS))
     rows = []
     with ProcessPoolExecutor(options.workers) as pool:
         for planner, network in progress(kinds, "cells"):
