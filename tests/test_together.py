@@ -409,6 +409,28 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
     assert clear_m(flown, walled.zones) > 0.0
 
 
+def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ablation: where ways lead around zones alone, the gap is tried for ever."""
+    (tmp_path / "goals.csv").write_text(
+        "vehicle,t,x,y\n1,0,0.2,0\n2,0,2.6,-2\n2,1,2.6,2\n3,0,-0.8,-0.9\n4,0,-0.8,0.9\n"
+    )
+    table = reading.to_table(scenario(4, duration=60.0))
+    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
+    table["mission"]["zones"] = "box(1, 5, -0.2, 0.2)"
+    gap = reading.check(table, "gap")
+
+    def left_over_m() -> float:
+        flown = flight.fly(gap, vehicles=4)
+        assert separation_m(flown) > 0.5
+        return float(np.linalg.norm(each_of(flown)[1]["state"][-1, :, 0] - [2.6, 2.0]))
+
+    assert left_over_m() < 0.3
+    monkeypatch.setattr(Together, "_detour", lambda self, *_: self._routes)
+    assert left_over_m() > 1.0
+
+
 # -- missions --------------------------------------------------------------------------------------
 
 

@@ -44,7 +44,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.zones import Zones
+from skytether.shared.scenario.zones import Zone, Zones
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
@@ -63,6 +63,11 @@ AHEAD_M = 1.5
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 """By how much further round a vehicle aims that is stuck, how far at most before directions are
 drawn, and by how much less once it moves [rad]."""
+DETOUR_M, DETOUR_S = 5.0, 20.0
+"""Distance up to which vehicles at rest are flown around by one that was stuck [m], and for how
+long it does so [s]."""
+AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
+"""Corners of an octagon around 0, of radius 1; shape (8, 2)."""
 TRIES = 5
 """Number of directions that are tried at a time."""
 ROUNDS = 5
@@ -103,6 +108,10 @@ class Known:
         """How far outside its tube it may be, as it was seen last [m]."""
         self.speed_mps = 0.0
         """How fast it was then [m/s]."""
+        self.detour: Routes | None = None
+        """Ways around others that rest where it was stuck; None before it ever was."""
+        self.detour_until = 0
+        """Step up to which it takes them."""
         self.waits = ""
         """What it waits for, as the operator is told; empty: for nothing."""
 
@@ -164,6 +173,7 @@ class Together:
         """Steps after which a motion is sent again, before it is too old to be flown."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
         """How fast it comes to rest without a motion [s, m/s²]."""
+        self._detours = round(DETOUR_S / terms.dt_s)
         self._plan = MotionPlan(terms, mission.acceleration_mps2, mission.speed_mps)
         self._rng = stream(scenario.seed, "together")
         self._now, self._ahead = 0, dict[int, int]()
@@ -357,7 +367,7 @@ class Together:
         (p0,), (v0,) = base.at(np.array([float(due)]), dt_s)
         kept_p, kept_v = base.at(np.arange(k, due, SPACING, dtype=np.float64), dt_s)
         planes, taken = None, np.zeros(self._flown.count + 1, dtype=np.bool_)
-        for aim in self._aims(known, p0, goal):
+        for aim in self._aims(row, known, k, p0, goal):
             for _ in range(ROUNDS):
                 held = planes.of_some(taken) if planes else None
                 solved = plan.solve(p0, v0, aim, held and held[:3])
@@ -380,14 +390,19 @@ class Together:
             self.counts["refused"] += bool(hit.any())
         return None
 
-    def _aims(self, known: Known, place: Array, goal: Array) -> Iterator[Array]:
+    def _aims(self, row: int, known: Known, k: int, place: Array, goal: Array) -> Iterator[Array]:
         """What to fly to: a point of the way to the goal, its next corner, or right of that."""
-        way = self._routes.way(place, goal)
+        detour = known.detour if k < known.detour_until else None
+        way = (detour or self._routes).way(place, goal)
         if not known.turned:
             if len(way) > 1:
                 yield _along(place, way, AHEAD_M)
             yield way[0]
             known.turned = TURN
+            # Stuck: from now on, for a while, around those as well that rest on the way.
+            known.detour, known.detour_until = self._detour(row, place, goal), k + self._detours
+            way = known.detour.way(place, goal)
+            yield _along(place, way, AHEAD_M)
         ahead = way[0, :2] - place[:2]
         far = float(np.linalg.norm(ahead))
         ahead = ahead / far if far > 1e-9 else np.array([1.0, 0.0])
@@ -402,6 +417,21 @@ class Together:
             known.turned += TURN
             if known.turned > TURN_MAX:
                 known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
+
+    def _detour(self, row: int, place: Array, goal: Array) -> Routes:
+        """Ways around zones and the vehicles that rest near a place, but for those at the goal."""
+        zones, keep_m = list(self._zones.zones), self._apart_m + MARGIN_M - self._tube_m
+        for other, each in self._rows.items():
+            now = self._now + self._ahead.get(other, 0)
+            rests = [motion.position[-1] for motion in each.motions() if motion.last <= now]
+            if other == row or len(rests) != len(each.motions()):
+                continue
+            for at in rests[:1]:
+                near_m = float(np.linalg.norm(at - place))
+                if near_m < DETOUR_M and np.linalg.norm(at - goal) > self._apart_m:
+                    radius_m = min(keep_m, near_m - self._tube_m) / np.cos(np.pi / len(AROUND))
+                    zones.append(Zone(f"vehicle {other}", at[:2] + radius_m * AROUND))
+        return Routes(Zones(zones), self._tube_m)
 
     def _planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
         """Half-planes of the others' motions, and behind them those of zones."""
