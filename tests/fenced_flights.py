@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from helpers import packaged
 from skytether.client.fence import Fence
 from skytether.client.navigation import Navigation
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.weather import Weather
 from skytether.client.vehicle import Measurement
 from skytether.shared.base.chance import stream
-from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 
 FLIGHT_S = 20.0
@@ -27,10 +27,7 @@ BOX_M = 6.0
 
 def scenario(**sections: Any) -> Scenario:
     """The scenario demo, with other keys in its sections."""
-    table = reading.to_table(reading.load("demo")) | {"duration": 30.0}
-    for section, values in sections.items():
-        table[section] = table[section] | values
-    return reading.check(table, "test")
+    return packaged("demo", {"duration": 30.0}, sections)
 
 
 class Gusts(Weather):

@@ -1,0 +1,111 @@
+"""Three autopilots on one mission: in virtual time, and over UDP as docs/together.md says."""
+
+import io
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from airborne import OFFSET_NS, SAFE
+from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.flavours import FlavourName
+from skytether.client import vehicles
+from skytether.client.endpoint import Client
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.reading import check
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import record
+from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, parse
+from skytether.sim.world import Clock, World
+
+NUMBERS = (1, 2, 3)
+DOCUMENT = Path(__file__).parents[2] / "docs" / "together.md"
+PX4 = {"tau_s": [0.5], "gain": [0.85], "dead_time_s": [0.1]}
+"""Model of PX4, as the scenario `px4` has it."""
+
+
+def scenario(flavour: FlavourName, number: int, loss: float) -> Scenario:
+    """The scenario of one of the three clients."""
+    table = reading.to_table(reading.load("swap-autopilot"))
+    table["vehicle"]["address"] = f"udpout:autopilot{number}:0"
+    table["network"]["uplink"]["loss"] = table["network"]["downlink"]["loss"] = loss
+    if flavour == "px4":
+        table["model"] |= PX4
+    return check(table, "three")
+
+
+def apart_m(paths: list[Array]) -> float:
+    """Smallest distance between two of them [m]; each of shape (n, 3)."""
+    steps = min(map(len, paths))
+    pairs = combinations((path[:steps] for path in paths), 2)
+    return min(float(np.linalg.norm(one - other, axis=1).min()) for one, other in pairs)
+
+
+@pytest.mark.parametrize(("flavour", "loss"), [("ardupilot", 0.1), ("px4", 0.4)])
+def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> None:
+    """From the ground where each begins, and back to it; by where they truly were."""
+    world, clients, truths = World(lambda *_: None), [], []
+    for number in NUMBERS:
+        flown = scenario(flavour, number, loss)
+        truths.append(io.BytesIO())
+        pilot = Autopilot(flown, flavour, ready_s=1.0, recorder=Recorder(TRUTH_COLUMNS, truths[-1]))
+        pilot.flight.parameters |= SAFE[flavour]
+        world.add(f"autopilot{number}", pilot)
+        flies = vehicles.make(flown, number)
+        client = Client(flown, flies, server=("netem", 0), vehicle=number, boot_id=number)
+        clients.append(client)
+        world.add(f"client{number}", client, clock=Clock(number * OFFSET_NS))
+    world.add("netem", Proxy(flown, server=("server", 0), flows=len(NUMBERS)))
+    server = Server(flown, boot_id=9, entropy=bytes)
+    world.add("server", server, clock=Clock(OFFSET_NS))
+    world.run(lambda: all(client.finished for client in clients), limit_ns=300 * 10**9)
+    assert [client.failure for client in clients] == [None, None, None]
+    paths = []
+    for number, truth in zip(NUMBERS, truths, strict=True):
+        stands = flown.start_m(number) * [1.0, 1.0, 0.0]  # its own frame begins there
+        path = parse(truth.getvalue())["state"][:, :, 0] + stands
+        paths.append(path)
+        goal = flown.make_reference(number)(np.array(flown.duration))[:, 0]
+        assert np.linalg.norm(path[-1, :2] - goal[:2]) < 0.5
+        assert path[-1, 2] < 0.1
+        assert flown.zones.clearance(path).min() > 0.0
+    assert apart_m(paths) > flown.mission.separation_m
+    assert server.figures()["counts"].get("left_tube", 0) == 0
+
+
+@pytest.mark.long
+def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:
+    """Each line in a process of its own; clients for 45 s."""
+    found = re.findall(r"```sh\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    (block,) = (each for each in found if "skytether autopilot" in each)
+    lines = [shlex.split(line)[1:] for line in block.splitlines()]
+    behind = [line for line in lines if line[0] != "client"]
+    flown = [line for line in lines if line[0] == "client"]
+    run = [sys.executable, "-P", "-m", "skytether"]
+    there = [subprocess.Popen([*run, *line], stdout=subprocess.DEVNULL) for line in behind]
+    try:
+        files = [tmp_path / line[line.index("--id") + 1] for line in flown]
+        flying = [
+            subprocess.Popen([*run, *line, "--duration", "45", "--record", str(file)])
+            for line, file in zip(flown, files, strict=True)
+        ]
+        assert [each.wait(120) for each in flying] == [0, 0, 0]
+    finally:
+        for each in there:
+            each.send_signal(signal.SIGTERM)
+            each.wait(30)
+    told = reading.load("swap-autopilot")
+    rows = [record.read(file) for file in files]
+    for number, each in zip(NUMBERS, rows, strict=True):
+        goal = told.make_reference(number)(np.array(told.duration))[:, 0]
+        assert np.linalg.norm(each["state"][-1, :, 0] - goal) < 1.0
+    assert apart_m([each["state"][:, :, 0] for each in rows]) > told.mission.separation_m

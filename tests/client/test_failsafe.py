@@ -1,0 +1,893 @@
+"""The failsafe aboard: what a vehicle does when the link, the server or itself fails.
+
+A hand makes the server's messages, at a step of 20 ms each; the vehicle is the real one.
+"""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+import skytether.client.endpoint
+import skytether.client.pilot
+import skytether.client.session
+from helpers import packaged
+from skytether.client import failsafe
+from skytether.client.clamp import clamped
+from skytether.client.compensator import Compensator
+from skytether.client.endpoint import Client
+from skytether.client.failsafe import HOLD, TABLE, Failsafe
+from skytether.client.link import PlainLink
+from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.lab.states import svg
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.events import Event, ModeChanged
+from skytether.shared.law import rule
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason, Recorder, Rows, client_columns, parse
+from skytether.shared.wire.protocol import (
+    NO_FEEDBACK,
+    NO_HORIZON,
+    Close,
+    Drop,
+    Heartbeat,
+    Hello,
+    Horizon,
+    Idle,
+    Message,
+    Mode,
+    Observation,
+    Refusal,
+    Welcome,
+    decode,
+    encode,
+    stamp_us,
+)
+
+SERVER: Address = ("server", 0)
+DIAGRAM = Path(__file__).parents[2] / "docs/failsafe.svg"
+STEPS_PER_S = 50
+H = 100
+D = 5
+"""Committed steps of the horizons."""
+SPEED = 1.0
+"""Input of all horizons, along x [m/s]."""
+
+
+class Sealed(PlainLink):
+    """A link that vouches for the server."""
+
+    secure = True
+
+
+class Hand:
+    """A vehicle, and a hand that plays its server: a heartbeat each 0.1 s, horizons on request."""
+
+    def __init__(self, *, secure: bool = False, armed: bool = True, **sections: Any) -> None:
+        self.scenario = msgspec.structs.replace(scenario(**sections), armed=armed)
+        self.terms = self.scenario.terms()
+        self.sink = io.BytesIO()
+        self.flies = simulated(self.scenario, 1)
+        self.client = Client(
+            self.scenario,
+            self.flies,
+            server=SERVER,
+            vehicle=4,
+            boot_id=99,
+            link=Sealed() if secure else PlainLink(),
+            recorder=Recorder(client_columns(self.terms.axes), self.sink),
+        )
+        self.now_ns = 5 * SECOND_NS
+        self.session = 7
+        self.events: list[Event] = []
+        self.client.wake(now_ns=self.now_ns)
+        self.client.outbox()
+        self.welcome()
+
+    def say(self, message: Message) -> None:
+        """One datagram to the vehicle."""
+        self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
+
+    def welcome(self, *, server_boot_id: int = 1) -> None:
+        """Open a session."""
+        self.say(Welcome(4, self.session, 99, server_boot_id, 1, Refusal.ACCEPTED, self.terms))
+
+    def heartbeat(self) -> None:
+        """Say that the server lives."""
+        self.say(Heartbeat(4, self.session, 1, Idle.PLANS, 0))
+
+    def horizon(
+        self,
+        made_for: int | None = None,
+        *,
+        observed: int | None = None,
+        gain: tuple[float, float] | None = None,
+    ) -> None:
+        """A horizon, of the step that was flown last unless told, with feedback if there is a gain.
+
+        It leads on from where the vehicle said that it was.
+        """
+        step = self.step if made_for is None else made_for
+        age = step - (self.step if observed is None else observed)
+        inputs = np.zeros((self.terms.axes, D + self.terms.horizon), np.float32)
+        inputs[0] = SPEED
+        feedback = NO_FEEDBACK
+        if gain is not None:
+            aboard = [[p, v, 0.0, *gain] for p, v in self.said[-1].state.tolist()]
+            feedback = np.array(aboard, np.float32)
+        self.say(Horizon(4, self.session, step, 1, age, inputs, feedback))
+
+    @property
+    def step(self) -> int:
+        """The step that was flown last."""
+        return self.said[-1].step
+
+    def fly(self, seconds: float, *, beats: bool = True, plans: bool = False) -> None:
+        """Let time pass, with heartbeats or without, and with a horizon at each step or none."""
+        for _ in range(round(seconds * STEPS_PER_S)):
+            due_ns = self.client.next_wake_ns()
+            assert due_ns is not None
+            self.now_ns = max(self.now_ns, due_ns)
+            self.client.wake(now_ns=self.now_ns)
+            self.out = [decode(each.payload, self.terms) for each in self.client.outbox()]
+            self.said = [each for each in self.out if isinstance(each, Observation)] or self.said
+            self.events += self.client.events()
+            if beats and self.step % 5 == 0:
+                self.heartbeat()
+            if plans:
+                self.horizon()
+
+    said: list[Observation]
+    out: list[Message]
+
+    @property
+    def mode(self) -> Mode:
+        """What the vehicle says that it does."""
+        return Mode(self.said[-1].mode)
+
+    @property
+    def takes(self) -> bool:
+        """Whether it says that it flies horizons."""
+        return bool(self.said[-1].takes)
+
+    @property
+    def speed(self) -> float:
+        """Magnitude of the input that it says it flies [m/s]."""
+        return float(np.linalg.norm(self.said[-1].input))
+
+    @property
+    def changes(self) -> list[tuple[str, str]]:
+        """Modes that it has told, and why."""
+        self.events += self.client.events()
+        told = [event for event in self.events if isinstance(event, ModeChanged)]
+        return [(event.after, event.reason) for event in told]
+
+    def rows(self) -> Rows:
+        """The record so far."""
+        return parse(self.sink.getvalue())
+
+
+def scenario(**sections: Any) -> Scenario:
+    """A long flight of the demo at 50 Hz in calm air; sections are laid over."""
+    preset = {
+        "duration": 100.0,
+        "control": {"dt": 0.02, "horizon": H, "feedback": False},
+        "vehicle": {"wind": 0.0, "land_after_s": 10.0, "report": "always"},
+        "link": {"heartbeat_s": 0.1, "timeout_s": 1.0},
+    }
+    return packaged("demo-committed", preset, sections)
+
+
+def tracking(**keys: Any) -> Hand:
+    """A vehicle that flies horizons."""
+    hand = Hand(**keys)
+    hand.fly(1.2)
+    assert hand.takes
+    hand.fly(2.0, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+    return hand
+
+
+def comes_to_hover_and_takes_no_horizon(hand: Hand, *, for_s: float = 0.8) -> None:
+    """Braked at 2 m/s² from 1 m/s, with the link good and horizons at every step meanwhile."""
+    hand.fly(0.02, plans=True)
+    assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, False, NO_HORIZON)
+    hand.fly(0.5, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.HOVER, 0.0)
+    hand.fly(for_s - 0.52, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
+    hand.fly(1.0)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, True)
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+
+
+# -- the way to the first horizon ------------------------------------------------------------------
+
+
+def test_a_vehicle_takes_a_horizon_after_a_second_of_good_link() -> None:
+    """One that comes before that is dropped, and counted."""
+    hand = Hand()
+    hand.fly(0.98, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.SYNC, False, 0.0)
+    assert hand.client.dropped[Drop.NOT_TAKEN] == 49
+    hand.fly(0.04)
+    assert (hand.mode, hand.takes) == (Mode.READY, True)
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+    modes = [(Mode(mode), Reason(reason)) for mode, reason in zip(*modes_of(hand), strict=True)]
+    assert list(dict.fromkeys(modes)) == [
+        (Mode.SYNC, Reason.OPENED),
+        (Mode.READY, Reason.GOOD),
+        (Mode.TRACK, Reason.HORIZON),
+    ]
+
+
+def modes_of(hand: Hand) -> tuple[list[int], list[int]]:
+    """Mode and reason of every step of the record."""
+    rows = hand.rows()
+    return rows["mode"].tolist(), rows["reason"].tolist()
+
+
+def test_a_link_that_stutters_is_not_good() -> None:
+    """A heartbeat every 1.1 s for ten seconds, where silence of 1 s is a loss."""
+    hand = Hand()
+    for _ in range(9):
+        hand.fly(1.1, beats=False)
+        hand.heartbeat()
+        assert hand.mode is Mode.SYNC
+
+
+@pytest.mark.parametrize(("steps", "mode"), [(25, Mode.READY), (26, Mode.SYNC)])
+def test_a_link_is_good_while_it_is_never_silent_for_more_than_half_of_the_time_out(
+    steps: int, mode: Mode
+) -> None:
+    """A heartbeat every 0.5 s, and every 0.52 s, for ten seconds: silence of 1 s is a loss."""
+    hand = Hand()
+    hand.fly(1 / STEPS_PER_S, beats=False)
+    for _ in range(20):
+        hand.heartbeat()
+        hand.fly(steps / STEPS_PER_S, beats=False)
+    assert (hand.mode, hand.takes) == (mode, mode is Mode.READY)
+
+
+def test_a_horizon_planned_before_the_vehicle_took_any_is_dropped() -> None:
+    """The server reckoned that it would stand still."""
+    hand = Hand()
+    hand.fly(1.2)
+    hand.horizon(observed=30)
+    hand.fly(0.02)
+    assert hand.mode is Mode.READY
+    assert hand.client.dropped[Drop.NOT_TAKEN] == 1
+
+
+def test_a_vehicle_that_is_not_armed_flies_nothing() -> None:
+    """It stays ready, says so, and tells the server that it takes no horizon."""
+    hand = Hand(armed=False)
+    hand.fly(3.0, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.READY, False, 0.0)
+    assert hand.changes[-1] == ("ready", "it is not armed")
+
+
+def test_a_client_that_was_restarted_begins_anew_and_disarmed_if_told() -> None:
+    """A new life of the vehicle has no session, no horizon, and no mode of the one before."""
+    before = tracking()
+    after = Hand(armed=False)
+    assert before.mode is Mode.TRACK
+    after.fly(0.02, plans=True)
+    assert (after.mode, after.said[-1].in_force, after.speed) == (Mode.SYNC, NO_HORIZON, 0.0)
+
+
+# -- what fails in flight --------------------------------------------------------------------------
+
+
+def test_without_a_newer_horizon_it_coasts_and_says_nothing() -> None:
+    """After a second; the heartbeats live, and the next horizon is flown at once."""
+    hand = tracking()
+    told = hand.changes
+    hand.fly(1.1)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.COAST, True, SPEED)
+    hand.horizon()
+    hand.fly(0.02)
+    assert hand.mode is Mode.TRACK
+    assert hand.changes == told
+
+
+def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() -> None:
+    """The link is good: nothing is locked."""
+    hand = tracking()
+    hand.fly((D + H) / STEPS_PER_S + 0.1)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, True)
+    assert hand.speed == pytest.approx(SPEED - 0.2, abs=0.05)
+    hand.fly(1.0)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, True, 0.0)
+    assert hand.changes[-2:] == [
+        ("brake", "no newer horizon has come"),
+        ("hover", "no newer horizon has come"),
+    ]
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+
+
+def test_with_feedback_it_hovers_where_it_came_to_rest_in_whatever_wind() -> None:
+    """What is told is braked to zero, so it hovers; what it flies stands against the wind."""
+    wind = [0.4, -0.3]
+    hand = Hand(control={"feedback": True}, vehicle={"steady_wind_mps": wind})
+    hand.fly(1.2)
+    hand.horizon(gain=(8.0, 2.0))
+    hand.fly((D + H) / STEPS_PER_S + 0.1)
+    assert hand.mode is Mode.BRAKE
+    hand.fly(0.4)
+    assert hand.mode is Mode.HOVER
+    hand.fly(8.0)
+    places = hand.rows()["state"][:, :, 0]
+    assert np.abs(places[-1] - places[-100]).max() < 1e-3
+    np.testing.assert_allclose(hand.said[-1].input, np.negative(wind), atol=1e-3)
+    hand.fly(2.0, beats=False)  # the link is lost: nothing of a plan is flown any more
+    assert (hand.mode, hand.speed, hand.said[-1].in_force) == (Mode.HOVER, 0.0, NO_HORIZON)
+
+
+def test_what_is_told_while_braking_never_speeds_up_whatever_feedback_adds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A compensator that tells full speed again after the last input is kept from it."""
+    hand = Hand(control={"feedback": True})
+    hand.fly(1.2)
+    hand.horizon(gain=(0.0, 0.0))
+    hand.fly((D + H) / STEPS_PER_S + 0.3)
+    braked = hand.speed
+    assert (hand.mode, 0.2 < braked < 0.8) == (Mode.BRAKE, True)
+    monkeypatch.setattr(rule, "remaining", lambda *_: 1.0)
+    hand.fly(0.02)
+    assert hand.speed == pytest.approx(braked - 2.0 * 0.02, abs=1e-6)
+
+
+def test_a_silent_server_ends_in_brake_with_horizon_left() -> None:
+    """After a second without a packet, with one more second of horizon."""
+    hand = tracking()
+    hand.fly(0.96, beats=False)
+    assert hand.speed == SPEED
+    hand.fly(0.1, beats=False)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
+    hand.fly(0.6, beats=False)
+    assert (hand.mode, hand.speed) == (Mode.HOVER, 0.0)
+    assert hand.changes[-1] == ("hover", "the server is silent")
+    hand.fly(0.9, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
+    hand.fly(0.2)
+    assert hand.takes
+
+
+def test_ten_seconds_of_hovering_alone_end_in_landing_for_good() -> None:
+    """In space it descends to the ground; what the server says then changes nothing."""
+    space = {"model": {"axes": 3}, "reference": {"altitude_m": 2.0}}
+    hand = tracking(control={"horizon": 60}, **space)
+    hand.fly(0.5, plans=True)
+    hand.fly(1.0 + 0.6 + 9.7, beats=False)
+    assert hand.mode is Mode.HOVER
+    hand.fly(0.5, beats=False)
+    assert hand.mode is Mode.LAND
+    assert hand.said[-1].input.tolist() == [0.0, 0.0, -0.5]
+    hand.fly(5.0, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.LAND, False, 0.0)
+    assert hand.rows()["state"][-1, 2, 0] == pytest.approx(0.0, abs=0.5)
+    assert hand.changes[-1] == ("land", "the server has been silent for long")
+
+
+def test_in_the_plane_landing_is_staying() -> None:
+    """There is no down."""
+    hand = tracking()
+    hand.fly(12.0, beats=False)
+    assert (hand.mode, hand.speed) == (Mode.LAND, 0.0)
+
+
+def test_horizons_that_come_late_for_half_a_second_end_in_brake() -> None:
+    """Three quarters of a horizon after its committed steps, although each could be flown."""
+    hand = tracking(control={"scheme": "predictive", "trigger": "always"})
+    hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
+    begun = hand.step
+    while hand.mode is not Mode.BRAKE:
+        hand.horizon(hand.step - D - 76)
+        hand.fly(0.02)
+        assert hand.step <= begun + 30
+    assert hand.step == begun + 26
+    assert hand.changes[-1] == ("brake", "horizons come too late")
+    comes_to_hover_and_takes_no_horizon(hand)
+
+
+def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
+    """A few stragglers say nothing."""
+    hand = tracking()
+    hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
+    for _ in range(5):
+        hand.horizon(hand.step - D - 76)
+        hand.fly(0.1)
+        hand.horizon(hand.step - D - 76)
+        hand.fly(0.3)
+        hand.horizon(hand.step - D - 74)
+        hand.fly(0.02)
+    assert ("brake", "horizons come too late") not in hand.changes
+
+
+def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
+    """What the former life planned is dropped."""
+    hand = tracking()
+    hand.session = 8
+    hand.welcome(server_boot_id=2)
+    comes_to_hover_and_takes_no_horizon(hand)
+    assert ("brake", "the server has restarted") in hand.changes
+
+
+def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
+    """Five within a second: one flipped bit is forgiven, a server gone mad is not."""
+    hand = tracking(secure=True)
+    for _ in range(4):
+        hand.client.receive(Datagram(b"?", SERVER), now_ns=hand.now_ns)
+    hand.fly(0.5, plans=True)
+    assert hand.mode is Mode.TRACK
+    hand.fly(0.6, plans=True)
+    for _ in range(5):
+        hand.say(with_input_out_of_range(hand))
+    comes_to_hover_and_takes_no_horizon(hand)
+    assert ("brake", "the server sends malformed messages") in hand.changes
+
+
+def with_input_out_of_range(hand: Hand) -> Horizon:
+    """A horizon that asks for more than u_max."""
+    inputs = np.full((2, H), 1.01 * hand.terms.u_max[0], np.float32)
+    return Horizon(4, hand.session, hand.step, 1, hand.step, inputs)
+
+
+def test_in_plaintext_a_stranger_cannot_make_it_brake_by_malformed_messages() -> None:
+    """Nobody vouches for them."""
+    hand = tracking()
+    for _ in range(100):
+        hand.client.receive(Datagram(b"?", SERVER), now_ns=hand.now_ns)
+    hand.fly(0.1, plans=True)
+    assert hand.mode is Mode.TRACK
+
+
+def test_horizons_for_impossible_times_end_in_a_new_session() -> None:
+    """Ten within a second: braked, and HELLO said; only a WELCOME is heard from then on."""
+    hand = tracking()
+    for n in range(10):
+        if n % 2:
+            hand.horizon(hand.step + H + 10 + n)
+        else:
+            hand.horizon(hand.step + 1, observed=hand.step + 2)
+    hand.fly(0.02, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
+    assert any(isinstance(each, Hello) for each in hand.out)
+    assert hand.changes[-1] == ("brake", "the server plans for impossible times")
+    hand.welcome()
+    comes_to_hover_and_takes_no_horizon(hand)
+
+
+def test_a_server_that_closes_the_session_ends_in_brake_at_once() -> None:
+    """What it sent before and what comes late is not heard; the vehicle asks for a session."""
+    hand = tracking()
+    for _ in range(3):
+        hand.say(Close(4, hand.session))
+    hand.fly(0.02, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.BRAKE, pytest.approx(SPEED - 0.04))
+    assert any(isinstance(each, Hello) for each in hand.out)
+    hand.fly(3.0, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+    assert hand.changes[-1] == ("hover", "the server has closed the session")
+    hand.session = 8
+    hand.welcome(server_boot_id=2)
+    hand.fly(1.2)
+    assert hand.takes
+
+
+def test_a_close_of_another_session_is_dropped() -> None:
+    """It may be of the life before."""
+    hand = tracking()
+    hand.say(Close(4, 6))
+    hand.fly(0.02, plans=True)
+    assert hand.mode is Mode.TRACK
+
+
+def test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon() -> None:
+    """121 ms late: what it was flying had been planned for other places."""
+    hand = tracking()
+    hand.now_ns += 141_000_000
+    hand.heartbeat()
+    hand.fly(0.02)
+    assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, True, NO_HORIZON)
+    assert hand.changes[-1] == ("brake", "its own computer woke it too late")
+    hand.horizon()
+    hand.fly(0.02)
+    assert hand.mode is Mode.TRACK
+
+
+def test_being_woken_late_is_not_said_to_be_sleep() -> None:
+    """A busy machine, a stopped process and a host that is asleep look alike to a vehicle."""
+    assert "asleep" not in str(Reason.STALLED)
+    assert "late" in str(Reason.STALLED)
+
+
+def test_a_vehicle_that_oversleeps_by_less_flies_on() -> None:
+    """A busy machine is no reason."""
+    hand = tracking()
+    hand.now_ns += 100_000_000
+    hand.fly(0.02)
+    assert hand.mode is Mode.TRACK
+
+
+def test_a_solver_that_fails_or_a_server_that_is_degraded_is_told() -> None:
+    """The vehicle coasts, brakes, and says what the server said."""
+    for idle, degraded, why in (
+        (Idle.UNSOLVED, 0, "the solver has found none"),
+        (Idle.PLANS, 1, "the server misses its deadlines"),
+    ):
+        hand = tracking()
+        for _ in range(30):
+            hand.say(Heartbeat(4, hand.session, 1, idle, degraded))
+            hand.fly(0.1, beats=False)
+        assert hand.changes[-2:] == [("brake", why), ("hover", why)]
+
+
+def test_what_is_not_finite_ends_in_fault_for_good() -> None:
+    """A state or an input: zero is flown, and nothing after that."""
+    for seen in (SimulatedVehicle, Compensator):
+        hand = tracking()
+        with pytest.MonkeyPatch.context() as mad:
+            if seen is Compensator:
+                mad.setattr(Compensator, "choose", lambda *_: np.array([np.nan, 0.0]))
+            else:
+                mad.setattr(hand.flies.plant, "x", [(np.inf, np.inf)] * 2)
+            hand.fly(0.02, plans=True)
+        hand.fly(3.0, plans=True)
+        rows = hand.rows()[160:]
+        assert (rows["mode"] == Mode.FAULT).all()
+        assert not rows["input"].any()
+        assert hand.changes[-1] == ("fault", "its state or its input is not finite")
+
+
+def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again() -> None:
+    """A position that changes by 300 m in a step, or a velocity by 20 m/s, is not flown by."""
+    for p, v in ((300.0, 0.0), (0.0, 20.0)):
+        hand = tracking()
+        hand.flies.plant.x = [(x + p, w + v) for x, w in hand.flies.plant.x]
+        hand.fly(0.02, plans=True)
+        assert (hand.mode, hand.speed) == (Mode.BRAKE, pytest.approx(SPEED - 0.04))
+        assert hand.changes[-1] == ("brake", "its state has leapt as no vehicle can")
+        hand.fly(20.0, plans=True)
+        assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+        assert hand.changes[-1] == ("hover", "its state has leapt as no vehicle can")
+        for armed in (False, True):
+            flown = msgspec.structs.replace(hand.scenario, armed=armed)
+            hand.client.change(flown, frozenset({"armed"}), now_ns=hand.now_ns)
+            hand.fly(0.1)
+        assert hand.takes
+        hand.fly(0.1, plans=True)
+        assert hand.mode is Mode.TRACK
+
+
+def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
+    """Once it is good again the vehicle still does not know where it is, and says so."""
+    hand = tracking()
+    hand.flies.plant.x = [(x + 300.0, w) for x, w in hand.flies.plant.x]
+    hand.fly(3.0, plans=True)
+    hand.fly(2.0, beats=False)
+    assert hand.changes[-1] == ("hover", "the server is silent")
+    hand.fly(3.0, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+    assert hand.changes[-1] == ("hover", "its state has leapt as no vehicle can")
+
+
+@pytest.mark.parametrize(("slept_s", "mode"), [(0, Mode.TRACK), (30, Mode.TRACK), (31, Mode.BRAKE)])
+def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
+    slept_s: int, mode: Mode
+) -> None:
+    """Seen through `Steady` no time has passed; the server's clock has gone on by half a minute."""
+    hand = tracking()
+    hand.say(Heartbeat(4, hand.session, stamp_us(SECOND_NS), Idle.PLANS, 0))
+    hand.fly(0.1, beats=False)
+    passed_ns = 100 * MILLISECOND_NS + slept_s * SECOND_NS
+    hand.say(Heartbeat(4, hand.session, stamp_us(SECOND_NS + passed_ns), Idle.PLANS, 0))
+    hand.fly(0.1, beats=False)
+    assert hand.mode is mode
+
+
+# -- the paper's own rule --------------------------------------------------------------------------
+
+
+def test_a_vehicle_that_holds_has_no_failsafe() -> None:
+    """The first horizon that comes is flown, and its last input for ever, whatever happens."""
+    hand = Hand(vehicle={"exhausted": "hold"})
+    hand.fly(0.02)
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+    hand.fly((D + H) / STEPS_PER_S + 0.1)
+    assert hand.changes[-1] == ("coast", "no newer horizon has come")
+    hand.session = 8
+    hand.welcome(server_boot_id=2)
+    hand.say(Close(4, hand.session))
+    hand.fly(20.0, beats=False)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.COAST, True, SPEED)
+    assert not {Mode.SYNC, Mode.BRAKE, Mode.HOVER, Mode.LAND} & {*HOLD.values()}
+
+
+# -- the last clamp --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wanted", "flown"),
+    [
+        ([0.5, -0.5], [0.5, -0.5]),
+        ([9.0, -9.0], [1.6, -0.8]),
+        ([1.6, -9.0], [1.6, -0.8]),
+        ([np.nan, 0.0], None),
+        ([0.0, np.inf], None),
+    ],
+)
+def test_the_last_clamp_bounds_value_and_change(
+    wanted: list[float], flown: list[float] | None
+) -> None:
+    """From 0.8 and 0.2 m/s, at most 1.6 m/s, and 1 m/s a step; nothing of what is not finite."""
+    assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0, told=wanted) == flown
+
+
+def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
+    """Along the way that was chosen; what is over by rounding alone stays as it is."""
+
+    def slowed(wanted: list[float], speed_max: float) -> list[float] | None:
+        """What is left of an input without feedback."""
+        at_rest, loose = [0.0, 0.0], [9.0, 9.0]
+        return clamped(wanted, at_rest, loose, 9.0, told=wanted, speed_max=speed_max)
+
+    assert slowed([3.0, 4.0], 2.5) == pytest.approx([1.5, 2.0])
+    assert slowed([3.0, 4.0], 5.0 - 1e-12) == [3.0, 4.0]
+    assert slowed([3.0, 4.0], 0.0) == [0.0, 0.0]
+
+
+def test_the_last_clamp_lets_feedback_through_while_braking() -> None:
+    """What is told is slowed from 5 to 2.5 m/s; the 1 m/s of feedback on top of it stays."""
+    loose = [0.0, 0.0], [9.0, 9.0], 9.0
+    flown = clamped([2.0, 4.0], *loose, told=[3.0, 4.0], speed_max=2.5)
+    assert flown == pytest.approx([0.5, 2.0])
+    assert clamped([2.0, 4.0], *loose, told=[0.0, 0.0], speed_max=0.0) == [2.0, 4.0]
+    assert clamped([2.0, 4.0], *loose, told=[np.nan, 0.0], speed_max=0.0) is None
+
+
+@pytest.mark.parametrize("clamps", [True, False])
+def test_no_mistake_of_the_compensator_reaches_the_plant(
+    monkeypatch: pytest.MonkeyPatch, *, clamps: bool
+) -> None:
+    """100 m/s on both axes, from one step to the next; without the clamp it is flown."""
+    hand = tracking(vehicle={"slew_mps2": 5.0})
+    if not clamps:
+        monkeypatch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: wanted)
+    monkeypatch.setattr(Compensator, "choose", lambda *_: np.array([100.0, -100.0]))
+    # What is over u_max is no message: the record tells.
+    monkeypatch.setattr(skytether.client.session.ServerSession, "send", lambda *_: None)
+    hand.fly(0.4, plans=True)
+    flown = hand.rows()["input"]
+    bounded = np.abs(flown).max() <= hand.terms.u_max[0]
+    slow = np.abs(np.diff(flown[70:], axis=0)).max() <= 5.0 * 0.02 + 1e-12
+    assert (bounded, slow) == (clamps, clamps)
+
+
+def test_a_slew_that_would_not_let_it_brake_is_refused() -> None:
+    """Braking is always allowed."""
+    with pytest.raises(ConfigError, match=r"^test: vehicle.slew_mps2: got 1.5, expected at least"):
+        scenario(vehicle={"slew_mps2": 1.5})
+
+
+# -- the table -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("table", [TABLE, HOLD])
+def test_nothing_leads_out_of_fault_and_only_fault_out_of_land(table: failsafe.Table) -> None:
+    """Somebody has to see to the vehicle first."""
+    out = [(before, after) for (before, _), after in table.items()]
+    assert {after for before, after in out if before is Mode.LAND} <= {Mode.FAULT}
+    assert not [before for before, _ in out if before is Mode.FAULT]
+    assert all((mode, Reason.NOT_FINITE) in table for mode in Mode if mode is not Mode.FAULT)
+
+
+def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
+    """Ten thousand causes by chance: no horizon leads out of a forced brake without a good link."""
+    rng = stream(1, "causes")
+    told: list[Reason] = []
+    aboard = Failsafe(
+        TABLE,
+        armed=True,
+        timeout_ns=SECOND_NS,
+        land_after_ns=SECOND_NS,
+        changed=lambda _, __, cause, ___: told.append(cause),
+    )
+    final = (Reason.ALONE, Reason.NOT_FINITE, Reason.LEAPT)
+    calm = [each for each in Reason if each not in final]
+    locked = False
+    for now_ns in range(10_000):
+        cause = calm[int(rng.integers(len(calm)))]
+        before = aboard.mode, aboard.takes
+        if cause is not Reason.HORIZON or aboard.takes:
+            aboard.meet(cause, now_ns=now_ns)
+        locked &= not (cause is Reason.GOOD and before[0] in (Mode.SYNC, Mode.HOVER))
+        locked |= told[-1:] == [cause] and cause in failsafe.LOCKING
+        assert not (locked and aboard.takes)
+
+
+def test_the_diagram_in_the_documents_is_that_of_the_table() -> None:
+    """Drawn by `lab.states`, which says how to draw it anew."""
+    assert DIAGRAM.read_text() == svg()
+
+
+# -- without its guards ----------------------------------------------------------------------------
+
+# -- what the vehicle's own side says ---------------------------------------------------------
+
+
+def hindered(monkeypatch: pytest.MonkeyPatch, hand: Hand, cause: Reason | None) -> None:
+    """Let the vehicle have this hindrance from now on."""
+    monkeypatch.setattr(hand.flies, "hindrance", lambda *, now_ns: cause)  # noqa: ARG005
+
+
+@pytest.mark.parametrize("cause", [Reason.TAKEN, Reason.DISARMED])
+def test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back(
+    cause: Reason, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zero from the next step on, and no horizon is taken; then it hovers for a second first."""
+    hand = tracking()
+    hindered(monkeypatch, hand, cause)
+    hand.fly(0.02)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.MANUAL, False, 0.0)
+    hand.fly(5.0, plans=True)
+    assert (hand.mode, hand.speed) == (Mode.MANUAL, 0.0)
+    hindered(monkeypatch, hand, None)
+    hand.fly(0.9, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+    hand.fly(0.2, plans=True)
+    hand.horizon()
+    hand.fly(0.02)
+    assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
+
+
+@pytest.mark.parametrize("cause", [Reason.BATTERY, Reason.ASTRAY])
+def test_a_vehicle_that_can_fly_no_further_brakes_and_lands(
+    cause: Reason, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does so with the best of links, and stays down where the cause is gone again."""
+    landed: list[Mode] = []
+    hand = tracking()
+    monkeypatch.setattr(hand.flies, "land", lambda: landed.append(hand.client._failsafe.mode))
+    hindered(monkeypatch, hand, cause)
+    hand.fly(0.02)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
+    hand.fly(2.0, plans=True)
+    assert hand.mode is Mode.LAND
+    assert landed == [Mode.LAND]
+    hindered(monkeypatch, hand, None)
+    hand.fly(2.0, plans=True)
+    assert hand.mode is Mode.LAND
+
+
+def test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However long it takes; a second after it is heard again, plans are flown."""
+    hand = tracking()
+    hindered(monkeypatch, hand, Reason.MUTE)
+    hand.fly(0.02)
+    assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
+    hand.fly(20.0, plans=True)
+    assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
+    hindered(monkeypatch, hand, None)
+    hand.fly(1.1)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, True)
+
+
+def hindrance_test(test: Callable[..., None], *causes: Reason) -> Callable[[], None]:
+    """Test of a hindrance as a row's scenario."""
+
+    def run() -> None:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            test(*causes, monkeypatch=monkeypatch)
+
+    return run
+
+
+ROWS: dict[Reason, Callable[[], None]] = {
+    Reason.GOOD: test_a_vehicle_takes_a_horizon_after_a_second_of_good_link,
+    Reason.UNARMED: test_a_vehicle_that_is_not_armed_flies_nothing,
+    Reason.OLD: test_without_a_newer_horizon_it_coasts_and_says_nothing,
+    Reason.ENDED: test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once,
+    Reason.STILL: test_a_silent_server_ends_in_brake_with_horizon_left,
+    Reason.LOST: test_a_silent_server_ends_in_brake_with_horizon_left,
+    Reason.ALONE: test_ten_seconds_of_hovering_alone_end_in_landing_for_good,
+    Reason.LATE: test_horizons_that_come_late_for_half_a_second_end_in_brake,
+    Reason.RESTARTED: test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link,
+    Reason.MALFORMED: test_malformed_messages_of_the_server_itself_end_in_brake,
+    Reason.RESYNC: test_horizons_for_impossible_times_end_in_a_new_session,
+    Reason.CLOSED: test_a_server_that_closes_the_session_ends_in_brake_at_once,
+    Reason.STALLED: test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon,
+    Reason.NOT_FINITE: test_what_is_not_finite_ends_in_fault_for_good,
+    Reason.LEAPT: test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again,
+    Reason.TAKEN: hindrance_test(
+        test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back, Reason.TAKEN
+    ),
+    Reason.DISARMED: hindrance_test(
+        test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back, Reason.DISARMED
+    ),
+    Reason.RETURNED: hindrance_test(
+        test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back, Reason.TAKEN
+    ),
+    Reason.BATTERY: hindrance_test(
+        test_a_vehicle_that_can_fly_no_further_brakes_and_lands, Reason.BATTERY
+    ),
+    Reason.ASTRAY: hindrance_test(
+        test_a_vehicle_that_can_fly_no_further_brakes_and_lands, Reason.ASTRAY
+    ),
+    Reason.MUTE: hindrance_test(test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it),
+}
+"""Scenario that needs the table's rows of a cause."""
+
+
+@pytest.mark.parametrize("cause", ROWS)
+def test_without_the_rows_of_a_cause_its_scenario_goes_wrong(
+    cause: Reason, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every row is needed."""
+    rows = {key: after for key, after in TABLE.items() if key[1] is not cause}
+    monkeypatch.setattr(skytether.client.endpoint, "TABLE", rows)
+    with pytest.raises(AssertionError):
+        ROWS[cause]()
+
+
+GUARDS: dict[str, tuple[object, str, object, Callable[[], None]]] = {
+    "a second of good link": (
+        *(failsafe, "GOOD_NS", 0),
+        test_a_vehicle_takes_a_horizon_after_a_second_of_good_link,
+    ),
+    "locking": (
+        *(failsafe, "LOCKING", frozenset()),
+        test_a_silent_server_ends_in_brake_with_horizon_left,
+    ),
+    "dropping": (
+        *(skytether.client.pilot, "DROPPING", frozenset()),
+        test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link,
+    ),
+    "closing": (
+        *(skytether.client.endpoint, "CLOSING", frozenset()),
+        test_a_server_that_closes_the_session_ends_in_brake_at_once,
+    ),
+    "who is malformed": (
+        *(PlainLink, "secure", True),
+        test_in_plaintext_a_stranger_cannot_make_it_brake_by_malformed_messages,
+    ),
+    "late in a row": (
+        *(failsafe, "LATE_NS", 0),
+        test_one_horizon_in_time_among_late_ones_is_enough,
+    ),
+    "malformed in a row": (
+        *(failsafe, "MALFORMED_MAX", 1),
+        test_malformed_messages_of_the_server_itself_end_in_brake,
+    ),
+}
+"""Guard that is switched off, how, and the scenario that needs it."""
+
+
+@pytest.mark.parametrize("guard", GUARDS)
+def test_without_a_guard_its_scenario_goes_wrong(
+    guard: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every guard is needed."""
+    where, name, off, goes_wrong = GUARDS[guard]
+    monkeypatch.setattr(where, name, off)
+    with pytest.raises(AssertionError):
+        goes_wrong()

@@ -1,0 +1,563 @@
+"""Torture: what it flies, what it finds once a guard is switched off, and that it comes again."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.ciphers import Cipher, algorithms
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+
+import skytether.client.compensator
+import skytether.client.endpoint
+import skytether.client.failsafe
+import skytether.client.pilot
+import skytether.client.secure
+import skytether.lab.commands.torture
+import skytether.lab.torture
+import skytether.server.plausibility
+import skytether.shared.wire.channel
+from skytether.__main__ import main
+from skytether.client.failsafe import LOCKING, TABLE
+from skytether.lab.faults import RANGES, Kind, ScheduledFault, Trial, dumps, loads
+from skytether.lab.invariants import Violation, check_bounds
+from skytether.lab.torture import (
+    CLOCK_NS,
+    Outcome,
+    fly,
+    long_trial,
+    make_scenario,
+    short_trial,
+    shrunk,
+)
+from skytether.netem.proxy import Proxy
+from skytether.server.sessions import Session
+from skytether.server.tick import Ticker
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.law import rule, spline
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Mode
+from skytether.shell.command import CommandError
+
+SEEDS = Path(__file__).parents[1] / "torture_seeds.txt"
+FAILED = [line for line in SEEDS.read_text().splitlines() if not line.startswith("#")]
+LONG = pytest.mark.skipif("SKYTETHER_LONG" not in os.environ, reason="long: set SKYTETHER_LONG=1")
+
+PLANS, FOLLOWS = 7, 11
+"""Seeds of a trial with horizons of inputs, and of one with trajectories."""
+
+Patch = Callable[[pytest.MonkeyPatch], None]
+
+
+def fault(
+    kind: Kind, where: str, start_s: float, length_s: float, amount: float = 1.0
+) -> ScheduledFault:
+    """A fault, in seconds."""
+    return ScheduledFault(
+        kind, where, round(start_s * SECOND_NS), round(length_s * SECOND_NS), amount
+    )
+
+
+# -- what is flown ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_a_trial_goes_well_and_the_same_each_time(seed: int) -> None:
+    """To the last count."""
+    outcome = fly(short_trial(seed))
+    assert not outcome.failure
+    assert outcome == fly(short_trial(seed))
+
+
+def test_trials_differ_in_scheme_step_axes_and_vehicles() -> None:
+    """All of them are drawn."""
+    drawn = [make_scenario(seed) for seed in range(100)]
+    control = {(scenario.control.scheme, scenario.control.feedback) for scenario, _ in drawn}
+    assert control == {
+        ("committed", False),
+        ("committed", True),
+        ("predictive", False),
+        ("trajectory", True),
+    }
+    assert {scenario.control.dt for scenario, _ in drawn} == {0.05, 0.1}
+    assert {scenario.model.axes for scenario, _ in drawn} == {2, 3}
+    assert {vehicles for _, vehicles in drawn} == {1, 2}
+    assert {any(scenario.terms().dead_time_s) for scenario, _ in drawn} == {False, True}
+
+
+def test_trajectories_are_flown_by_a_third_or_more_with_all_that_belongs_to_them() -> None:
+    """Previews, triggers, reports, heartbeats, and vehicles that are not as their models say."""
+    drawn = [make_scenario(seed)[0] for seed in range(200)]
+    some = [each for each in drawn if each.control.scheme == "trajectory"]
+    assert len(some) > len(drawn) / 3
+    assert {each.reference.preview for each in some} == {"all", "none", 1.0, 3.0}
+    assert {each.link.heartbeat_s for each in some} == {0.1, "auto"}
+    assert {each.vehicle.gain == () for each in some} == {False, True}
+    for word in ("expected_gap", "cost_gap", "deviation", "heartbeat", "silence", "budget"):
+        assert {word in each.control.trigger for each in some} == {False, True}
+    for word in ("always", "deviation", "periodic"):
+        assert {word in each.vehicle.report for each in some} == {False, True}
+
+
+def test_each_step_under_a_plan_is_held_against_the_compiled_rule() -> None:
+    """Along a trajectory, and by inputs."""
+    along, planned = fly(Trial(FOLLOWS, ())).counts, fly(Trial(PLANS, ())).counts
+    assert along["steps along trajectories"] > 30
+    assert planned["steps by inputs"] > 30
+    assert "steps by inputs" not in along
+    assert "steps along trajectories" not in planned
+
+
+@pytest.mark.parametrize("line", FAILED)
+def test_what_has_failed_once_fails_no_more(line: str) -> None:
+    """Schedules that torture has found, each shrunk."""
+    outcome = fly(loads(line))
+    assert not outcome.failure
+
+
+EFFECTS = [
+    (fault(Kind.LOSS, "both", 5, 4, 0.9), "packets: loss"),
+    (fault(Kind.BURST, "uplink", 5, 4, 10.0), "packets: burst"),
+    (fault(Kind.DUPLICATES, "both", 5, 4, 0.9), "packets: duplicates"),
+    (fault(Kind.REORDERING, "both", 5, 4, 2.0), "packets: reordering"),
+    (fault(Kind.PARTITION, "both", 5, 4), "brake: the server is silent"),
+    (fault(Kind.PARTITION, "both", 5, 14), "land: the server has been silent for long"),
+    (fault(Kind.RESTART, "server", 5, 0.05), "brake: the server is silent"),
+    (fault(Kind.RESTART, "client", 5, 1.0), "lives of client"),
+    (fault(Kind.RESTART, "netem", 5, 1.5), "brake: the server is silent"),
+    (fault(Kind.FREEZE, "client", 5, 1.0), "brake: its own computer woke it too late"),
+    (fault(Kind.FREEZE, "server", 5, 2.0), "brake: the server is silent"),
+    (fault(Kind.SOLVER, "server", 5, 4), "brake: the solver has found none"),
+    (fault(Kind.OVERLOAD, "server", 5, 6, 20.0), "brake: the server is silent"),
+    (fault(Kind.REPLAY, "both", 5, 4, 1.0), "packets: replay"),
+    (fault(Kind.DELAY, "uplink", 5, 6, 3.0), "brake: the server is silent"),
+    (fault(Kind.CORRUPTION, "both", 5, 4, 0.9), "brake: the server is silent"),
+    (fault(Kind.FLOOD, "server", 5, 2, 500.0), "packets: flood"),
+    (fault(Kind.FLOOD, "client", 5, 2, 500.0), "packets: flood"),
+    (fault(Kind.COPY, "both", 5, 6), "packets: copy"),
+    (fault(Kind.KEYS, "server", 5, 3), "brake: the server is silent"),
+]
+
+
+@cache
+def undisturbed() -> Outcome:
+    """A trial without faults."""
+    return fly(Trial(1, ()))
+
+
+@pytest.mark.parametrize(("one", "effect"), EFFECTS)
+def test_each_fault_has_its_effect_and_is_survived(one: ScheduledFault, effect: str) -> None:
+    """The effect is something that was counted, and is not without the fault."""
+    assert not undisturbed().counts.get(effect)
+    outcome = fly(Trial(1, (one,)))
+    assert not outcome.failure
+    assert outcome.counts[effect] > 0
+
+
+@pytest.mark.parametrize("amount", [3600.0, -3600.0])
+def test_a_clock_that_is_set_costs_nothing(amount: float) -> None:
+    """Nobody brakes for it, whichever clock it is."""
+    braked = "brake: its own computer woke it too late"
+    for where in ("client", "server"):
+        outcome = fly(Trial(1, (fault(Kind.STEP, where, 5, 0, amount),)))
+        assert not outcome.failure
+        assert braked not in outcome.counts
+
+
+def test_every_kind_of_fault_is_tried() -> None:
+    """In the tests above."""
+    assert {one.kind for one, _ in EFFECTS} | {Kind.STEP, Kind.SKEW} == set(RANGES)
+
+
+# -- what is found ---------------------------------------------------------------------------
+
+
+class Unchecked:
+    """ChaCha20-Poly1305 that opens whatever comes."""
+
+    def __init__(self, key: bytes) -> None:
+        self._key = key
+        self.encrypt = ChaCha20Poly1305(key).encrypt
+
+    def decrypt(self, nonce: bytes, data: bytes, _: bytes) -> bytes:
+        """Plaintext, whether or not the tag is right."""
+        algorithm = algorithms.ChaCha20(self._key, (1).to_bytes(4, "little") + nonce)
+        return Cipher(algorithm, mode=None).decryptor().update(data[:-16])
+
+
+def no_clamp(patch: pytest.MonkeyPatch) -> None:
+    """No last clamp aboard."""
+    patch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: list(wanted))
+
+
+def no_feedback_at_the_end(patch: pytest.MonkeyPatch) -> None:
+    """Feedback that stops after the last input, aboard."""
+    step = rule.step
+
+    def end(held: rule.Held, stage: int, *states: float) -> tuple[float, float, float, float]:
+        """Feedback up to the last input."""
+        if stage >= held.length:
+            held = held._replace(gain_p=0.0, gain_v=0.0)
+        return step(held, stage, *states)
+
+    patch.setattr(rule, "step", end)
+
+
+def no_window(patch: pytest.MonkeyPatch) -> None:
+    """No replay window."""
+    patch.setattr(skytether.shared.wire.channel.ReplayWindow, "is_new", lambda *_: True)
+
+
+def no_tag(patch: pytest.MonkeyPatch) -> None:
+    """No check of the tag of a packet."""
+    patch.setattr(skytether.shared.wire.channel, "ChaCha20Poly1305", Unchecked)
+
+
+def no_age(patch: pytest.MonkeyPatch) -> None:
+    """No bound on the age of the observation behind an input, aboard."""
+    patch.setattr(skytether.client.compensator, "lasting", lambda length, *_: length)
+
+
+def no_brake_without_link(patch: pytest.MonkeyPatch) -> None:
+    """No braking where the link is lost."""
+    table = {(mode, cause): after for (mode, cause), after in TABLE.items() if cause != Reason.LOST}
+    patch.setattr(skytether.client.endpoint, "TABLE", table)
+
+
+def no_lock_at_restart(patch: pytest.MonkeyPatch) -> None:
+    """No dropping of horizons, and no waiting, when the server has restarted."""
+    dropping = skytether.client.pilot.DROPPING - {Reason.RESTARTED}
+    patch.setattr(skytether.client.pilot, "DROPPING", dropping)
+    patch.setattr(skytether.client.failsafe, "LOCKING", LOCKING - {Reason.RESTARTED})
+
+
+def no_stall(patch: pytest.MonkeyPatch) -> None:
+    """No braking after sleep."""
+    patch.setattr(skytether.client.failsafe, "STALL_NS", 2**62)
+
+
+def no_lock(patch: pytest.MonkeyPatch) -> None:
+    """No waiting for a good link once it was broken."""
+    patch.setattr(skytether.client.failsafe, "LOCKING", frozenset())
+
+
+def no_good_link(patch: pytest.MonkeyPatch) -> None:
+    """No waiting for a good link at all."""
+    patch.setattr(skytether.client.failsafe, "GOOD_NS", 0)
+
+
+def no_steady(patch: pytest.MonkeyPatch) -> None:
+    """No steady time."""
+
+    def as_it_is(endpoint: Endpoint) -> Endpoint:
+        return endpoint
+
+    patch.setattr(skytether.lab.torture, "Steady", as_it_is)
+
+
+def no_latch(patch: pytest.MonkeyPatch) -> None:
+    """No latch in LAND."""
+    patch.setattr(
+        skytether.client.endpoint, "TABLE", {**TABLE, (Mode.LAND, Reason.HORIZON): Mode.TRACK}
+    )
+
+
+def no_plausibility(patch: pytest.MonkeyPatch) -> None:
+    """No doubt of observations at the server."""
+    judge = lambda *_: skytether.server.plausibility.BELIEVED  # noqa: E731
+    patch.setattr(skytether.server.plausibility.Plausibility, "judge", judge)
+
+
+def no_home(patch: pytest.MonkeyPatch) -> None:
+    """Packets go only where the newest observation came from."""
+
+    def sealed(self: Session, payload: bytes) -> tuple[Datagram]:
+        return (Datagram(self.line.seal(payload), self.address),)
+
+    patch.setattr(Session, "sealed", sealed)
+
+
+def no_second_try(patch: pytest.MonkeyPatch) -> None:
+    """A challenge is believed once, and the newest of all cookies is kept."""
+    patch.setattr(skytether.client.secure, "AGAIN_NS", skytether.client.secure.ATTEMPT_NS)
+
+
+ABLATIONS: list[tuple[Patch, str, tuple[ScheduledFault, ...]]] = [
+    (no_clamp, "slew", ()),
+    (no_window, "once", (fault(Kind.REPLAY, "downlink", 5, 2, 0.5),)),
+    (no_window, "once", (fault(Kind.DUPLICATES, "uplink", 5, 2, 0.9),)),
+    (no_tag, "authentic", (fault(Kind.CORRUPTION, "both", 5, 2, 0.9),)),
+    (no_tag, "authentic", (fault(Kind.FLOOD, "server", 5, 2, 500.0),)),
+    (no_age, "expired", (fault(Kind.LOSS, "downlink", 5, 5),)),
+    (no_brake_without_link, "brakes", (fault(Kind.PARTITION, "both", 5, 3),)),
+    (no_lock_at_restart, "good link", (fault(Kind.RESTART, "server", 5, 0.05),)),
+    (no_stall, "asleep", (fault(Kind.FREEZE, "client", 5, 0.6),)),
+    (no_lock, "good link", (fault(Kind.PARTITION, "both", 5, 3),)),
+    (no_good_link, "good link", ()),
+    (no_steady, "recovers", (fault(Kind.STEP, "client", 5, 0, -3600.0),)),
+    (no_steady, "recovers", (fault(Kind.STEP, "server", 5, 0, -3600.0),)),
+    (no_latch, "table", (fault(Kind.PARTITION, "both", 5, 14),)),
+    (no_home, "recovers", (fault(Kind.COPY, "both", 3, 20), fault(Kind.COPY, "both", 5, 15))),
+    (
+        no_second_try,
+        "recovers",
+        (
+            fault(Kind.COPY, "both", 4, 20),
+            fault(Kind.RESTART, "server", 6, 0.5),
+            fault(Kind.LOSS, "both", 6, 3, 0.7),
+        ),
+    ),
+]
+
+
+def test_feedback_that_ends_too_early_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight with feedback whose observations are lost brakes, and holds its place in wind."""
+    seed = next(
+        seed
+        for seed in range(100)
+        if make_scenario(seed)[0].control.scheme == "committed"
+        and make_scenario(seed)[0].control.feedback
+    )
+    trial = Trial(seed, (fault(Kind.LOSS, "downlink", 5, 8),))
+    assert not fly(trial).failure
+    no_feedback_at_the_end(monkeypatch)
+    assert fly(trial).invariant == "follows"
+
+
+@pytest.mark.parametrize(("switch_off", "invariant", "faults"), ABLATIONS)
+def test_a_guard_that_is_switched_off_is_caught(
+    switch_off: Patch,
+    invariant: str,
+    faults: tuple[ScheduledFault, ...],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By its invariant; with the guard the same flight goes well."""
+    trial = Trial(PLANS, faults)
+    assert not fly(trial).failure
+    switch_off(monkeypatch)
+    assert fly(trial).invariant == invariant
+
+
+@pytest.mark.parametrize(
+    ("switch_off", "invariant", "faults"),
+    [each for each in ABLATIONS if each[0] not in (no_home, no_second_try)],
+)
+def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
+    switch_off: Patch,
+    invariant: str,
+    faults: tuple[ScheduledFault, ...],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As with horizons; the two that are left out are the link's alone.
+
+    What a flood of forgeries does to a server that believes them may be found by what comes of it.
+    """
+    trial = Trial(FOLLOWS, faults)
+    assert not fly(trial).failure
+    switch_off(monkeypatch)
+    assert fly(trial).invariant in (invariant, "recovers")
+
+
+def no_disturbance(patch: pytest.MonkeyPatch) -> None:
+    """The disturbance that the filter has found is not flown off."""
+    follow = spline.follow
+    patch.setattr(spline, "follow", lambda *given: follow(*given[:-1], 0.0))
+
+
+def no_end(patch: pytest.MonkeyPatch) -> None:
+    """Braking begins a step too late."""
+    guided = spline.guided
+    late = lambda guide, stage: guided(guide._replace(length=guide.length + 1), stage)  # noqa: E731
+    patch.setattr(spline, "guided", late)
+
+
+def one_bit_off(patch: pytest.MonkeyPatch) -> None:
+    """The rule as it is flown by is not quite the compiled one."""
+    follow = spline.follow
+
+    def off(*given: Any) -> tuple[float, float]:
+        u, told = follow(*given)
+        return math.nextafter(u, 0.0), told
+
+    patch.setattr(spline, "follow", off)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "invariant", "faults"),
+    [
+        (no_disturbance, "follows", ()),
+        (no_end, "follows", (fault(Kind.LOSS, "downlink", 5, 8),)),
+        (one_bit_off, "rule", ()),
+    ],
+)
+def test_a_rule_of_trajectories_that_is_broken_is_caught(
+    wrong: Patch,
+    invariant: str,
+    faults: tuple[ScheduledFault, ...],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also where no more than rounding would tell."""
+    trial = Trial(FOLLOWS, faults)
+    assert not fly(trial).failure
+    wrong(monkeypatch)
+    assert fly(trial).invariant == invariant
+
+
+def test_a_solver_that_fails_is_nothing_to_trajectories() -> None:
+    """They need none."""
+    counts = fly(Trial(FOLLOWS, (fault(Kind.SOLVER, "server", 5, 4),))).counts
+    assert counts["steps along trajectories"] > 100
+    assert not any(name.startswith("brake") for name in counts)
+
+
+@LONG
+@pytest.mark.parametrize("switch_off", dict.fromkeys(patch for patch, _, _ in ABLATIONS))
+def test_schedules_that_are_drawn_catch_each_guard(
+    switch_off: Patch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of the first 400."""
+    switch_off(monkeypatch)
+    assert any(fly(short_trial(seed)).failure for seed in range(1, 401))
+
+
+@LONG
+def test_two_hours_go_well() -> None:
+    """With faults all along, and keys that are replaced on the way."""
+    outcome = fly(long_trial(1, 2.0))
+    assert not outcome.failure
+
+
+def test_a_failure_shrinks_to_the_fault_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five faults shrink to the one that the guard is there for; it fails again from its JSON."""
+    no_stall(monkeypatch)
+    culprit = fault(Kind.FREEZE, "client", 6, 1.0)
+    others = (
+        fault(Kind.DUPLICATES, "both", 3, 2, 0.5),
+        fault(Kind.SKEW, "server", 3, 9, 200.0),
+        fault(Kind.REPLAY, "both", 4, 4, 1.0),
+        culprit,
+        fault(Kind.FLOOD, "client", 9, 1, 100.0),
+    )
+    failed = fly(Trial(1, others))
+    assert failed.invariant == "asleep"
+    short = shrunk(failed)
+    assert short.failure
+    (left,) = short.trial.faults
+    assert (left.kind, left.start_ns) == (Kind.FREEZE, culprit.start_ns)
+    assert left.length_ns < culprit.length_ns
+    assert fly(loads(dumps(short.trial))) == short
+
+
+def test_an_endpoint_that_raises_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With what it raised, and where."""
+
+    def raise_(*_: Any, **__: Any) -> None:
+        raise ValueError("no such thing")
+
+    monkeypatch.setattr(Ticker, "tick", raise_)
+    outcome = fly(Trial(1, ()))
+    assert outcome.invariant == "raises"
+    assert "ValueError no such thing" in outcome.failure
+
+
+def test_a_container_without_a_bound_is_found() -> None:
+    """However deep in an endpoint it is."""
+    scenario, _ = make_scenario(1)
+    netem = Proxy(scenario, server=("server", 0), flows=10**6)
+    for port in range(2100):
+        netem.receive(Datagram(b"", ("host", port)), now_ns=CLOCK_NS)
+    with pytest.raises(Violation, match=r"bounded memory: netem\.\w+ holds 2100"):
+        check_bounds("netem", netem)
+
+
+# -- the command -----------------------------------------------------------------------------
+
+
+def run(*argv: str) -> "subprocess.CompletedProcess[str]":
+    """The command in a process of its own."""
+    line = [sys.executable, "-P", "-m", "skytether", "torture", *argv]
+    return subprocess.run(line, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.long
+def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: Path) -> None:
+    """As a table, and as JSON."""
+    path = tmp_path / "counts.json"
+    done = run("--seed", "1", "--count", "3", "--jobs", "2", "--json", str(path))
+    assert done.returncode == 0, done.stderr
+    assert "torture from seed 1" in done.stdout
+    said = json.loads(path.read_text())
+    outcomes = [fly(short_trial(seed)) for seed in (1, 2, 3)]
+    assert (said["flights"], said["failed"], said["failures"]) == (3, 0, [])
+    assert said["counts"]["steps"] == sum(outcome.counts["steps"] for outcome in outcomes)
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--schedule", "{"], "schedule of faults: "),
+        (["--schedule", "{}", "--seed", "1"], "got --seed and --schedule, expected one of them"),
+        (["--hours", "-1"], "--hours: got -1, expected more than 0, at most 10000"),
+        (["--seed", "-1"], "--seed: got -1, expected 0 to 4294967295"),
+        (["--replay", "/nowhere"], "--replay: /nowhere: "),
+    ],
+)
+def test_what_cannot_be_flown_is_refused(
+    argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line."""
+    assert main(["torture", *argv]) == 2
+    assert said in capsys.readouterr().err
+
+
+class Alone:
+    """A crew of this process alone."""
+
+    def advance(self, amount: float, text: str = "") -> None:
+        """Count nothing."""
+
+    def map(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+        """See `Crew`."""
+        return [function(item) for item in items]
+
+    def share(
+        self,
+        function: Callable[[Any], Any],
+        items: Sequence[Any],
+        on_done: Callable[[int, Any], None],
+    ) -> None:
+        """See `Crew`."""
+        for number, result in enumerate(self.map(function, items)):
+            on_done(number, result)
+
+
+@contextmanager
+def alone(*_: Any) -> Iterator[Alone]:
+    """A crew that knows what is patched here."""
+    yield Alone()
+
+
+def test_a_failure_is_printed_with_its_schedule_and_flies_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Exit code 1, a command line to fly it again, and a file of schedules does as well."""
+    monkeypatch.setattr(skytether.lab.commands.torture, "crew", alone)
+    no_stall(monkeypatch)
+    file = tmp_path / "seeds.txt"
+    frozen = Trial(1, (fault(Kind.FREEZE, "client", 5, 0.6),))
+    file.write_text(f"# two\n{dumps(Trial(1, ()))}\n{dumps(frozen)}\n")
+    for argv in (["--replay", str(file)], ["--schedule", dumps(frozen)]):
+        with pytest.raises(CommandError, match=r"1 of [12] flights failed") as refused:
+            skytether.lab.commands.torture.torture(argv)
+        assert refused.value.code == 1
+        printed = capsys.readouterr().out
+        assert "asleep: " in printed
+        assert 'skytether torture --schedule \'{"seed":1,' in printed

@@ -1,0 +1,280 @@
+"""Netem for any UDP: the examples of docs/netem.md, with real programs on loopback."""
+
+import re
+import shlex
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from queue import Empty, Queue
+from threading import Thread
+
+import msgspec
+import numpy as np
+import pytest
+
+from skytether.__main__ import main
+from skytether.netem.proxy import Proxy
+from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.change import Running
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.air.traces import recorded_in
+from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK
+from skytether.view import traffic
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "netem.md").read_text()
+BLOCKS = [block.splitlines() for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)]
+PATIENCE_S = 60.0
+
+
+def block(word: str) -> list[str]:
+    """Commands of the block that has this word, with ports that are free now."""
+    (found,) = [lines for lines in BLOCKS if any(word in line for line in lines)]
+    ports: dict[str, str] = {}
+    for port in re.findall(r"(?<=127\.0\.0\.1:)\d+|(?<=-port )\d+", "\n".join(found)):
+        if port not in ports:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+                free.bind(("127.0.0.1", 0))
+                ports[port] = str(free.getsockname()[1])
+    return [_with_ports(line, ports) for line in found]
+
+
+def _with_ports(text: str, ports: dict[str, str]) -> str:
+    return re.sub(r"\b\d{4,5}\b", lambda found: ports.get(found[0], found[0]), text)
+
+
+def argv(line: str) -> list[str]:
+    """A documented command as this environment runs it."""
+    name, *rest = shlex.split(line)
+    if name == "skytether":
+        return [sys.executable, "-P", "-m", "skytether", *rest]
+    return [sys.executable if name == "python" else name, *rest]
+
+
+@contextmanager
+def running(line: str, folder: Path, until: str = "") -> Iterator["subprocess.Popen[str]"]:
+    """A command that goes on, once it has said what is waited for; ended by Ctrl-C."""
+    with subprocess.Popen(
+        argv(line),
+        cwd=folder,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        try:
+            if until:
+                assert process.stdout is not None
+                assert any(until in said for said in process.stdout), line
+            yield process
+        finally:
+            process.terminate()
+
+
+def counted(said: str, name: str) -> tuple[int, int]:
+    """What netem has counted on the uplink and on the downlink, of what it says at its end."""
+    found = re.search(rf"  {name} +(\d+) +(\d+)$", said, re.MULTILINE)
+    assert found, said
+    return int(found[1]), int(found[2])
+
+
+def ended(process: "subprocess.Popen[str]") -> str:
+    """All that a process says until its end."""
+    process.terminate()
+    return process.communicate(timeout=PATIENCE_S)[0]
+
+
+@pytest.mark.long
+def test_two_programs_of_ones_own(tmp_path: Path) -> None:
+    """Half of a round trip each way, and a tenth of the requests lost."""
+    echo, netem, ask = block("ask.py")
+    ports = dict(zip(("5001", "5000"), re.findall(r"127\.0\.0\.1:(\d+)", netem), strict=True))
+    for code in re.findall(r"```python\n# (\w+\.py)\n(.*?)```", TEXT, re.DOTALL):
+        (tmp_path / code[0]).write_text(_with_ports(code[1], ports))
+    with running(echo, tmp_path), running(netem, tmp_path, "listening") as relay:
+        done = subprocess.run(
+            argv(ask), cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+        )
+        said = ended(relay)
+    found = re.fullmatch(r"(\d+) lost, round trip (\d+) ms\n", done.stdout)
+    assert found, done.stdout
+    assert 1 <= int(found[1]) <= 30
+    assert int(found[2]) >= 50
+    assert counted(said, "lost") == (0, int(found[1]))
+    assert counted(said, "packets") == (100 - int(found[1]), 100)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(120)
+def test_a_ground_station_and_an_autopilot(tmp_path: Path) -> None:
+    """MAVLink passes both ways, and some of it is lost."""
+    station, netem, autopilot = block("--law led")
+    with (
+        running(f"{station} --duration 10", tmp_path),
+        running(netem, tmp_path, "listening") as relay,
+        running(autopilot, tmp_path),
+    ):
+        time.sleep(12.0)  # real programs, on their own clocks
+        said = ended(relay)
+    assert min(counted(said, "forwarded")) > 50
+    assert max(counted(said, "lost")) > 0
+
+
+@pytest.mark.long
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs OpenSSL's program")
+def test_dtls_gets_through(tmp_path: Path) -> None:
+    """The handshake ends, and a line comes out as it went in, whatever was lost on the way."""
+    server, netem, client = block("openssl")
+    with (
+        running(server, tmp_path) as far,
+        running(netem, tmp_path, "listening"),
+        running(client, tmp_path) as near,
+    ):
+        assert near.stdin is not None
+        assert far.stdout is not None
+        told: Queue[str] = Queue()
+        # A line may be lost, so reading must not keep the next one from being sent.
+        Thread(
+            target=lambda lines: list(map(told.put, lines)), args=[far.stdout], daemon=True
+        ).start()
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            near.stdin.write("hello through netem\n")
+            near.stdin.flush()
+            with suppress(Empty):
+                if "hello through netem" in told.get(timeout=0.5):
+                    return
+    pytest.fail("no line came through")
+
+
+@pytest.mark.long
+def test_changes_and_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Everything changes while it runs; what has passed becomes a trace and a capture."""
+    monkeypatch.chdir(tmp_path)
+    netem, *changes = block("netem.sock")
+    with running(netem, tmp_path, "listening"):
+        for line in changes:
+            assert main(shlex.split(line)[1:]) == 0
+    said = capsys.readouterr().out
+    assert 'network.downlink is "loss(0.6)" from now on, it was "loss(0.1)"' in said
+    assert 'network.uplink is "constant(0.1) & rate(12500, queue=20000)" from now on' in said
+    netem, export = block("passed.mcap")
+    with running(netem, tmp_path, "listening") as relay:
+        port = int(re.findall(r"127\.0\.0\.1:(\d+)", netem)[0])
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            for _ in range(60):
+                client.sendto(bytes(40), ("127.0.0.1", port))
+                time.sleep(0.005)
+        time.sleep(0.5)
+        ended(relay)
+    assert main(shlex.split(export)[1:]) == 0
+    found = recorded_in(str(tmp_path / "traces" / "downlink-0.csv"))
+    assert len(found.time_s) == 60
+    assert 0.01 <= found.delay_s.min() <= found.delay_s.mean() <= 0.1
+    assert 0 < found.lost.sum() < 30
+    assert len(captured((tmp_path / "passed.pcap").read_bytes())) == 60 - found.lost.sum()
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--uplink", "los(1)"], "netem: the command line: network.uplink: got 'los(1)', expected"),
+        (["--downlink", "loss(2)"], "expected loss(share) with 0 <= share <= 1"),
+        (["--downlink", "trace(none.csv)"], "none.csv: cannot be read: No such file or directory"),
+    ],
+)
+def test_a_wrong_direction_is_told_in_a_line(
+    flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is refused, and nothing is started."""
+    assert main(["netem", "--bind", "127.0.0.1:0", *flags]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+
+
+def test_a_change_shows_at_once_and_a_wrong_one_changes_nothing() -> None:
+    """From a loss of 0.1 to 0.6, counted within two seconds; then a wrong key and a wrong value."""
+    scenario = reading.with_directions(
+        reading.load("demo"), {"uplink": "none", "downlink": "loss(0.1)"}
+    )
+    proxy = Proxy(scenario, server=("server", 1))
+    running_ = Running(proxy, scenario)
+
+    def lost_in(seconds: range) -> float:
+        before = proxy.downlink.counts.lost
+        times_ns = [second * SECOND_NS + part * MILLISECOND_NS
+                    for second in seconds for part in range(0, 1000, 5)]  # fmt: skip
+        for now_ns in times_ns:
+            proxy.receive(Datagram(b"x", ("client", 1)), now_ns=now_ns)
+        return (proxy.downlink.counts.lost - before) / len(times_ns)
+
+    def ask(text: str) -> dict[str, object]:
+        answer: dict[str, object] = msgspec.json.decode(
+            running_.answer(msgspec.json.encode({"network.downlink": text}), now_ns=10 * SECOND_NS)
+        )
+        return answer
+
+    assert lost_in(range(10)) == pytest.approx(0.1, abs=0.03)
+    assert "refused" not in ask("loss(0.6)")
+    assert lost_in(range(10, 12)) == pytest.approx(0.6, abs=0.08)
+    assert "did you mean loss?" in str(ask("los(0.1)")["refused"])
+    assert "no such key" in running_.answer(b'{"network.sidelink": "none"}', now_ns=0).decode()
+    assert lost_in(range(12, 14)) == pytest.approx(0.6, abs=0.08)
+
+
+def captured(content: bytes) -> list[tuple[int, bytes, bytes, int]]:
+    """Packets of a capture: time [ns], addresses of source and target, UDP payload [B]."""
+    magic, major, minor, _, _, kept, kind = struct.unpack_from("<IHHiIII", content)
+    assert (magic, major, minor, kept, kind) == (0xA1B23C4D, 2, 4, HEADER_BYTES, 101)
+    found, at = [], 24
+    while at < len(content):
+        seconds, rest_ns, held, size = struct.unpack_from("<IIII", content, at)
+        header = content[at + 16 : at + 16 + held]
+        assert sum(struct.unpack(">10H", header[:20])) % 0xFFFF == 0  # its checksum
+        assert struct.unpack_from(">H", header, 2)[0] == size
+        assert struct.unpack_from(">H", header, 24)[0] == size - 20
+        found.append(
+            (seconds * SECOND_NS + rest_ns, header[12:16], header[16:20], size - HEADER_BYTES)
+        )
+        at += 16 + held
+    return found
+
+
+def test_a_capture_has_what_came_out() -> None:
+    """In the order of leaving, without what was lost, with true lengths."""
+    rows = np.zeros(4, PACKET_COLUMNS)
+    rows["direction"] = [UPLINK, DOWNLINK, DOWNLINK, DOWNLINK]
+    rows["flow"], rows["bytes"] = [0, 0, 300, 0], [100, 7, 1400, 5]
+    rows["arrived_ns"], rows["delay_ns"] = [5, 1, 2, 3], [10, 20, 1, 1]
+    rows["lost"] = [False, False, False, True]
+    packets = captured(traffic.pcap(rows, began_ns=SECOND_NS))
+    assert [time_ns - SECOND_NS for time_ns, *_ in packets] == [3, 15, 21]
+    assert [size for *_, size in packets] == [1400, 100, 7]
+    assert packets[0][1] == bytes((10, 0, 1, 45))
+    assert packets[1][1:3] == (traffic.SERVER, bytes((10, 0, 0, 1)))
+
+
+def test_a_recording_becomes_the_trace_of_each_flow(tmp_path: Path) -> None:
+    """With its losses, and one row where two packets came at the same time."""
+    rows = np.zeros(5, PACKET_COLUMNS)
+    rows["direction"], rows["flow"] = DOWNLINK, [0, 0, 0, 1, 0]
+    rows["arrived_ns"] = np.array([2, 1, 3, 9, 3]) * SECOND_NS
+    rows["delay_ns"] = np.array([0.2, 0.1, 0.3, 0.9, 0.4]) * SECOND_NS
+    rows["lost"] = [True, False, False, False, False]
+    made = traffic.traces(rows)
+    assert set(made) == {"downlink-0", "downlink-1"}
+    (tmp_path / "a.csv").write_text(made["downlink-0"])
+    found = recorded_in(str(tmp_path / "a.csv"))
+    assert found.time_s.tolist() == [0.0, 1.0, 2.0]
+    assert found.lost.tolist() == [False, True, False]
+    assert found.delay_s.tolist() == [0.1, 0.2, 0.3]

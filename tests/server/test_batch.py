@@ -1,0 +1,266 @@
+"""Runs that share a server: each is, to the last bit, what it would be alone."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from helpers import packaged
+from skytether.server import sessions
+from skytether.server.control.desired import Desired
+from skytether.shared.base import chance
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.events import NoAnswer, SessionEnded
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.wire.protocol import Heartbeat, encode
+from skytether.sim import flight
+from skytether.sim.flight import COMPANY_MAX, fly, fly_batch
+
+
+def scenario(**changes: Any) -> Scenario:
+    """The scenario paper for two seconds, with some keys changed."""
+    return packaged("paper", {"duration": 2.0, "settle": 0.0}, changes)
+
+
+def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Record]:
+    """Every part of every run's record; the runs."""
+    flights = fly_batch(flown, seeds)
+    assert len(flights) == len(seeds)
+    for seed, together in zip(seeds, flights, strict=True):
+        alone = fly(replace(flown, seed=seed))
+        for part in ("client", "server", "netem"):
+            assert getattr(together, part).tobytes() == getattr(alone, part).tobytes(), part
+        assert together.trace_hash() == alone.trace_hash()
+        assert together.failure == alone.failure
+        assert together.events == alone.events
+    return flights
+
+
+directions = st.fixed_dictionaries(
+    {
+        "delay": st.sampled_from(["poisson", "constant", "none"]),
+        "minimum_s": st.sampled_from([0.0, 0.05, 0.1, 0.4]),
+        "loss": st.sampled_from([0.0, 0.1, 0.5]),
+    }
+)
+
+scenarios = st.fixed_dictionaries(
+    {
+        "control": st.fixed_dictionaries(
+            {
+                "dt": st.sampled_from([0.05, 0.03]),
+                "scheme": st.sampled_from(["predictive", "none", "committed"]),
+                "feedback": st.booleans(),
+                "trigger": st.sampled_from(
+                    ["state_gap", "always", "periodic", "state_gap & budget(5, 2) | silence(0.3)"]
+                ),
+                "observer_s": st.sampled_from([0.0, 2.0]),
+                "epsilon": st.sampled_from([0.01, 0.5]),
+                "solver": st.sampled_from(["exact", "exact", "exact", "osqp"]),
+            }
+        ).filter(lambda control: not (control["feedback"] and control["scheme"] == "none")),
+        "model": st.fixed_dictionaries({"axes": st.sampled_from([2, 3])}),
+        "vehicle": st.fixed_dictionaries(
+            {"wind": st.sampled_from([0.0, 0.3]), "gust_mps2": st.sampled_from([0.0, 0.5])}
+        ),
+        "network": st.fixed_dictionaries({"uplink": directions, "downlink": directions}),
+        "link": st.just({"heartbeat_s": 0.2, "timeout_s": 0.5}),
+        "simulation": st.fixed_dictionaries(
+            {
+                "compute_s": st.sampled_from([0.0, 0.001, 0.01, 0.03, 0.08]),
+                "clock_offset_s": st.sampled_from([0.0, -3600.0]),
+                "clock_drift_ppm": st.sampled_from([0.0, 200.0, -1000.0]),
+            }
+        ),
+    }
+)
+committing = st.builds(
+    lambda changes, control: changes | {"control": changes["control"] | control},
+    scenarios,
+    st.fixed_dictionaries(
+        {
+            "scheme": st.just("committed"),
+            "feedback": st.booleans(),
+            "trigger": st.sampled_from(["cost_gap", "deviation & budget(5, 2) | cost_gap(1)"]),
+            "cost_gap": st.sampled_from([0.01, 1.0]),
+        }
+    ),
+)
+"""With triggers that need committed inputs."""
+guided = st.builds(
+    lambda changes, control, shape: (
+        changes | {"control": changes["control"] | control, "reference": {"shape": shape}}
+    ),
+    scenarios,
+    st.fixed_dictionaries(
+        {
+            "scheme": st.just("trajectory"),
+            "feedback": st.just(True),
+            "trigger": st.sampled_from(
+                ["always", "expected_gap(0.1) | silence(1)", "deviation(0.2) & budget(5, 2)"]
+            ),
+        }
+    ),
+    st.sampled_from(["circle", "target"]),
+)
+"""With trajectories that are sent as they are."""
+companies = st.lists(st.integers(0, 2**32 - 1), min_size=2, max_size=4, unique=True)
+phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, max_size=4)
+"""None leaves them to the seeds; the others make everything fall on the same instants."""
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.one_of(scenarios, committing, guided), companies, phases_ms)
+def test_a_run_is_the_same_in_any_company(
+    changes: dict[str, Any], seeds: list[int], phases: list[int] | None
+) -> None:
+    """Whatever flies, whoever else flies, also where all that happens happens at once."""
+    with pytest.MonkeyPatch.context() as patch:
+        if phases:
+            given_ns = {
+                seed: phase * MILLISECOND_NS for seed, phase in zip(seeds, phases, strict=False)
+            }
+            patch.setattr(flight, "stream", lambda seed, *names: Drawn.of(given_ns, seed, *names))
+        assert_as_alone(scenario(**changes), seeds)
+
+
+class Drawn:
+    """A phase that is given, in place of chance."""
+
+    def __init__(self, phase_ns: int) -> None:
+        self._phase_ns = phase_ns
+
+    def integers(self, _: int) -> int:
+        """The phase."""
+        return self._phase_ns
+
+    @classmethod
+    def of(cls, given_ns: dict[int, int], seed: int, *names: str | int) -> Any:
+        """The stream of these names, but for the phase."""
+        return cls(given_ns[seed]) if names == ("phase",) else chance.stream(seed, *names)
+
+
+def test_runs_are_the_same_in_another_order_and_in_larger_company() -> None:
+    """Five seeds, then those and three more, backwards."""
+    flown = scenario(vehicle={"wind": 0.3})
+    few = fly_batch(flown, range(3, 8))
+    many = fly_batch(flown, range(9, 1, -1))
+    assert [run.trace_hash() for run in few] == [run.trace_hash() for run in many[2:7]][::-1]
+    assert len({run.trace_hash() for run in many}) == 8
+
+
+@pytest.mark.parametrize("preview", ["none", 0.5, "all"])
+def test_each_run_follows_the_target_of_its_own_seed(
+    preview: float | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if alone; ablation: with the first run's target for all, the others are not."""
+    flown = scenario(reference={"shape": "target", "preview": preview})
+    runs = assert_as_alone(flown, (3, 1, 2))
+    monkeypatch.setattr(Desired, "assign", lambda self, row, _: self._number.put(row, 1))
+    same = [run.trace_hash() for run in fly_batch(flown, (3, 1, 2))]
+    assert [run.trace_hash() == other for run, other in zip(runs, same, strict=True)] == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:
+    """Half a minute unheard: alone, the server stops ticking; in company it ticks on."""
+    rare = {"downlink": {"delay": "none", "loss": 0.93}, "uplink": {"delay": "none", "loss": 0.0}}
+    flown = scenario(
+        duration=240.0, control={"dt": 1.0, "horizon": 3}, network=rare, link={"connect_s": 60.0}
+    )
+    flights = assert_as_alone(flown, range(4))
+    assert flights[0].figures["server"]["dropped"]["unknown session"] > 0
+
+
+def test_a_session_is_forgotten_at_the_same_time_in_any_company() -> None:
+    """The server looks for those that are gone on the grid of its clock, whoever flies."""
+    rare = {"downlink": {"delay": "none", "loss": 0.9}, "uplink": {"delay": "none", "loss": 0.0}}
+    flown = scenario(
+        duration=300.0, control={"dt": 0.9, "horizon": 3}, network=rare, link={"connect_s": 60.0}
+    )
+    flights = assert_as_alone(flown, range(4))
+    ended = [sum(event == SessionEnded(vehicle=1) for *_, event in run.events) for run in flights]
+    assert sum(ended) >= 2
+
+
+@pytest.mark.parametrize("name", ["demo", "paper"])
+def test_a_run_whose_sessions_expire_is_the_same_in_any_company(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Vehicles heard once in some seconds, by a server that forgets them after three."""
+    monkeypatch.setattr(sessions, "SESSION_NS", 3 * SECOND_NS)
+    table = reading.to_table(reading.load(name)) | {"duration": 20.0, "settle": 0.0}
+    table["network"]["downlink"]["loss"] = 0.97
+    table["link"]["connect_s"] = 1000.0
+    flights = assert_as_alone(reading.check(table, "test"), range(1, 6))
+    assert sum(event == SessionEnded(vehicle=1) for run in flights for *_, event in run.events) >= 3
+
+
+def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
+    """Five packets in six are lost: some give up, at different times, and some fly."""
+    deaf = {"uplink": {"loss": 0.85}, "downlink": {"loss": 0.5}}
+    flights = assert_as_alone(scenario(network=deaf, link={"connect_s": 5.0}), range(6))
+    gave_up = [isinstance(run.failure, NoAnswer) for run in flights]
+    assert 0 < sum(gave_up) < 6
+    assert [len(run.client) == 0 for run in flights] == gave_up
+
+
+def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where no place is left, all pages of the reference are forgotten for whoever comes first."""
+    made: list[Desired] = []
+    init = Desired.__init__
+
+    def crowded(self: Desired, *given: Any) -> None:
+        """Room for two pages."""
+        init(self, *given)
+        self._held[3:] = 2**62
+        made.append(self)
+
+    monkeypatch.setattr(Desired, "__init__", crowded)
+    quiet = {"delay": "constant", "minimum_s": 0.0, "loss": 0.0}
+    flown = scenario(
+        duration=0.6,
+        control={"dt": 0.001, "horizon": 2},
+        network={"uplink": quiet, "downlink": quiet},
+        simulation={"compute_s": 0.0},
+    )
+    assert_as_alone(flown, (1, 2))
+    assert [2**62 in each._held for each in made] == [False] * 3
+
+
+def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
+    """Otherwise the bytes sent would depend on the other runs of the batch."""
+    sizes = {
+        len(encode(Heartbeat(vehicle, number, 2**31, 0, 0)))
+        for vehicle in (1, COMPANY_MAX)
+        for number in (2**31, 2**32 - 1)
+    }
+    assert len(sizes) == 1
+
+
+def test_more_runs_than_share_a_server_are_flown_in_turn() -> None:
+    """The last of 101 is as good as the first."""
+    flown = scenario(duration=0.2)
+    flights = fly_batch(flown, range(COMPANY_MAX + 1))
+    assert len(flights) == COMPANY_MAX + 1
+    assert flights[-1].trace_hash() == fly(replace(flown, seed=COMPANY_MAX)).trace_hash()
+    assert fly_batch(flown, ()) == []
+
+
+def test_a_batch_can_be_broken_off() -> None:
+    """A batch tells the time and asks whether to go on; what was flown until then is returned."""
+    seconds: list[int] = []
+    flown = scenario(duration=60.0)
+    runs = fly_batch(flown, range(3), on_second=seconds.append, stopped=lambda: len(seconds) >= 4)
+    assert seconds == [1, 2, 3, 4]
+    assert 0 < max(len(run.client) for run in runs) < 80

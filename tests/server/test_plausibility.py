@@ -1,0 +1,460 @@
+"""Which observations are believed: those that a vehicle can make, and those that repeat."""
+
+import random
+from itertools import count
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import skytether.sim.flight
+from helpers import packaged
+from skytether.client.session import ServerSession
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.netem.proxy import Proxy
+from skytether.server.plausibility import REPEATS, Belief, Plausibility
+from skytether.shared.base.units import MILLISECOND_NS as MS
+from skytether.shared.base.units import SECOND_NS as S
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import ModeChanged, StateDoubted
+from skytether.shared.law.heartbeat import NUMBERS
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire.protocol import Drop, Mode, Observation, stamp_us, stamped_ns
+from skytether.sim.flight import fly, fly_batch
+from skytether.sim.world import Clock
+
+quick = settings(max_examples=60, deadline=None)
+
+TERMS = reading.load("demo-committed").terms()
+DT_NS, H = TERMS.dt_ns, TERMS.horizon
+HOUR = 3600 * S
+DELAY_NS = 440 * MS
+BEGAN_NS = 3 * HOUR
+"""Begin of step 0, by the server's clock."""
+BACKWARD_NS = DELAY_NS - BEGAN_NS
+"""G of a packet that comes to the vehicle after its delay."""
+
+
+def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
+    """What a vehicle says that flies a circle of 2 m at 0.5 m/s, with some fields changed."""
+    angle, pace = 0.25 * step * TERMS.dt_s, 0.5
+    x = 2.0 * np.array([[np.cos(angle), 0.0], [np.sin(angle), 0.0]])
+    x[:, 1] = -pace * np.sin(angle), pace * np.cos(angle)
+    told = Observation(
+        1,
+        1,
+        step,
+        in_force=step - 12,
+        since=step - 2,
+        backward_us=stamp_us(BACKWARD_NS),
+        heard=step % NUMBERS,
+        mode=Mode.TRACK,
+        takes=1,
+        state=x,
+        input=np.zeros(2),
+    )
+    return told._replace(**changed or {})
+
+
+def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: int = -1) -> Belief:
+    """The verdict on an observation that arrives after its delay, or when that of `step` would."""
+    now_ns = BEGAN_NS + (told.step if step < 0 else step) * DT_NS + DELAY_NS
+    forward_ns = now_ns - told.step * DT_NS
+    backward_ns = stamped_ns(told.backward_us, near_ns=-forward_ns)
+    return plausibility.judge(row, told, forward_ns, backward_ns)
+
+
+def after(count: int = 5) -> Plausibility:
+    """What has believed the steps from 100 on, so many of them."""
+    plausibility = Plausibility(TERMS, 2)
+    for step in range(100, 100 + count):
+        assert judge(plausibility, seen(step)) == Belief.BELIEVED
+    return plausibility
+
+
+def moved(metres: float, speed: float = 0.0) -> np.ndarray:
+    """The state of step 105, so far off along the first axis."""
+    return seen(105).state + np.array([[metres, speed], [0.0, 0.0]])
+
+
+def test_a_predicted_position_may_be_off_by_what_the_velocity_may_over_the_dead_time() -> None:
+    """Ablation: of a vehicle whose model has none, the same position is a jump."""
+    for dead_time_s, verdict in ((0.0, Belief.JUMP), (0.5, Belief.BELIEVED)):
+        terms = TERMS._replace(dead_time_s=(0.0, dead_time_s))
+        plausibility = Plausibility(terms, 2)
+        for step in range(100, 105):
+            judge(plausibility, seen(step))
+        assert judge(plausibility, seen(105, {"state": moved(1.8)})) == verdict
+
+
+ODD: dict[str, tuple[dict[str, Any], Belief]] = {
+    "step 2^31": ({"step": 2**31}, Belief.CLOCK),
+    "a step from a second and more ahead": ({"step": 124}, Belief.CLOCK),
+    "an echo from half an hour ahead": (
+        {"backward_us": stamp_us(BACKWARD_NS - HOUR // 2)},
+        Belief.CLOCK,
+    ),
+    "an echo that came before it was sent": (
+        {"backward_us": stamp_us(-BEGAN_NS - S)},
+        Belief.CLOCK,
+    ),
+    "a horizon from far ahead": ({"in_force": 105 + H + 1}, Belief.HORIZON),
+    "a horizon of before": ({"in_force": 91}, Belief.HORIZON),
+    "in force since a later step": ({"since": 106}, Belief.HORIZON),
+    "in force since long ago": ({"since": 101}, Belief.HORIZON),
+    "a jump": ({"state": moved(2.0)}, Belief.JUMP),
+    "a jump in speed": ({"state": moved(0.0, 5.0)}, Belief.JUMP),
+    "the end of the world": ({"state": moved(1e300, 1e300)}, Belief.JUMP),
+}
+"""What is odd in the observation of step 105, and what is said of it."""
+
+
+@pytest.mark.parametrize(("changed", "verdict"), ODD.values(), ids=ODD)
+def test_an_odd_observation_is_not_believed_and_changes_nothing(
+    changed: dict[str, Any], verdict: Belief
+) -> None:
+    """Once or twice; the next that follows from those before is believed as ever."""
+    for times in (1, 2):
+        plausibility = after()
+        for _ in range(times):
+            assert judge(plausibility, seen(105, changed), step=105) == verdict
+        assert judge(plausibility, seen(106)) == Belief.BELIEVED
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
+    """What is odd for one may be the first that is heard of another."""
+    expected = Belief.JUMP if row == 0 else Belief.BELIEVED
+    assert judge(after(), elsewhere(105), row=row) == expected
+
+
+def elsewhere(step: int, metres: float = 100.0) -> Observation:
+    """What the vehicle says once it has been carried away."""
+    told = seen(step)
+    return told._replace(state=told.state + np.array([[metres, 0.0], [0.0, 0.0]]))
+
+
+def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
+    """The first two are not; from the third on it is the others that are odd."""
+    plausibility = after()
+    verdicts = [judge(plausibility, elsewhere(step)) for step in range(105, 110)]
+    assert verdicts == [
+        *[Belief.JUMP] * (REPEATS - 1),
+        Belief.ANEW,
+        Belief.BELIEVED,
+        Belief.BELIEVED,
+    ]
+    assert judge(plausibility, seen(110)) == Belief.JUMP
+
+
+def test_three_that_do_not_agree_are_not_believed() -> None:
+    """Each contradicts the one before it."""
+    plausibility = after()
+    for n, step in enumerate(range(105, 125)):
+        assert judge(plausibility, elsewhere(step, 100.0 * (n + 1))) == Belief.JUMP
+    assert judge(plausibility, seen(125)) == Belief.BELIEVED
+
+
+def test_two_among_believed_ones_are_not_in_a_row() -> None:
+    """However many there are of them."""
+    plausibility = after()
+    for step in range(105, 205, 3):
+        assert judge(plausibility, elsewhere(step)) == Belief.JUMP
+        assert judge(plausibility, elsewhere(step + 1)) == Belief.JUMP
+        assert judge(plausibility, seen(step + 2)) == Belief.BELIEVED
+
+
+def test_an_odd_one_among_those_that_agree_begins_the_row_anew() -> None:
+    """One that follows neither from what is believed nor from what is doubted."""
+    plausibility = after()
+    told = [
+        elsewhere(105),
+        elsewhere(106),
+        elsewhere(107, -100.0),
+        elsewhere(108),
+        elsewhere(109),
+    ]
+    assert all(judge(plausibility, each) > Belief.BELIEVED for each in told)
+    assert judge(plausibility, elsewhere(110)) == Belief.ANEW
+
+
+def test_a_late_observation_tells_of_the_clocks_alone() -> None:
+    """Its horizon and its state are of before; what is held against the next is the newest."""
+    plausibility = after()
+    assert judge(plausibility, seen(90)) == Belief.BELIEVED
+    assert judge(plausibility, seen(105)) == Belief.BELIEVED
+    early = seen(90, {"backward_us": stamp_us(BACKWARD_NS - S)})
+    assert judge(plausibility, early) == Belief.CLOCK
+    assert judge(plausibility, seen(104, {"in_force": -1, "state": moved(50.0)})) == Belief.BELIEVED
+    assert judge(plausibility, seen(106)) == Belief.BELIEVED
+
+
+def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
+    """As one that was never heard; its neighbour is not forgotten."""
+    plausibility = after()
+    assert judge(plausibility, seen(100), row=1) == Belief.BELIEVED
+    plausibility.forget(0)
+    assert judge(plausibility, elsewhere(3)) == Belief.BELIEVED
+    assert judge(plausibility, elsewhere(101), row=1) == Belief.JUMP
+
+
+def test_an_odd_first_observation_is_forgotten_after_three() -> None:
+    """Nothing is known that would speak against it."""
+    plausibility = Plausibility(TERMS, 1)
+    assert judge(plausibility, elsewhere(100)) == Belief.BELIEVED
+    verdicts = [judge(plausibility, seen(step)) for step in range(101, 105)]
+    assert verdicts == [Belief.JUMP, Belief.JUMP, Belief.ANEW, Belief.BELIEVED]
+
+
+@quick
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(-300, 300),
+    st.integers(0, 3000),
+    st.lists(st.integers(1, 60), max_size=30),
+)
+def test_whatever_a_vehicle_may_say_is_believed(
+    seed: int, drift_ppm: int, jitter_ms: int, gaps: list[int]
+) -> None:
+    """Drifting clocks, delays that vary by seconds, losses, and wind."""
+    rng, plausibility, step = np.random.default_rng(seed), Plausibility(TERMS, 1), 100
+    for gap in gaps:
+        step += gap
+        told = seen(step)
+        told = told._replace(state=told.state + rng.normal(scale=0.1, size=(2, 2)))
+        up_ns, down_ns = (int(rng.integers(jitter_ms * MS + 1)) for _ in range(2))
+        # The server's clock drifts away from the vehicle's.
+        drift_ns = (step - 100) * DT_NS * drift_ppm // 1_000_000
+        forward_ns = BEGAN_NS + drift_ns + down_ns
+        backward_us = stamp_us(up_ns - BEGAN_NS - drift_ns)
+        backward_ns = stamped_ns(backward_us, near_ns=-forward_ns)
+        assert plausibility.judge(0, told, forward_ns, backward_ns) == Belief.BELIEVED
+
+
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("backward_us", [0, 2**31, 2**32 - 1])
+def test_the_largest_step_on_the_wire_overflows_nothing(backward_us: int, *, first: bool) -> None:
+    """First in its session, it is believed: nothing is known that would speak against it."""
+    plausibility = Plausibility(TERMS, 1) if first else after()
+    last = seen(105)._replace(step=2**32 - 1, in_force=-1, since=0, backward_us=backward_us)
+    verdict = judge(plausibility, last, step=105)
+    assert verdict == Belief.CLOCK or (first and verdict == Belief.BELIEVED)
+
+
+@pytest.mark.parametrize(
+    ("steps", "metres", "speed"), [(1, 1.06, 4.4), (10, 7.2, 26.9), (40, 100.9, 101.9)]
+)
+def test_how_far_a_vehicle_may_have_come_grows_with_the_time_since_the_last_one(
+    steps: int, metres: float, speed: float
+) -> None:
+    """Noise, and 50 m/s² for 0.05 s a step: that far is believed, a fifth more is a jump."""
+    for p, v in ((metres, 0.0), (0.0, speed)):
+        for share, verdict in ((1.0, Belief.BELIEVED), (1.2, Belief.JUMP)):
+            plausibility = Plausibility(TERMS, 1)
+            still = {"state": np.zeros((2, 2))}
+            assert judge(plausibility, seen(100, still)) == Belief.BELIEVED
+            # A change of velocity takes the vehicle along by its mean.
+            gone = share * np.array([p + 0.5 * v * steps * TERMS.dt_s, v])
+            told = seen(100 + steps, {"state": np.array([gone, [0.0, 0.0]])})
+            assert judge(plausibility, told) == verdict
+
+
+@quick
+@given(st.integers(0, 3), st.integers(0, 63))
+def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit: int) -> None:
+    """Within a metre or so, and two metres per second."""
+    told = seen(105)
+    state = told.state.copy()
+    state.view(np.uint64).ravel()[number] ^= np.uint64(1 << bit)
+    if np.isfinite(state).all() and judge(after(), told._replace(state=state)) == Belief.BELIEVED:
+        assert np.abs(state - told.state).max() < 5.0
+    else:
+        assert np.abs(state - told.state).max() > 0.9 or not np.isfinite(state).all()
+
+
+# -- in flight -------------------------------------------------------------------------------------
+
+
+def scenario(**changes: Any) -> Scenario:
+    """The demo with a report at every step, with some keys changed."""
+    reports = {"vehicle": {"report": "always"}, "link": {"heartbeat_s": 0.1, "timeout_s": 1.0}}
+    return packaged("demo-committed", reports, changes)
+
+
+def flipped(share: float) -> list[Record]:
+    """Flights with one bit flipped in a share of the packets to the server."""
+
+    class Flipping(Proxy):
+        """Netem of a bad cable."""
+
+        def __init__(self, scenario: Scenario, **more: Any) -> None:
+            super().__init__(scenario, **more)
+            self._rng = random.Random(scenario.seed)
+
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            """See `Endpoint`."""
+            rng = self._rng
+            if datagram.socket == 0 and rng.random() < share:
+                payload = bytearray(datagram.payload)
+                bit = rng.randrange(8 * len(payload))
+                payload[bit // 8] ^= 1 << bit % 8
+                datagram = datagram._replace(payload=bytes(payload))
+            super().receive(datagram, now_ns=now_ns)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(skytether.sim.flight, "Proxy", Flipping)
+        return fly_batch(scenario(), SEEDS)
+
+
+SEEDS = range(1, 7)
+
+
+def rmse(flights: list[Record]) -> float:
+    """Mean RMSE xy of flights [m]."""
+    errors = [summarise(scenario(), "test", flight.client).rmse_xy or 0.0 for flight in flights]
+    return float(np.mean(errors))
+
+
+def believe(*_: Any) -> Belief:
+    """Ablation: the verdict of the credulous."""
+    return Belief.BELIEVED
+
+
+def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """RMSE within a tenth of that of a good cable; if all is believed it is several times that."""
+    good, bad = rmse(flipped(0.0)), flipped(0.01)
+    assert rmse(bad) == pytest.approx(good, rel=0.1)
+    dropped = bad[0].figures["server"]["dropped"]  # of all of them
+    assert dropped.get(Drop.IMPLAUSIBLE_HORIZON, 0) > 0
+    assert all(flight.failure is None for flight in bad)
+    monkeypatch.setattr(Plausibility, "judge", believe)
+    assert rmse(flipped(0.01)) > 2.0 * good
+
+
+def oddly(
+    monkeypatch: pytest.MonkeyPatch, number: int, field: str, value: int, *, feedback: bool = True
+) -> Record:
+    """A flight of which one observation, by its number from 0, has a field changed."""
+    send, said = ServerSession.send, iter(range(10**9))
+
+    def lie(self: ServerSession, message: Any) -> None:
+        if isinstance(message, Observation) and next(said) == number:
+            message = message._replace(**{field: getattr(message, field) + value})
+        send(self, message)
+
+    monkeypatch.setattr(ServerSession, "send", lie)
+    control = reading.to_table(reading.load("demo-committed"))["control"] | {"feedback": feedback}
+    network = {"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}
+    return fly(scenario(control=control, network=network))
+
+
+@pytest.mark.parametrize("number", [0, 300])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("step", 16),
+        ("step", 2**20),
+        ("backward_us", -10_000_000),
+        ("since", -1),
+        ("in_force", 2**30),
+    ],
+)
+def test_one_odd_observation_costs_a_few_steps_at_most(
+    number: int, field: str, value: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it is the first of its session."""
+    flight = oddly(monkeypatch, number, field, value)
+    assert flight.failure is None
+    steps = flight.server["step"]
+    steps = steps[steps < 2**19]
+    assert steps[0] <= 12 + REPEATS + 1
+    assert np.diff(steps).max() <= 9  # one within the round trip, of 0.88 s, is believed
+    error = summarise(scenario(), "test", flight.client).error_max
+    assert error is not None
+    assert error < 0.5
+
+
+def test_believed_one_odd_observation_leaves_the_vehicle_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ablation: no observation is newer than step 2^20, no horizon is for a step of now.
+
+    Without feedback: with it the server would go 2^20 steps along where its plan leads.
+    """
+    monkeypatch.setattr(Plausibility, "judge", believe)
+    flight = oddly(monkeypatch, 300, "step", 2**20, feedback=False)
+    error = summarise(scenario(), "test", flight.client).error_max
+    assert flight.failure is not None or (error or 0.0) > 0.5
+
+
+class Stepped(NamedTuple):
+    """A clock that is set by an hour while it runs."""
+
+    clock: Clock
+    at_ns: int
+    """Time of the world at which it is set."""
+    by_ns: int
+
+    def local(self, time_ns: int) -> int:
+        """See `Clock`."""
+        return self.clock.local(time_ns) + self.by_ns * (time_ns >= self.at_ns)
+
+    def world(self, local_ns: int) -> int:
+        """See `Clock`."""
+        before_ns = self.clock.world(local_ns)
+        if before_ns < self.at_ns:
+            return before_ns
+        return max(self.at_ns, self.clock.world(local_ns - self.by_ns))
+
+
+@pytest.mark.parametrize("by_ns", [HOUR, -HOUR])
+def test_a_server_whose_clock_steps_goes_on_planning(
+    by_ns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By an hour, in flight: the vehicle is without a plan for as long as a session takes to open.
+
+    No observation of before the step agrees with those after it.
+    """
+    ours = iter([False, True])
+
+    def clock(*numbers: int) -> Clock | Stepped:
+        """The client's, then the server's."""
+        made = Clock(*numbers)
+        return Stepped(made, 15 * S, by_ns) if next(ours) else made
+
+    monkeypatch.setattr(skytether.sim.flight, "Clock", clock)
+    flown = scenario(network={"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}})
+    flight = fly(flown)
+    assert flight.failure is None
+    covered = flight.client["covered"]
+    assert covered[600:].all()
+    assert np.linalg.norm(flight.client["state"][:, :, 0], axis=1).max() < 3.0
+
+
+def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """300 m in a step: the vehicle hovers from then on, and the server has not believed it."""
+    advance, steps = FirstOrderPlant.advance, count()
+
+    def leaping(self: FirstOrderPlant, command: Array) -> None:
+        advance(self, command)
+        if next(steps) == 400:
+            self.x = [(p + 300.0, v) for p, v in self.x]
+
+    monkeypatch.setattr(FirstOrderPlant, "advance", leaping)
+    flight = fly(
+        reading.check(reading.to_table(reading.load("demo-committed")) | {"duration": 40.0}, "test")
+    )
+    said = [event for _, _, event in flight.events]
+    assert StateDoubted(vehicle=1) in said
+    changes = [(each.after, each.reason) for each in said if isinstance(each, ModeChanged)]
+    why = "its state has leapt as no vehicle can"
+    assert changes[-2:] == [("brake", why), ("hover", why)]
+    assert np.abs(flight.client["input"][-1]).max() == 0.0

@@ -1,0 +1,701 @@
+"""The server as an endpoint: sessions, ticks, and what it sends to whom."""
+
+import io
+import math
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers import packaged
+from skytether.server.endpoint import VEHICLES_MAX, Server
+from skytether.server.gate import PlainGate
+from skytether.server.secure import SecureGate
+from skytether.server.sessions import SESSION_NS, WELCOME_NS, Sessions
+from skytether.server.tick import Grid
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Events
+from skytether.shared.core.events import (
+    Degraded,
+    NumberTaken,
+    PlanningResumed,
+    PlanningStopped,
+    ServerFull,
+    SessionEnded,
+    SessionOpened,
+    SessionRefused,
+    Unauthenticated,
+)
+from skytether.shared.law.heartbeat import NUMBERS, Hearing
+from skytether.shared.law.terms import Difference
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, Rows, parse, server_columns
+from skytether.shared.wire.keys import Keyring
+from skytether.shared.wire.protocol import (
+    NO_HORIZON,
+    Close,
+    Drop,
+    Heartbeat,
+    Hello,
+    Horizon,
+    Idle,
+    Message,
+    Mode,
+    Observation,
+    ProtocolError,
+    Refusal,
+    Welcome,
+    decode,
+    encode,
+    stamp_us,
+)
+
+HERE: Address = ("vehicle", 1)
+LINE = PlainGate().open(Datagram(b"", ("", 0)), now_ns=0).line
+SILENCE_NS = 1500 * MILLISECOND_NS
+"""Time after which another life of a vehicle may take its number, in all of these tests."""
+DAY_NS = 86_400 * SECOND_NS
+"""A day [ns]."""
+
+
+def scenario(**control: Any) -> Scenario:
+    """The paper's, with some keys of `control` changed, and vehicles that are soon found silent."""
+    soon = {"timeout_s": SILENCE_NS / SECOND_NS}
+    return packaged("paper-every-step", control=control, link=soon)
+
+
+class Vehicles:
+    """A server, and vehicles that say to it exactly what a test wants them to."""
+
+    def __init__(self, flown: Scenario, boot_id: int = 77, room: int = VEHICLES_MAX) -> None:
+        self.terms = flown.terms()
+        self.dt_ns = flown.dt_ns
+        self.sink = io.BytesIO()
+        recorder = Recorder(server_columns(flown.model.axes, flown.control.scheme), self.sink)
+        self.server = Server(
+            flown, boot_id=boot_id, entropy=stream(1, "entropy").bytes, room=room, recorder=recorder
+        )
+        # Ticks lie on multiples of 50 ms: the first comes 30 ms after what is said first.
+        self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
+        self.epochs_ns: dict[int, int] = {}
+        """Begin of step 0 of each session."""
+
+    def say(self, message: Message, sender: Address = HERE) -> list[tuple[Message, Address]]:
+        """One datagram, and the answers to it."""
+        self.server.receive(Datagram(encode(message), sender), now_ns=self.now_ns)
+        return self.answers()
+
+    def answers(self) -> list[tuple[Message, Address]]:
+        """What is in the outbox, decoded."""
+        return [(decode(out.payload, self.terms), out.peer) for out in self.server.outbox()]
+
+    def ask(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
+        """The answer to a HELLO."""
+        ((welcome, peer),) = self.say(Hello(vehicle, boot_id, self.terms), sender)
+        assert isinstance(welcome, Welcome)
+        assert peer == sender
+        return welcome
+
+    def open(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
+        """A session, welcomed but not yet live."""
+        welcome = self.ask(vehicle, boot_id, sender)
+        assert welcome.refusal == Refusal.ACCEPTED
+        return welcome
+
+    def observe(
+        self,
+        welcome: Welcome,
+        step: int,
+        state: object = ((1.0, 0.0), (0.0, 0.0)),
+        sender: Address = HERE,
+    ) -> None:
+        """An observation that took no time, unless it is an old one."""
+        epoch_ns = self.epochs_ns.setdefault(welcome.session, self.now_ns - step * self.dt_ns)
+        self.now_ns = max(self.now_ns, epoch_ns + step * self.dt_ns)
+        assert self.say(self.told(welcome, step, state), sender) == []
+
+    def told(
+        self, welcome: Welcome, step: int, state: object = ((1.0, 0.0), (0.0, 0.0))
+    ) -> Observation:
+        """Observation of a step of a session that has an epoch."""
+        epoch_ns = self.epochs_ns[welcome.session]
+        return Observation(
+            welcome.vehicle,
+            welcome.session,
+            step,
+            in_force=NO_HORIZON,
+            since=0,
+            backward_us=stamp_us(-epoch_ns),
+            heard=step % NUMBERS,
+            mode=Mode.TRACK,
+            takes=1,
+            state=np.array(state),
+            input=np.zeros(2),
+            number=step % NUMBERS,
+            silence=40,
+        )
+
+    def tick(self) -> list[tuple[Message, Address]]:
+        """Time passes until the next tick; what is sent at it."""
+        due_ns = self.server.next_wake_ns()
+        assert due_ns is not None
+        self.now_ns = max(self.now_ns, due_ns)
+        self.server.wake(now_ns=self.now_ns)
+        return self.answers()
+
+    def rows(self) -> Rows:
+        """The record so far."""
+        return parse(self.sink.getvalue())
+
+
+def test_hello_is_welcomed_with_the_servers_terms() -> None:
+    """The answer echoes the vehicle's boot id and carries the server's."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open(vehicle=3, boot_id=42)
+    assert (welcome.vehicle, welcome.boot_id, welcome.server_boot_id) == (3, 42, 77)
+    assert welcome.terms == vehicles.terms
+    assert welcome.server_ns == vehicles.now_ns
+
+
+def test_a_repeated_hello_gets_the_same_session() -> None:
+    """A WELCOME that was lost costs nothing but time, before and after the first observation."""
+    vehicles = Vehicles(scenario())
+    first = vehicles.open()
+    assert vehicles.open().session == first.session
+    vehicles.observe(first, 0)
+    assert vehicles.open().session == first.session
+
+
+def test_other_terms_open_no_session() -> None:
+    """The server says what it flies, and the operator hears what differs."""
+    vehicles = Vehicles(scenario())
+    other = vehicles.terms._replace(horizon=20)
+    ((welcome, _),) = vehicles.say(Hello(1, 5, other))
+    assert isinstance(welcome, Welcome)
+    assert welcome.terms == vehicles.terms
+    assert (welcome.refusal, welcome.session) == (Refusal.OTHER_TERMS, 0)
+    differences = (Difference("control.horizon", here="40", there="20"),)
+    assert vehicles.server.events() == (SessionRefused(vehicle=1, differences=differences),)
+    vehicles.observe(welcome, 0)
+    assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
+
+
+def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
+    """One of a vehicle that has been forgotten since is told again."""
+    vehicles = Vehicles(scenario())
+    other = vehicles.terms._replace(horizon=20)
+
+    def told(*boot_ids: int) -> int:
+        """Number of refusals that the operator is told of these lives of vehicle 1."""
+        for boot_id in boot_ids:
+            vehicles.say(Hello(1, boot_id, other))
+        return len(vehicles.server.events())
+
+    assert told(*range(64)) == 64
+    assert told(0, 63) == 0
+    assert told(64) == 1
+    assert told(1, 64) == 0
+    assert told(0) == 1
+
+
+def test_strangers_are_told_of_every_ten_seconds_with_their_number() -> None:
+    """At once of the first; the address and reason are those of the newest."""
+    gate = SecureGate(Keyring("keys", {}), entropy=stream(2, "gate").bytes)
+    server = Server(scenario(), boot_id=1, entropy=stream(1, "entropy").bytes, gate=gate)
+    told = []
+    for second in range(25):
+        peer = (f"stranger {second}", second)
+        server.receive(Datagram(b"?", peer), now_ns=(100 + second) * SECOND_NS)
+        told += [(second, event) for event in server.events()]
+    assert server.dropped == {Drop.NOT_SEALED: 25}
+    assert told == [
+        (
+            second,
+            Unauthenticated(
+                count=second + 1, host=f"stranger {second}", port=second, reason=Drop.NOT_SEALED
+            ),
+        )
+        for second in (0, 10, 20)
+    ]
+
+
+def test_an_idle_server_asks_for_no_wake() -> None:
+    """No vehicle, no ticks; they begin with the first observation."""
+    vehicles = Vehicles(scenario())
+    assert vehicles.server.next_wake_ns() is None
+    welcome = vehicles.open()
+    assert vehicles.server.next_wake_ns() is None
+    vehicles.observe(welcome, 0)
+    due_ns = vehicles.server.next_wake_ns()
+    assert due_ns is not None
+    assert due_ns % vehicles.dt_ns == 0
+    assert 0 < due_ns - vehicles.now_ns <= vehicles.dt_ns
+
+
+def test_the_first_tick_sends_a_horizon_for_the_step_it_is_aboard() -> None:
+    """Stamped with k on the vehicle's grid and with the observation behind it."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 100)
+    ((horizon, peer),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert peer == HERE
+    assert (horizon.vehicle, horizon.session) == (1, welcome.session)
+    # 30 ms have passed since the start of step 100, a step is 50 ms.
+    assert horizon.step == 100
+    assert horizon.age == 0
+    ((later, _),) = vehicles.tick()
+    assert isinstance(later, Horizon)
+    assert (later.step, later.age) == (101, 1)
+
+
+@pytest.mark.parametrize("minutes", [36, 71, 71.6, 72, 143.2, 1000])
+def test_an_observation_that_was_held_back_is_no_new_one(minutes: float) -> None:
+    """However often stamps have begun anew since: it makes a round trip of less than nothing."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    vehicles.observe(welcome, 1)
+    later = round(minutes * 60 * SECOND_NS) // vehicles.dt_ns
+    vehicles.observe(welcome, later)
+    assert vehicles.server.dropped == {}
+    vehicles.say(vehicles.told(welcome, 1))
+    assert vehicles.server.dropped == {Drop.IMPLAUSIBLE_CLOCK: 1}
+    vehicles.observe(welcome, later + 1)
+    assert vehicles.server.dropped == {Drop.IMPLAUSIBLE_CLOCK: 1}
+
+
+def test_a_vehicle_that_is_begun_anew_has_its_packets_counted_anew() -> None:
+    """Else all were late after one that told of a step 71 minutes ahead, and none counted."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.epochs_ns[welcome.session] = vehicles.now_ns
+    vehicles.say(vehicles.told(welcome, 71 * 60 * 20))
+    for step in range(4):
+        vehicles.say(vehicles.told(welcome, step))
+        vehicles.now_ns += vehicles.dt_ns
+    (session,) = vehicles.server.sessions
+    assert vehicles.server.dropped == {Drop.IMPLAUSIBLE_CLOCK: 2}
+    assert session.hearing.newest == 3
+
+
+def test_the_newest_observation_wins_after_reordering() -> None:
+    """An older one is counted as stale, and neither state nor address follow it."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 5)
+    vehicles.observe(welcome, 4, state=((9.0, 0.0), (9.0, 0.0)), sender=("old", 2))
+    ((_, peer),) = vehicles.tick()
+    assert peer == HERE
+    row = vehicles.rows()[-1]
+    assert (row["observed_step"], row["stale"]) == (5, 1)
+    assert row["estimate"][:, 0].tolist() == [1.0, 0.0]
+
+
+def test_answers_follow_the_vehicle_to_its_new_address() -> None:
+    """A restarted netem has other ports: the newest observation says where the vehicle is.
+
+    Until it says HELLO there it is answered at home as well, for somebody may send on copies.
+    """
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    assert [peer for _, peer in vehicles.tick()] == [HERE]
+    vehicles.observe(welcome, 1, sender=("elsewhere", 9))
+    (there, at), (here, home) = vehicles.tick()
+    assert (at, home) == (("elsewhere", 9), HERE)
+    assert isinstance(there, Horizon)
+    assert isinstance(here, Horizon)
+    np.testing.assert_array_equal(there.inputs, here.inputs)
+    vehicles.ask(sender=("elsewhere", 9))
+    vehicles.observe(welcome, 2, sender=("elsewhere", 9))
+    assert [peer for _, peer in vehicles.tick()] == [("elsewhere", 9)]
+
+
+def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None:
+    """Until then the old session flies on; after it, the old one is a stranger."""
+    vehicles = Vehicles(scenario())
+    old = vehicles.open(boot_id=5)
+    vehicles.observe(old, 50)
+    vehicles.now_ns += SILENCE_NS + 1
+    new = vehicles.open(boot_id=6)
+    assert new.session != old.session
+    ((horizon, _),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert horizon.session == old.session
+    vehicles.observe(new, 0)
+    ((horizon, _),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert (horizon.session, horizon.step) == (new.session, 0)
+    vehicles.observe(old, 51)
+    assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
+
+
+def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing() -> None:
+    """As long as the first is heard; both operators read it, once for each life."""
+    vehicles = Vehicles(scenario())
+    first = vehicles.open(vehicle=3, boot_id=5)
+    for step in range(100):
+        vehicles.observe(first, step)
+        if step % 20 == 0:
+            refused = vehicles.ask(vehicle=3, boot_id=6, sender=("other", 2))
+            assert (refused.refusal, refused.session, refused.boot_id) == (Refusal.TAKEN, 0, 6)
+        ((horizon, peer),) = vehicles.tick()
+        assert isinstance(horizon, Horizon)
+        assert (horizon.session, peer) == (first.session, HERE)
+    taken = NumberTaken(vehicle=3, host="other", port=2, holder="vehicle:1")
+    opened = SessionOpened(vehicle=3, host="vehicle", port=1)
+    assert vehicles.server.events() == (opened, taken)
+    assert vehicles.server.refused[Refusal.TAKEN] == 5
+
+
+def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
+    """The second is refused before the first has come, and gets in if that never does."""
+    vehicles = Vehicles(scenario())
+    first = vehicles.open(boot_id=5)
+    assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
+    vehicles.observe(first, 0)
+    ((horizon, _),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert horizon.session == first.session
+    vehicles = Vehicles(scenario())
+    vehicles.open(boot_id=5)
+    vehicles.now_ns += WELCOME_NS + 1
+    vehicles.observe(vehicles.open(boot_id=6), 0)
+    assert len(vehicles.server.sessions) == 1
+
+
+def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_heard_again() -> None:
+    """The network was away, not the vehicle: who was welcomed meanwhile is told when it asks."""
+    vehicles = Vehicles(scenario())
+    first = vehicles.open(boot_id=5)
+    vehicles.observe(first, 0)
+    vehicles.now_ns += SILENCE_NS + 1
+    second = vehicles.open(boot_id=6, sender=("other", 2))
+    vehicles.observe(first, 61)
+    vehicles.observe(second, 0, sender=("other", 2))
+    assert vehicles.server.dropped[Drop.TAKEN] == 1
+    assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
+    ((horizon, peer),) = vehicles.tick()
+    assert isinstance(horizon, Horizon)
+    assert (horizon.session, peer) == (first.session, HERE)
+
+
+def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> None:
+    """It was welcomed while the old one had its row, and gets one of its own."""
+    vehicles = Vehicles(scenario(), room=1)
+    vehicles.observe(vehicles.open(boot_id=5), 0)
+    vehicles.now_ns += SESSION_NS - SECOND_NS
+    new = vehicles.open(boot_id=6)
+    vehicles.now_ns += 2 * SECOND_NS
+    vehicles.tick()
+    assert len(vehicles.server.sessions) == 0
+    assert vehicles.ask(vehicle=2).refusal == Refusal.FULL
+    vehicles.observe(new, 0)
+    assert [session.boot_id for session in vehicles.server.sessions] == [6]
+
+
+def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None:
+    """Two lives of the server share no session."""
+    welcome = Vehicles(scenario(), boot_id=1).open()
+    vehicles = Vehicles(scenario(), boot_id=2**63)
+    vehicles.observe(welcome, 3)
+    assert vehicles.server.dropped == {Drop.UNKNOWN_SESSION: 1}
+
+
+def test_a_close_ends_the_session_that_it_names_and_no_other() -> None:
+    """One of another session is dropped; after its own the vehicle is a stranger."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    vehicles.server.events()
+    assert vehicles.say(Close(1, welcome.session + 1)) == []
+    assert vehicles.say(Close(2, welcome.session)) == []
+    assert vehicles.server.dropped == {Drop.UNKNOWN_SESSION: 2}
+    assert len(vehicles.tick()) == 1
+    assert vehicles.say(Close(1, welcome.session)) == []
+    assert vehicles.server.events() == (SessionEnded(vehicle=1),)
+    assert vehicles.tick() == []
+    vehicles.observe(welcome, 2)
+    assert vehicles.server.dropped == {Drop.UNKNOWN_SESSION: 3}
+
+
+def test_ticks_slept_through_are_counted_and_skipped() -> None:
+    """One horizon, for the step it is now; the grid does not move."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    vehicles.tick()
+    due_ns = vehicles.server.next_wake_ns()
+    assert due_ns is not None
+    vehicles.now_ns = due_ns + 3 * vehicles.dt_ns + 1
+    vehicles.server.wake(now_ns=vehicles.now_ns)
+    ((horizon, _),) = vehicles.answers()
+    assert isinstance(horizon, Horizon)
+    assert horizon.step == 4
+    assert vehicles.server.missed == 3
+    assert vehicles.server.next_wake_ns() == due_ns + 4 * vehicles.dt_ns
+
+
+@pytest.mark.parametrize(
+    ("late", "degraded"),
+    [({5: 5}, []), ({1: 1, 7: 5}, [*range(7, 22)]), ({1: 1, 29: 6}, [*range(29, 50)])],
+    ids=["five", "six, a second from the first on", "six, and one of before"],
+)
+def test_more_than_five_ticks_missed_within_a_second_make_a_degraded_server(
+    late: dict[int, int], degraded: list[int]
+) -> None:
+    """To the tick; older ones count for nothing, and then it is in time again.
+
+    Args:
+        late: ticks of 50 ms that were missed just before each of these.
+        degraded: ticks at which the server is.
+    """
+    events, dt_ns = Events(), 50 * MILLISECOND_NS
+    grid = Grid(dt_ns, events)
+    grid.arm(0)
+    slept = {tick - back for tick, count in late.items() for back in range(1, count + 1)}
+    awake = [tick for tick in range(60) if tick not in slept]
+    found = []
+    for tick in awake:
+        assert grid.take(tick * dt_ns) == tick * dt_ns
+        found += [tick] * grid.degraded
+    assert found == degraded
+    assert grid.missed == sum(late.values())
+    told = [Degraded(degraded=True), Degraded(degraded=False)] if degraded else []
+    assert list(events) == told
+
+
+def test_a_wake_before_its_time_does_nothing() -> None:
+    """A timer that fires early must not tick twice."""
+    vehicles = Vehicles(scenario())
+    vehicles.observe(vehicles.open(), 0)
+    due_ns = vehicles.server.next_wake_ns()
+    assert due_ns is not None
+    vehicles.server.wake(now_ns=due_ns - 1)
+    assert vehicles.answers() == []
+    assert vehicles.server.next_wake_ns() == due_ns
+
+
+def test_a_silent_server_sends_heartbeats() -> None:
+    """Where no event sends a horizon, a heartbeat keeps the session alive."""
+    vehicles = Vehicles(scenario(trigger="state_gap", epsilon=1e9))
+    welcome = vehicles.open()
+    sent = []
+    for step in range(61):
+        vehicles.observe(welcome, step)
+        sent += [message for message, _ in vehicles.tick()]
+    assert isinstance(sent[0], Horizon)
+    heartbeats = sent[1:]
+    # The vehicle asks for one a second, and a step is 50 ms.
+    assert [type(message) for message in heartbeats] == [Heartbeat] * 3
+    assert {message.session for message in heartbeats} == {welcome.session}
+
+
+def test_no_estimate_without_a_recent_observation() -> None:
+    """Five seconds after the last one the server plans no more, says why, and stays in touch."""
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    vehicles.observe(welcome, 0)
+    said = [[message for message, _ in vehicles.tick()] for _ in range(122)]
+    assert [[type(message) for message in each] for each in said[:101]] == [[Horizon]] * 101
+    ((heartbeat,),) = (each for each in said[101:] if each)
+    assert isinstance(heartbeat, Heartbeat)
+    assert heartbeat.idle == Idle.OBSERVATION
+    stopped = PlanningStopped(vehicle=1, why=str(Idle.OBSERVATION))
+    assert vehicles.server.events()[-1] == stopped
+    vehicles.observe(welcome, 123)
+    assert [type(message) for message, _ in vehicles.tick()] == [Horizon]
+    assert vehicles.server.events() == (PlanningResumed(vehicle=1),)
+
+
+def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
+    """The vehicle's row is free again, and the server comes to rest."""
+    vehicles = Vehicles(scenario())
+    vehicles.observe(vehicles.open(), 0)
+    vehicles.now_ns += SESSION_NS + vehicles.dt_ns
+    vehicles.server.wake(now_ns=vehicles.now_ns)
+    assert vehicles.server.next_wake_ns() is None
+    assert vehicles.server.events()[-1] == SessionEnded(vehicle=1)
+
+
+def test_a_vehicle_too_many_is_told_that_the_server_is_full() -> None:
+    """So is the operator, once; a vehicle that is known is always welcome."""
+    vehicles = Vehicles(scenario())
+    for number in range(VEHICLES_MAX):
+        vehicles.observe(vehicles.open(vehicle=number), 0)
+    vehicles.server.events()
+    for _ in range(3):
+        refused = vehicles.ask(vehicle=1000)
+        assert (refused.refusal, refused.session) == (Refusal.FULL, 0)
+    full = ServerFull(vehicle=1000, host="vehicle", port=1, room=VEHICLES_MAX)
+    assert vehicles.server.events() == (full,)
+    assert vehicles.server.refused[Refusal.FULL] == 3
+    assert vehicles.open(vehicle=7).vehicle == 7
+
+
+def test_a_full_server_keeps_the_second_life_of_a_vehicle_from_a_stranger() -> None:
+    """The vehicle that restarts has its row already: no stranger is welcomed in its place."""
+    vehicles = Vehicles(scenario(), room=2)
+    for number in (1, 2):
+        vehicles.observe(vehicles.open(vehicle=number), 0)
+    vehicles.now_ns += SILENCE_NS + 1
+    second_life = vehicles.open(vehicle=1, boot_id=6)
+    for _ in range(2):
+        assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
+        vehicles.now_ns += WELCOME_NS + 1
+    vehicles.observe(second_life, 0)
+    assert [session.boot_id for session in vehicles.server.sessions] == [6, 5]
+
+
+def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
+    """Each that was told so gets its row; one that never came makes room for the next."""
+    vehicles = Vehicles(scenario(), room=3)
+    welcomes = [vehicles.open(vehicle=number) for number in range(3)]
+    assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
+    vehicles.now_ns += WELCOME_NS
+    vehicles.open(vehicle=0)  # says HELLO again: of the others, 1 has waited longest
+    assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
+    vehicles.now_ns += 1
+    late = vehicles.open(vehicle=1000)
+    for welcome in (welcomes[0], welcomes[2], late):
+        vehicles.observe(welcome, 0)
+    assert len(vehicles.server.sessions) == 3
+    vehicles.observe(welcomes[1], 0)
+    assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["hello", "observe", "wait"]), st.integers(0, 5), st.integers(0, 2)
+        ),
+        max_size=60,
+    )
+)
+def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
+    moves: list[tuple[str, int, int]],
+) -> None:
+    """Any vehicles, lives and waits: never more than there is room for, and never a crash."""
+    ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
+    sessions, now_ns = Sessions(3, stream(1, "entropy").bytes, SILENCE_NS, ear), DAY_NS
+    terms = scenario().terms()
+    numbers: dict[tuple[int, int], int] = {}
+    due: dict[int, tuple[int, int]] = {}
+    """Life that each vehicle must be granted, and until when."""
+    for move, vehicle, boot_id in moves:
+        match move:
+            case "hello":
+                hello = Hello(vehicle, boot_id, terms)
+                if sessions.holder(hello, now_ns) is None and not sessions.is_full(hello, now_ns):
+                    session = sessions.welcome(hello, HERE, LINE, now_ns)
+                    numbers[vehicle, boot_id] = session.number
+                    due[vehicle] = (boot_id, now_ns + WELCOME_NS)
+            case "observe" if (vehicle, boot_id) in numbers:
+                told = 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
+                said = Observation(vehicle, numbers[vehicle, boot_id], *told)
+                granted, refused = due.get(vehicle, (-1, 0)), ""
+                try:
+                    (sessions.find(said) or sessions.begin(said, now_ns)).heard_ns = now_ns
+                except ProtocolError as error:
+                    refused = error.reason
+                in_time = granted[0] == boot_id and now_ns <= granted[1]
+                assert refused in ("", "taken") or not in_time
+            case "wait":
+                now_ns += boot_id * (SILENCE_NS // 2 + 1) + vehicle * SECOND_NS
+                if vehicle == 5:
+                    now_ns += SESSION_NS
+                sessions.expire(now_ns)
+        assert len(sessions) + len(sessions.coming) <= 3
+        assert len(sessions.rows) == len(sessions)
+
+
+def test_two_vehicles_fly_as_each_would_alone() -> None:
+    """One batch equals its singles, to the last bit of every horizon."""
+
+    def horizons(numbers: tuple[int, ...]) -> dict[int, list[bytes]]:
+        vehicles = Vehicles(scenario())
+        sent: dict[int, list[bytes]] = {number: [] for number in numbers}
+        welcomes = {number: vehicles.open(vehicle=number, sender=("v", number)) for number in sent}
+        for step in range(20):
+            for number, welcome in welcomes.items():
+                angle = 0.1 * step + number
+                state = ((math.cos(angle), 0.2), (math.sin(angle), number))
+                vehicles.observe(welcome, 10 * number + step, state, ("v", number))
+            for message, (_, number) in vehicles.tick():
+                assert isinstance(message, Horizon)
+                sent[number].append(message.inputs.tobytes())
+        return sent
+
+    together = horizons((1, 2))
+    assert together[1] == horizons((1,))[1]
+    assert together[2] == horizons((2,))[2]
+    assert together[1] != together[2]
+    assert [len(sent) for sent in together.values()] == [20, 20]
+
+
+def test_a_row_that_was_left_is_used_again_as_if_it_were_new() -> None:
+    """The first of three vehicles falls silent; a fourth takes its row, and flies as if alone."""
+
+    def fourth(others: tuple[int, ...]) -> list[bytes]:
+        vehicles = Vehicles(scenario())
+        welcomes = {number: vehicles.open(vehicle=number) for number in others}
+        for number, welcome in welcomes.items():
+            vehicles.observe(welcome, 100, ((number, 1.0), (2.0, 3.0)))
+        for step in range(101, 901):
+            for number, welcome in welcomes.items():
+                if number != 1:
+                    vehicles.observe(welcome, step)
+            if welcomes:
+                vehicles.tick()
+        vehicles.now_ns = 50 * SECOND_NS + 20 * MILLISECOND_NS
+        assert {each.vehicle for each in vehicles.server.sessions} == set(others) - {1}
+        welcome, sent = vehicles.open(vehicle=4, sender=("v", 4)), []
+        for step in range(10):
+            vehicles.observe(welcome, step, ((1.0, 0.1), (0.1 * step, 0.2)), ("v", 4))
+            sent += [message for message, peer in vehicles.tick() if peer == ("v", 4)]
+        if others:
+            assert vehicles.server.sessions.at(0).vehicle == 4
+        return [message.inputs.tobytes() for message in sent if isinstance(message, Horizon)]
+
+    alone = fourth(())
+    assert len(alone) == 10
+    assert fourth((1, 2, 3)) == alone
+
+
+def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
+    """One vehicle is at a position at which its QP overflows; the other flies on."""
+    vehicles = Vehicles(scenario())
+    good = vehicles.open(vehicle=1, sender=("v", 1))
+    bad = vehicles.open(vehicle=2, sender=("v", 2))
+    vehicles.observe(good, 0, sender=("v", 1))
+    vehicles.observe(bad, 0, sender=("v", 2))
+    vehicles.server.controller._scheme._memory.state[1, 0] = 1e308  # no float32 is as large
+    with np.errstate(all="ignore"):
+        sent = vehicles.tick()
+    assert [peer for _, peer in sent] == [("v", 1)]
+    assert vehicles.server.controller.counts["unsolved"] == 1
+
+
+def test_figures_of_many_vehicles_stay_readable() -> None:
+    """Sixteen of them, and how many more."""
+    vehicles = Vehicles(scenario())
+    for number in range(20):
+        vehicles.observe(vehicles.open(vehicle=number), 0)
+    figures = vehicles.server.figures()
+    assert (len(figures["by_vehicle"]), figures["vehicles"]) == (16, 20)
+
+
+def test_figures_tell_what_was_counted() -> None:
+    """For the operator, with how well each vehicle's clock is known."""
+    vehicles = Vehicles(scenario())
+    vehicles.observe(vehicles.open(), 0)
+    vehicles.tick()
+    figures = vehicles.server.figures()
+    assert (figures["vehicles"], figures["missed"]) == (1, 0)
+    assert figures["counts"] == {"events": 1, "steps": 1, "unsolved": 0}
+    assert figures["by_vehicle"] == {"1": {"step": 0, "clock_bound_ms": 0.0}}

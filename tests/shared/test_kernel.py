@@ -1,0 +1,159 @@
+"""Machine code of kernels on disk is used as long as all that it was made of is the same."""
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+HELPER = """
+from typing import NamedTuple
+from skytether.shared.base.kernel import F1, inline
+
+FACTOR = 2
+
+class Given(NamedTuple):
+    values: F1
+
+@inline
+def scaled(x):
+    return x * FACTOR
+"""
+CALLER = """
+import numpy as np
+from helper import Given, scaled
+from skytether.shared.base.kernel import kernel
+
+@kernel
+def double(given: Given) -> None:
+    values = given.values
+    for i in range(len(values)):
+        values[i] = scaled(values[i])
+
+values = np.ones(1)
+double(Given(values))
+print(values[0], sum(double.stats.cache_hits.values()))
+"""
+
+
+HELP = """
+import sys
+from skytether.__main__ import COMMANDS, main
+for line in [f"{name} --help" for name in COMMANDS] + sys.argv[1:]:
+    try:
+        code = main(line.split())
+    except SystemExit as ended:
+        code = ended.code
+    assert code == (2 if line in sys.argv else 0), (line, code)
+"""
+REFUSED = (
+    "fly nosuch --virtual",
+    "fly demo --virtual --control.horizon 0",
+    "fleet --virtual --workers 2",
+    "margins demo --runs 0",
+    "reproduce --runs 0",
+    "sweep demo --out x --grid control.horizon=0",
+    "server demo --bind 0.0.0.0:0 --no-such-flag",
+    "server demo --bind 0.0.0.0:0",
+    "server demo --bind 127.0.0.1:0 --keys no-such-file",
+    "server demo --bind 0.0.0.0:0 --workers 2 --keys no-such-file",
+)
+PREPARED = """
+import caller
+from skytether.shared.base import kernel
+from skytether.shell.command import prepare
+prepare(kernel.missing())
+"""
+
+
+def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
+    """What the caller prints: the result, and whether its machine code came from the disk.
+
+    Args:
+        file_bytes: size at which a file cannot grow, as if the disk were full.
+    """
+    done = subprocess.run(
+        [sys.executable, "caller.py"],
+        cwd=folder,
+        env={
+            "PYTHONPATH": f"{Path(__file__).parents[2]}:{folder}",
+            "HOME": str(folder),
+            "PYTHONDONTWRITEBYTECODE": "1",  # Python itself keeps what it could write half of
+        },
+        capture_output=True,
+        text=True,
+        check=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes)),
+    )
+    return done.stdout.strip()
+
+
+def test_a_kernel_is_compiled_anew_when_what_it_calls_has_changed(tmp_path: Path) -> None:
+    """A function, and a constant, of another module; left alone, it comes from the disk."""
+    helper = tmp_path / "helper.py"
+    helper.write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER)
+    assert run(tmp_path) == "2.0 0"
+    assert run(tmp_path) == "2.0 1"
+    helper.write_text(HELPER.replace("FACTOR = 2", "FACTOR = 3"))
+    assert run(tmp_path) == "3.0 0"
+    helper.write_text(HELPER.replace("x * FACTOR", "x * FACTOR + 1"))
+    assert run(tmp_path) == "3.0 0"
+    assert run(tmp_path) == "3.0 1"
+
+
+def quiet(folder: Path, code: str, *argv: str) -> str:
+    """What a program prints on stderr that keeps machine code in a folder."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code, *argv],
+        cwd=folder,
+        env={"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stderr
+
+
+def test_a_help_and_a_refusal_compile_nothing(tmp_path: Path) -> None:
+    """Every command is asked, with nothing on disk: it took 80 s until the first words."""
+    quiet(tmp_path, HELP, *REFUSED)
+    assert not (tmp_path / "kept").exists()
+
+
+def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
+    """A line where there is no terminal; nothing where machine code is on disk."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER.split("\nvalues = ", maxsplit=1)[0])
+    said = "compiling what flies, once on this machine: it takes up to a minute\n"
+    assert quiet(tmp_path, PREPARED) == said
+    assert quiet(tmp_path, PREPARED) == ""
+
+
+def test_machine_code_for_a_type_that_is_gone_is_no_reason_to_fail(tmp_path: Path) -> None:
+    """The type has moved to another module, as it may between two versions."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    caller = tmp_path / "caller.py"
+    caller.write_text(CALLER)
+    assert run(tmp_path) == "2.0 0"
+    (tmp_path / "elsewhere.py").write_text(HELPER)
+    (tmp_path / "helper.py").write_text(HELPER.replace("Given", "Told"))
+    caller.write_text(CALLER.replace("from helper import Given, ", "from elsewhere import Given, "))
+    assert run(tmp_path) == "2.0 0"
+
+
+def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path) -> None:
+    """Neither beside the source, nor in a home: it compiles, and keeps nothing."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER)
+    (tmp_path / "__pycache__").write_text("a file, where a folder should be")
+    (tmp_path / ".cache").write_text("likewise")
+    assert run(tmp_path) == "2.0 0"
+
+
+def test_a_full_disk_is_no_reason_to_fail(tmp_path: Path) -> None:
+    """What can be opened and not written: it compiles, and keeps nothing."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER)
+    assert run(tmp_path, file_bytes=100) == "2.0 0"
+    assert run(tmp_path) == "2.0 0"
+    assert run(tmp_path) == "2.0 1"

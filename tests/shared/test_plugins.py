@@ -1,0 +1,777 @@
+"""Plug-ins: triggers and references of files and packages, in every process; their mistakes."""
+
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, chdir
+from functools import partial
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hatchling.build import build_wheel
+
+from helpers import packaged
+from skytether.__main__ import main
+from skytether.lab.commands.pool import _equipped
+from skytether.lab.journal import digests
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.events import Fault
+from skytether.shared.scenario.catalogue import differences
+from skytether.shared.scenario.registry import REFERENCES, TABLES, TRIGGERS
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shell import plugins
+from skytether.sim.flight import fly, fly_batch
+
+ROOT = Path(__file__).parents[2]
+TRIGGERS_MD, TARGETS_MD, VEHICLES_MD, NETWORK_MD = (
+    ROOT / "docs" / f"{name}.md" for name in ("triggers", "targets", "vehicles", "network")
+)
+HEAD = "import numpy as np\nfrom skytether.plugin import *\n"
+NEVER = """\
+@trigger
+def never(now):
+    return np.zeros(len(now.rows), dtype=bool)
+"""
+SLOPE = """\
+@reference
+def slope(scenario, mps: float = 0.5):
+    def at(t):
+        state = np.zeros((*np.shape(t), scenario.model.axes, 2))
+        state[..., 0, 0], state[..., 0, 1] = mps * t, mps
+        return state
+    return at
+"""
+IMPAIRING = """\
+@impairment
+class bad(Impairment):
+    def __call__(self, fate, draws):
+        {mistake}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _tables() -> Iterator[None]:
+    """Leave the tables as they were."""
+    before = [dict(table) for table in TABLES]
+    yield
+    plugins._loaded.clear()
+    for table, entries in zip(TABLES, before, strict=True):
+        table.clear()
+        table.update(entries)
+
+
+def plug(folder: Path, code: str, name: str = "mine.py") -> str:
+    """Path of a plug-in that is imported."""
+    path = folder / name
+    path.write_text(HEAD + dedent(code))
+    plugins.load([str(path)])
+    return str(path)
+
+
+def scenario(**sections: Any) -> Scenario:
+    """The scenario demo-committed for ten seconds, with other keys in its sections."""
+    return packaged("demo-committed", {"duration": 10.0}, sections)
+
+
+def flown(trigger: str, **control: Any) -> Record:
+    """The scenario's flight with a trigger."""
+    return fly(scenario(control={"trigger": trigger} | control))
+
+
+def faults(flight: Record) -> list[str]:
+    """Last lines of what was told of mistakes."""
+    events = (each.event for each in flight.events)
+    return [each.traceback.splitlines()[-1] for each in events if isinstance(each, Fault)]
+
+
+def refusal(run: Callable[[], object]) -> str:
+    """What is said of something that is refused."""
+    with pytest.raises(ConfigError) as caught:
+        run()
+    return str(caught.value)
+
+
+# -- what the documents say ------------------------------------------------------------------------
+
+
+def example(document: Path) -> str:
+    """The one plug-in in a document."""
+    (code,) = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
+    return str(code)
+
+
+@pytest.mark.parametrize(
+    ("document", "file"),
+    [
+        (TRIGGERS_MD, "slip.py"),
+        (TARGETS_MD, "spiral.py"),
+        (VEHICLES_MD, "cart.py"),
+        (NETWORK_MD, "fading.py"),
+    ],
+    ids=["trigger", "reference", "vehicle", "impairment"],
+)
+def test_the_documented_plugin_flies_with_the_documented_command(
+    document: Path, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As it stands there, put into the file of that name."""
+    (line,) = re.findall(r"^skytether .*--plugin.*$", document.read_text(), re.MULTILINE)
+    (tmp_path / file).write_text(example(document))
+    with chdir(tmp_path):
+        assert main([*shlex.split(line)[1:], "--duration", "20"]) == 0
+    assert "RMSE x, y, xy" in capsys.readouterr().out
+
+
+def test_the_documented_trigger_sends_where_the_velocity_is_off(tmp_path: Path) -> None:
+    """More often with a tighter bound, and never later than the silence beside it."""
+    plug(tmp_path, example(TRIGGERS_MD))
+    loose, tight = (flown(f"slip({mps}) | silence(1)").server for mps in (0.3, 0.05))
+    assert 0 < loose["event"].sum() < tight["event"].sum()
+    assert np.diff(loose["step"][loose["event"]]).max() <= 20
+
+
+def test_the_documented_reference_moves_as_fast_as_it_says(tmp_path: Path) -> None:
+    """Its velocity is the slope of its positions; at the end it rests at `radius_m`."""
+    plug(tmp_path, example(TARGETS_MD))
+    wanted = {"shape": "spiral(2)", "period_s": 40.0, "radius_m": 3.0}
+    at = scenario(reference=wanted).make_reference()
+    times = np.linspace(1.0, 39.0, 300)
+    slope = (at(times + 1e-4)[..., 0] - at(times - 1e-4)[..., 0]) / 2e-4
+    np.testing.assert_allclose(at(times)[..., 1], slope, atol=1e-5)
+    np.testing.assert_allclose(at(np.array(50.0)), [[3.0, 0.0], [0.0, 0.0]], atol=1e-9)
+
+
+def test_the_documented_policies_are_those_that_there_are() -> None:
+    """A row each."""
+    rows = re.findall(r"^\| `(\w+)", TRIGGERS_MD.read_text(), re.MULTILINE)
+    assert set(TRIGGERS) <= set(rows)
+
+
+# -- how they are listed ---------------------------------------------------------------------------
+
+
+def test_triggers_are_listed_with_a_sentence_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ours and a plug-in's, the latter with its file."""
+    path, about = tmp_path / "mine.py", '    """Sends nothing.\n\n    More."""\n'
+    path.write_text(HEAD + NEVER.replace("    return", f"{about}    return"))
+    assert main(["triggers", "--plugin", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert f"never\n    Sends nothing. (from {path})\n" in said
+    assert "periodic or periodic(N) with 1 <= N <= 1000000 (whole)\n    Sends N steps" in said
+    assert all(entry.about.endswith(".") for table in TABLES for entry in table.values())
+
+
+def test_references_are_listed_with_a_sentence_each(capsys: pytest.CaptureFixture[str]) -> None:
+    """Those that come with Skytether."""
+    assert main(["references"]) == 0
+    said = capsys.readouterr().out
+    assert "figure-eight\n    Lemniscate, 2 `radius_m` wide" in said
+
+
+# -- what a policy is given ------------------------------------------------------------------------
+
+
+def test_a_policy_is_given_what_it_may_know(tmp_path: Path) -> None:
+    """Every field has its shape, and nothing can be written into the server's own arrays."""
+    code = """
+        @trigger
+        def look(now):
+            n, axes, H = now.plan.shape
+            assert (n, axes, H) == now.held.shape == (1, 2, 60)
+            assert now.desired.shape == (n, axes, H + 1, 2)
+            later = now.model.step(now.estimate, now.plan[:, :, 0])
+            assert later.shape == now.estimate.shape == now.planned.shape
+            assert now.since_sent_s.shape == now.rows.shape == (n,)
+            assert now.dt_s == 0.05
+            assert not now.estimate.flags.writeable and not now.figures.flags.writeable
+            return now.since_sent_s >= 0.5
+    """
+    plug(tmp_path, code)
+    flight = flown("look", horizon=60)
+    assert faults(flight) == []
+    sent = flight.server["step"][flight.server["event"]]
+    assert len(sent) > 10
+    assert set(np.diff(sent)) == {10}
+
+
+def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path) -> None:
+    """A plan is what is sent; with no loss, what is held aboard is the plan that was sent last."""
+    code = """
+        @trigger
+        def look(now):
+            k, start = now.figures["step"][0], now.figures["start"][0]
+            seen.append((k, start, now.plan[0], now.held[0], now.desired[0]))
+            return now.figures["step"] % 20 == 0
+    """
+    plug(tmp_path, code)
+    seen: list[Any] = []
+    TRIGGERS["look"].make.__globals__["seen"] = seen  # type: ignore[attr-defined]
+    way = {"delay": "constant", "minimum_s": 0.1, "loss": 0.0, "burst_s": 0.0}
+    asked = scenario(
+        control={"trigger": "look", "feedback": False},
+        network={"uplink": way, "downlink": way, "mtu": 1472},
+    )
+    sent = {int(row["step"]): row for row in fly(asked).plan}
+    compared = 0
+    for step, start, plan, held, desired in seen:
+        if step in sent:
+            np.testing.assert_array_equal(plan, sent[step]["inputs"])
+        last = max((each for each in sent if each < step), default=None)
+        if last is not None:
+            inputs = sent[last]["inputs"][:, start - sent[last]["begins"] :]
+            # The vehicle's clamp cuts off what a float32 is above the bound.
+            np.testing.assert_allclose(held[:, : inputs.shape[1]], inputs, rtol=1e-7)
+            compared += 1
+        times = (start + np.arange(desired.shape[1])) * asked.control.dt
+        truth = asked.make_reference()(times).transpose(1, 0, 2)
+        np.testing.assert_allclose(desired, truth, atol=1e-9)
+    assert compared > 100
+
+
+def test_what_is_held_aboard_is_known_with_committed_inputs_alone(tmp_path: Path) -> None:
+    """Elsewhere it is a mistake to ask, which is told."""
+    plug(tmp_path, "@trigger\ndef look(now):\n    return now.held[:, 0, 0] > 0.0\n")
+    (said,) = faults(flown("look", scheme="predictive"))
+    known = "held: what is held aboard is known with the scheme 'committed' alone"
+    assert said == f"the trigger look: ValueError: {known}; where it fails, it sends"
+
+
+@pytest.mark.parametrize("scheme", ["predictive", "none", "trajectory"])
+def test_every_other_field_is_known_with_every_scheme(scheme: str, tmp_path: Path) -> None:
+    """With a trajectory a plan is the velocity alone."""
+    code = """
+        @trigger
+        def look(now):
+            assert now.plan.shape[:2] == now.desired.shape[:2] == (len(now.rows), 2)
+            assert np.isfinite(now.desired).all()
+            return now.since_sent_s > 0.2
+    """
+    plug(tmp_path, code)
+    flight = flown("look", scheme=scheme, feedback=scheme != "none")
+    assert faults(flight) == []
+    assert flight.server["event"].any()
+
+
+def test_a_vehicle_that_was_sent_nothing_is_sent_to_whatever_a_function_says(
+    tmp_path: Path,
+) -> None:
+    """Once, and with nothing after it."""
+    plug(tmp_path, NEVER)
+    assert flown("never").server["event"].sum() == 1
+
+
+def test_a_class_remembers_what_was_sent(tmp_path: Path) -> None:
+    """Written anew, `periodic` flies as ours does, to the last bit."""
+    code = """
+        @trigger(name="every")
+        class Every(Trigger):
+            def __init__(self, control, capacity, N: int):
+                self.period, self.step = N, np.zeros(capacity, dtype=np.int64)
+
+            def forget(self, row):
+                self.step[row] = 0
+
+            def test(self, now):
+                step, fresh = now.figures["step"], now.figures["fresh"]
+                self.step[now.rows[fresh]] = step[fresh] - self.period
+                event = step - self.step[now.rows] >= self.period
+                gap = now.figures["state_gap"]
+                return Verdict(event, gap, np.zeros(len(event)), Compared.NOTHING)
+
+            def sent(self, rows, figures):
+                self.step[rows] = figures["step"]
+    """
+    plug(tmp_path, code)
+    assert flown("every(7)").trace_hash() == flown("periodic(7)").trace_hash()
+
+
+def test_figures_of_a_plugin_are_recorded_and_a_batch_is_its_singles(tmp_path: Path) -> None:
+    """With `above`, the record has figure and threshold."""
+    code = """
+        @trigger
+        def far(now, m: float = 0.2):
+            return above(now, np.abs(now.estimate[:, 0, 0]), m)
+    """
+    plug(tmp_path, code)
+    one = scenario(control={"trigger": "far & periodic(3)"})
+    assert set(fly(one).server["threshold"]) == {0.2}
+    alone = [fly(msgspec.structs.replace(one, seed=seed)).trace_hash() for seed in (1, 2)]
+    assert [each.trace_hash() for each in fly_batch(one, [1, 2])] == alone
+
+
+# -- checks ----------------------------------------------------------------------------------------
+
+SLIP = "slip(mps, N) with 0 <= mps <= 5 and 1 <= N (whole)"
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [
+        ("slip(-1, 2)", SLIP),
+        ("slip(1)", SLIP),
+        ("slip(1, 2.5)", SLIP),
+        ("slop(1, 2)", "a policy; did you mean slip?"),
+    ],
+)
+def test_arguments_of_a_plugin_are_checked_like_ours(
+    written: str, expected: str, tmp_path: Path
+) -> None:
+    """Bounds, whole numbers, names."""
+    code = """
+        from typing import Annotated
+        from msgspec import Meta
+
+        @trigger
+        def slip(now, mps: Annotated[float, Meta(ge=0, le=5)], N: Annotated[int, Meta(ge=1)]):
+            return now.figures["fresh"]
+    """
+    plug(tmp_path, code)
+    said = refusal(lambda: scenario(control={"trigger": written}))
+    assert said == f"test: control.trigger: got {written!r}, expected {expected}"
+    scenario(control={"trigger": "slip(1, 2) | always"})
+
+
+def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) -> None:
+    """All numbers are written, or none."""
+    code = """
+        @trigger
+        def slip(now, a: float = -2.0, b: int = 3):
+            assert (a, b) in ((-2.0, 3), (-1.5, 4))
+            return now.figures["fresh"]
+    """
+    plug(tmp_path, code)
+    for written in ("slip", "slip(-1.5, 4)"):
+        assert faults(flown(written)) == []
+    said = refusal(lambda: scenario(control={"trigger": "slip(1)"}))
+    assert said.endswith("expected slip or slip(a, b) with a and b (whole)")
+
+
+def test_a_plugin_that_needs_a_scheme_is_refused_with_another(tmp_path: Path) -> None:
+    """As ours are."""
+    code = """
+        @trigger(schemes=("committed",))
+        def mine(now):
+            return now.held[:, 0, 0] > 0.0
+    """
+    plug(tmp_path, code)
+    said = refusal(lambda: scenario(control={"trigger": "mine", "scheme": "predictive"}))
+    assert said.endswith("got 'predictive', expected 'committed' with the trigger mine")
+
+
+def test_a_trigger_that_cannot_be_made_is_refused_before_a_flight(tmp_path: Path) -> None:
+    """With what its class says."""
+    code = """
+        @trigger(name="between")
+        class Between(Trigger):
+            def __init__(self, control, capacity, low: float, high: float):
+                if low > high:
+                    raise ValueError("low is above high")
+    """
+    plug(tmp_path, code)
+    said = refusal(lambda: scenario(control={"trigger": "between(2, 1)"}))
+    assert said.endswith("expected a trigger that can be made (ValueError: low is above high)")
+
+
+ADDS = "expected @trigger, @reference, @vehicle or @impairment on something, see docs"
+OURS = "skytether.shared.scenario.triggers"
+WRONG = {
+    "a syntax error": ("def f(:\n", "line 3: SyntaxError: invalid syntax"),
+    "an exception": ("\n1 / 0\n", "line 4: ZeroDivisionError: division by zero"),
+    "an exit": ("raise SystemExit(0)\n", "line 3: SystemExit: 0"),
+    "nothing": (
+        "def slip(now):\n    return now\n",
+        f"adds nothing, {ADDS}",
+    ),
+    "a name of ours": (
+        "@trigger\ndef budget(now):\n    return now\n",
+        f"policy budget: expected another name, {OURS} has one of this name",
+    ),
+    "a text": (
+        "@trigger\ndef slip(now, how: str):\n    return now\n",
+        "policy slip: how: str: expected a number, as in how: float",
+    ),
+    "no situation": (
+        "@trigger\ndef slip():\n    return 1\n",
+        "policy slip: got 0 parameters, expected at least 1",
+    ),
+    "any number of numbers": (
+        "@trigger\ndef slip(now, *numbers: float):\n    return 1\n",
+        "policy slip: *numbers: float: expected a number, as in numbers: float",
+    ),
+    "a default out of bounds": (
+        "@trigger\ndef slip(now, N: int = 1.5):\n    return 1\n",
+        "policy slip: got the default N = 1.5, expected N (whole)",
+    ),
+    "an impossible name": (
+        "@trigger(name='my trigger')\ndef slip(now):\n    return 1\n",
+        "policy my trigger: expected a name of letters, digits and _",
+    ),
+}
+
+
+@pytest.mark.parametrize(("code", "said"), WRONG.values(), ids=WRONG)
+def test_a_file_that_is_no_plugin_is_refused_in_one_line(
+    code: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With exit code 2."""
+    path = tmp_path / "mine.py"
+    path.write_text(HEAD + code)
+    assert main(["fly", "demo", "--virtual", "--plugin", str(path)]) == 2
+    assert capsys.readouterr().err == f"fly: --plugin: {path}: {said}\n"
+
+
+def test_a_file_that_fails_adds_nothing(tmp_path: Path) -> None:
+    """Not even what stands before the mistake."""
+    assert "line 6: ZeroDivisionError" in refusal(lambda: plug(tmp_path, NEVER + "1 / 0\n"))
+    assert "never" not in TRIGGERS
+    assert plugins.flags() == []
+
+
+def test_a_file_that_cannot_be_read_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """So is a folder."""
+    for path, why in (
+        (tmp_path / "no.py", "No such file or directory"),
+        (tmp_path, "Is a directory"),
+    ):
+        assert main(["server", "--plugin", str(path)]) == 2
+        assert capsys.readouterr().err == f"server: --plugin: {path}: cannot be read: {why}\n"
+
+
+def test_two_files_cannot_have_one_name(tmp_path: Path) -> None:
+    """A file that is imported again, with other content, takes the place of itself."""
+    one = plug(tmp_path, NEVER, "one.py")
+    said = refusal(lambda: plug(tmp_path, NEVER, "two.py"))
+    assert said.endswith(f"policy never: expected another name, {one} has one of this name")
+    plug(tmp_path, NEVER.replace("never", "rarely"), "one.py")
+    assert "never" not in TRIGGERS
+    assert TRIGGERS["rarely"].source == one
+
+
+def test_a_flag_without_its_file_is_told_by_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """As for any other flag."""
+    with pytest.raises(SystemExit) as caught:
+        main(["triggers", "--plugin"])
+    assert caught.value.code == 2
+    assert "--plugin" in capsys.readouterr().err
+
+
+# -- mistakes in flight ----------------------------------------------------------------------------
+
+MISTAKES = {
+    "raises": ("return now.figures['nothing']", "ValueError: no field of name nothing"),
+    "another shape": (
+        "return np.zeros((len(now.rows), 2), dtype=bool)",
+        "ValueError: got bool of shape (1, 2), expected bool of shape (1,)",
+    ),
+    "no yes or no": (
+        "return above(now, now.estimate[:, 0, 0], 1)._replace(event=now.estimate[:, 0, 0])",
+        "ValueError: got float64 of shape (1,), expected bool of shape (1,)",
+    ),
+    "writes": (
+        "now.planned[:] = 9.0\n    return now.figures['fresh']",
+        "ValueError: assignment destination is read-only",
+    ),
+}
+
+
+@pytest.mark.parametrize(("body", "said"), MISTAKES.values(), ids=MISTAKES)
+def test_a_trigger_that_fails_sends_and_is_told_once(body: str, said: str, tmp_path: Path) -> None:
+    """A packet too many costs bytes, one too few the flight."""
+    plug(tmp_path, f"@trigger\ndef bad(now):\n    {body}\n")
+    flight, always = flown("bad"), flown("always")
+    assert faults(flight) == [f"the trigger bad: {said}; where it fails, it sends"]
+    np.testing.assert_array_equal(flight.server["event"], always.server["event"])
+    assert flight.client.tobytes() == always.client.tobytes()
+    assert faults(always) == []
+
+
+def test_a_budget_caps_a_trigger_that_fails(tmp_path: Path) -> None:
+    """Two packets at once, and one a second."""
+    plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError\n")
+    assert 0 < flown("bad & budget(1, 2)").server["event"].sum() <= 12
+
+
+def test_a_class_may_fail_anywhere(tmp_path: Path) -> None:
+    """It is told once in all, and the flight goes on."""
+    code = """
+        @trigger(name="bad")
+        class Bad(Trigger):
+            def __init__(self, control, capacity):
+                pass
+
+            def test(self, now):
+                return above(now, now.figures["error"], -1.0)
+
+            def sent(self, rows, figures):
+                raise KeyError("sent")
+
+            def forget(self, row):
+                raise KeyError("forget")
+    """
+    plug(tmp_path, code)
+    flight = flown("bad")
+    assert len(faults(flight)) == 1
+    assert flight.client.tobytes() == flown("always").client.tobytes()
+
+
+def test_a_batch_with_a_trigger_that_fails_is_no_measurement(tmp_path: Path) -> None:
+    """It ends with what the trigger's mistake is."""
+    plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n")
+    said = refusal(lambda: fly_batch(scenario(control={"trigger": "bad"}), [1, 2]))
+    assert said == "the trigger bad: RuntimeError: no; where it fails, it sends"
+
+
+# -- references ------------------------------------------------------------------------------------
+
+
+def test_a_reference_of_a_plugin_is_flown(tmp_path: Path) -> None:
+    """Along x at 0.4 m/s, or at its default."""
+    plug(tmp_path, SLOPE)
+    asked = scenario(reference={"shape": "slope(0.4)"}, vehicle={"wind": 0.0})
+    assert fly(asked).client[-1]["state"][0, 1] == pytest.approx(0.4, abs=0.05)
+    assert asked.make_reference()(np.array([2.0]))[0, 0].tolist() == [0.8, 0.4]
+    bare = scenario(reference={"shape": "slope"}).make_reference()
+    assert bare(np.array(2.0))[0].tolist() == [1.0, 0.5]
+
+
+UNFLYABLE = {
+    "raises": ("raise RuntimeError('no map')", "RuntimeError: no map"),
+    "another shape": (
+        "return lambda t: np.zeros(3)",
+        "ValueError: got float64 of shape (3,) at 1 times, expected floats of shape (2, 2)",
+    ),
+    "whole numbers": (
+        "return lambda t: np.zeros((*t.shape, 2, 2), dtype=np.int64)",
+        "ValueError: got int64 of shape (2, 2) at 1 times, expected floats of shape (2, 2)",
+    ),
+    "no number": (
+        "return lambda t: np.full((*t.shape, 2, 2), np.nan)",
+        "ValueError: expected at most 1e+06 m from the origin, and 1e+06 m/s",
+    ),
+    "far away": (
+        "return lambda t: np.full((*t.shape, 2, 2), 1.1e6)",
+        "ValueError: expected at most 1e+06 m from the origin, and 1e+06 m/s",
+    ),
+}
+
+
+@pytest.mark.parametrize(("body", "said"), UNFLYABLE.values(), ids=UNFLYABLE)
+def test_a_reference_that_cannot_be_flown_is_refused(body: str, said: str, tmp_path: Path) -> None:
+    """Before a flight, in one line."""
+    plug(tmp_path, f"@reference\ndef mine(scenario):\n    {body}\n")
+    told = refusal(lambda: scenario(reference={"shape": "mine"}))
+    expected = f"expected a trajectory that can be flown ({said})"
+    assert told == f"test: reference.shape: got 'mine', {expected}"
+
+
+@pytest.mark.parametrize(
+    "shape", [" circle", "circle()", "slope & circle", "slope(1, 2)", "circle(1)"]
+)
+def test_a_shape_is_written_in_one_way(shape: str, tmp_path: Path) -> None:
+    """Code that compares a shape with a name meets no other text for it."""
+    plug(tmp_path, SLOPE)
+    assert f"reference.shape: got {shape!r}" in refusal(
+        lambda: scenario(reference={"shape": shape})
+    )
+
+
+def test_ends_whose_references_differ_have_other_terms(tmp_path: Path) -> None:
+    """In name, numbers or what the function gives, but not in how that is computed."""
+    terms = []
+    for states in ("mps * t", "t * mps + 1e-9", "0.999 * mps * t"):
+        plug(tmp_path, SLOPE.replace("mps * t", states))
+        terms.append(scenario(reference={"shape": "slope(0.4)"}).terms())
+    here, rounded, other = terms
+    assert rounded == here
+    (difference,) = differences(here, other)
+    assert difference.key == "reference.shape"
+    assert difference.here.startswith("slope(0.4) ")
+    assert scenario(reference={"shape": "slope( .4 )"}).terms() == other
+    (difference,) = differences(other, scenario(reference={"shape": "slope(0.41)"}).terms())
+    assert difference.there.startswith("slope(0.41) ")
+
+
+def test_a_long_shape_fits_the_wire(tmp_path: Path) -> None:
+    """Its beginning and a digest, 32 characters at most."""
+    name = "a_name_that_is_a_good_deal_longer_than_others"
+    plug(tmp_path, SLOPE.replace("slope", name))
+    shapes = [scenario(reference={"shape": f"{name}({mps})"}).terms().shape for mps in (0.1, 0.2)]
+    assert [len(shape) for shape in shapes] == [32, 32]
+    assert shapes[0] != shapes[1]
+
+
+def test_the_terms_of_our_shapes_are_their_names() -> None:
+    """Whatever they give follows from other terms."""
+    for shape in ("circle", "figure-eight", "square", "target", "live"):
+        assert scenario(reference={"shape": shape}).terms().shape == shape
+    assert all(entry.is_ours for entry in REFERENCES.values())
+
+
+# -- other processes -------------------------------------------------------------------------------
+
+
+def test_a_worker_is_given_the_plugin_with_its_content(tmp_path: Path) -> None:
+    """Also where the file is gone, or is another one by now."""
+    path = plug(tmp_path, NEVER)
+    job = partial(_equipped, lambda name: name in TRIGGERS, plugins.loaded())
+    Path(path).unlink()
+    plugins._loaded.clear()
+    del TRIGGERS["never"]
+    assert job("never")
+    assert plugins.flags() == ["--plugin", path]
+
+
+def test_a_journal_knows_the_plugins_that_its_results_follow_from(tmp_path: Path) -> None:
+    """By the digest of their content; those that are not named do not count."""
+    path = plug(tmp_path, NEVER)
+    plug(tmp_path, SLOPE, "unused.py")
+    named = scenario(control={"trigger": "never | silence(1)"})
+    before = digests([named, scenario()])
+    assert list(before) == [path]
+    plug(tmp_path, NEVER + "\n")
+    assert digests([named])[path] != before[path]
+    assert digests([scenario()]) == {}
+
+
+SHORT = "--settle 0 --duration 4 --reference.shape slope(0.4)"
+
+
+def run(line: str, *more: str, folder: Path, path: str = "") -> str:
+    """What a command prints that ends well, in a process of its own."""
+    argv = [sys.executable, "-P", "-m", "skytether", *line.split(), *more]
+    env = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(argv, cwd=folder, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Folder that tests/plugin_package is installed into."""
+    folder = tmp_path_factory.mktemp("installed")
+    with chdir(ROOT / "tests" / "plugin_package"):
+        wheel = build_wheel(str(folder))
+    zipfile.ZipFile(folder / wheel).extractall(folder)
+    return str(folder)
+
+
+def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
+    installed: str, tmp_path: Path
+) -> None:
+    """Without a flag, and without a change of Skytether."""
+    about = "Sends where the velocity is off its plan by more than so many m/s. (from my_package)"
+    listed = run("triggers", folder=tmp_path, path=installed)
+    assert f"slip or slip(mps) with 0 <= mps\n    {about}\n" in listed
+    trigger = ("--control.trigger", "slip & budget(5, 2) | silence(1)")
+    flies = ("--vehicle.kind", "rail")
+    argv = (*trigger, *flies)
+    assert "RMSE" in run(f"fly demo --virtual {SHORT}", *argv, folder=tmp_path, path=installed)
+    assert "rail\n    Vehicle that has any velocity" in run(
+        "vehicles", folder=tmp_path, path=installed
+    )
+
+
+def test_a_package_whose_entry_point_leads_nowhere_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line."""
+    info = tmp_path / "broken-2.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 2.0\n")
+    (info / "entry_points.txt").write_text("[skytether.triggers]\nslip = no_such_module:slip\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    plugins._load_installed.cache_clear()
+    assert main(["triggers"]) == 2
+    assert capsys.readouterr().err == (
+        "triggers: entry point slip = no_such_module:slip of broken 2.0: "
+        "ModuleNotFoundError: No module named 'no_such_module'\n"
+    )
+
+
+def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path) -> None:
+    """As it adds the others."""
+    listed = run("impairments", folder=tmp_path, path=installed)
+    assert "dark(every_s) with 1 <= every_s\n    Loses what is sent in every other" in listed
+    network = ("--network.uplink", "constant(0.2) & dark(2)")
+    said = run(
+        "fly demo --virtual --settle 0 --duration 8", *network, folder=tmp_path, path=installed
+    )
+    assert "RMSE" in said
+
+
+@pytest.mark.parametrize(
+    "mistake", ["raise RuntimeError('no')", "fate.delay_ns = -1", "fate.delay_ns = None"]
+)
+def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path) -> None:
+    """It changes nothing, and is told once a flow and direction."""
+    plug(tmp_path, IMPAIRING.format(mistake=mistake))
+    network = {"uplink": "constant(0.2) & bad", "downlink": "constant(0.2)"}
+    flight = fly(scenario(network=network))
+    assert len(faults(flight)) == 1
+    plain = fly(scenario(network=dict.fromkeys(network, "constant(0.2)")))
+    assert np.array_equal(flight.client, plain.client)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(400)
+def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
+    """Over UDP: a trigger's mistake is told, and a reference is flown by both ends."""
+    bad = "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n"
+    (tmp_path / "mine.py").write_text(HEAD + SLOPE + bad)
+    plugged = f"{SHORT} --plugin mine.py --record flight.mcap"
+    said = run(f"fly demo --page 127.0.0.1:0 {plugged} --control.trigger bad", folder=tmp_path)
+    assert said.count("the trigger bad: RuntimeError: no; where it fails, it sends") == 1
+    assert "goes on without a page" not in said
+    run("report flight.mcap --plugin mine.py", folder=tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(400)
+def test_workers_of_every_kind_know_the_plugin(tmp_path: Path) -> None:
+    """Processes of sweep and calibrate, and of a fleet's server."""
+    (tmp_path / "mine.py").write_text(HEAD + SLOPE + NEVER)
+    here = f"--workers 2 --plugin mine.py {SHORT}"
+    grid = 'control.trigger="never | silence(1)","always"'
+    run(f"sweep demo --out swept --runs 2 {here} --grid", grid, folder=tmp_path)
+    search = "--objective rmse --runs 1 --generations 1 --population 4 --control.trigger"
+    run(f"calibrate demo {here} {search}", "never | cost_gap", folder=tmp_path)
+    run(f"fleet --vehicles 2 {here}", folder=tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(400)
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs `distributed`")
+def test_a_dask_worker_knows_the_plugin(tmp_path: Path) -> None:
+    """One that was there before, in a folder without the file."""
+    (tmp_path / "mine.py").write_text(HEAD + NEVER)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    with ExitStack() as stack:
+
+        def dask(name: str, *argv: str) -> "subprocess.Popen[str]":
+            line = [sys.executable, "-P", "-m", f"distributed.cli.dask_{name}", *argv]
+            child = stack.enter_context(
+                subprocess.Popen(line, cwd=elsewhere, stderr=subprocess.PIPE, text=True)
+            )
+            stack.callback(child.kill)
+            return child
+
+        scheduler = dask("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+        assert scheduler.stderr is not None
+        at = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
+        dask("worker", at, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        flags = f"--settle 0 --duration 4 --plugin mine.py --scheduler {at} --control.trigger"
+        run(f"sweep demo --out swept --runs 2 {flags}", "never | silence(1)", folder=tmp_path)

@@ -1,0 +1,418 @@
+"""Metrics: every figure has a name or is left out on purpose, and who asks holds nobody up."""
+
+import json
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from time import perf_counter_ns
+from typing import Any
+
+import msgspec
+import pytest
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.parser import text_string_to_metric_families
+
+import skytether.shell.exporter
+from airborne import Air
+from skytether.client.endpoint import Client
+from skytether.client.fleet import Fleet
+from skytether.client.simulated.vehicle import simulated
+from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX
+from skytether.shared.core.events import Measured
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario import reading
+from skytether.shared.wire.protocol import Drop, Mode
+from skytether.shell import command, metrics
+from skytether.shell.exporter import CONNECTIONS_MAX, Collected, Metrics, MetricsError, names
+from skytether.shell.log import LogLine
+from skytether.shell.metrics import (
+    HEALTHY,
+    LEFT_OUT,
+    TABLES,
+    Label,
+    families,
+    flat,
+    matched,
+    trouble,
+)
+from skytether.sim import flight
+
+ROOT = Path(__file__).parents[2]
+DEMO = reading.load("demo")
+PROCESS: dict[str, Any] = {
+    "cpu_s": 1.5,
+    "kernel_drops": 2,
+    "send_errors": 0,
+    "feed": {"readers": 3, "dropped": 1, "refused": 0},
+}
+"""Figures that a process adds to those of its endpoint."""
+
+
+@pytest.fixture(scope="module")
+def figures() -> dict[str, dict[str, Any]]:
+    """Figures of each kind of process, after a flight of two vehicles."""
+    eight_s, stopwatch = msgspec.structs.replace(DEMO, duration=8.0), Stopwatch(perf_counter_ns)
+    flown = flight.fly(eight_s, vehicles=2, stopwatch=stopwatch)
+    clients = [
+        Client(
+            DEMO,
+            simulated(DEMO, 1),
+            server=("server", 1),
+            vehicle=vehicle,
+            boot_id=1,
+        )
+        for vehicle in range(20)
+    ]
+    clients[0].horizons += 1
+    clients[0].dropped[Drop.NOT_A_MESSAGE] += 1
+    air = Air()
+    air.run(5.0)
+    each = {**flown.figures, "client": Fleet(clients).figures(), "alone": clients[0].figures()}
+    for client in ("client", "alone"):
+        each[client]["by_vehicle"]["0"]["autopilot"] = air.figures()
+    each["server"] |= {"dropped": {"forged": 3}, "refused": {"full": 1}}
+    return {process: told | PROCESS for process, told in each.items()}
+
+
+def numbers(process: str, told: dict[str, Any]) -> dict[tuple[str, tuple[str, ...]], float]:
+    """What is served of figures, as Prometheus's own parser reads it."""
+    collected, registry = Collected(process, "demo", 0.05), CollectorRegistry(auto_describe=False)
+    collected.take(told)
+    registry.register(collected)
+    text = generate_latest(registry).decode()
+    return {
+        (sample.name, tuple(f"{name}={value}" for name, value in sorted(sample.labels.items()))): (
+            sample.value
+        )
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+@pytest.mark.parametrize("process", ["server", "netem", "client", "alone"])
+def test_every_figure_is_told_or_left_out(process: str, figures: dict[str, dict[str, Any]]) -> None:
+    """One that is new has to be given a name, or be left out on purpose."""
+    kind = "client" if process == "alone" else process
+    told, unknown = families(kind, figures[process])
+    assert unknown == []
+    assert {family.metric.name for family in told} <= {each.name for each in TABLES[kind]}
+
+
+def test_a_figure_that_is_not_known_is_found(figures: dict[str, dict[str, Any]]) -> None:
+    """It is counted where metrics are served, so that nothing goes missing in silence."""
+    told = figures["server"] | {"brand": {"new": 1}}
+    assert families("server", told)[1] == ["brand/new"]
+    assert numbers("server", told)["skytether_unmapped_figures", ()] == 1.0
+    assert numbers("server", figures["server"])["skytether_unmapped_figures", ()] == 0.0
+
+
+def test_no_line_of_the_tables_is_about_nothing(figures: dict[str, dict[str, Any]]) -> None:
+    """Each metric tells something in a flight, and each that is left out is there."""
+    rare = {
+        ("counts", "horizons_lost"),
+        ("by_vehicle", Label("vehicle"), "age_ms"),
+        ("by_vehicle", Label("vehicle"), "plan_age_ms"),
+    }
+    for process, table in TABLES.items():
+        paths = [path for path, _ in flat(figures[process])]
+        for figure in [*(each.figure for each in table), *LEFT_OUT[process]]:
+            told = [path for path in paths if matched(figure, path) is not None]
+            assert told or figure in rare, (process, figure)
+
+
+def test_names_follow_prometheus() -> None:
+    """Base units last, `_total` for what only grows; letters alone, as dashboards are checked."""
+    for table in (*TABLES.values(), metrics.OWN):
+        for metric in table:
+            assert re.fullmatch("[a-z_]+", metric.name)
+            assert metric.name.endswith("_total") == (metric.kind == "counter")
+            assert metric.help[0].isupper()
+            assert metric.help.endswith(".")
+            assert (metric.scale != 1.0) <= ("_seconds" in metric.name)
+    of_name = {metric.name: metric for table in TABLES.values() for metric in table}
+    for table in TABLES.values():
+        for metric in table:
+            assert metric[2:4] == of_name[metric.name][2:4]
+
+
+def test_numbers_are_the_figures_in_base_units(figures: dict[str, dict[str, Any]]) -> None:
+    """Milliseconds are seconds, groups are labels, and bins add up."""
+    server, netem = figures["server"], figures["netem"]
+    told = numbers("server.2", server)
+    assert told["skytether_info", ("process=server.2", "scenario=demo")] == 1.0
+    assert told["skytether_step_seconds", ()] == 0.05
+    assert told["skytether_server_steps_total", ()] == server["counts"]["steps"] > 100
+    assert told["skytether_server_dropped_datagrams_total", ("reason=forged",)] == 3.0
+    bound_s = told["skytether_server_vehicle_clock_bound_seconds", ("vehicle=1",)]
+    assert bound_s == pytest.approx(server["by_vehicle"]["1"]["clock_bound_ms"] / 1e3)
+    ticks = told["skytether_server_tick_seconds_bucket", ("le=+Inf",)]
+    assert ticks == told["skytether_server_tick_seconds_count", ()] > 100
+    assert told["skytether_feed_dropped_readers_total", ()] == 1.0
+    told = numbers("netem", netem)
+    up = ("direction=uplink",)
+    assert told["skytether_netem_bytes_total", up] == netem["uplink"]["bytes"]
+    late = told["skytether_netem_lateness_seconds", (*up, "quantile=0.99")]
+    assert late == netem["uplink"]["error_ms_p99"] / 1e3
+    buckets = [
+        value for (name, _), value in told.items() if name == "skytether_netem_delay_seconds_bucket"
+    ]
+    half = len(buckets) // 2
+    assert buckets[:half] == sorted(buckets[:half])
+    assert buckets[half - 1] == netem["uplink"]["forwarded"]
+
+
+def test_a_vehicle_is_in_one_mode(figures: dict[str, dict[str, Any]]) -> None:
+    """The others are 0; a client of one vehicle tells what one of several does."""
+    for process in ("client", "alone"):
+        told = numbers("client", figures[process])
+        modes = {
+            labels[0].removeprefix("mode="): value
+            for (name, labels), value in told.items()
+            if name == "skytether_client_mode" and labels[1] == "vehicle=0"
+        }
+        assert modes == {str(mode): float(mode is Mode.INIT) for mode in Mode}
+        assert told["skytether_client_horizons_total", ("vehicle=0",)] == 1.0
+        assert told["skytether_client_missed_steps_total", ()] == 0.0
+
+
+def test_vehicles_told_of_are_bounded(figures: dict[str, dict[str, Any]]) -> None:
+    """Twenty fly, and a gatherer is told of sixteen: it keeps each of them for weeks."""
+    told = {
+        labels for name, labels in numbers("client", figures["client"]) if "client_step" in name
+    }
+    assert len({label for labels in told for label in labels}) == VEHICLES_TOLD_MAX
+
+
+def test_figures_of_a_client_in_flight_have_ages() -> None:
+    """As its record has them; before a horizon is in force there are none."""
+    seen: list[dict[str, Any]] = []
+    fly = Client._fly
+
+    def spied(self: Client, now_ns: int) -> None:
+        fly(self, now_ns)
+        seen.append(self.told())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Client, "_fly", spied)
+        flown = flight.fly(msgspec.structs.replace(DEMO, duration=8.0))
+    assert "age_ms" not in seen[0]
+    ages = [-1 if "age_ms" not in told else round(told["age_ms"] * 1e6) for told in seen]
+    assert ages == flown.client["age_ns"].tolist()
+    plans = [round(told["plan_age_ms"]) for told in seen if "plan_age_ms" in told]
+    held = flown.client[flown.client["in_force"] >= 0]
+    assert plans == ((held["step"] - held["in_force"]) * 50).tolist()
+
+
+# -- health ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_a_client_is_well_while_it_is_flown_or_could_be(mode: Mode) -> None:
+    """The metrics of a vehicle that is alone, and of any among several."""
+    one = {"mode": str(mode), "missed": 0}
+    alone = {"vehicles": 1, "missed": 0, "by_vehicle": {"1": one}}
+    several = {"vehicles": 2, "missed": 0, "by_vehicle": {"3": {"mode": "track"}, "1": one}}
+    why = "" if mode in (Mode.READY, Mode.TRACK, Mode.COAST) else f"vehicle 1 is in mode {mode}"
+    assert (str(mode) in HEALTHY) == (not why)
+    assert trouble("client", alone) == trouble("client", several) == why
+
+
+def test_a_server_is_well_while_it_is_in_time() -> None:
+    """A netem is while it turns."""
+    assert trouble("server", {"degraded": False}) == trouble("netem", {}) == ""
+    assert trouble("server", {"degraded": True}) == "it misses more ticks than it may"
+
+
+def test_a_process_that_is_stuck_is_not_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its figures grow old; before the first there is nothing to tell."""
+    collected = Collected("server.1", "demo", 0.05)
+    assert collected.health()[0] == 503
+    collected.take({"degraded": False})
+    assert collected.health() == (200, b'{"process":"server.1","healthy":true,"trouble":""}\n')
+    monkeypatch.setattr(skytether.shell.exporter, "FRESH_S", -1.0)
+    status, body = collected.health()
+    assert (status, json.loads(body)["trouble"]) == (503, "it has been stuck for 0 s")
+
+
+# -- HTTP ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def served() -> Iterator[Metrics]:
+    """Metrics of a netem, on loopback."""
+    with closing(Metrics(("127.0.0.1", 0), Collected("netem", "demo", 0.05))) as one:
+        one.take({"flows": 1, **PROCESS})
+        yield one
+
+
+def calling(served: Metrics) -> socket.socket:
+    """A connection."""
+    return socket.create_connection(served.address, timeout=30.0)
+
+
+def said(sock: socket.socket) -> bytes:
+    """All that comes until the other end hangs up."""
+    text = b""
+    while piece := sock.recv(65536):
+        text += piece
+    return text
+
+
+def asked(served: Metrics, request: bytes) -> tuple[bytes, bytes]:
+    """Status line and body of the answer to a request."""
+    with calling(served) as sock:
+        sock.sendall(request)
+        head, _, body = said(sock).partition(b"\r\n\r\n")
+    assert b"Content-Length: %d\r\n" % len(body) in head + b"\r\n"
+    return head.split(b"\r\n")[0], body
+
+
+def test_a_thread_that_ends_by_itself_is_closed_in_order(served: Metrics) -> None:
+    """One that was awake anyway sees that it is to end before it is told so."""
+    served._closed = True
+    calling(served).close()
+    served._thread.join(30.0)
+    assert not served._thread.is_alive()  # the fixture closes it
+
+
+def test_metrics_and_health_are_served(served: Metrics) -> None:
+    """As Prometheus and Docker ask for them."""
+    request = b"GET %s HTTP/1.1\r\nHost: netem:9464\r\nAccept: */*\r\n\r\n"
+    status, text = asked(served, request % b"/metrics")
+    assert status == b"HTTP/1.1 200 OK"
+    assert b"\nskytether_netem_flows 1.0\n" in text
+    assert asked(served, request % b"/metrics?name=x") != (b"", b"")
+    status, body = asked(served, request % b"/healthz")
+    assert (status, json.loads(body)["healthy"]) == (b"HTTP/1.1 200 OK", True)
+    served.take({"flows": 2, **PROCESS})
+    assert b"\nskytether_netem_flows 2.0\n" in asked(served, request % b"/metrics")[1]
+
+
+@pytest.mark.parametrize(
+    ("request_", "status"),
+    [
+        (b"GET / HTTP/1.1\r\n\r\n", b"404 Not Found"),
+        (b"GET /metrics/../etc/passwd HTTP/1.1\r\n\r\n", b"404 Not Found"),
+        (b"POST /metrics HTTP/1.1\r\n\r\n", b"405 Method Not Allowed"),
+        (b"HEAD /healthz HTTP/1.1\r\n\r\n", b"405 Method Not Allowed"),
+        (b"GET /metrics\r\n\r\n", b"400 Bad Request"),
+        (b"\xff\x00\r\n\r\n", b"400 Bad Request"),
+        (b"\r\n\r\n", b"400 Bad Request"),
+        (b"GET /" + b"x" * 8200, b"431 Request Header Fields Too Large"),
+    ],
+)
+def test_anything_else_is_refused(served: Metrics, request_: bytes, status: bytes) -> None:
+    """In a line, and the next is answered."""
+    assert asked(served, request_)[0] == b"HTTP/1.1 " + status
+    assert asked(served, b"GET /healthz HTTP/1.0\r\n\r\n")[0] == b"HTTP/1.1 200 OK"
+
+
+def test_a_request_may_come_in_pieces(served: Metrics) -> None:
+    """Byte by byte."""
+    with calling(served) as sock:
+        for byte in b"GET /healthz HTTP/1.1\r\n\r\n":
+            sock.send(bytes([byte]))
+        assert said(sock).startswith(b"HTTP/1.1 200 OK\r\n")
+
+
+def test_who_says_nothing_keeps_nobody_out(served: Metrics) -> None:
+    """However many there are: the oldest of them gives way."""
+    silent = [calling(served) for _ in range(CONNECTIONS_MAX + 2)]
+    assert asked(served, b"GET /healthz HTTP/1.1\r\n\r\n")[0] == b"HTTP/1.1 200 OK"
+    assert [said(sock) for sock in silent[:3]] == [b"", b"", b""]
+    silent[-1].sendall(b"GET /healthz HTTP/1.1\r\n\r\n")
+    assert said(silent[-1]).startswith(b"HTTP/1.1 200 OK\r\n")
+    assert len(served._connections) < CONNECTIONS_MAX
+    for sock in silent:
+        sock.close()
+
+
+def test_who_is_slow_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether it is slow to ask or never to end."""
+    monkeypatch.setattr(skytether.shell.exporter, "PATIENCE_S", 0.05)
+    with closing(Metrics(("127.0.0.1", 0), Collected("netem", "demo", 0.05))) as served:
+        with calling(served) as sock:
+            sock.sendall(b"GET /metr")
+            assert said(sock) == b""
+        with calling(served) as sock:
+            assert said(sock) == b""
+
+
+def test_who_hangs_up_is_forgotten(served: Metrics) -> None:
+    """In the middle of a request, or with an answer that is not read."""
+    for request in (b"GET", b"GET /metrics HTTP/1.1\r\n\r\n"):
+        for _ in range(3):
+            with calling(served) as sock:
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+                sock.sendall(request)
+    assert asked(served, b"GET /healthz HTTP/1.1\r\n\r\n")[0] == b"HTTP/1.1 200 OK"
+
+
+def test_an_address_that_is_taken_is_said_in_a_line(
+    served: Metrics, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before anything flies, with the flag and the reason."""
+    from skytether.netem.__main__ import emulate
+
+    host, port = served.address
+    argv = ["--bind", "127.0.0.1:0", "--metrics", f"{host}:{port}"]
+    assert command.main(emulate, argv, "netem") == command.CONFIGURATION
+    said_ = f"netem: --metrics: cannot listen at {host}:{port}: Address already in use\n"
+    assert capsys.readouterr().err == said_
+    with pytest.raises(MetricsError):
+        Metrics(("no.such.invalid", 0), Collected("netem", "demo", 0.05))
+
+
+def test_all_names_can_be_listed(figures: dict[str, dict[str, Any]]) -> None:
+    """What a dashboard may ask for; nothing is served beside them."""
+    told: Callable[[str], set[str]] = lambda process: {  # noqa: E731
+        name for name, _ in numbers(process, figures[process])
+    }
+    assert told("server") | told("netem") | told("client") <= names()
+
+
+def test_the_documented_metrics_are_those_there_are() -> None:
+    """Line by line: name, kind and what it is; and the labels that a number has."""
+    text = (ROOT / "docs" / "feed.md").read_text()
+    lines = re.findall(r"^\| `skytether_(\w+)` \| (\w+) \| ([^|]*) \| (.*) \|$", text, re.MULTILINE)
+    documented = {(name, kind, what) for name, kind, _, what in lines}
+    assert documented == {
+        (each.name, "gauge" if each.kind == "modes" else each.kind, each.help.rstrip("."))
+        for table in (*TABLES.values(), metrics.OWN)
+        for each in table
+    }
+    labels = {name: set(filter(None, told.split(", "))) for name, _, told, _ in lines}
+    for table in TABLES.values():
+        for each in table:
+            named = {name.name for name in each.figure if isinstance(name, Label)} - {"le"}
+            modes = {"mode"} if each.kind == "modes" else set()
+            assert labels[each.name] == named | {name for name, _ in each.labels} | modes
+
+
+@pytest.mark.long
+def test_each_worker_of_a_server_has_a_feed_and_metrics_of_its_own(tmp_path: Path) -> None:
+    """Numbered as its other files are; its port follows that of the one before."""
+    with closing(socket.create_server(("127.0.0.1", 0))) as free:
+        port = free.getsockname()[1]
+    argv = ["server", "demo", "--bind", "127.0.0.1:0", "--workers", "2", "--log", "json"]
+    argv += ["--feed", str(tmp_path / "feed"), "--metrics", f"127.0.0.1:{port}"]
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", "skytether", *argv], stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdout is not None
+        told = {}
+        try:
+            while len(told) < 2:
+                line = msgspec.json.decode(server.stdout.readline(), type=LogLine)
+                if isinstance(line.event, Measured):
+                    told[line.process] = line.event.port
+            assert told == {"server.1": port, "server.2": port + 1}
+            assert sorted(path.name for path in tmp_path.iterdir()) == ["feed.1", "feed.2"]
+        finally:
+            server.terminate()
+            server.communicate()
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,223 @@
+"""The Compose profile `observe`: what its dashboard asks for is there, and it is locked in.
+
+Neither Prometheus nor Grafana runs here; server, netem and client do.
+"""
+
+import asyncio
+import json
+import re
+import sys
+import urllib.request
+from collections.abc import Iterator
+from contextlib import AbstractAsyncContextManager
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from prometheus_client.parser import text_string_to_metric_families
+
+from skytether.cli.processes import Child, started
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import Measured, ModeChanged
+from skytether.shell.exporter import names
+from skytether.shell.log import LogLine
+from skytether.shell.metrics import TABLES
+
+pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).parents[2]
+OBSERVE = ROOT / "deploy"
+DOCUMENT = ROOT / "docs" / "feed.md"
+DASHBOARD = json.loads((OBSERVE / "grafana" / "dashboards" / "skytether.json").read_text())
+RULES = yaml.safe_load((OBSERVE / "rules.yml").read_text())
+COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
+THREE = ("server", "netem", "client")
+NEVER_YET = {
+    "skytether_server_lost_horizons_total",
+    "skytether_server_dropped_datagrams_total",
+    "skytether_client_dropped_datagrams_total",
+}
+"""Metrics that are there once something of the kind has happened."""
+EXPRESSIONS = [
+    *(target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]),
+    *(rule["expr"] for group in RULES["groups"] for rule in group["rules"]),
+]
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, set[str]], str]:
+    """See `_flown`."""
+    return asyncio.run(_flown(tmp_path_factory.mktemp("feeds")))
+
+
+@pytest.fixture(scope="module")
+def exported(flown: tuple[dict[str, set[str]], str]) -> dict[str, set[str]]:
+    """Names of the numbers that processes serve while they fly, and of their labels."""
+    return flown[0]
+
+
+async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
+    """What processes serve while they fly, and what the documented reader of a feed prints."""
+    told: dict[str, Address] = {}
+    flying = asyncio.Event()
+
+    def hear(process: str) -> Any:
+        def on_event(line: LogLine) -> None:
+            event = line.event
+            if isinstance(event, Measured):
+                told[process] = event.host, event.port
+            if isinstance(event, ModeChanged) and event.after == "track":
+                flying.set()
+
+        return on_event
+
+    def process(name: str, *argv: str) -> AbstractAsyncContextManager[Child]:
+        common = ["demo", "--metrics", "127.0.0.1:0", "--feed", str(feeds / f"{name}.feed")]
+        return started(name, *common, *argv, on_event=hear(name))
+
+    here = ["--bind", "127.0.0.1:0"]
+    async with (
+        process("server", *here) as server,
+        process("netem", *here, "--server", at(server.address)) as netem,
+        process("client", "--server", at(netem.address)),
+    ):
+        await asyncio.wait_for(flying.wait(), 60.0)
+        found: dict[str, set[str]] = {}
+        deadline = asyncio.get_running_loop().time() + 30.0
+        # Figures are a second old: until they have the first plan, too.
+        while "skytether_client_age_seconds" not in found:
+            assert asyncio.get_running_loop().time() < deadline
+            await asyncio.sleep(0.2)
+            for name, address in told.items():
+                body = await asyncio.to_thread(fetched, address, "/metrics")
+                for family in text_string_to_metric_families(body):
+                    for sample in family.samples:
+                        found.setdefault(sample.name, set()).update(sample.labels, {"job"})
+                health = json.loads(await asyncio.to_thread(fetched, address, "/healthz"))
+                assert health == {"process": name, "healthy": True, "trouble": ""}
+        (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+        reader = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", example, cwd=feeds, stdout=asyncio.subprocess.PIPE
+        )
+        printed, _ = await reader.communicate()
+        assert reader.returncode == 0
+    return found, printed.decode()
+
+
+def at(address: Address) -> str:
+    """An address as a flag has it."""
+    return f"{address[0]}:{address[1]}"
+
+
+def fetched(address: Address, path: str) -> str:
+    """Body of an answer of 200."""
+    with urllib.request.urlopen(f"http://{at(address)}{path}", timeout=10.0) as answer:
+        return str(answer.read().decode())
+
+
+def metrics_of(expression: str) -> set[str]:
+    """Names of the metrics in an expression."""
+    return set(re.findall(r"skytether_[a-z_]+", expression))
+
+
+def test_every_metric_that_is_asked_for_is_served(exported: dict[str, set[str]]) -> None:
+    """By processes that fly; and those of them are known by name."""
+    asked = set[str]().union(*map(metrics_of, EXPRESSIONS))
+    assert asked - set(exported) <= NEVER_YET
+    assert set(exported) <= names()
+    assert asked <= names()
+    assert len(asked) > 20
+
+
+def test_the_documented_reader_of_a_feed_reads_it(flown: tuple[dict[str, set[str]], str]) -> None:
+    """As it stands in docs/feed.md, beside the flight of three processes."""
+    lines = flown[1].splitlines()
+    assert len(lines) > 20
+    assert all(re.fullmatch(r"vehicle 1 is at \[[^]]*\] m", line) for line in lines)
+
+
+def test_every_label_that_is_asked_for_is_served(exported: dict[str, set[str]]) -> None:
+    """In selections and sums; those that Prometheus adds are known."""
+    for expression in EXPRESSIONS:
+        labels = set(re.findall(r"(\w+)(?:=|=~|!=)\"", expression))
+        labels |= {
+            label.strip()
+            for group in re.findall(r"by \(([^)]*)\)", expression)
+            for label in group.split(",")
+        }
+        known = set[str]().union(*(exported.get(name, set()) for name in metrics_of(expression)))
+        if metrics_of(expression) <= NEVER_YET:
+            known |= {"reason"}
+        assert labels <= known | {"job"}, expression
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS)
+def test_expressions_fit_what_they_are_about(expression: str) -> None:
+    """Rates are of what only grows, quantiles of buckets, and brackets are closed."""
+    for opening, closing in ("()", "[]", "{}"):
+        assert expression.count(opening) == expression.count(closing)
+    kinds = {metric.name: metric.kind for table in TABLES.values() for metric in table}
+    for name in re.findall(r"(?:rate|increase)\(skytether_(\w+)", expression):
+        assert kinds[name.removesuffix("_bucket")] in ("counter", "histogram")
+    for name in re.findall(r"skytether_(\w+_total)\b(?![^)]*\[)", expression):
+        assert name == "feed_dropped_readers_total"  # a number so far is what is wanted there
+    if "histogram_quantile" in expression:
+        assert "sum by (le" in expression
+        assert "_bucket" in expression
+
+
+def test_panels_lie_side_by_side() -> None:
+    """None over another, and each asks the one source there is."""
+    (source,) = yaml.safe_load(
+        (OBSERVE / "grafana/provisioning/datasources/prometheus.yml").read_text()
+    )["datasources"]
+    boxes = []
+    for panel in DASHBOARD["panels"]:
+        assert panel["datasource"]["uid"] == source["uid"]
+        box = panel["gridPos"]
+        assert box["x"] + box["w"] <= 24
+        boxes.append((box["x"], box["y"], box["x"] + box["w"], box["y"] + box["h"]))
+    for one, other in combinations(boxes, 2):
+        assert one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(boxes)
+
+
+def test_what_is_scraped_is_what_the_services_serve() -> None:
+    """Name by name, at one port."""
+    settings = yaml.safe_load((OBSERVE / "prometheus.yml").read_text())
+    targets = {
+        job["job_name"]: target
+        for job in settings["scrape_configs"]
+        for each in job["static_configs"]
+        for target in each["targets"]
+    }
+    assert targets == {service: f"{service}:9464" for service in THREE}
+    for service in THREE:
+        assert "--metrics=0.0.0.0:9464" in COMPOSE[service]["command"]
+        assert "ports" not in COMPOSE[service]
+        assert set(COMPOSE[service]["networks"]) <= {"air", "ground"}
+
+
+def observing() -> Iterator[tuple[str, dict[str, Any]]]:
+    """Services of the profile."""
+    return ((name, each) for name, each in COMPOSE.items() if each.get("profiles") == ["observe"])
+
+
+def test_the_observers_are_pinned_and_locked_in() -> None:
+    """Read-only, without privileges, for this machine alone; and what they mount is there."""
+    assert {name for name, _ in observing()} == {"prometheus", "grafana"}
+    for _, service in observing():
+        assert re.fullmatch(r"[a-z]+/[a-z]+:v?\d+\.\d+\.\d+", service["image"])
+        assert service["read_only"]
+        assert service["cap_drop"] == ["ALL"]
+        assert all(port.startswith("127.0.0.1:") for port in service["ports"])
+        for volume in service["volumes"]:
+            source, _, mode = volume.split(":") if volume[0] == "." else ("", "", "ro")
+            assert (ROOT / source).exists()
+            assert mode == "ro"
+    environment = COMPOSE["grafana"]["environment"]
+    assert environment["GF_AUTH_ANONYMOUS_ORG_ROLE"] == "Viewer"
+    home = environment["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"]
+    assert (OBSERVE / "grafana" / home.removeprefix("/etc/skytether/")).exists()

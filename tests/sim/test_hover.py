@@ -1,0 +1,168 @@
+"""Flights without a plan: never flown, ended in hover, or with a gap, and how they end."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import skytether.sim.flight
+from helpers import packaged
+from skytether.server.endpoint import Server
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import Finished, ModeChanged, NotFlown
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.wire.protocol import Heartbeat, Horizon, Idle, decode, encode
+from skytether.sim.flight import MIDNIGHT_NS, fly
+
+
+def scenario(**sections: Any) -> Scenario:
+    """Twenty seconds of the demo over 0.2 s each way without loss; sections are laid over."""
+    quick = {"delay": "constant", "minimum_s": 0.2, "loss": 0.0}
+    preset = {
+        "duration": 20.0,
+        "network": {"uplink": quick, "downlink": quick},
+        "link": {"heartbeat_s": 0.1, "timeout_s": 1.0},
+    }
+    return packaged("demo-committed", preset, sections)
+
+
+def said(flight: Record, host: str = "client") -> list[Any]:
+    """Events of a host of the flight."""
+    return [event for _, name, event in flight.events if name.split()[0] == host]
+
+
+class Interrupted(Server):
+    """A server that is gone for a while, and may come back as another life of it."""
+
+    gone_s = 0.0, 0.0
+    """When it is gone, from the start of the world [s]."""
+    mute = False
+    """Whether it does everything but send horizons while it is gone."""
+
+    def __init__(self, flown: Scenario, **keys: Any) -> None:
+        super().__init__(flown, **keys)
+        self._terms = flown.terms()
+        self._made: tuple[Scenario, dict[str, Any]] | None = flown, keys
+
+    def gone(self, now_ns: int) -> bool:
+        """Whether it is gone; the first that comes after that is heard by another life."""
+        begin, end = (MIDNIGHT_NS + round(each * SECOND_NS) for each in self.gone_s)
+        if now_ns >= end and self._made is not None and not self.mute:
+            flown, keys = self._made
+            Server.__init__(self, flown, **keys | {"boot_id": keys["boot_id"] + 1})
+            self._made = None
+        return begin <= now_ns < end
+
+    def muted(self, payload: bytes) -> bytes:
+        """A heartbeat in place of a horizon."""
+        message = decode(payload, self._terms)
+        if not isinstance(message, Horizon):
+            return payload
+        vehicle, session, _, server_us, *_ = message
+        return encode(Heartbeat(vehicle, session, server_us, Idle.PLANS, 0))
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        if self.mute or not self.gone(now_ns):
+            super().receive(datagram, now_ns=now_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        if not self.gone(now_ns):
+            super().wake(now_ns=now_ns)
+        elif self.mute:
+            super().wake(now_ns=now_ns)
+            self._out[:] = [each._replace(payload=self.muted(each.payload)) for each in self._out]
+        else:
+            self._grid.rest()
+
+
+def interrupted(
+    monkeypatch: pytest.MonkeyPatch,
+    flown: Scenario,
+    begin_s: float,
+    end_s: float = 1e6,
+    *,
+    mute: bool = False,
+) -> Record:
+    """A flight with a server that is gone, or sends no horizon, from one time to another."""
+
+    class ThisOne(Interrupted):
+        gone_s = begin_s, end_s
+
+    ThisOne.mute = mute
+    monkeypatch.setattr(skytether.sim.flight, "Server", ThisOne)
+    return fly(flown)
+
+
+def test_a_vehicle_that_never_had_a_horizon_was_never_flown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The server answers, and sends heartbeats: that is no flight."""
+    flight = interrupted(monkeypatch, scenario(), 0.0, mute=True)
+    why = "no newer horizon has come"
+    assert flight.failure == NotFlown(vehicle=1, covered=0, steps=400, why=why)
+    assert said(flight)[-1] == flight.failure
+    assert not flight.client["input"].any()
+
+
+@pytest.mark.parametrize("mute", [False, True])
+def test_a_vehicle_that_hovers_to_the_end_has_not_been_flown(
+    monkeypatch: pytest.MonkeyPatch, *, mute: bool
+) -> None:
+    """The server dies after a heartbeat, or sends nothing but heartbeats from then on."""
+    flight = interrupted(monkeypatch, scenario(), 10.6, mute=mute)
+    why = "no newer horizon has come" if mute else "the server is silent"
+    assert isinstance(flight.failure, NotFlown)
+    assert flight.failure.why == why
+    assert flight.failure.covered == np.count_nonzero(flight.client["covered"])
+    *_, brakes, hovers, _ = (event for event in said(flight) if not isinstance(event, Finished))
+    changed = {"vehicle": 1, "reason": why}
+    assert brakes == ModeChanged(before="coast", after="brake", **changed)
+    assert hovers == ModeChanged(before="brake", after="hover", **changed)
+    assert said(flight)[-1] == flight.failure
+    assert np.abs(flight.client["state"][-1, :, 1]).max() < 0.1
+
+
+def test_a_server_that_dies_within_the_last_horizon_leaves_a_flight(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No longer without a plan than `link.timeout_s`: it was flown to the end."""
+    flight = interrupted(monkeypatch, scenario(), 18.5)
+    assert not flight.client["covered"][-1]
+    assert flight.failure is None
+    assert said(flight)[-1] == Finished(vehicle=1, steps=400, missed=0)
+
+
+def test_a_flight_with_a_gap_is_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server is gone for six seconds and back in another life: braked, hovered, flown on."""
+    flight = interrupted(monkeypatch, scenario(), 6.0, 12.0)
+    assert flight.failure is None
+    *changes, finished = said(flight)[-6:]
+    assert isinstance(finished, Finished)
+    assert [(each.after, each.reason) for each in changes] == [
+        ("brake", "the server is silent"),
+        ("hover", "the server is silent"),
+        ("hover", "the server has restarted"),
+        ("hover", "the link has been good for a second"),
+        ("track", "a horizon has come"),
+    ]
+    assert not flight.client["covered"].all()
+    assert flight.client["covered"][-100:].all()
+
+
+def test_after_a_restart_a_vehicle_is_flown_that_drifts_faster_than_any_input(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Wind of 4 m/s against inputs of up to 1.6 m/s: what is committed is kept within these."""
+    wind = {"steady_wind_mps": [4.0, 0.0], "start_m": [-10.0, 0.0]}
+    flown = scenario(vehicle=wind, model={"u_max": [1.6]})
+    flight = interrupted(monkeypatch, flown, 3.0, 10.0)
+    before, after = flight.client[199], flight.client[-1]
+    assert before["state"][0, 1] > 3.9
+    assert not before["covered"]
+    assert flight.client["covered"][-100:].all()
+    assert after["in_force"] > 200
+    assert after["state"][0, 1] < 2.5  # all that 1.6 m/s can do

@@ -1,0 +1,87 @@
+"""The services of docker-compose.yml, as far as can be told without an engine."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from skytether.client.__main__ import ClientOptions
+from skytether.shared.scenario import reading
+from skytether.shell import command
+
+ROOT = Path(__file__).parents[2]
+FILE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
+SERVICES: dict[str, dict[str, Any]] = FILE["services"]
+ALWAYS = {"keys", "server", "netem", "client", "page"}
+PROFILES = {
+    "observe": {"prometheus", "grafana"},
+    "px4": {"px4", "aboard"},
+    "netem": {"relay"},
+}
+DOCKERFILE = (ROOT / "Dockerfile").read_text()
+
+
+def argv(service: str, scenario: str) -> list[str]:
+    """Command line of a service, with its variables as they are unless set, but for SCENARIO."""
+    told = SERVICES[service]["command"]
+    named = [re.sub(r"\$\{SCENARIO:-demo\}", scenario, each) for each in told]
+    return [re.sub(r"\$\{\w+:-(.*?)\}", r"\1", each) for each in named]
+
+
+def test_a_profile_adds_services_and_changes_none() -> None:
+    """Without one there are the five of a flight; none of them waits for one of a profile."""
+    assert {name for name, each in SERVICES.items() if "profiles" not in each} == ALWAYS
+    for profile, added in PROFILES.items():
+        assert {n for n, each in SERVICES.items() if each.get("profiles") == [profile]} == added
+    for name in ALWAYS:
+        assert set(SERVICES[name].get("depends_on", {})) <= ALWAYS
+
+
+def test_compose_understands_its_file() -> None:
+    """With each profile and without one, where Compose is."""
+    docker = shutil.which("docker")
+    if docker is None or subprocess.run([docker, "compose", "version"], check=False).returncode:
+        pytest.skip("no Compose")
+    for profile, added in {"": set(), **PROFILES}.items():
+        flag = ["--profile", profile] if profile else []
+        line = [docker, "compose", *flag, "config", "--services"]
+        done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert set(done.stdout.split()) == ALWAYS | added
+
+
+def test_each_image_of_ours_is_a_stage_with_a_lock_file() -> None:
+    """The Dockerfile builds what is named, of what is pinned."""
+    targets = {each["build"]["target"] for each in SERVICES.values() if "build" in each}
+    assert targets == set(re.findall(r"^FROM bare AS (\w+)$", DOCKERFILE, re.MULTILINE))
+    for lock in re.findall(r"^COPY (requirements-\w+\.lock)", DOCKERFILE, re.MULTILINE):
+        assert (ROOT / lock).exists()
+
+
+def test_the_autopilot_is_pinned_and_speaks_to_the_computer_aboard_alone() -> None:
+    """No port is published, and its network is one that nobody leaves."""
+    autopilot, aboard = SERVICES["px4"], SERVICES["aboard"]
+    assert re.fullmatch(r"px4io/px4-sitl:v\d+\.\d+\.\d+", autopilot["image"])
+    assert aboard["network_mode"] == "service:px4"
+    assert "networks" not in aboard
+    assert not {"ports"} & {*autopilot, *aboard}
+    assert all(FILE["networks"][each]["internal"] for each in autopilot["networks"])
+    for each in (autopilot, aboard):
+        assert each["read_only"]
+        assert each["cap_drop"] == ["ALL"]
+
+
+def test_the_computer_aboard_flies_it_by_the_scenario_that_the_server_has() -> None:
+    """The vehicle is the autopilot of its own loopback, with parameters that are set."""
+    name, *flags = argv("aboard", "px4")
+    assert (name, argv("server", "px4")[1]) == ("client", flags[0])
+    here = [flag for flag in flags if "=/" not in flag]  # paths are those of the container
+    options = command.parse(ClientOptions(), here, "skytether client", "")
+    assert options.set_parameters
+    assert options.config.model == reading.load("px4").model
+    assert options.config.vehicle.kind == "mavlink"
+    assert options.config.vehicle.address == "udp:127.0.0.1:14540"

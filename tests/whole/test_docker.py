@@ -1,0 +1,513 @@
+"""The containers, flown for real: how they are locked in, and what a flight survives.
+
+`make docker-test` needs a Docker engine with Compose and takes about three minutes; `-s` shows how
+it goes. COMPOSE is the command to use where neither `docker compose` nor `docker-compose` will do,
+BASE_IMAGE what to build the images on.
+"""
+
+import contextlib
+import json
+import os
+import re
+import secrets
+import shlex
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import msgspec
+import pytest
+
+from skytether.shared.scenario import reading
+from skytether.shared.telemetry.record import read
+from skytether.shared.telemetry.summary import Summary
+
+pytestmark = [pytest.mark.docker, pytest.mark.timeout(900)]
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+SERVICES = ("server", "netem", "client")
+IMAGES = ("client", "page", "server")
+STEPS_PER_S = round(1 / reading.load("demo").control.dt)
+
+FLIGHT_S = 60
+GATE_FLIGHT_S = 10
+FAULTY_FLIGHT_S = 110
+"""Duration of the flight with faults [s]; faults and what proves their end take 45 s of it."""
+FAULT_S = 3.0
+"""Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client notices."""
+HORIZONS = 6
+"""Number of new horizons that shows that orders flow."""
+HOVER_M = 1.58
+"""Error `rmse_xy` of the demo for a vehicle that stays at its start [m]."""
+
+
+@pytest.mark.usefixtures("compose")
+def test_each_image_carries_what_it_runs_and_no_more() -> None:
+    """The client's is the bare package; the server's and the page's have an extra each."""
+    packages, sizes = {}, {}
+    listing = "ls /opt/skytether/lib/*/site-packages"
+    for image in IMAGES:
+        name = f"skytether-{image}"
+        listed = ("--entrypoint=sh", name, "-c", listing)
+        packages[image] = set(run("docker", "run", "--rm", "--network=none", *listed).split())
+        sizes[image] = int(run("docker", "image", "inspect", "--format", "{{.Size}}", name))
+        say(f"the image of the {image} has {sizes[image] / 1e6:.0f} MB")
+    extras = {"numba", "llvmlite", "scipy", "osqp", "viser", "mcap", "matplotlib", "pip"}
+    assert packages["client"] & extras == set()
+    assert packages["page"] & extras == {"viser"}
+    assert packages["server"] & extras == {"numba", "llvmlite", "scipy", "osqp"}
+    assert sizes["client"] < min(sizes["page"], sizes["server"])
+
+
+def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
+    """From `up` to the summary, with the doors that ought to be locked tried on the way."""
+    with containers(compose, FLIGHT_S) as three, three.capture() as captured:
+        three.flies()
+        for service in SERVICES:
+            three.check_privileges(service)
+        three.check_isolation()
+        # A kernel that had to be compiled would lie in the copy alone.
+        copied = ("diff", "-r", "/opt/skytether/kernels", "/tmp/kernels")
+        assert three.inside("server", *copied) == (0, "")
+        say("locked in: not root, read-only, no capabilities, no way round netem")
+        three.check_key()
+
+        summary = three.land(tmp_path)
+        assert summary.scenario == "demo"
+        assert summary.steps + summary.deadline_misses == FLIGHT_S * STEPS_PER_S
+        assert summary.rmse_xy is not None
+        assert 0 < summary.rmse_xy < 0.5 * HOVER_M
+        assert summary.deadline_misses < 0.1 * summary.steps
+        assert summary.secure
+        check_capture(captured, tmp_path / "client")
+
+        # As they are, even if somebody has built the image anew meanwhile.
+        three.compose("up", "--detach", "--no-recreate")
+        until("a second flight", lambda: three.said("client").count("session open, flying") == 2)
+        say("flying again, until SIGTERM")
+        three.compose("stop")
+        for service in SERVICES:
+            assert three.state(service)["ExitCode"] == 0, three.said(service)
+        last_words = three.said("client").rsplit("flying", 1)[1]
+        assert 0 < number("step", last_words) < FLIGHT_S * STEPS_PER_S
+        say("SIGTERM ended all three with 0")
+
+
+@pytest.mark.parametrize(("seconds", "code"), [(GATE_FLIGHT_S, 0), (0, 2)])
+def test_one_command_flies_for_a_gate(
+    compose: list[str], tmp_path: Path, seconds: int, code: int
+) -> None:
+    """README's: after the flight all have ended, and the exit code is the client's."""
+    (line,) = (line for line in README.splitlines() if "--exit-code-from" in line)
+    *command, build = shlex.split(line)[:4]
+    assert (command, build) == (["docker", "compose", "up"], "--build")
+    three = Containers(compose, seconds)
+    try:
+        found, said = three.attempt("up", *shlex.split(line)[4:])
+        assert found == code, said[-4000:]
+        statuses = {each: three.state(each)["Status"] for each in (*SERVICES, "keys", "page")}
+        assert set(statuses.values()) == {"exited"}, statuses
+        if code == 0:
+            assert three.land(tmp_path).steps > 0.9 * seconds * STEPS_PER_S
+    finally:
+        three.compose("down", "--volumes", "--remove-orphans")
+
+
+def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) -> None:
+    """One flight, in which everything that can break breaks, and horizons flow again."""
+    with containers(compose, FAULTY_FLIGHT_S) as three:
+        three.flies()
+
+        with three.fault(f"netem is paused for {FAULT_S:g} s"):
+            three.docker("pause", three.id("netem"))
+            time.sleep(FAULT_S)
+            three.docker("unpause", three.id("netem"))
+
+        before = three.addresses("server")
+        with three.fault("the server is killed, and started at another address"):
+            three.docker("kill", three.id("server"))
+            with three.squatter("ground"):
+                time.sleep(FAULT_S)
+                three.docker("start", three.id("server"))
+        assert three.addresses("server") != before
+
+        with three.fault("the server crashes, and Docker restarts it"):
+            # Everything of its user's but this shell; the init process follows.
+            three.inside("server", "sh", "-c", "kill -9 -1")
+            until("the restart", lambda: three.inspect("server")["RestartCount"] == 1)
+
+        with three.fault("netem is killed, and started again"):
+            three.docker("kill", three.id("netem"))
+            time.sleep(FAULT_S)
+            three.docker("start", three.id("netem"))
+
+        before = three.addresses("client")
+        with three.fault(f"the client has no network for {FAULT_S:g} s, then another address"):
+            three.docker("network", "disconnect", three.network("air"), three.id("client"))
+            with three.squatter("air"):
+                time.sleep(FAULT_S)
+                three.docker("network", "connect", three.network("air"), three.id("client"))
+        assert three.addresses("client") != before
+
+        summary = three.land(tmp_path)
+        assert three.said("client").count("session open, flying") == 1
+        assert three.said("client").count("the server has restarted") >= 2
+        assert summary.steps + summary.deadline_misses == FAULTY_FLIGHT_S * STEPS_PER_S
+        assert summary.rmse_xy is not None
+        # However long the engine took: it waited on its path, at worst at the far end.
+        assert summary.rmse_xy < 2 * HOVER_M
+        three.compose("stop")
+        assert [three.state(service)["ExitCode"] for service in SERVICES] == [0, 0, 0]
+
+
+@dataclass
+class Containers:
+    """The project of one test."""
+
+    command: list[str]
+    """Compose."""
+    seconds: int
+    """Length of the flight."""
+    project: str = field(default_factory=lambda: f"skytether-test-{secrets.token_hex(4)}")
+    ids: dict[str, str] = field(default_factory=dict)
+    """Identifiers of the containers, by service; they stay the same from `up` to `down`."""
+
+    def compose(self, *arguments: str) -> str:
+        """What Compose printed."""
+        return run(*self.argv(*arguments), more_env=self.flight)
+
+    def attempt(self, *arguments: str) -> tuple[int, str]:
+        """Exit code of Compose, and what it printed."""
+        return attempt(*self.argv(*arguments), within_s=150.0, more_env=self.flight)
+
+    def argv(self, *arguments: str) -> list[str]:
+        """Command line of Compose."""
+        return [
+            *self.command,
+            "-f",
+            str(ROOT / "docker-compose.yml"),
+            "-p",
+            self.project,
+            *arguments,
+        ]
+
+    @property
+    def flight(self) -> dict[str, str]:
+        """What the environment says of the flight."""
+        return {"FLIGHT_SECONDS": str(self.seconds), "SCENARIO": "demo"}
+
+    def docker(self, *arguments: str) -> str:
+        """What Docker printed."""
+        return run("docker", *arguments)
+
+    def id(self, service: str) -> str:
+        """The container of a service, running or not."""
+        if service not in self.ids:
+            self.ids[service] = self.compose("ps", "--all", "--quiet", service).strip()
+        return self.ids[service]
+
+    def network(self, name: str) -> str:
+        """Name of a network with Docker."""
+        return f"{self.project}_{name}"
+
+    def inspect(self, service: str) -> dict[str, Any]:
+        """Description of a container by Docker."""
+        return json.loads(self.docker("inspect", self.id(service)))[0]
+
+    def state(self, service: str) -> dict[str, Any]:
+        """Status, ExitCode, Health."""
+        return self.inspect(service)["State"]
+
+    def addresses(self, service: str) -> dict[str, str]:
+        """By network."""
+        networks = self.inspect(service)["NetworkSettings"]["Networks"]
+        return {name: network["IPAddress"] for name, network in networks.items()}
+
+    def said(self, service: str) -> str:
+        """Log of a container."""
+        return attempt("docker", "logs", self.id(service))[1]
+
+    def inside(self, service: str, *command: str) -> tuple[int, str]:
+        """Exit code and output of a command in a container."""
+        return attempt("docker", "exec", self.id(service), *command)
+
+    def has_said(self, service: str, what: str, *, since: int = 0) -> bool:
+        """Whether its log has the words, from a place on."""
+        return what in self.said(service)[since:]
+
+    # -- the flight --------------------------------------------------------------------------
+
+    def figures(self, service: str) -> str:
+        """The lines of figures that a process prints at SIGUSR1, up to the last of them."""
+        pattern = r"(?s)counted so far:.*?send_errors +\d+"
+        before = len(re.findall(pattern, self.said(service)))
+        self.docker("kill", "--signal", "USR1", self.id(service))
+        new = until(
+            f"figures of the {service}", lambda: re.findall(pattern, self.said(service))[before:]
+        )
+        return str(new[-1])
+
+    def flies(self) -> None:
+        """Wait until orders reach the vehicle, newly made ones."""
+        until("the session", lambda: self.has_said("server", "vehicle 1 flies"))
+        first = self.figures("client")
+        # A second later netem holds nothing that it held until now.
+        second = self.figures_with("step", number("step", first) + STEPS_PER_S)
+        server = self.figures("server")
+        last = self.figures_with("horizons", number("horizons", second) + HORIZONS)
+        assert number("events", self.figures("server")) > number("events", server)
+        counts = [number("horizons", figures) for figures in (first, last)]
+        say(f"orders reach the vehicle: {counts[0]} ... {counts[1]}")
+
+    def figures_with(self, name: str, least: int) -> str:
+        """The first figures of the client that count so many of something."""
+
+        def enough() -> str | None:
+            assert self.state("client")["Status"] == "running", "the flight has ended too soon"
+            figures = self.figures("client")
+            return figures if number(name, figures) >= least else None
+
+        return until(f"{name}: {least}", enough)
+
+    @contextlib.contextmanager
+    def fault(self, what: str) -> Iterator[None]:
+        """Something that the client notices, and that is over when this block has ended."""
+        before = len(self.said("client"))
+        say(what)
+        yield
+        began_s = time.monotonic()
+        for event in ("brakes: the server is silent", "flies a plan"):
+            until(event, partial(self.has_said, "client", event, since=before))
+        say(f"a plan is flown again, {time.monotonic() - began_s:.1f} s after the repair")
+        self.flies()
+
+    @contextlib.contextmanager
+    def squatter(self, network: str) -> Iterator[None]:
+        """A stranger who takes the address that a container had in a network."""
+        argv = ["run", "--detach", "--rm", "--network", self.network(network)]
+        argv += ["--entrypoint", "sleep", "skytether-client", "600"]
+        stranger = self.docker(*argv).strip()
+        try:
+            yield
+        finally:
+            self.docker("rm", "--force", stranger)
+
+    def land(self, folder: Path) -> Summary:
+        """The summary of the flight, once the client has ended with 0."""
+        until(
+            "the end of the flight",
+            lambda: self.state("client")["Status"] == "exited",
+            within_s=self.seconds + 30,
+        )
+        assert self.state("client")["ExitCode"] == 0, self.said("client")
+        self.docker("cp", f"{self.id('client')}:/results/.", str(folder))
+        summary = msgspec.json.decode((folder / "summary.json").read_bytes(), type=Summary)
+        say(f"landed: {summary.steps} steps, rmse_xy {summary.rmse_xy:.3f} m")
+        return summary
+
+    # -- the locks ---------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def capture(self) -> Iterator[Path]:
+        """File of every UDP payload that netem hears and sends meanwhile, on both networks."""
+        script = (ROOT / "tests" / "sniff.py").read_text()
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "capture.pcap"
+            argv = ["docker", "run", "--rm", "--network", f"container:{self.id('netem')}"]
+            argv += ["--user=0", "--cap-add=NET_RAW", "--entrypoint=python", "skytether-client"]
+            with (
+                file.open("wb") as out,
+                subprocess.Popen([*argv, "-c", script], stdout=out) as sniffer,
+            ):
+                try:
+                    yield file
+                finally:
+                    sniffer.terminate()
+                    sniffer.wait(30.0)
+
+    def check_key(self) -> None:
+        """The key is one file that only its owner can read, the same for both ends."""
+        shown = [self.inside(each, "cat", "/keys/vehicle-1") for each in ("server", "client")]
+        assert shown[0] == shown[1]
+        assert shown[0][0] == 0
+        assert self.inside("server", "stat", "-c", "%a", "/keys/vehicle-1") == (0, "600\n")
+        assert self.inside("server", "touch", "/keys/another")[0] != 0
+        assert self.inside("netem", "ls", "/keys/vehicle-1")[0] != 0
+        secret = shown[0][1].split()[-1]
+        assert all(secret not in self.said(each) for each in ("server", "client", "netem"))
+
+    def check_privileges(self, service: str) -> None:
+        """As Docker was told, and as the process finds it."""
+        host = self.inspect(service)["HostConfig"]
+        assert host["ReadonlyRootfs"]
+        assert host["CapDrop"] == ["ALL"]
+        assert not host["CapAdd"]
+        assert not host["Privileged"]
+        assert not host["PortBindings"]
+        assert host["Memory"] > 0
+        assert host["NanoCpus"] > 0
+        assert host["PidsLimit"] > 0
+
+        _, status = self.inside(service, "cat", "/proc/1/status")
+        assert re.search(r"^Uid:(\s10001){4}$", status, re.MULTILINE)
+        assert re.search(r"^Gid:(\s10001){4}$", status, re.MULTILINE)
+        assert set(re.findall(r"^Cap(?:Eff|Prm|Bnd):\s(\w+)$", status, re.MULTILINE)) == {"0" * 16}
+        assert "NoNewPrivs:\t1" in status
+        code, output = self.inside(service, "touch", "/opt/skytether/file")
+        assert code != 0
+        assert "Read-only file system" in output
+        assert self.inside(service, "touch", "/tmp/file")[0] == 0
+
+        code, where = self.inside(
+            service, "python", "-c", "import skytether; print(skytether.__file__)"
+        )
+        assert where.startswith("/opt/skytether/lib/"), where
+        assert self.inside(service, "sh", "-c", "command -v cc gcc g++ make")[0] != 0
+
+    def check_isolation(self) -> None:
+        """Client and server share no network; netem is the client's only neighbour."""
+        client, server = self.addresses("client"), self.addresses("server")
+        assert set(client) == {self.network("air")}
+        assert set(server) == {self.network("ground")}
+        assert set(self.addresses("netem")) == {self.network("air"), self.network("ground")}
+        for name in ("air", "ground"):
+            assert json.loads(self.docker("network", "inspect", self.network(name)))[0]["Internal"]
+
+        for service in ("server", "netem"):
+            assert self.state(service)["Health"]["Status"] == "healthy"
+            # The same question in a container where nobody listens: it can say no.
+            _, *question = self.inspect(service)["Config"]["Healthcheck"]["Test"]
+            assert self.inside(service, *question)[0] == 0
+            assert self.inside("client", *question)[0] == 1
+
+        (address,) = server.values()
+        code, output = self.ask_for_the_server("server")
+        assert (code, "cannot find server" in output) == (1, True), output
+        code, output = self.ask_for_the_server(address)
+        assert (code, f"no answer from {address}" in output) == (1, True), output
+
+    def ask_for_the_server(self, host: str) -> tuple[int, str]:
+        """Exit code and output of another client, where the client is."""
+        argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}"]
+        argv += [
+            "skytether-client",
+            "client",
+            "demo",
+            "--id=2",
+            "--link.connect-s=2",
+            f"--server={host}:47001",
+        ]
+        argv += ["--insecure"]
+        return attempt(*argv)
+
+
+@contextlib.contextmanager
+def containers(compose: list[str], seconds: int) -> Iterator[Containers]:
+    """The three, up; whatever happens, nothing of them stays."""
+    three = Containers(compose, seconds)
+    try:
+        three.compose("up", "--detach")
+        say(f"up, for a flight of {seconds} s")
+        yield three
+    except BaseException:
+        with contextlib.suppress(AssertionError):
+            print(three.compose("logs", "--no-color"))
+        raise
+    finally:
+        three.compose("down", "--volumes", "--remove-orphans")
+
+
+@pytest.fixture(scope="module")
+def compose() -> list[str]:
+    """The command for Compose, after it has built the images."""
+    given = os.environ.get("COMPOSE")
+    known = [given] if given else ["docker compose", "docker-compose"]
+    if not works("docker", "version"):
+        pytest.skip("no Docker engine answers")
+    command = next((found for found in map(shlex.split, known) if works(*found, "version")), None)
+    if command is None:
+        pytest.skip(f"no Compose: tried {' and '.join(known)}")
+    say(f"{shlex.join(command)} builds the images")
+    Containers(command, FLIGHT_S).compose("build")
+    return command
+
+
+def check_capture(capture: Path, part: Path) -> None:
+    """No position or velocity that was flown stands in what went over the networks."""
+    payloads, rows = capture.read_bytes(), read(part)
+    assert len(payloads) > 100 * len(rows)  # an OBSERVATION a step, before netem and behind
+    states = {number.tobytes() for number in rows["state"].ravel()}
+    states = {state for state in states if len(set(state)) > 5}  # 0 and 2.0 stand everywhere
+    assert len(states) > len(rows)
+    found = [state for state in states if state in payloads]
+    assert not found
+    say(f"{len(payloads)} B captured; none of {len(states)} numbers of the state is in them")
+
+
+def works(*command: str) -> bool:
+    """Whether a command exists and succeeds."""
+    try:
+        return attempt(*command)[0] == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+def attempt(
+    *command: str, within_s: float = 60.0, more_env: Mapping[str, str] = MappingProxyType({})
+) -> tuple[int, str]:
+    """Exit code and output of a command."""
+    done = subprocess.run(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=within_s,
+        check=False,
+        env={**os.environ, **more_env},
+    )
+    return done.returncode, done.stdout
+
+
+def run(*command: str, more_env: Mapping[str, str] = MappingProxyType({})) -> str:
+    """The standard output of a command that ought to succeed."""
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+        env={**os.environ, **more_env},
+    )
+    said = f"{shlex.join(command)}\n{done.stdout[-4000:]}{done.stderr[-4000:]}"
+    assert done.returncode == 0, said
+    return done.stdout
+
+
+def number(name: str, figures: str) -> int:
+    """What figures count under a name; 0 where there is none of it."""
+    found = re.search(rf"(?m): +{name} +(\d+)$", figures)
+    return int(found[1]) if found else 0
+
+
+T = TypeVar("T")
+
+
+def until(what: str, condition: Callable[[], T | None], within_s: float = 30.0) -> T:
+    """What a condition gives once it holds."""
+    deadline_s = time.monotonic() + within_s
+    while not (value := condition()):
+        assert time.monotonic() < deadline_s, f"in {within_s:g} s not come: {what}"
+        time.sleep(0.2)
+    return value
+
+
+def say(text: str) -> None:
+    """A line for whoever watches."""
+    print(f"{time.strftime('%H:%M:%S')}  {text}", flush=True)

@@ -1,0 +1,318 @@
+"""The documents: their commands run, their links lead somewhere, their names exist."""
+
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import warm
+from skytether.__main__ import main
+from skytether.cli.set import set_keys
+from skytether.lab import maps
+from skytether.shared.telemetry.summary import Summary
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
+from skytether.shell import command
+
+pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
+
+
+def blocks(document: Path) -> list[list[str]]:
+    """The commands in each shell block of a document, without comments."""
+    found = re.findall(r"```sh\n(.*?)```", document.read_text(), re.DOTALL)
+    return [
+        [line for line in (raw.split("#")[0].strip() for raw in block.splitlines()) if line]
+        for block in found
+    ]
+
+
+COMMANDS = [line for document in DOCUMENTS for block in blocks(document) for line in block]
+
+
+def skytether(line: str) -> list[str]:
+    """A documented command as this environment runs it."""
+    name, *argv = shlex.split(line)
+    assert name == "skytether"
+    return [sys.executable, "-P", "-m", "skytether", *argv]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        line
+        for line in dict.fromkeys(COMMANDS)
+        if line.startswith(
+            (
+                "skytether fl",
+                "skytether sc",
+                "skytether sw",
+                "skytether ca",
+                "skytether cr",
+                "skytether en",
+                "skytether ma",
+                "skytether st",
+                "skytether id",
+                "skytether im",
+            )
+        )
+        and "--control " not in line  # by test_the_documented_changes_are_made_in_flight
+        and "mavlink" not in line  # there is no autopilot to be heard; by test_identify.py
+        and "--record" not in line
+        and "--plugin" not in line  # by test_plugins.py
+        and not line.startswith("skytether station")  # by hand
+    ],
+)
+@pytest.mark.usefixtures("here")
+def test_a_documented_flight_flies(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As written, and shorter; fleets are smaller, and sweeps have few flights."""
+    if "sweep" in line:
+        line += " --settle 0 --duration 1 --runs 2"
+    if "envelope" in line:
+        line += " --settle 0 --duration 1 --points 3"
+    if "margins" in line:
+        line += " --runs 1"
+    if "crowd --out" in line:
+        line = re.sub(r"--vehicles [\d ]+", "", line)
+        line += " --vehicles 2 --settle 0 --duration 4"
+    if "--maps" in line:
+        line += " --tau 1 --gain 1 --dead-time 0 --burst 0 --settle 0 --duration 1"
+    if "calibrate" in line:
+        line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
+    if "fleet swap" in line or "--mission" in line:
+        line += " --settle 0 --duration 30"
+    line = re.sub(r"--vehicles \d+0\b", "--vehicles 5", line)
+    if re.search(r"--duration (20|600)\b", line):
+        line += " --settle 0 --duration 4"
+    _, *argv = shlex.split(line)
+    monkeypatch.setattr(maps, "TIMINGS", 2)
+    monkeypatch.chdir(tmp_path)
+    if argv[0] in ("fly", "fleet"):
+        run = warm.skytether(*argv)
+        assert run.returncode == 0, run.stderr
+        assert run.stdout.strip()
+    else:
+        assert main(argv) == 0
+        assert capsys.readouterr().out.strip()
+
+
+def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
+    """The block of README with server, netem and client, each line in a process of its own."""
+    on_one, _ = terminals()
+    said = fly_together(on_one, tmp_path)
+    assert "PLAINTEXT" in said
+    assert "NO FAILSAFE" not in said
+
+
+def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
+    """The block of README with keys, all of its hosts being this one."""
+    _, on_three = terminals()
+    keygen, *processes = on_three
+    made = subprocess.run(skytether(keygen), cwd=tmp_path, capture_output=True, check=False)
+    assert made.returncode == 0
+    processes = [re.sub(r"0\.0\.0\.0|ground|lab(?=:)", "127.0.0.1", line) for line in processes]
+    assert "PLAINTEXT" not in fly_together(processes, tmp_path)
+
+
+def terminals() -> list[list[str]]:
+    """Blocks of README with a client of their own."""
+    return [
+        block
+        for block in blocks(ROOT / "README.md")
+        if any(line.startswith("skytether client") for line in block)
+    ]
+
+
+def fly_together(lines: list[str], folder: Path) -> str:
+    """What the client says that flies with a server and a netem."""
+    server, netem, client = (skytether(line) for line in lines)
+    client += ["--settle", "0", "--duration", "6"]  # with keys the first plan comes after 3 s
+    with (
+        subprocess.Popen(server, cwd=folder, stdout=subprocess.DEVNULL) as one,
+        subprocess.Popen(netem, cwd=folder, stdout=subprocess.DEVNULL) as two,
+    ):
+        try:
+            run = subprocess.run(
+                client, cwd=folder, capture_output=True, text=True, timeout=60, check=False
+            )
+        finally:
+            one.terminate()
+            two.terminate()
+    assert run.returncode == 0, run.stderr
+    assert "session open, flying" in run.stdout
+    assert (one.returncode, two.returncode) == (0, 0)
+    return run.stdout
+
+
+def test_the_documented_changes_are_made_in_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of docs/control.md, one after the other, and the flight that they are for."""
+    monkeypatch.chdir(tmp_path)
+    (flies,), changes = blocks(ROOT / "docs" / "control.md")
+    with subprocess.Popen(
+        skytether(flies), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as flight:
+        try:
+            while not Path("flying/client").exists():  # it is started last
+                assert flight.poll() is None
+                time.sleep(0.05)
+            for line in changes:
+                assert command.main(set_keys, shlex.split(line)[2:], "set") == 0
+        finally:
+            flight.send_signal(signal.SIGINT)
+            _, told = flight.communicate()
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "armed = false"
+    made = [line for line in said if "from now on" in line]
+    assert len(made) == 9
+    assert sorted(made) == sorted(line for line in told.splitlines() if "from now on" in line)
+
+
+@pytest.mark.parametrize("document", ["docs/page.md", "docs/tour.md"])
+def test_the_documented_pages_are_served(
+    document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Replays and duels of a document, until Ctrl-C; what they show is recorded before."""
+    lines = [line for block in blocks(ROOT / document) for line in block]
+    served = [line for line in lines if line.startswith(("skytether replay ", "skytether duel "))]
+    assert served
+    records = next(line for line in lines if "--record" in line)
+    monkeypatch.chdir(tmp_path)
+    assert warm.skytether(*shlex.split(records)[1:]).returncode == 0
+    for line in served:
+        said = []
+        with warm.Command(*shlex.split(line)[1:], "--page", "127.0.0.1:0") as page:
+            for word in page.stdout:
+                said.append(word)
+                if "the page is at http://127.0.0.1:" in word:
+                    page.send_signal(signal.SIGINT)
+                    break
+            said.append(page.stdout.read())
+            assert page.wait(60) in (0, command.INTERRUPTED), said
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/recordings.md", "docs/tour.md"])
+def test_the_documented_recordings_are_made_and_read(
+    document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a document, one after the other."""
+    reads = ("skytether report ", "skytether export ", "skytether recover ")
+    lines = [line for block in blocks(ROOT / document) for line in block]
+    lines = [line for line in lines if line.startswith(reads) or "--record" in line]
+    assert any(line.startswith(reads) for line in lines)
+    monkeypatch.chdir(tmp_path)
+    for line in lines:
+        short = "--duration 20" if "--virtual" in line else "--duration 5 --settle 0"
+        made = warm.skytether(*shlex.split(line.replace("--duration 20", short))[1:])
+        assert (made.returncode, made.stderr) == (0, "")
+        assert made.stdout.strip()
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/python.md"])
+def test_the_documented_python_runs_and_prints_what_it_says(
+    document: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Every block of a document, one after the other; `# →` is what a block prints."""
+    pytest.importorskip("pandas")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "docs"}
+    compared = 0
+    found = re.findall(r"```python\n(.*?)```", (ROOT / document).read_text(), re.DOTALL)
+    for block in found:
+        exec(block, names)
+        printed = capsys.readouterr().out.splitlines()
+        told = re.findall(r"^# → (.*)$", block, re.MULTILINE)
+        assert not told or printed == told, block
+        compared += len(told)
+    assert compared
+
+
+@pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
+def test_documented_targets_exist(line: str) -> None:
+    """`make -n` knows each."""
+    run = subprocess.run(
+        ["make", "-n", *shlex.split(line)[1:]], cwd=ROOT, capture_output=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+
+
+def test_documented_extras_exist() -> None:
+    """README's table has each that is for users, and whatever is installed names one of them."""
+    extras = set(metadata.metadata("skytether").get_all("Provides-Extra", ()))
+    readme = (ROOT / "README.md").read_text()
+    told = set(re.findall(r"(?m)^\| `(\w+)` \| .* \| .* \|$", readme.partition("| extra |")[2]))
+    assert told == extras - {"bench", "dev", "fuzz"}
+    for document in DOCUMENTS:
+        for named in re.findall(r"pip install [^`\n]*\[(\w+)\]", document.read_text()):
+            assert named in extras
+
+
+def test_every_documented_command_is_tested() -> None:
+    """Here, or by make docker-test."""
+    known: tuple[str, ...] = ("pip install .", "pip install '.[all]'")  # by test_packaging.py
+    known += ("make ", "skytether fly ", "skytether fleet ", "skytether sweep ")
+    known += ("skytether scenarios", "skytether calibrate ", "skytether envelope ")
+    known += ("skytether impairments", "skytether crowd ")
+    known += ("skytether margins ", "skytether straight", "skytether identify ")
+    known += ("skytether reproduce --quick",)  # by test_reproduce.py
+    known += ("skytether compare",)  # by test_compare.py
+    known += ("skytether keygen ",)  # by test_keys.py
+    known += ("skytether torture",)  # by test_torture.py
+    known += ("skytether set ", "skytether report ", "skytether export ", "skytether recover ")
+    known += ("skytether replay ", "skytether duel ", "skytether page ")
+    known += ("skytether autopilot ",)  # by test_autopilot.py
+    known += ("docker compose up",)
+    # By test_observe.py and test_compose.py, as far as they can be.
+    known += ("docker compose --profile observe up",)
+    known += ("SCENARIO=px4 docker compose --profile px4 up",)
+    known += ("skytether autopilot ",)  # by test_aboard_udp.py
+    # By test_netem.py and test_compose.py.
+    known += ("python echo.py", "python ask.py", "openssl s_", "UPLINK=")
+    known += ("skytether probe ",)  # by test_probe.py
+    by_hand = ("skytether server ", "skytether netem ", "skytether client ")
+    by_hand += ("skytether station ", "skytether autopilot ")
+    for line in COMMANDS:
+        assert line.startswith((*known, *by_hand)), line
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(document: Path) -> None:
+    """Every relative link of every document."""
+    for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text()):
+        assert (document.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_named_places_in_the_code_exist(document: Path) -> None:
+    """`path/file.py` and, behind it, the names it is said to hold."""
+    text = document.read_text()
+    for path, names in re.findall(r"`((?:\w+/)+\w+\.py)`?(?::((?:,? ?`?\.?[\w.]+`?)+))?", text):
+        code = (ROOT / path).read_text()
+        for name in re.findall(
+            r"`\.?([A-Za-z_][\w.]*)`", f"`{names}`" if "`" not in names else names
+        ):
+            assert name.split(".")[-1] in code, f"{path} has no {name}"
+
+
+def test_the_protocols_table_states_the_limits() -> None:
+    """The numbers in prose are the numbers in code."""
+    text = (ROOT / "docs" / "protocol.md").read_text()
+    assert f"at most {PAYLOAD_BYTES_MAX} bytes" in text
+    assert '| OBSERVATION, scheme "trajectory" | 107 | 129 | 41 | 55 | 139 | 73 |' in text
+    assert "| HORIZON, d = 0 and no feedback | 361 | 371 | 345 | 355 | 393 | 377 |" in text
+    assert "| HEARTBEAT | 26 | 30 | 18 | 22 | 58 | 50 |" in text
+    assert "rmse_xy" in Summary.__struct_fields__

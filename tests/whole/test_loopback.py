@@ -1,0 +1,452 @@
+"""Real sockets on loopback: the shell, and the three endpoints through it."""
+
+import asyncio
+import io
+import socket
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers import LOOPBACK, driven, packaged
+from skytether.client.endpoint import Client
+from skytether.client.simulated.vehicle import simulated
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.events import Event, FlowOpened
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import (
+    PACKET_COLUMNS,
+    Record,
+    Recorder,
+    client_columns,
+    parse,
+    server_columns,
+)
+from skytether.shell import timer, udp
+from skytether.shell.driver import Shell, new_event_loop
+from skytether.shell.udp import AddressError, open_socket
+from skytether.sim.flight import fly as fly_virtually
+
+LOOPBACK_6: Address = ("::1", 0)
+LATE_NS = SECOND_NS // 4
+"""How late anything may come on a busy machine before a test gives up on it."""
+
+
+class Echo(Endpoint):
+    """Sends back what it hears, by its sockets in turn; wakes at given times."""
+
+    def __init__(
+        self, wakes_ns: list[int] | None = None, *, last: int = 10**9, sockets: int = 1
+    ) -> None:
+        super().__init__()
+        self.sockets = sockets
+        self.wakes_ns = wakes_ns or []
+        self.woken_ns: list[int] = []
+        self.heard: list[bytes] = []
+        self.last = last
+
+    @property
+    def finished(self) -> bool:
+        """After so many datagrams or wakes."""
+        return len(self.heard) + len(self.woken_ns) >= self.last
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Answer."""
+        assert now_ns > 0
+        self.heard.append(datagram.payload)
+        host, port = datagram.peer
+        self._events.append(FlowOpened(flow=len(self.heard), host=host, port=port))
+        self._out.append(Datagram(datagram.payload, datagram.peer, len(self.heard) % self.sockets))
+
+    def wake(self, *, now_ns: int) -> None:
+        """Note the time."""
+        self.woken_ns.append(now_ns - self.wakes_ns.pop(0))
+
+    def next_wake_ns(self) -> int | None:
+        """The next of the list."""
+        return self.wakes_ns[0] if self.wakes_ns else None
+
+
+@pytest.mark.parametrize(
+    ("loopback", "family"),
+    [
+        (LOOPBACK, socket.AF_INET),
+        pytest.param(LOOPBACK_6, socket.AF_INET6, marks=pytest.mark.ipv6),
+    ],
+    ids=["IPv4", "IPv6"],
+)
+async def test_datagrams_come_and_go_through_several_sockets(
+    loopback: Address, family: socket.AddressFamily
+) -> None:
+    """Every second answer leaves by a socket that was opened for it; every event is handed on."""
+    echo = Echo(last=4, sockets=2)
+    events: list[Event] = []
+    with socket.socket(family, socket.SOCK_DGRAM) as peer:
+        peer.setblocking(False)
+        peer.bind(loopback)
+        own = peer.getsockname()[:2]
+        driver = Shell(echo, loopback, [own])
+        loop = asyncio.get_running_loop()
+        task = asyncio.create_task(driver.run(events.append))
+        answers = []
+        for number in range(4):
+            await loop.sock_sendto(peer, b"%d" % number, driver.address)
+            answers.append(await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 5))
+        await asyncio.wait_for(task, 5)
+    assert [payload for payload, _ in answers] == [b"0", b"1", b"2", b"3"]
+    ports = [sender[1] for _, sender in answers]
+    assert driver.address[0] == loopback[0]
+    assert ports[1] == ports[3] == driver.address[1]
+    assert ports[0] == ports[2] != driver.address[1]
+    assert driver.is_local
+    assert events == [FlowOpened(flow=n, host=own[0], port=own[1]) for n in range(1, 5)]
+
+
+@pytest.mark.parametrize("kernel", [True, False], ids=["timerfd", "the loop's timer"])
+async def test_wakes_come_in_time_and_never_early(
+    kernel: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both timers, twenty wakes: some already past when asked for, some in the future."""
+    if not kernel:
+        monkeypatch.setattr("skytether.shell.driver.make_timer", timer.LoopTimer)
+    now_ns = time.monotonic_ns()
+    wakes_ns = [now_ns + step * 2_000_000 for step in range(-5, 15)]
+    echo = Echo(wakes_ns, last=20)
+    await asyncio.wait_for(Shell(echo, LOOPBACK).run(), 5)
+    assert len(echo.woken_ns) == 20
+    assert min(echo.woken_ns) >= 0
+
+
+async def test_a_fault_of_ours_is_told_and_does_not_end_the_flight() -> None:
+    """An exception in a wake or in a datagram: the loop's handler hears it, the timer goes on."""
+
+    class Faulty(Echo):
+        def wake(self, *, now_ns: int) -> None:
+            super().wake(now_ns=now_ns)
+            if len(self.woken_ns) == 1:
+                raise ZeroDivisionError
+
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            super().receive(datagram, now_ns=now_ns)
+            if len(self.heard) == 1:
+                raise ZeroDivisionError
+
+    told: list[object] = []
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _, context: told.append(type(context["exception"])))
+    now_ns = time.monotonic_ns()
+    faulty = Faulty([now_ns, now_ns + 1_000_000], last=4)
+    driver = Shell(faulty, LOOPBACK)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        for _ in range(2):
+            peer.sendto(b"x", driver.address)
+        await asyncio.wait_for(driver.run(), 5)
+    assert told == [ZeroDivisionError] * 2
+    assert (len(faulty.heard), len(faulty.woken_ns)) == (2, 2)
+
+
+async def test_a_closed_port_and_an_unknown_network_are_lost_packets() -> None:
+    """Nothing that a peer's absence does to a socket reaches the endpoint."""
+    echo = Echo()
+    driver = Shell(echo, LOOPBACK)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(LOOPBACK)
+        closed = gone.getsockname()
+    async with driven(driver):
+        for peer in (closed, closed, ("255.255.255.255", 9)):
+            echo._out.append(Datagram(b"x", peer))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+            peer.setblocking(False)
+            peer.bind(LOOPBACK)
+            loop = asyncio.get_running_loop()
+            for _ in range(2):
+                await loop.sock_sendto(peer, b"still there?", driver.address)
+                answer, _ = await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 5)
+    assert answer == b"still there?"
+    assert driver.send_errors >= 1
+
+
+async def test_names_are_looked_up_and_seen_by_the_endpoint_as_names() -> None:
+    """What it sends to ("localhost", port) is answered by ("localhost", port)."""
+    seen: list[Address] = []
+
+    class Asker(Echo):
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            seen.append(datagram.peer)
+            super().receive(datagram, now_ns=now_ns)
+
+    answerer, asker = Shell(Echo(), LOOPBACK), Asker(last=1)
+    peer = ("localhost", answerer.address[1])
+    asker._out.append(Datagram(b"who?", peer))
+    async with driven(answerer):
+        await asyncio.wait_for(Shell(asker, LOOPBACK, [peer]).run(), 5)
+    assert seen == [peer]
+
+
+async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names are looked up all along, and the old address stands for the name no more."""
+    addresses = {"first": ("127.0.0.1", 1), "then": ("127.0.0.2", 1)}
+    looked_up: list[Address] = []
+
+    def look_up(peer: Address) -> Address:
+        looked_up.append(peer)
+        return addresses["first" if len(looked_up) == 1 else "then"]
+
+    monkeypatch.setattr(udp, "look_up", look_up)
+    monkeypatch.setattr("skytether.shell.driver.RESOLVE_EVERY_S", 0.001)
+    driver = Shell(Echo(), LOOPBACK, [("moving", 1)])
+    assert driver._names.name(addresses["first"]) == ("moving", 1)
+    async with driven(driver):
+        while len(looked_up) < 3:
+            await asyncio.sleep(0.001)
+    assert driver._names.number(("moving", 1)) == addresses["then"]
+    assert driver._names.name(addresses["then"]) == ("moving", 1)
+    assert driver._names.name(addresses["first"]) == addresses["first"]
+
+
+@pytest.mark.ipv6
+async def test_a_peer_is_seen_as_it_was_written_whatever_the_kernel_calls_it() -> None:
+    """An IPv6 address in long form: its answers come from the endpoint's own peer."""
+    seen: list[Address] = []
+
+    class Asker(Echo):
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            seen.append(datagram.peer)
+            super().receive(datagram, now_ns=now_ns)
+
+    answerer, asker = Shell(Echo(), LOOPBACK_6), Asker(last=1)
+    peer = ("0:0:0:0:0:0:0:1", answerer.address[1])
+    asker._out.append(Datagram(b"who?", peer))
+    driver = Shell(asker, None, [peer])
+    assert driver.address[0] == "::1"
+    async with driven(answerer):
+        await asyncio.wait_for(driver.run(), 5)
+    assert seen == [peer]
+
+
+def test_the_scope_of_a_link_local_address_is_part_of_its_host() -> None:
+    """The kernel keeps it apart, as a number, beside a flow that nobody needs."""
+    name = socket.if_indextoname(1)
+    assert udp.from_kernel(("fe80::1", 5, 7, 1)) == (f"fe80::1%{name}", 5)
+    assert udp.to_kernel((f"fe80::1%{name}", 5)) == ("fe80::1", 5, 0, 1)
+    for address in (("127.0.0.1", 5), ("::1", 5)):
+        assert udp.to_kernel(address) == address
+    assert udp.from_kernel(("::1", 5, 7, 0)) == ("::1", 5)
+    with pytest.raises(OSError, match=r"interface|device"):
+        udp.to_kernel(("fe80::1%no-such-interface", 5))
+
+
+@pytest.mark.parametrize(
+    ("peers", "host"),
+    [
+        ([("127.0.0.1", 1)], "127.0.0.1"),
+        ([("127.0.0.1", 1), ("192.0.2.1", 1)], "0.0.0.0"),
+        ([("::1", 1)], "::1"),
+        ([("::1", 1), ("2001:db8::1", 1)], "::"),
+        ([("fe80::1%eth0", 1)], "::"),
+        ([], "127.0.0.1"),
+    ],
+)
+def test_a_socket_is_bound_as_near_as_its_peers_allow(peers: list[Address], host: str) -> None:
+    """On loopback where all of them are, and in their family."""
+    assert udp.within_reach_of(peers) == (host, 0)
+
+
+@pytest.mark.parametrize(
+    ("families", "host"),
+    [
+        ((socket.AF_INET6, socket.AF_INET), "192.0.2.1"),
+        ((socket.AF_INET6,), "2001:db8::1"),
+    ],
+)
+def test_a_name_means_its_ipv4_address_if_it_has_one(
+    families: tuple[socket.AddressFamily, ...], host: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A name of both families must mean one socket, and the defaults are IPv4."""
+    kernel = {
+        socket.AF_INET: ("192.0.2.1", 5),
+        socket.AF_INET6: ("2001:db8::1", 5, 0, 0),
+    }
+    found = [(family, socket.SOCK_DGRAM, 17, "", kernel[family]) for family in families]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    assert udp.look_up(("both", 5)) == (host, 5)
+
+
+@pytest.mark.ipv6
+def test_an_ipv6_socket_hears_ipv6_alone() -> None:
+    """So that one port may be bound in both families."""
+    with open_socket(("::", 0)) as six:
+        port = six.getsockname()[1]
+        with open_socket(("0.0.0.0", port)) as four:
+            assert four.getsockname()[1] == port
+
+
+def test_addresses_of_no_use_are_named() -> None:
+    """A port in use, and a name that nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(LOOPBACK)
+        host, port = taken.getsockname()
+        with pytest.raises(AddressError, match=f"cannot listen on {host}:{port}: Address already"):
+            Shell(Echo(), (host, port))
+    with pytest.raises(AddressError, match=r"cannot find no-such-host\.invalid: "):
+        Shell(Echo(), LOOPBACK, [("no-such-host.invalid", 1)])
+
+
+async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = None) -> Record:
+    """The three endpoints in this process, over real UDP.
+
+    Args:
+        at_phase: start when the server's clock is so far into one of its steps.
+    """
+    axes = flown.model.axes
+    sinks = [io.BytesIO() for _ in range(3)]
+    columns = (client_columns(axes), server_columns(axes, flown.control.scheme), PACKET_COLUMNS)
+    recorders = [Recorder(column, sink) for column, sink in zip(columns, sinks, strict=True)]
+    server = Shell(
+        Server(flown, boot_id=1, entropy=stream(1, "entropy").bytes, recorder=recorders[1]),
+        LOOPBACK,
+    )
+    netem = Shell(Proxy(flown, server=server.address, recorder=recorders[2]), LOOPBACK)
+    clients = [
+        Shell(
+            Client(
+                flown,
+                simulated(flown, number),
+                server=netem.address,
+                vehicle=number,
+                boot_id=1,
+                recorder=recorders[0],
+            ),
+            LOOPBACK,
+        )
+        for number in range(1, vehicles + 1)
+    ]
+    async with driven(server, netem):
+        if at_phase is not None:
+            into_ns = time.monotonic_ns() % flown.dt_ns
+            await asyncio.sleep((at_phase * flown.dt_ns - into_ns) % flown.dt_ns / SECOND_NS)
+        flights = asyncio.gather(*(each.run() for each in clients))
+        await asyncio.wait_for(flights, flown.duration + 20.0)
+    client_rows, server_rows, netem_rows = (parse(sink.getvalue()) for sink in sinks)
+    return Record(client_rows, server_rows, netem_rows)
+
+
+FAST = {
+    "uplink": {"delay": "constant", "minimum_s": 0.02, "loss": 0.0},
+    "downlink": {"delay": "constant", "minimum_s": 0.02, "loss": 0.0},
+}
+
+
+async def test_a_flight_over_real_sockets() -> None:
+    """Delays of 20 ms, an observation and a horizon a step, and the circle is flown."""
+    flown = packaged("paper-every-step", settle=0.0, duration=4.0, network=FAST)
+    flight = await fly(flown)
+    assert flight.client["step"][-1] == 79
+    assert len(flight.client) + flight.client["missed"][-1] == 80
+    assert flight.server["solved"].all()
+    assert flight.server["event"].all()
+    assert not flight.netem["lost"].any()
+    # Each observation takes 20 ms down, waits for a tick, and takes 20 ms up: at most 3 steps.
+    flown_on = flight.client["step"][5:] - flight.client["in_force"][5:]
+    assert np.median(flown_on) in (1, 2)
+
+
+async def test_two_vehicles_in_space_on_one_server() -> None:
+    """3-D, two flows through netem, two sessions that tick together."""
+    flown = packaged("paper-every-step", settle=0.0, duration=3.0, network=FAST, model={"axes": 3})
+    flight = await fly(flown, vehicles=2)
+    for vehicle in (1, 2):
+        rows = flight.client[flight.client["vehicle"] == vehicle]
+        assert rows["step"][-1] == 59
+        assert rows["in_force"][-1] > 50
+        assert rows["state"].shape[1:] == (3, 2)
+    assert set(flight.netem["flow"]) == {0, 1}
+
+
+def differences(real: Record, virtual: Record) -> list[str]:
+    """Columns in which two flights of one scenario are not equal to the last bit."""
+    steps = min(len(real.server), len(virtual.server))
+    return [
+        column
+        for flown, expected, columns in (
+            (real.server[:steps], virtual.server[:steps], virtual.server.dtype.names),
+            (real.client, virtual.client, virtual.client.dtype.names),
+        )
+        for column in columns or ()
+        if column != "age_ns"
+        and not np.array_equal(flown[column], expected[column], equal_nan=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    "control",
+    [
+        {"epsilon": 0.05},
+        {
+            "scheme": "committed",
+            "feedback": True,
+            "trigger": "cost_gap",
+            "cost_gap": 1.0,
+            "delay_bound": 0.4,
+        },
+    ],
+    ids=["paper", "feedback"],
+)
+async def test_both_worlds_decide_the_same_on_a_network_without_delay(
+    control: dict[str, Any],
+) -> None:
+    """Over loopback and in virtual time a scenario has equal events and inputs, in one order.
+
+    Steps are 0.2 s, and the server ticks in the middle of the vehicle's. Only a pause of the
+    machine by 0.1 s can change a decision; then the flight is flown again. No two flights are alike
+    to the last bit by chance.
+    """
+    none = {"delay": "none", "loss": 0.0}
+    changes = {
+        "duration": 5.0,
+        "network": {"uplink": none, "downlink": none},
+        "control": {"dt": 0.2, "horizon": 10, **control},
+        "vehicle": {"wind": 0.1},
+        "seed": 4,
+    }
+    flown = packaged("paper", settle=0.0, **changes)
+    virtual = fly_virtually(flown)
+    for _ in range(4):
+        real = await fly(flown, at_phase=0.5)
+        if not differences(real, virtual):
+            break
+    assert differences(real, virtual) == []
+    assert min(len(real.server), len(virtual.server)) >= 24
+    assert 2 <= real.server["event"].sum() < len(real.server)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="SO_MEMINFO is Linux's")
+async def test_datagrams_dropped_by_the_kernel_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Uncounted, these drops would look like losses of the network."""
+    monkeypatch.setattr(udp, "BUFFER_BYTES", 4096)
+    driver = Shell(Echo(), LOOPBACK)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        for _ in range(200):
+            peer.sendto(bytes(1000), driver.address)
+    assert driver.kernel_drops() > 100
+    drops = driver.kernel_drops()
+    async with driven(driver):
+        await asyncio.sleep(0)
+    assert driver.kernel_drops() == drops
+
+
+def test_uvloop_is_used_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where uvloop does not exist, asyncio's own loop is used."""
+    for module in ("uvloop", "asyncio"):
+        loop = new_event_loop()
+        loop.close()
+        assert type(loop).__module__.startswith(module)
+        monkeypatch.setitem(sys.modules, "uvloop", None)
