@@ -179,7 +179,9 @@ def _judge(
     new = numbers[NEW, row]
     new.step, new.in_force, new.since = step, in_force, since
     new.forward, new.backward, new.count = F, G, 0
-    said.states[NEW, row] = state
+    for axis in range(len(state)):
+        for n in range(2):
+            said.states[NEW, row, axis, n] = state[axis, n]
     verdict = _against(said, row, LAST, H, dt, noise_m)
     if verdict != BELIEVED:
         place = DOUBTED
@@ -194,5 +196,7 @@ def _judge(
     if place == LAST:
         numbers[DOUBTED, row].step = -1
     numbers[place, row] = numbers[NEW, row]
-    said.states[place, row] = said.states[NEW, row]
+    for axis in range(len(state)):
+        for n in range(2):
+            said.states[place, row, axis, n] = said.states[NEW, row, axis, n]
     return verdict

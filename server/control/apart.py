@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.shared.base.kernel import F1, F2, F3, I1, kernel, part
+from skytether.shared.base.kernel import F1, F2, F3, I1, making_kernel, making_part
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion
 
@@ -167,7 +167,7 @@ def half_planes(
     return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
 
 
-@part
+@making_part
 def _place(
     first: int, knots: int, position: F2, velocity: F2, axis: int, step: float, dt_s: float
 ) -> float:
@@ -184,7 +184,7 @@ def _place(
     return float(position[knot, axis] + t * (v + 0.5 * t / T * (velocity[knot + 1, axis] - v)))
 
 
-@kernel
+@making_kernel
 def _least_apart(
     points: F2,
     begin: int,
@@ -226,7 +226,7 @@ def _least_apart(
         least[m] = np.sqrt(nearest)
 
 
-@kernel
+@making_kernel
 def _half_planes(
     times: F1,
     held: F2,

@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.base.kernel import I1, I2, I3, kernel, part, plain, record, records
+from skytether.shared.base.kernel import I1, I2, I3, inline, kernel, part, plain, record, records
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Indices
 
@@ -120,10 +120,19 @@ class ClockMap:
         return int(plain(half_trip_ns)(self.seen, row))
 
 
+@inline
+def least(values: I1) -> int:
+    """Least of some numbers."""
+    found = values[0]
+    for value in values:
+        found = min(found, value)
+    return found
+
+
 @part
 def half_trip_ns(seen: Seen, row: int) -> int:
     """Half of the smallest round trip of a vehicle [ns]."""
-    return (seen.minimum[row, 0].min() + seen.minimum[row, 1].min()) // 2
+    return (least(seen.minimum[row, 0]) + least(seen.minimum[row, 1])) // 2
 
 
 @part
@@ -132,7 +141,7 @@ def shortest_ns(seen: Seen, row: int) -> int:
 
     It is negative while there are fewer.
     """
-    return seen.echoes[row].min() - seen.vehicles[row]["adopted"]
+    return least(seen.echoes[row]) - seen.vehicles[row]["adopted"]
 
 
 @kernel
@@ -195,7 +204,7 @@ def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
     for i in range(len(rows)):
         row = rows[i]
         _drop_stepped(seen, row)
-        estimate = (seen.minimum[row, 1].min() - seen.minimum[row, 0].min()) // 2
+        estimate = (least(seen.minimum[row, 1]) - least(seen.minimum[row, 0])) // 2
         vehicle = seen.vehicles[row]
         if vehicle["adopted"] == UNSEEN or abs(estimate - vehicle["adopted"]) > dt // 2:
             vehicle["adopted"] = estimate

@@ -237,6 +237,11 @@ class Replay:
             inputs=np.zeros((capacity, room, axes, most + H), dtype=np.float32),
             led=np.zeros((capacity, room, axes), dtype=LEAD),
         )
+        longest = terms.age_max + most + H + 1
+        self._course = HorizonsInForce(
+            np.empty(room + 2, dtype=np.int64), np.empty(room + 2, dtype=np.int64)
+        )
+        self._track = FlownTrack(np.empty(longest), np.empty((longest, 2)))
         given = control.delay_bound
         fixed_s = None if given == "auto" else given
         self.delay_bound = delay_bound(capacity, terms.dt_s, most, fixed_s)
@@ -271,7 +276,15 @@ class Replay:
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
         """See `Scheme`: planning starts at k + d."""
         lost = _foresee(
-            self._settings, self._memory, self.delay_bound, self._clock.seen, rows, step, found
+            self._settings,
+            self._memory,
+            self.delay_bound,
+            self._clock.seen,
+            self._course,
+            self._track,
+            rows,
+            step,
+            found,
         )
         if lost:
             self.counts["horizons_lost"] += lost
@@ -623,15 +636,18 @@ def _foresee(
     memory: ReplayMemory,
     bound: DelayBound,
     clock: Seen,
+    course: HorizonsInForce,
+    track: FlownTrack,
     rows: I1,
     steps: I1,
     found: Foresight,
 ) -> int:
-    """Fill in what is foreseen of vehicles at their steps k; the number of horizons newly lost."""
+    """Fill in what is foreseen of vehicles at their steps k; the number of horizons newly lost.
+
+    Both `course` and `track` are scratch.
+    """
     axes, H, room = len(settings.laws), settings.H, memory.sent.shape[1]
-    course = HorizonsInForce(np.empty(room + 2, dtype=np.int64), np.empty(room + 2, dtype=np.int64))
-    longest = settings.age_max + bound.most + H + 1
-    track, lost = FlownTrack(np.empty(longest), np.empty((longest, 2))), 0
+    lost = 0
     for i in range(len(rows)):
         row, k = rows[i], steps[i]
         _listen(settings, memory, bound, clock, row, k)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.base.kernel import F1, F2, I1, R2, kernel, part
+from skytether.shared.base.kernel import F1, F2, I1, R2, making_kernel, making_part
 from skytether.shared.law.model import Array
 
 SOLVED, INFEASIBLE, ENDLESS = 0, 1, 2
@@ -59,7 +59,7 @@ class DualSolver:
 # are kept transposed.
 
 
-@kernel
+@making_kernel
 def _solve(
     root: F2,
     x: F1,
@@ -126,7 +126,7 @@ def _solve(
     return ENDLESS
 
 
-@part
+@making_part
 def _most_violated(columns: R2, least: F1, equal: int, x: F1, slack: F1) -> int:
     """The inequality that is violated most, or -1."""
     for i in range(len(least)):
@@ -142,7 +142,7 @@ def _most_violated(columns: R2, least: F1, equal: int, x: F1, slack: F1) -> int:
     return at
 
 
-@part
+@making_part
 def _direction(J: F2, R: F2, normal: F1, d: F1, z: F1, r: F1, q: int) -> tuple[float, float]:
     """Fill in the step of x, z, and of the multipliers, r, that a constraint asks for.
 
@@ -169,7 +169,7 @@ def _direction(J: F2, R: F2, normal: F1, d: F1, z: F1, r: F1, q: int) -> tuple[f
     return length, gain
 
 
-@part
+@making_part
 def _let_go(J: F2, R: F2, u: F1, active: I1, leaves: int, q: int) -> None:
     """Let a constraint go, of q in force."""
     for i in range(leaves, q - 1):
@@ -189,7 +189,7 @@ def _let_go(J: F2, R: F2, u: F1, active: I1, leaves: int, q: int) -> None:
             J[i, j], J[i + 1, j] = c * one + s * other, c * other - s * one
 
 
-@part
+@making_part
 def _turn(d: F1, J: F2, j: int) -> None:
     """Turn rows j - 1 and j so that d[j] becomes 0."""
     one, other = d[j - 1], d[j]

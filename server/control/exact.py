@@ -22,8 +22,8 @@ import numpy as np
 from skytether.server.control.law import advance, axis_at
 from skytether.server.control.mpc import MPC, Problem, shifted
 from skytether.server.control.solver import NEAR, SolverFailed
-from skytether.shared.base.kernel import F1, F2, F3, F5, I2, kernel, part
-from skytether.shared.law.model import Array, Flags
+from skytether.shared.base.kernel import F1, F2, F3, F5, I2, inline, kernel, part
+from skytether.shared.law.model import Array, Axis, Flags
 
 ROUNDS_MAX = 8
 """Rounds in which the whole set may change; five have been the most on recorded flights."""
@@ -56,6 +56,42 @@ class Workspace(NamedTuple):
     """What each stage would choose for itself at x = 0 [m/s]; shape (H,)."""
 
 
+Three = tuple[float, float, float]
+Nine = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@part
+def stage_of(model: Axis, rho: float, after: Three, free: bool) -> tuple[Nine, Three]:
+    """A stage of a backward pass: its columns from S0 to F11, and P before W is added.
+
+    Args:
+        model: eq. (4) on one axis.
+        rho: weight of the input.
+        after: P of the stage behind, as (P00, P01, P11).
+        free: whether the input is free, not at its bound.
+    """
+    a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
+    p00, p01, p11 = after
+    pb0, pb1 = p00 * b0 + p01 * b1, p01 * b0 + p11 * b1
+    inverse = 1.0 / (rho + b0 * pb0 + b1 * pb1)
+    s0, s1 = pb0, pb0 * a01 + pb1 * a11
+    k0, k1 = s0 * inverse, s1 * inverse
+    e01, e11 = p00 * a01 + p01 * a11, p01 * a01 + p11 * a11
+    p01, p11 = e01, a01 * e01 + a11 * e11
+    # Chosen, not branched to, so that stages of several vehicles are computed side by side.
+    p00 = p00 - s0 * k0 if free else p00
+    p01 = p01 - s0 * k1 if free else p01
+    p11 = p11 - s1 * k1 if free else p11
+    f0, f1 = (1.0 - b0 * k0, a01 - b0 * k1), (-b1 * k0, a11 - b1 * k1)
+    return (s0, s1, k0, k1, inverse, f0[0], f0[1], f1[0], f1[1]), (p00, p01, p11)
+
+
+@inline
+def own_input(model: Axis, q0: float, q1: float, g: float, inverse: float) -> float:
+    """Input that a stage would choose for itself at x = 0 [m/s]."""
+    return -(model.b0 * q0 + model.b1 * q1 + g) * inverse
+
+
 @part
 def _backward(
     after: tuple[float, float, float], stages: F2, side: F1, last: int, mpc: MPC, axis: int, rho: F1
@@ -69,25 +105,16 @@ def _backward(
         last: the last stage whose side is another than the one its row was made for.
         rho: weights of the inputs; shape (H,).
     """
-    model, W = axis_at(mpc.model, axis), mpc.weights.states
-    a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
-    p00, p01, p11 = after
+    model, W, P = axis_at(mpc.model, axis), mpc.weights.states, after
     for i in range(last, -1, -1):
-        pb0, pb1 = p00 * b0 + p01 * b1, p01 * b0 + p11 * b1
-        inverse = 1.0 / (rho[i] + b0 * pb0 + b1 * pb1)
-        s0, s1 = pb0, pb0 * a01 + pb1 * a11
-        k0, k1 = s0 * inverse, s1 * inverse
-        e01, e11 = p00 * a01 + p01 * a11, p01 * a01 + p11 * a11
-        p01, p11 = e01, a01 * e01 + a11 * e11
-        if side[i] == 0.0:
-            p00, p01, p11 = p00 - s0 * k0, p01 - s0 * k1, p11 - s1 * k1
+        found, P = stage_of(model, rho[i], P, side[i] == 0.0)
         if i > 0:
-            p00, p11 = p00 + W[i - 1, 0], p11 + W[i - 1, 1]
-        stages[i, S0], stages[i, S1] = s0, s1
-        stages[i, K0], stages[i, K1], stages[i, INVERSE] = k0, k1, inverse
-        stages[i, F00], stages[i, F01] = 1.0 - b0 * k0, a01 - b0 * k1
-        stages[i, F10], stages[i, F11] = -b1 * k0, a11 - b1 * k1
-        stages[i, P00], stages[i, P01], stages[i, P11] = p00, p01, p11
+            P = (P[0] + W[i - 1, 0], P[1], P[2] + W[i - 1, 1])
+        stages[i, S0], stages[i, S1] = found[0], found[1]
+        stages[i, K0], stages[i, K1], stages[i, INVERSE] = found[2], found[3], found[4]
+        stages[i, F00], stages[i, F01] = found[5], found[6]
+        stages[i, F10], stages[i, F11] = found[7], found[8]
+        stages[i, P00], stages[i, P01], stages[i, P11] = P
 
 
 @part
@@ -133,7 +160,7 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
         q0, q1 = 0.0, 0.0
         for i in range(H - 1, -1, -1):
             row = OWN if i <= changed else FREE
-            own[i] = -(b0 * q0 + b1 * q1 + g[i]) * stages[row, i, INVERSE]
+            own[i] = own_input(model, q0, q1, g[i], stages[row, i, INVERSE])
             if side[i] == 0.0:
                 q0, q1 = (
                     stages[row, i, F00] * q0 + stages[row, i, F10] * q1 - stages[row, i, K0] * g[i],
@@ -181,9 +208,9 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
 
 @kernel
 def _table(mpc: MPC, work: Workspace) -> None:
-    """Fill in the stages of FREE sets."""
+    """Fill in the stages of FREE sets, with `side` as it is at first: 0."""
     W = mpc.weights.states
-    end, free = (W[-1, 0], 0.0, W[-1, 1]), np.zeros(len(W))
+    end, free = (W[-1, 0], 0.0, W[-1, 1]), work.side
     for which in range(2):
         for axis in range(len(mpc.model)):
             stages, rho = work.stages[which, axis, FREE], mpc.weights.inputs[which]
@@ -205,7 +232,7 @@ def _solve(
 def workspace(mpc: MPC) -> Workspace:
     """A workspace for the problems of an MPC."""
     axes, H = len(mpc.model), len(mpc.weights.states)
-    work = Workspace(np.empty((2, axes, 2, H, 12)), np.empty(H), np.empty(H))
+    work = Workspace(np.empty((2, axes, 2, H, 12)), np.zeros(H), np.empty(H))
     _table(mpc, work)
     return work
 

@@ -157,15 +157,30 @@ def follow(
 
 
 @inline
-def adjoint(model: Axis, co: tuple[float, float], drift: F1) -> tuple[float, float]:
+def adjoint(
+    model: Axis, co: tuple[float, float], drift_p: float, drift_v: float
+) -> tuple[float, float]:
     """Costate λ of (4) a stage earlier, λ(i) = Aᵀ λ(i+1) + drift(i); Bᵀ λ is what an input does.
 
     Args:
         model: eq. (4) on one axis.
         co: λ of the stage behind, on position and velocity; 0 behind the last.
-        drift: derivative of the cost by the state that the stage leads to; shape (2,).
+        drift_p, drift_v: derivative of the cost by the state that the stage leads to.
     """
-    return co[0] + drift[0], model.a01 * co[0] + model.a11 * co[1] + drift[1]
+    return co[0] + drift_p, model.a01 * co[0] + model.a11 * co[1] + drift_v
+
+
+@inline
+def pulled(S: float, previous: float, T: float, target_v: float, R: float, w: float) -> float:
+    """S- and R-terms of the gradient of one input, with its sign turned.
+
+    Args:
+        S, T, R: weights of change, desired velocity and input, see `Weights`.
+        previous: this input in the horizon before [m/s].
+        target_v: desired velocity [m/s].
+        w: what is added to the input on its way [m/s].
+    """
+    return S * previous + T * target_v - R * w
 
 
 @part
@@ -195,9 +210,8 @@ def gradient(
     S, R, T = weights.changes[which], weights.input, weights.target[axis]
     co = (0.0, 0.0)
     for i in range(len(g) - 1, -1, -1):
-        co = adjoint(model, co, drift[i])
-        toward = S[i] * shifted(previous, gap, fresh, i) + T * target[i, 1]
-        toward -= R * w
+        co = adjoint(model, co, drift[i, 0], drift[i, 1])
+        toward = pulled(S[i], shifted(previous, gap, fresh, i), T, target[i, 1], R, w)
         g[i] = model.b0 * co[0] + model.b1 * co[1] - toward
 
 
@@ -218,7 +232,7 @@ def slope(mpc: MPC, axis: int, which: int, u: F1, g: F1, drift: F2) -> None:
         drift[i, 0], drift[i, 1] = W[i, 0] * p, W[i, 1] * v
     co = (0.0, 0.0)
     for i in range(len(u) - 1, -1, -1):
-        co = adjoint(model, co, drift[i])
+        co = adjoint(model, co, drift[i, 0], drift[i, 1])
         g[i] += model.b0 * co[0] + model.b1 * co[1] + rho[i] * u[i]
 
 

@@ -73,7 +73,8 @@ def plan_nominal(nominal: Nominal, row: int, k: int, desired: F3, states: F3) ->
         gradient(mpc, axis, FIRST, 0.0, target, before, gap, fresh, drift, g)
         if active_set(mpc, axis, FIRST, nominal.work, g, before, gap, fresh, u) <= 0:
             return False
-        before[:] = u
+        for stage in range(H):
+            before[stage] = u[stage]
         for stage in range(states.shape[1] - 1):
             p, v = advance(model, p, v, u[stage])
             states[axis, stage + 1, 0], states[axis, stage + 1, 1] = p, v

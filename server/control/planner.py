@@ -6,8 +6,9 @@ the UAV's estimated state along the generator's plan. What the new plan is worth
 way: V of eq. (16), and the cost and the deviation of flying on with what was sent.
 
 With the exact solver, all of that is one compiled pass over a vehicle, which touches no more memory
-than a horizon takes. Another solver, or one that has to help out, takes the same moves in turn with
-it: pose the generator's problem, solve; pose the tracker's, solve; conclude.
+than a horizon takes, or over several side by side (`server.control.lanes`). Another solver, or one
+that has to help out, takes the same moves in turn with it: pose the generator's problem, solve;
+pose the tracker's, solve; conclude.
 """
 
 from typing import Annotated, NamedTuple
@@ -15,8 +16,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.server.control import lanes as side_by_side
 from skytether.server.control.desired import Desired, Window
-from skytether.server.control.exact import ExactSolver, Workspace, active_set
+from skytether.server.control.exact import FREE, ExactSolver, Workspace, active_set
+from skytether.server.control.lanes import LANES, Lanes, make_lanes
 from skytether.server.control.law import advance, axis_at
 from skytether.server.control.mpc import (
     FIRST,
@@ -35,6 +38,7 @@ from skytether.server.control.mpc import (
 from skytether.server.control.scheme import Foresight
 from skytether.server.control.solver import OsqpSolver, Solver
 from skytether.shared.base.kernel import (
+    B1,
     F1,
     F2,
     F3,
@@ -135,6 +139,12 @@ class Batch(NamedTuple):
     """What is foreseen of the vehicles."""
     figures: Figures
     """What their plans are worth."""
+    lanes: Lanes
+    """Scratch of vehicles side by side."""
+    picked: I1
+    """Scratch: vehicle in each lane, by its place in the block; shape (LANES,)."""
+    settled: B1
+    """Scratch: whether the plan of each lane is found; shape (LANES,)."""
 
 
 def make_solver(control: ControlConfig, problem: Problem) -> Solver:
@@ -179,6 +189,9 @@ class Planner:
             drift=np.zeros((H, 2)),
             distance=np.zeros(H + 1),
         )
+        self._lanes = make_lanes(H)
+        self._picked = np.zeros(LANES, dtype=np.int64)
+        self._settled = np.zeros(LANES, dtype=np.bool_)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         """What the last plans are worth; those of a block come first."""
         self.planned = self._draft.planned
@@ -209,6 +222,9 @@ class Planner:
             desired=self._desired.window(rows, step, found.ahead),
             found=found,
             figures=self.figures,
+            lanes=self._lanes,
+            picked=self._picked,
+            settled=self._settled,
         )
         left = np.arange(len(rows))
         solver = self.solvers[LATER]
@@ -353,7 +369,16 @@ def _add_gap(
 
 
 @inline
-def _conclude(
+def _finish(mpc: MPC, draft: Draft, plan: PlanFigures, compares: bool, at: int, axis: int) -> None:
+    """Round the tracker's answer on one axis, and find its slope where plans are compared."""
+    u, which = draft.inputs[TRACKER, at, axis], FIRST if plan.fresh else LATER
+    _rounded(u)
+    if compares:
+        slope(mpc, axis, which, u, draft.gradient[at, axis], draft.drift)
+
+
+@inline
+def _conclude(  # noqa: PLR0912 - each comparison on each axis
     mpc: MPC,
     terminal_weight: F1,
     compares: bool,
@@ -370,19 +395,17 @@ def _conclude(
     # Beyond that a plan is never flown: what was sent would seem to end too early at every step.
     change = draft.guess[at, 0, : found.flown[i]]
     distance, furthest = draft.distance, 0.0
-    which = FIRST if plan.fresh else LATER
     sure, doubted = 1.0, 0.0
     if compares:
-        distance[:] = 0.0
+        for stage in range(H + 1):
+            distance[stage] = 0.0
     for axis in range(axes):
         u = draft.inputs[TRACKER, at, axis]
-        _rounded(u)
         off_p = found.start[i, axis, 0] - draft.planned[i, axis, 0]
         off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
         state_gap += off_p * off_p * P[0] + off_v * off_v * P[1]
         if compares:
             steep = draft.gradient[at, axis]
-            slope(mpc, axis, which, u, steep, draft.drift)
             x = (0.0, 0.0)
             cost = _add_gap(mpc, axis, x, found.held[i, axis], u, steep, change, cost)
             for j in range(found.doubt.shape[1]):
@@ -401,15 +424,20 @@ def _conclude(
         for stage in range(H):
             found.horizons[i, axis, d + stage] = u[stage]
     if compares:
-        furthest = np.sqrt(distance.max())
+        for stage in range(H + 1):
+            furthest = max(furthest, distance[stage])
+        furthest = np.sqrt(furthest)
     for j in range(found.doubt.shape[1]):
         sure -= found.doubt[i, j]
     plan.state_gap, plan.cost_gap, plan.deviation_m = state_gap, cost, furthest
     plan.expected_gap = sure * cost + doubted
     for axis in range(axes):
-        memory.inputs[GENERATOR, row, axis] = draft.inputs[GENERATOR, at, axis]
-        memory.inputs[TRACKER, row, axis] = draft.inputs[TRACKER, at, axis]
-        memory.states[row, axis] = draft.states[at, axis]
+        for stage in range(H):
+            memory.inputs[GENERATOR, row, axis, stage] = draft.inputs[GENERATOR, at, axis, stage]
+            memory.inputs[TRACKER, row, axis, stage] = draft.inputs[TRACKER, at, axis, stage]
+        for stage in range(H + 1):
+            memory.states[row, axis, stage, 0] = draft.states[at, axis, stage, 0]
+            memory.states[row, axis, stage, 1] = draft.states[at, axis, stage, 1]
     # A first plan that failed is no plan to go on from.
     memory.step[row] = plan.start if plan.solved or not plan.fresh else -1
 
@@ -431,30 +459,120 @@ def _solve_exactly(
     return active_set(mpc, axis, weights, work, g, previous, gap, fresh, u) > 0
 
 
+@part
+def _plan_one(batch: Batch, i: int, work: Workspace) -> bool:
+    """Plan for vehicle `i` of the block, which has begun; whether it is solved."""
+    mpc, terminal_weight, compares, memory = batch[:4]
+    draft, desired, found, figures = batch[4:8]
+    plan = figures[i]
+    plan.solved = True
+    for axis in range(len(mpc.model)):
+        _pose_generator(mpc, memory, draft, desired, found, plan, i, 0, axis)
+        if not _solve_exactly(mpc, memory, draft, plan, GENERATOR, axis, work):
+            plan.solved = False
+            break
+        _pose_tracker(mpc, memory, draft, found, plan, i, 0, axis)
+        if not _solve_exactly(mpc, memory, draft, plan, TRACKER, axis, work):
+            plan.solved = False
+            break
+        _finish(mpc, draft, plan, compares, 0, axis)
+    if plan.solved:
+        _conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, 0)
+    return plan.solved
+
+
+@part
+def _gather(
+    memory: PlanMemory, lanes: Lanes, plan: PlanFigures, which: int, axis: int, lane: int
+) -> None:
+    """Put the horizon of the step before into a lane."""
+    previous = memory.inputs[which, plan.row, axis]
+    for stage in range(len(previous)):
+        lanes.previous[stage, lane] = shifted(previous, plan.gap, False, stage)
+
+
+@part
+def _plan_lanes(batch: Batch, work: Workspace) -> None:
+    """Plan for as many vehicles as there are lanes, none of them at its first plan.
+
+    Args:
+        batch: the block; `picked` says which vehicles, and `settled` is filled in.
+        work: of the exact solver.
+    """
+    mpc, terminal_weight, compares, memory = batch[:4]
+    draft, desired, found, figures, lanes, picked, settled = batch[4:]
+    H = memory.inputs.shape[3]
+    for lane in range(LANES):
+        settled[lane] = True
+    for axis in range(len(mpc.model)):
+        free = work.stages[LATER, axis, FREE]
+        for lane in range(LANES):
+            i = picked[lane]
+            plan, place, first = figures[i], desired.place[i], desired.first[i]
+            x = memory.states[plan.row, axis, plan.gap]
+            draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x[0], x[1]
+            lanes.p[lane], lanes.v[lane], lanes.w[lane] = x[0], x[1], 0.0
+            for stage in range(H + 1):
+                lanes.target_p[stage, lane] = desired.states[place, axis, first + stage, 0]
+                lanes.target_v[stage, lane] = desired.states[place, axis, first + stage, 1]
+            _gather(memory, lanes, plan, GENERATOR, axis, lane)
+        side_by_side.lead(mpc, axis, lanes)
+        side_by_side.gradient(mpc, axis, lanes, lanes.target_v)
+        side_by_side.active_sets(mpc, axis, lanes, free, settled)
+        side_by_side.rounded(lanes.inputs)
+        for lane in range(LANES):
+            i = picked[lane]
+            lanes.p[lane], lanes.v[lane] = found.start[i, axis, 0], found.start[i, axis, 1]
+            planned = draft.planned[i, axis]
+            lanes.led_p[lane], lanes.led_v[lane] = planned[0], planned[1]
+            lanes.w[lane] = found.disturbance[i, axis]
+            for stage in range(H):
+                draft.inputs[GENERATOR, i, axis, stage] = lanes.inputs[stage, lane]
+            _gather(memory, lanes, figures[i], TRACKER, axis, lane)
+        side_by_side.follow(mpc, axis, lanes)
+        side_by_side.gradient(mpc, axis, lanes, lanes.states_v)
+        side_by_side.active_sets(mpc, axis, lanes, free, settled)
+        side_by_side.rounded(lanes.inputs)
+        if compares:
+            side_by_side.slope(mpc, axis, lanes)
+        for lane in range(LANES):
+            i = picked[lane]
+            for stage in range(H):
+                draft.inputs[TRACKER, i, axis, stage] = lanes.inputs[stage, lane]
+                draft.gradient[i, axis, stage] = lanes.gradient[stage, lane]
+            for stage in range(H + 1):
+                draft.states[i, axis, stage, 0] = lanes.states_p[stage, lane]
+                draft.states[i, axis, stage, 1] = lanes.states_v[stage, lane]
+    for lane in range(LANES):
+        i = picked[lane]
+        if settled[lane]:
+            plan = figures[i]
+            _conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, i)
+
+
 @kernel
 def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
     """Plan for vehicles with the exact solver, see `Planner.plan`; how many have to be left.
 
     Those have no `solved` in their figures, and are as they were.
     """
-    mpc, terminal_weight, compares, memory, draft, desired, found, figures = batch
-    undone = 0
+    memory, found, figures = batch.memory, batch.found, batch.figures
+    picked, settled, waiting, undone = batch.picked, batch.settled, 0, 0
     for i in range(len(rows)):
-        plan = figures[i]
-        _begin(memory, found.ahead[i], plan, rows[i], steps[i])
-        for axis in range(len(mpc.model)):
-            _pose_generator(mpc, memory, draft, desired, found, plan, i, 0, axis)
-            if not _solve_exactly(mpc, memory, draft, plan, GENERATOR, axis, work):
-                plan.solved = False
-                break
-            _pose_tracker(mpc, memory, draft, found, plan, i, 0, axis)
-            if not _solve_exactly(mpc, memory, draft, plan, TRACKER, axis, work):
-                plan.solved = False
-                break
-        if plan.solved:
-            _conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, 0)
-        else:
-            undone += 1
+        _begin(memory, found.ahead[i], figures[i], rows[i], steps[i])
+        if figures[i].fresh:
+            undone += not _plan_one(batch, i, work)
+            continue
+        picked[waiting] = i
+        waiting += 1
+        if waiting == LANES:
+            _plan_lanes(batch, work)
+            for lane in range(LANES):
+                if not settled[lane]:
+                    undone += not _plan_one(batch, picked[lane], work)
+            waiting = 0
+    for lane in range(waiting):
+        undone += not _plan_one(batch, picked[lane], work)
     return undone
 
 
@@ -470,10 +588,13 @@ def _guess(memory: PlanMemory, plan: PlanFigures, which: int, guess: F2) -> None
 @kernel
 def _move(batch: Batch, rows: I1, steps: I1, left: I1, move: int) -> None:
     """Make one move for those `left` in a block, by index: pose for an MPC, or CONCLUDE."""
-    mpc, terminal_weight, compares, memory, draft, desired, found, figures = batch
+    mpc, terminal_weight, compares, memory = batch[:4]
+    draft, desired, found, figures = batch[4:8]
     for i in left:
         plan = figures[i]
         if move == CONCLUDE:
+            for axis in range(len(mpc.model)):
+                _finish(mpc, draft, plan, compares, i, axis)
             _conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, i)
             continue
         if move == GENERATOR:

@@ -482,4 +482,6 @@ def _remember(
         sent.step, sent.due = steps[i], steps[i] + bound.steps[row]
         sent.ends = memory.observed[row] + settings.age_max + 1
         sent.spacing, sent.count = spacing, count
-        memory.knots[row, slot, :, : 2 * count] = told.knots[i, :, : 2 * count]
+        for axis in range(len(settings.bounds)):
+            for number in range(2 * count):
+                memory.knots[row, slot, axis, number] = told.knots[i, axis, number]

@@ -23,7 +23,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 import numba
 import numpy as np
-from numba.core import caching, config
+from numba.core import caching, compiler, config
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import register_jitable
 from numpy.typing import NDArray
@@ -67,8 +67,21 @@ def records(dtype: np.dtype[np.void], ndim: int) -> Any:
 
 
 def kernel(function: F) -> F:
-    """A function, compiled at its first call for the types that its annotations name."""
-    dispatcher = numba.njit(error_model="numpy")(function)
+    """A function, compiled at its first call for the types that its annotations name.
+
+    It cannot make arrays: numba counts no references in it. Counting them is an atomic instruction
+    for each array and slice, and took half of the time of a plan.
+    """
+    return _at_first_call(numba.njit(error_model="numpy", _nrt=False)(function))
+
+
+def making_kernel(function: F) -> F:
+    """A kernel that makes arrays of its own."""
+    return _at_first_call(numba.njit(error_model="numpy")(function))
+
+
+def _at_first_call(dispatcher: Any) -> Any:
+    """The dispatcher of a kernel, which compiles for its annotations once it is called."""
 
     def at_first_call(*_: Any) -> Any:
         _compile(dispatcher)
@@ -76,8 +89,7 @@ def kernel(function: F) -> F:
 
     dispatcher._compile_for_args = at_first_call
     KERNELS.append(dispatcher)
-    compiled: F = dispatcher
-    return compiled
+    return dispatcher
 
 
 KERNELS: list[Any] = []
@@ -146,14 +158,42 @@ def _type(hint: Any) -> Any:
 
 
 def part(function: F) -> F:
-    """A function that kernels call, once for a vehicle or an axis."""
+    """A function that kernels call, once for a vehicle or an axis; it makes no arrays."""
+    compiled: F = numba.njit(error_model="numpy", _nrt=False)(function)
+    return compiled
+
+
+def making_part(function: F) -> F:
+    """A part that makes arrays of its own."""
     compiled: F = numba.njit(error_model="numpy")(function)
+    return compiled
+
+
+class Disjoint(compiler.Compiler):  # type: ignore[misc]
+    """Numba's compiler for functions whose arrays share no memory.
+
+    Numba promises that to LLVM of none of its own functions, and LLVM gives up on vectors where
+    more than a few pairs of arrays would have to be compared in flight.
+    """
+
+    def define_pipelines(self) -> Any:
+        """Numba's passes, with that promise."""
+        self.state.flags.noalias = True
+        return super().define_pipelines()
+
+
+def lanes(function: F) -> F:
+    """A part whose innermost loops go over lanes, side by side in vectors.
+
+    No two of its arrays may share memory, unless both are only read.
+    """
+    compiled: F = numba.njit(error_model="numpy", _nrt=False, pipeline_class=Disjoint)(function)
     return compiled
 
 
 def inline(function: F) -> F:
     """A function of a few numbers that kernels call at every stage."""
-    compiled: F = numba.njit(error_model="numpy", inline="always")(function)
+    compiled: F = numba.njit(error_model="numpy", _nrt=False, inline="always")(function)
     return compiled
 
 

@@ -22,7 +22,7 @@ from skytether.server.control.observer import decay_of, learned
 from skytether.server.control.predictive import APART_NS
 from skytether.server.control.trajectory import follow
 from skytether.shared.base.chance import stream
-from skytether.shared.base.kernel import B1, F1, F2, F3, I1, inline, kernel, part
+from skytether.shared.base.kernel import B1, F1, F2, F3, I1, inline, making_kernel, making_part
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.dead_time import dead_time
 from skytether.shared.law.model import Array, Axis, Indices, Model, discretise, white_acceleration
@@ -150,7 +150,7 @@ began; and the horizon and the stage that x̄ belongs to."""
 # -- one flight's timing ---------------------------------------------------------------------------
 
 
-@part
+@making_part
 def _number(past: Past, made_for: int) -> int:
     """Number of the horizon made for a step, see `server.control.committed`."""
     room, sent = len(past.made), past.marks[SENT]
@@ -162,7 +162,7 @@ def _number(past: Past, made_for: int) -> int:
     return UNKNOWN
 
 
-@part
+@making_part
 def _first_under_way(past: Past, in_force: int, observed: int) -> int:
     """Number of the first horizon made after the one in force, and not due yet."""
     room, sent = len(past.made), past.marks[SENT]
@@ -175,7 +175,7 @@ def _first_under_way(past: Past, in_force: int, observed: int) -> int:
     return number
 
 
-@part
+@making_part
 def _move(axis: Axis, x: F2, u: F1, w: F1, to: F2) -> None:
     """Advance all columns a step, from `x` to `to`, which may be the same."""
     for c in range(x.shape[1]):
@@ -201,7 +201,7 @@ def _held(loop: Loop, past: Past, number: int, column: int) -> Held:
     )
 
 
-@part
+@making_part
 def _flown(loop: Loop, past: Past, number: int, stage: int, led: F2, x: F2, u: F1) -> None:
     """Fill in what is flown at a stage of a horizon, and lead x̄ on to the next."""
     for c in range(len(u)):
@@ -209,7 +209,7 @@ def _flown(loop: Loop, past: Past, number: int, stage: int, led: F2, x: F2, u: F
         u[c], _, led[0, c], led[1, c] = fly(held, stage, led[0, c], led[1, c], x[0, c], x[1, c])
 
 
-@part
+@making_part
 def _lead(loop: Loop, past: Past, number: int, first: int, last: int, led: F2) -> None:
     """Roll x̄ of a horizon on from one stage to another."""
     for c in range(led.shape[1]):
@@ -217,7 +217,7 @@ def _lead(loop: Loop, past: Past, number: int, first: int, last: int, led: F2) -
         led[0, c], led[1, c] = lead_to(held, first, last, led[0, c], led[1, c])
 
 
-@part
+@making_part
 def _go_on(loop: Loop, last: F1, stage: int, holds: bool, u: F1) -> None:
     """Fill in what is flown without a horizon: an input of before is held, or braked at once."""
     brake = 0.0 if holds else np.inf
@@ -226,7 +226,7 @@ def _go_on(loop: Loop, last: F1, stage: int, holds: bool, u: F1) -> None:
         u[c], _, _, _ = fly(held, stage, 0.0, 0.0, 0.0, 0.0)
 
 
-@part
+@making_part
 def _follow(loop: Loop, past: Past, x: F2, u: F1) -> None:
     """Fill in what is flown along a trajectory that rests at the origin."""
     rests = (0.0, 0.0)
@@ -236,7 +236,7 @@ def _follow(loop: Loop, past: Past, x: F2, u: F1) -> None:
         u[c], _ = follow(guide, 0, 0.0, 0.0, x[0, c], x[1, c], past.filtered[2, c])
 
 
-@part
+@making_part
 def _fly_leg(loop: Loop, past: Past, number: int, begin: int, first: int, last: int) -> None:
     """Fly what is in force from one step to another, in the roll that began at `begin`."""
     room, w, made, led = len(past.made), past.disturbance, begin, past.scratch[:2]
@@ -256,7 +256,7 @@ def _fly_leg(loop: Loop, past: Past, number: int, begin: int, first: int, last: 
         _move(loop.model, x, u, w, past.track[k - begin + 1])
 
 
-@part
+@making_part
 def _roll(loop: Loop, past: Past, begin: int, flying: int, under_way: range, end: int) -> None:
     """Fly from an observation on with what is in force, then what is under way, to step `end`."""
     past.track[0] = past.reported[begin % len(past.reported)]
@@ -271,7 +271,7 @@ def _roll(loop: Loop, past: Past, begin: int, flying: int, under_way: range, end
     _fly_leg(loop, past, number, begin, first, end)
 
 
-@part
+@making_part
 def _learn(loop: Loop, past: Past, end: int, m: int, trip_ns: int) -> None:
     """Correct ŵ by where the velocity is that a roll of `m` steps says, see `control.observer`."""
     velocity, w = past.reported[end % len(past.reported), 1], past.disturbance
@@ -280,7 +280,7 @@ def _learn(loop: Loop, past: Past, end: int, m: int, trip_ns: int) -> None:
         w[c] = learned(w[c], off, m, loop.model.a11, loop.decay, trip_ns, np.inf)
 
 
-@part
+@making_part
 def _observe(loop: Loop, timing: Timing, past: Past, t: int) -> None:
     """Disturbance observer of committed inputs, to the observation of tick `t`."""
     begin, end = past.marks[BASE], timing.observed[t]
@@ -303,7 +303,7 @@ def _observe(loop: Loop, timing: Timing, past: Past, t: int) -> None:
     _learn(loop, past, end, end - begin, (timing.step[t] + timing.ahead[t] - end) * loop.dt_ns)
 
 
-@part
+@making_part
 def _observe_between(loop: Loop, timing: Timing, past: Past, t: int) -> None:
     """Disturbance observer of eq. (13), to the observation of tick `t`."""
     begin, end, reach = past.marks[BASE], timing.observed[t], len(past.reported)
@@ -325,7 +325,7 @@ def _observe_between(loop: Loop, timing: Timing, past: Past, t: int) -> None:
     _learn(loop, past, end, m, (timing.step[t] - end) * loop.dt_ns)
 
 
-@part
+@making_part
 def _estimate(loop: Loop, timing: Timing, past: Past, t: int) -> None:
     """Eq. (13): the newest observation, moved on to the present by û."""
     k, o, reach = timing.step[t], timing.observed[t], len(past.first)
@@ -342,7 +342,7 @@ def _estimate(loop: Loop, timing: Timing, past: Past, t: int) -> None:
         )
 
 
-@part
+@making_part
 def _plan(loop: Loop, past: Past, start: int, x: F2) -> None:
     """Plan from a state at step `start`, without bounds; into `past.plan`."""
     H, w, plan = len(loop.plan), past.disturbance, past.plan
@@ -361,7 +361,7 @@ def _plan(loop: Loop, past: Past, start: int, x: F2) -> None:
                 plan[stage, c] += share * then[c]
 
 
-@part
+@making_part
 def _tick(loop: Loop, timing: Timing, past: Past, t: int) -> None:
     """Do what the server does at a tick."""
     k, d, o, H = timing.step[t], timing.ahead[t], timing.observed[t], len(loop.plan)
@@ -402,7 +402,7 @@ def _tick(loop: Loop, timing: Timing, past: Past, t: int) -> None:
         past.marks[SENT] += 1
 
 
-@part
+@making_part
 def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
     """Do what the compensator aboard does at step `s`."""
     reach = len(past.flown)
@@ -424,7 +424,7 @@ def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
     past.marks[LED_STAGE] = max(s - made + 1, 0)
 
 
-@part
+@making_part
 def _know(loop: Loop, past: Past, s: int, push: int) -> None:
     """Fill in what the vehicle reports at step `s`, from what it measures and filters.
 
@@ -457,7 +457,7 @@ def _know(loop: Loop, past: Past, s: int, push: int) -> None:
     _predict(loop, past, s, reported)
 
 
-@part
+@making_part
 def _act(loop: Loop, past: Past, step: int, x: F2) -> None:
     """Advance what is known, `x`, over a step by the inputs that act in it."""
     reach = len(past.flown)
@@ -469,7 +469,7 @@ def _act(loop: Loop, past: Past, step: int, x: F2) -> None:
         x[1, c] += loop.known_late[1] * (before[c] - due[c])
 
 
-@part
+@making_part
 def _predict(loop: Loop, past: Past, s: int, x: F2) -> None:
     """Advance the state known at step `s` by the inputs on their way: what the next will meet."""
     reach, n, w = len(past.flown), loop.known_dead_steps, past.filtered[2]
@@ -480,7 +480,7 @@ def _predict(loop: Loop, past: Past, s: int, x: F2) -> None:
         _move(loop.model, x, past.flown[step % reach], w, x)
 
 
-@part
+@making_part
 def _forget(past: Past, column: int) -> None:
     """Forget a push, so that its column can take another."""
     for rows in (past.filtered, past.flown, past.first, past.plan, past.led):
@@ -490,7 +490,7 @@ def _forget(past: Past, column: int) -> None:
     past.disturbance[column] = 0.0
 
 
-@kernel
+@making_kernel
 def _respond(
     loop: Loop, timing: Timing, past: Past, begin: int, every: int, squares: F3, counts: I1
 ) -> None:

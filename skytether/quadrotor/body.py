@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.quadrotor.frames import GRAVITY, Frame
-from skytether.shared.base.kernel import F1, kernel, part
+from skytether.shared.base.kernel import F1, making_kernel, making_part
 
 STATES = 17
 """Number of states: position (0 to 2), velocity (3 to 5), quaternion (6 to 9, w first), rates
@@ -36,7 +36,7 @@ class Signs(NamedTuple):
 FRONT, RIGHT, TURN = Signs()
 
 
-@part
+@making_part
 def rotated(q: F1, body: F1, out: F1) -> None:
     """Turn a vector of the body into north, east, down; all of shape (3,), q of shape (4,)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -46,7 +46,7 @@ def rotated(q: F1, body: F1, out: F1) -> None:
     out[2] = 2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * c
 
 
-@part
+@making_part
 def turned_back(q: F1, world: F1, out: F1) -> None:
     """Turn a vector from north, east, down into the body's axes."""
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -56,7 +56,7 @@ def turned_back(q: F1, world: F1, out: F1) -> None:
     out[2] = 2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c
 
 
-@part
+@making_part
 def derivative(frame: Frame, x: F1, command: F1, wind: F1, out: F1) -> None:
     """Time derivative of the states, the equations above; shape (STATES,).
 
@@ -105,7 +105,7 @@ def derivative(frame: Frame, x: F1, command: F1, wind: F1, out: F1) -> None:
     out[12] = (yaw + (jx - jy) * rates[0] * rates[1]) / jz
 
 
-@part
+@making_part
 def advance(frame: Frame, x: F1, command: F1, wind: F1) -> None:
     """Advance the states by a step, by the method of Runge and Kutta of the fourth order."""
     slopes, between = np.empty((4, STATES)), np.empty(STATES)
@@ -123,7 +123,7 @@ def advance(frame: Frame, x: F1, command: F1, wind: F1) -> None:
         x[i] /= norm
 
 
-@kernel
+@making_kernel
 def drive(frame: Frame, x: F1, command: F1, wind: F1, steps: int) -> None:
     """Advance the states by some steps with the same speeds for the rotors, and no loop closed."""
     for _ in range(steps):

@@ -18,7 +18,7 @@ import numpy as np
 from skytether.quadrotor.air import Air, blow
 from skytether.quadrotor.body import FRONT, RIGHT, STEP_S, TURN, advance, rotated
 from skytether.quadrotor.frames import GRAVITY, Frame
-from skytether.shared.base.kernel import F1, F2, inline, kernel, part
+from skytether.shared.base.kernel import F1, F2, inline, making_kernel, making_part
 
 
 class Gains(NamedTuple):
@@ -147,7 +147,7 @@ def pull(error: float, jerk: float, acceleration: float) -> float:
     return np.sqrt(2.0 * jerk * (error - 0.5 * near))
 
 
-@part
+@making_part
 def shape(gains: Gains, wanted: F1, target: F1) -> None:
     """Lead the wanted velocity a step towards the target, within the limits."""
     if gains.jerk == 0.0:
@@ -173,7 +173,7 @@ def shape(gains: Gains, wanted: F1, target: F1) -> None:
             wanted[i] += STEP_S * wanted[3 + i]
 
 
-@part
+@making_part
 def accelerate(gains: Gains, quad: Quad, out: F1) -> None:
     """Specific force a - g that the loop of velocity asks for [m/s²]; shape (3,)."""
     x, wanted, integral = quad.x, quad.wanted, quad.integral
@@ -194,7 +194,7 @@ def accelerate(gains: Gains, quad: Quad, out: F1) -> None:
         out[1] *= most / aside
 
 
-@part
+@making_part
 def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
     """Thrust [N] and torques [N m] that turn the body to the force that is asked for, nose north.
 
@@ -238,7 +238,7 @@ def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
     return frame.mass_kg * max(thrust, 0.0)
 
 
-@part
+@making_part
 def mix(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1) -> None:
     """Rotors' speeds that make a thrust and torques, as far as the rotors can.
 
@@ -261,7 +261,7 @@ def mix(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1) 
         command[k] = np.sqrt(force / frame.thrust)
 
 
-@part
+@making_part
 def drain(frame: Frame, x: F1, battery: F1) -> None:
     """Take a step's charge from the battery; its voltage sags with the current."""
     hover = np.sqrt(frame.mass_kg * GRAVITY / (4.0 * frame.thrust))
@@ -278,7 +278,7 @@ def drain(frame: Frame, x: F1, battery: F1) -> None:
     battery[1] = max(frame.cells * rest - frame.resistance_ohm * battery[2], 0.0)
 
 
-@part
+@making_part
 def stand(quad: Quad, ground: float) -> None:
     """Keep the body out of the ground: what has come down stands level."""
     x = quad.x
@@ -294,7 +294,7 @@ def stand(quad: Quad, ground: float) -> None:
         quad.integral[:] = 0.0
 
 
-@kernel
+@making_kernel
 def fly(
     frame: Frame, gains: Gains, quad: Quad, air: Air, drawn: F2, target: F1, ground: float, on: bool
 ) -> None:

@@ -1,0 +1,341 @@
+"""Vehicles side by side: the passes of `mpc` and `exact` over several problems at once.
+
+Each pass is a chain in which every stage waits for the one before, about ten cycles a stage,
+while the processor could do many times as much. So the innermost loop goes over `LANES` vehicles on
+the same axis, which the compiler turns into vector instructions. Lanes do not mix, and each does
+the very operations of the pass for one vehicle in the same order: a vehicle gets the same bits in a
+lane as alone (`tests/server/test_planner.py`).
+
+A lane whose active set does not settle within `ROUNDS_MAX` rounds is left to `exact`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.server.control.exact import (
+    F00,
+    F01,
+    F10,
+    F11,
+    INVERSE,
+    K0,
+    K1,
+    ROUNDS_MAX,
+    own_input,
+    stage_of,
+)
+from skytether.server.control.law import advance, axis_at
+from skytether.server.control.mpc import LATER, MPC, adjoint, pulled
+from skytether.server.control.solver import NEAR
+from skytether.shared.base.kernel import B1, F1, F2, lanes
+
+LANES = 16
+"""Number of vehicles side by side: LLVM makes no vectors of loops known to be shorter than 16."""
+
+
+class Lanes(NamedTuple):
+    """Scratch of `LANES` problems on one axis; the last axis of each array is the lane."""
+
+    p: F1
+    """Position, or costate of it, at the stage under way; shape (LANES,)."""
+    v: F1
+    """Velocity, or costate of it; shape (LANES,)."""
+    led_p: F1
+    """Position of the vehicle that is followed [m]; shape (LANES,)."""
+    led_v: F1
+    """Velocity of that [m/s]; shape (LANES,)."""
+    w: F1
+    """Disturbance ŵ [m/s]; shape (LANES,)."""
+    total: F1
+    """Sum of a gradient, which is not finite where one of its numbers is not; shape (LANES,)."""
+    changed: F1
+    """Number of inputs that entered or left the active set in the last round; shape (LANES,)."""
+    held: F1
+    """Number of inputs in the active set; shape (LANES,)."""
+    target_p: F2
+    """Desired positions at the stages 0 … H [m]; shape (H + 1, LANES)."""
+    target_v: F2
+    """Desired velocities [m/s]; shape (H + 1, LANES)."""
+    states_p: F2
+    """Positions of the generator's plan [m]; shape (H + 1, LANES)."""
+    states_v: F2
+    """Velocities of it [m/s]; shape (H + 1, LANES)."""
+    drift_p: F2
+    """See `mpc.lead`, on position; shape (H, LANES)."""
+    drift_v: F2
+    """The drift on velocity; shape (H, LANES)."""
+    previous: F2
+    """Horizon of the step before, shifted [m/s]; shape (H, LANES)."""
+    gradient: F2
+    """Gradient g; shape (H, LANES)."""
+    inputs: F2
+    """Optimal inputs [m/s]; shape (H, LANES)."""
+    side: F2
+    """-1 or 1 where the input is at that bound, 0 where it is free; shape (H, LANES)."""
+    own: F2
+    """See `exact.Workspace.own`; shape (H, LANES)."""
+    s0: F2
+    """Backward passes for the active sets under way, column S0 of `exact`; shape (H, LANES)."""
+    s1: F2
+    """Column S1."""
+    k0: F2
+    """Column K0."""
+    k1: F2
+    """Column K1."""
+    inverse: F2
+    """Column INVERSE."""
+    f00: F2
+    """Column F00."""
+    f01: F2
+    """Column F01."""
+    f10: F2
+    """Column F10."""
+    f11: F2
+    """Column F11."""
+
+
+def make_lanes(H: int) -> Lanes:
+    """Room for problems of H inputs."""
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(Lanes._fields, (H, LANES))
+    for name in ("p", "v", "led_p", "led_v", "w", "total", "changed", "held"):
+        shapes[name] = (LANES,)
+    for name in ("target_p", "target_v", "states_p", "states_v"):
+        shapes[name] = (H + 1, LANES)
+    return Lanes(**{name: np.zeros(shape) for name, shape in shapes.items()})
+
+
+@lanes
+def lead(mpc: MPC, axis: int, to: Lanes) -> None:
+    """Fill in the drift from p, v, w and the target: `mpc.lead`."""
+    model, W = axis_at(mpc.model, axis), mpc.weights.states
+    p, v, w = to.p, to.v, to.w
+    target_p, target_v = to.target_p, to.target_v
+    drift_p, drift_v = to.drift_p, to.drift_v
+    for i in range(len(drift_p)):
+        weight_p, weight_v = W[i, 0], W[i, 1]
+        for lane in range(LANES):
+            p_, v_ = advance(model, p[lane], v[lane], w[lane])
+            p[lane], v[lane] = p_, v_
+            drift_p[i, lane] = weight_p * (p_ - target_p[i + 1, lane])
+            drift_v[i, lane] = weight_v * (v_ - target_v[i + 1, lane])
+
+
+@lanes
+def follow(mpc: MPC, axis: int, to: Lanes) -> None:
+    """Fill in the drift and the states from p, v, w, led_p, led_v and the inputs: `mpc.follow`."""
+    model, W = axis_at(mpc.model, axis), mpc.weights.states
+    p, v, led_p, led_v, w = to.p, to.v, to.led_p, to.led_v, to.w
+    states_p, states_v, u = to.states_p, to.states_v, to.inputs
+    drift_p, drift_v = to.drift_p, to.drift_v
+    for lane in range(LANES):
+        states_p[0, lane], states_v[0, lane] = led_p[lane], led_v[lane]
+    for i in range(len(u)):
+        weight_p, weight_v = W[i, 0], W[i, 1]
+        for lane in range(LANES):
+            led_p_, led_v_ = advance(model, led_p[lane], led_v[lane], u[i, lane])
+            led_p[lane], led_v[lane] = led_p_, led_v_
+            states_p[i + 1, lane], states_v[i + 1, lane] = led_p_, led_v_
+            p_, v_ = advance(model, p[lane], v[lane], w[lane])
+            p[lane], v[lane] = p_, v_
+            drift_p[i, lane] = weight_p * (p_ - led_p_)
+            drift_v[i, lane] = weight_v * (v_ - led_v_)
+
+
+@lanes
+def gradient(mpc: MPC, axis: int, to: Lanes, target_v: F2) -> None:
+    """Fill in the gradient from drift, w, horizon before, desired velocities: `mpc.gradient`."""
+    model, weights = axis_at(mpc.model, axis), mpc.weights
+    R, T = weights.input, weights.target[axis]
+    p, v, w, g, previous = to.p, to.v, to.w, to.gradient, to.previous
+    drift_p, drift_v = to.drift_p, to.drift_v
+    for lane in range(LANES):
+        p[lane], v[lane] = 0.0, 0.0
+    for i in range(len(g) - 1, -1, -1):
+        S = weights.changes[LATER, i]
+        for lane in range(LANES):
+            co = adjoint(model, (p[lane], v[lane]), drift_p[i, lane], drift_v[i, lane])
+            p[lane], v[lane] = co
+            toward = pulled(S, previous[i, lane], T, target_v[i, lane], R, w[lane])
+            g[i, lane] = model.b0 * co[0] + model.b1 * co[1] - toward
+
+
+@lanes
+def slope(mpc: MPC, axis: int, to: Lanes) -> None:
+    """Turn the gradient into 𝓗 U + g: `mpc.slope`."""
+    model, W, rho = axis_at(mpc.model, axis), mpc.weights.states, mpc.weights.inputs[LATER]
+    p, v, u, g = to.p, to.v, to.inputs, to.gradient
+    drift_p, drift_v = to.drift_p, to.drift_v
+    for lane in range(LANES):
+        p[lane], v[lane] = 0.0, 0.0
+    for i in range(len(u)):
+        weight_p, weight_v = W[i, 0], W[i, 1]
+        for lane in range(LANES):
+            p_, v_ = advance(model, p[lane], v[lane], u[i, lane])
+            p[lane], v[lane] = p_, v_
+            drift_p[i, lane], drift_v[i, lane] = weight_p * p_, weight_v * v_
+    for lane in range(LANES):
+        p[lane], v[lane] = 0.0, 0.0
+    for i in range(len(u) - 1, -1, -1):
+        weight = rho[i]
+        for lane in range(LANES):
+            co = adjoint(model, (p[lane], v[lane]), drift_p[i, lane], drift_v[i, lane])
+            p[lane], v[lane] = co
+            g[i, lane] += model.b0 * co[0] + model.b1 * co[1] + weight * u[i, lane]
+
+
+@lanes
+def rounded(u: F2) -> None:
+    """Round inputs to float32, see `planner`."""
+    for i in range(len(u)):
+        for lane in range(LANES):
+            u[i, lane] = np.float64(np.float32(u[i, lane]))
+
+
+@lanes
+def _backward(mpc: MPC, axis: int, to: Lanes) -> None:
+    """Fill in `stages` for the active sets: `exact._backward`, from the last stage on."""
+    model, W, rho = axis_at(mpc.model, axis), mpc.weights.states, mpc.weights.inputs[LATER]
+    side, p00, p01, p11 = to.side, to.p, to.v, to.led_p
+    s0, s1, k0, k1, inverse = to.s0, to.s1, to.k0, to.k1, to.inverse
+    f00, f01, f10, f11 = to.f00, to.f01, to.f10, to.f11
+    H = len(side)
+    for lane in range(LANES):
+        p00[lane], p01[lane], p11[lane] = W[H - 1, 0], 0.0, W[H - 1, 1]
+    for i in range(H - 1, -1, -1):
+        weight = rho[i]
+        add_p, add_v = (W[i - 1, 0], W[i - 1, 1]) if i > 0 else (0.0, 0.0)
+        for lane in range(LANES):
+            found, after = stage_of(
+                model, weight, (p00[lane], p01[lane], p11[lane]), side[i, lane] == 0.0
+            )
+            s0[i, lane], s1[i, lane] = found[0], found[1]
+            k0[i, lane], k1[i, lane], inverse[i, lane] = found[2], found[3], found[4]
+            f00[i, lane], f01[i, lane] = found[5], found[6]
+            f10[i, lane], f11[i, lane] = found[7], found[8]
+            p00[lane], p01[lane], p11[lane] = after[0] + add_p, after[1], after[2] + add_v
+
+
+@lanes
+def _round_free(mpc: MPC, axis: int, to: Lanes, stages: F2) -> None:
+    """Make a round of `exact.active_set` in which every input of every lane is free.
+
+    Args:
+        stages: those of the FREE set; shape (H, 12).
+    """
+    model, bound = axis_at(mpc.model, axis), mpc.bounds[axis]
+    b0, b1 = model.b0, model.b1
+    q0, q1, x0, x1 = to.p, to.v, to.led_p, to.led_v
+    g, u, side, own = to.gradient, to.inputs, to.side, to.own
+    changed, held = to.changed, to.held
+    for lane in range(LANES):
+        q0[lane], q1[lane], x0[lane], x1[lane] = 0.0, 0.0, 0.0, 0.0
+        changed[lane], held[lane] = 0.0, 0.0
+    for i in range(len(g) - 1, -1, -1):
+        k0, k1, inverse = stages[i, K0], stages[i, K1], stages[i, INVERSE]
+        f00, f01, f10, f11 = stages[i, F00], stages[i, F01], stages[i, F10], stages[i, F11]
+        for lane in range(LANES):
+            g_, p_, v_ = g[i, lane], q0[lane], q1[lane]
+            own[i, lane] = own_input(model, p_, v_, g_, inverse)
+            q0[lane] = f00 * p_ + f10 * v_ - k0 * g_
+            q1[lane] = f01 * p_ + f11 * v_ - k1 * g_
+    for i in range(len(g)):
+        k0, k1 = stages[i, K0], stages[i, K1]
+        f00, f01, f10, f11 = stages[i, F00], stages[i, F01], stages[i, F10], stages[i, F11]
+        for lane in range(LANES):
+            own_, p_, v_ = own[i, lane], x0[lane], x1[lane]
+            chosen = own_ - (k0 * p_ + k1 * v_)
+            verdict = 1.0 if chosen > bound else -1.0 if chosen < -bound else 0.0
+            free = verdict == 0.0
+            value = chosen if free else verdict * bound
+            then_p, then_v = advance(model, p_, v_, value)
+            x0[lane] = f00 * p_ + f01 * v_ + b0 * own_ if free else then_p
+            x1[lane] = f10 * p_ + f11 * v_ + b1 * own_ if free else then_v
+            u[i, lane], side[i, lane] = value, verdict
+            changed[lane] += abs(verdict)
+            held[lane] += abs(verdict)
+
+
+@lanes
+def _round(mpc: MPC, axis: int, to: Lanes) -> None:
+    """Make a round of `exact.active_set` with an active set in each lane."""
+    model, bound = axis_at(mpc.model, axis), mpc.bounds[axis]
+    a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
+    _backward(mpc, axis, to)
+    q0, q1, x0, x1 = to.p, to.v, to.led_p, to.led_v
+    g, u, side, own = to.gradient, to.inputs, to.side, to.own
+    changed, held = to.changed, to.held
+    s0, s1, k0, k1, inverse = to.s0, to.s1, to.k0, to.k1, to.inverse
+    f00, f01, f10, f11 = to.f00, to.f01, to.f10, to.f11
+    for lane in range(LANES):
+        q0[lane], q1[lane], x0[lane], x1[lane] = 0.0, 0.0, 0.0, 0.0
+        changed[lane], held[lane] = 0.0, 0.0
+    for i in range(len(g) - 1, -1, -1):
+        for lane in range(LANES):
+            g_, p_, v_, at = g[i, lane], q0[lane], q1[lane], side[i, lane]
+            own[i, lane] = own_input(model, p_, v_, g_, inverse[i, lane])
+            free_p = f00[i, lane] * p_ + f10[i, lane] * v_ - k0[i, lane] * g_
+            free_v = f01[i, lane] * p_ + f11[i, lane] * v_ - k1[i, lane] * g_
+            held_p = p_ + s0[i, lane] * (at * bound)
+            held_v = a01 * p_ + a11 * v_ + s1[i, lane] * (at * bound)
+            q0[lane] = free_p if at == 0.0 else held_p
+            q1[lane] = free_v if at == 0.0 else held_v
+    for i in range(len(g)):
+        for lane in range(LANES):
+            own_, p_, v_, at = own[i, lane], x0[lane], x1[lane], side[i, lane]
+            chosen = own_ - (k0[i, lane] * p_ + k1[i, lane] * v_)
+            verdict = 1.0 if chosen > bound else -1.0 if chosen < -bound else 0.0
+            # An input that would leave its bound stays at it for this round.
+            stays = at if at != 0.0 else verdict
+            value = chosen if stays == 0.0 else stays * bound
+            then_p, then_v = advance(model, p_, v_, value)
+            free_p = f00[i, lane] * p_ + f01[i, lane] * v_ + b0 * own_
+            free_v = f10[i, lane] * p_ + f11[i, lane] * v_ + b1 * own_
+            x0[lane] = free_p if stays == 0.0 else then_p
+            x1[lane] = free_v if stays == 0.0 else then_v
+            u[i, lane], side[i, lane] = value, verdict
+            changed[lane] += 0.0 if verdict == at else 1.0
+            held[lane] += abs(verdict)
+
+
+@lanes
+def _any(number: F1) -> bool:
+    """Whether a number is above 0 in any lane."""
+    found = False
+    for lane in range(LANES):
+        found |= number[lane] > 0.0
+    return found
+
+
+@lanes
+def active_sets(mpc: MPC, axis: int, to: Lanes, stages: F2, settled: B1) -> None:
+    """Fill in the optimal inputs of one axis: `exact.active_set` with LATER weights.
+
+    Args:
+        mpc, axis: the problem.
+        lanes: gradient and horizon before; the inputs are filled in [m/s].
+        stages: those of the FREE set; shape (H, 12).
+        settled: set to False where a lane has no answer; shape (LANES,).
+    """
+    bound, g, side, previous = mpc.bounds[axis], to.gradient, to.side, to.previous
+    total, changed, held, x0, x1 = to.total, to.changed, to.held, to.led_p, to.led_v
+    for lane in range(LANES):
+        total[lane], held[lane] = 0.0, 0.0
+    for i in range(len(g)):
+        for lane in range(LANES):
+            v = previous[i, lane]
+            at = 1.0 if v >= NEAR * bound else -1.0 if v <= -NEAR * bound else 0.0
+            side[i, lane] = at
+            held[lane] += abs(at)
+            total[lane] += g[i, lane]
+    for _ in range(ROUNDS_MAX):
+        if _any(held):
+            _round(mpc, axis, to)
+        else:
+            _round_free(mpc, axis, to, stages)
+        # A lane that has settled finds the same again, to the last bit.
+        if not _any(changed):
+            break
+    for lane in range(LANES):
+        finite = np.isfinite(total[lane] + x0[lane] + x1[lane])
+        settled[lane] = settled[lane] and changed[lane] == 0.0 and finite
