@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.quadrotor.body import STEP_S
-from skytether.shared.base.kernel import F1, making_part
+from skytether.shared.base.kernel import F1, part
 
 FOOT_M = 0.3048
 """A foot [m]."""
@@ -35,7 +35,7 @@ class Air(NamedTuple):
     """States of the filters: u, two of v, two of w [m/s]; shape (5,)."""
 
 
-@making_part
+@part
 def blow(air: Air, drawn: F1, height: float, out: F1) -> None:
     """Velocity of the air over the next step.
 
@@ -44,7 +44,8 @@ def blow(air: Air, drawn: F1, height: float, out: F1) -> None:
         height: altitude, above ground at 0 [m].
         out: velocity [m/s; north, east, down]; shape (3,).
     """
-    out[:] = air.steady
+    for axis in range(3):
+        out[axis] = air.steady[axis]
     speed = air.turbulence[0]
     if speed == 0.0:
         return
@@ -68,7 +69,7 @@ def blow(air: Air, drawn: F1, height: float, out: F1) -> None:
     out[2] += _passed(gust[3:5])
 
 
-@making_part
+@part
 def _second_order(state: F1, keep: float, strength: float, drawn: float) -> None:
     """Two lags in a row, the first driven so that what passes has the standard deviation σ."""
     spread = strength / np.sqrt(2.0) * np.sqrt(1.0 - keep * keep)
@@ -76,7 +77,7 @@ def _second_order(state: F1, keep: float, strength: float, drawn: float) -> None
     state[0] = keep * state[0] + spread * drawn
 
 
-@making_part
+@part
 def _passed(state: F1) -> float:
     """Output of the filter (1 + √3 T s) / (1 + T s)², by its two lags."""
     return ROOT_3 * state[0] + (1.0 - ROOT_3) * state[1]
