@@ -28,7 +28,8 @@ from skytether.server.control.exact import (
 from skytether.server.control.law import advance, axis_at
 from skytether.server.control.mpc import LATER, MPC, adjoint, pulled
 from skytether.server.control.solver import NEAR
-from skytether.shared.base.kernel import B1, F1, F2, lanes
+from skytether.shared.base.kernel import B1, F1, F2, F3, inline, lanes
+from skytether.shared.law.model import Array
 
 LANES = 16
 """Number of vehicles side by side: LLVM makes no vectors of loops known to be shorter than 16."""
@@ -95,14 +96,45 @@ class Lanes(NamedTuple):
     """Column F11."""
 
 
-def make_lanes(H: int) -> Lanes:
-    """Room for problems of H inputs."""
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(Lanes._fields, (H, LANES))
-    for name in ("p", "v", "led_p", "led_v", "w", "total", "changed", "held"):
-        shapes[name] = (LANES,)
-    for name in ("target_p", "target_v", "states_p", "states_v"):
-        shapes[name] = (H + 1, LANES)
-    return Lanes(**{name: np.zeros(shape) for name, shape in shapes.items()})
+def make_room(H: int) -> Array:
+    """Memory of `Lanes` for problems of H inputs: one array, since each costs time in a call."""
+    return np.zeros((len(Lanes._fields), H + 1, LANES))
+
+
+@inline
+def lanes_in(room: F3) -> Lanes:
+    """The parts of what `make_room` made."""
+    H = room.shape[1] - 1
+    return Lanes(
+        p=room[0, 0],
+        v=room[1, 0],
+        led_p=room[2, 0],
+        led_v=room[3, 0],
+        w=room[4, 0],
+        total=room[5, 0],
+        changed=room[6, 0],
+        held=room[7, 0],
+        target_p=room[8],
+        target_v=room[9],
+        states_p=room[10],
+        states_v=room[11],
+        drift_p=room[12, :H],
+        drift_v=room[13, :H],
+        previous=room[14, :H],
+        gradient=room[15, :H],
+        inputs=room[16, :H],
+        side=room[17, :H],
+        own=room[18, :H],
+        s0=room[19, :H],
+        s1=room[20, :H],
+        k0=room[21, :H],
+        k1=room[22, :H],
+        inverse=room[23, :H],
+        f00=room[24, :H],
+        f01=room[25, :H],
+        f10=room[26, :H],
+        f11=room[27, :H],
+    )
 
 
 @lanes

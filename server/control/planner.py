@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from skytether.server.control import lanes as side_by_side
 from skytether.server.control.desired import Desired, Window
 from skytether.server.control.exact import FREE, ExactSolver, Workspace, active_set
-from skytether.server.control.lanes import LANES, Lanes, make_lanes
+from skytether.server.control.lanes import LANES, Lanes, lanes_in, make_room
 from skytether.server.control.law import advance, axis_at
 from skytether.server.control.mpc import (
     FIRST,
@@ -139,8 +139,8 @@ class Batch(NamedTuple):
     """What is foreseen of the vehicles."""
     figures: Figures
     """What their plans are worth."""
-    lanes: Lanes
-    """Scratch of vehicles side by side."""
+    room: F3
+    """Scratch of vehicles side by side, see `lanes.make_room`."""
     picked: I1
     """Scratch: vehicle in each lane, by its place in the block; shape (LANES,)."""
     settled: B1
@@ -189,7 +189,7 @@ class Planner:
             drift=np.zeros((H, 2)),
             distance=np.zeros(H + 1),
         )
-        self._lanes = make_lanes(H)
+        self._room = make_room(H)
         self._picked = np.zeros(LANES, dtype=np.int64)
         self._settled = np.zeros(LANES, dtype=np.bool_)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
@@ -222,7 +222,7 @@ class Planner:
             desired=self._desired.window(rows, step, found.ahead),
             found=found,
             figures=self.figures,
-            lanes=self._lanes,
+            room=self._room,
             picked=self._picked,
             settled=self._settled,
         )
@@ -500,8 +500,8 @@ def _plan_lanes(batch: Batch, work: Workspace) -> None:
         work: of the exact solver.
     """
     mpc, terminal_weight, compares, memory = batch[:4]
-    draft, desired, found, figures, lanes, picked, settled = batch[4:]
-    H = memory.inputs.shape[3]
+    draft, desired, found, figures, room, picked, settled = batch[4:]
+    lanes, H = lanes_in(room), memory.inputs.shape[3]
     for lane in range(LANES):
         settled[lane] = True
     for axis in range(len(mpc.model)):
