@@ -4,6 +4,7 @@ What is not installed does not compete; nothing here asserts a time.
 """
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +18,7 @@ from skytether.lab.benchmarks import (
     accuracy,
     flood,
     footprint,
+    least,
     link,
     netem,
     restarts,
@@ -266,3 +268,12 @@ def test_the_footprint_is_of_what_is_installed(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(bytes(100_000))
     (tmp_path / "link").symlink_to("file")
     assert 100_000 <= footprint.disk_bytes(tmp_path) < 110_000
+
+
+def test_the_least_stands_beside_what_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every part has a row with its time."""
+    assert least.main(["--vehicles", "20", "--turns", "2"]) == 0
+    rows = re.findall(r"^ (\w.*?) {2,}(\d[\d.]*) *$", capsys.readouterr().out, re.MULTILINE)
+    assert [name.split(",")[0] for name, _ in rows][:2] == ["memory of a plan", "planning"]
+    assert len(rows) == 6
+    assert all(float(figure) > 0.0 for _, figure in rows)
