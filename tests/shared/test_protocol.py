@@ -81,6 +81,8 @@ terms = st.builds(
     speed_mps=positive,
     loop=st.booleans(),
     table=text,
+    feedback=st.booleans(),
+    join_s=positive,
 )
 """Any terms that another end may have."""
 
@@ -505,3 +507,44 @@ def test_terms_differ_in_keys_exactly_where_they_are_not_equal(one: Terms, other
         Difference(difference.key, here=difference.there, there=difference.here)
         for difference in differences(other, one)
     )
+
+
+anything = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.floats(),
+    st.binary(max_size=40),
+    st.text(max_size=4),
+    st.integers(-(2**63), 2**64 - 1),
+    st.lists(st.integers(0, 3), max_size=2),
+)
+
+
+def verdict(payload: bytes) -> Message | Drop:
+    """Message of a datagram, or the reason why there is none."""
+    try:
+        return decode(payload, TERMS)
+    except ProtocolError as error:
+        return error.reason
+
+
+@given(observations, st.integers(0, 12), anything, st.binary(max_size=2))
+def test_an_observation_is_read_at_once_as_it_is_field_by_field(
+    observation: Observation, field: int, value: object, more: bytes
+) -> None:
+    """The quick decoder takes nothing that the checks refuse, and every reason is theirs."""
+    fields = list(msgpack.unpackb(encode(observation)))
+    for payload in (encode(observation) + more, replaced(fields, field, value)):
+        quick = verdict(payload)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(protocol, "_QUICK_START", b"\xc1")
+            slow = verdict(payload)
+        if isinstance(quick, Drop) or isinstance(slow, Drop):
+            assert quick is slow
+        else:
+            assert same(quick, slow)
+
+
+def replaced(fields: list[object], field: int, value: object) -> bytes:
+    """Datagram with one field replaced."""
+    return msgpack.packb([*fields[:field], value, *fields[field + 1 :]])
