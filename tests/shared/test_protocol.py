@@ -25,6 +25,7 @@ from skytether.shared.wire.protocol import (
     TEXT_MAX,
     VERSION,
     Close,
+    Drop,
     Heartbeat,
     Hello,
     Horizon,
