@@ -270,7 +270,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether margins ", "skytether straight", "skytether identify ")
     known += ("skytether reproduce --quick",)  # by test_reproduce.py
     known += ("skytether compare",)  # by test_compare.py
-    known += ("skytether keygen ",)  # by test_keys.py
+    known += ("skytether keygen ",)  # by test_keyring.py
     known += ("skytether torture",)  # by test_torture.py
     known += ("skytether set ", "skytether report ", "skytether export ", "skytether recover ")
     known += ("skytether replay ", "skytether duel ", "skytether page ")
