@@ -163,7 +163,7 @@ class Together:
         self._apart_m = mission.separation_m + 2.0 * mission.tube_m
         self._scale = np.ones(terms.axes)
         """By what coordinates are multiplied before distances of vehicles are taken."""
-        self._scale[2:] = mission.separation_m / mission.height_m if mission.height_m else 1.0
+        self._scale[2:] = mission.height_scale
         bend_m = apart.bend_m(float(np.sqrt(terms.axes)) * mission.acceleration_mps2, terms.dt_s)
         self._tube_m, self._bend_m, self._dt_s = mission.tube_m, bend_m, terms.dt_s
         self._join = terms.join

@@ -61,11 +61,11 @@ def each_of(flown: Record) -> list[Rows]:
     return [flown.client[flown.client["vehicle"] == number] for number in numbers]
 
 
-def separation_m(flown: Record) -> float:
+def separation_m(flown: Record, height_scale: float = 1.0) -> float:
     """Smallest distance between two vehicles [m]."""
     told = flown.figures["client"]["by_vehicle"]
     began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each_of(flown)]
-    least = least_separation(each_of(flown), began_s, DT_S)
+    least = least_separation(each_of(flown), began_s, DT_S, height_scale)
     assert least is not None
     return least
 
@@ -372,6 +372,38 @@ def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) ->
     assert np.abs(other[-1] - [-3.0, 0.0, 2.2]).max() < 0.3
     assert np.abs(one[:, 1]).max() < 0.8  # below the box: it goes straight, but for the other
     assert np.abs(other[:, 1]).max() > 1.0
+
+
+def test_vehicles_on_a_sphere_swap_places_through_its_centre() -> None:
+    """Six of them; the distance that is kept is that of the ellipsoid of `mission.height_m`."""
+    table = reading.to_table(reading.load("sphere"))
+    table |= {"duration": 40.0}
+    table["reference"]["shape"] = "sphere(6)"
+    sphere = reading.check(table, "sphere")
+    goals = sphere.make_reference()
+    assert isinstance(goals, Mission)
+    centre = np.array([0.0, 0.0, sphere.reference.altitude_m])
+    assert np.linalg.norm(goals.places - centre, axis=1) == pytest.approx(4.0)
+    begins, ends = (np.stack([goals.goals(n)[at] for n in goals.vehicles]) for at in (0, 1))
+    assert begins + ends == pytest.approx(np.tile(2.0 * centre, (6, 1)))
+    flown = flight.fly(sphere, vehicles=6)
+    assert separation_m(flown, sphere.mission.height_scale) > 0.5
+    for rows, end in zip(each_of(flown), ends, strict=True):
+        assert np.linalg.norm(rows["state"][-1, :, 0] - end) < 0.3
+    table["model"]["axes"] = 2
+    with pytest.raises(ConfigError, match=r"model\.axes: got 2, expected 3 with the shape sphere"):
+        reading.check(table, "sphere")
+
+
+def test_the_least_distance_counts_heights_less() -> None:
+    """Two vehicles 1 m above each other are 0.5 m apart where 1 m of height counts half."""
+    columns = [("step", "i8"), ("mode", "u1"), ("state", "f8", (3, 2))]
+    one, other = (np.zeros(3, columns) for _ in range(2))
+    for rows in (one, other):
+        rows["step"], rows["mode"] = np.arange(3), Mode.TRACK
+    other["state"][:, 2, 0] = 1.0
+    assert least_separation([one, other], [0.0, 0.0], DT_S) == pytest.approx(1.0)
+    assert least_separation([one, other], [0.0, 0.0], DT_S, 0.5) == pytest.approx(0.5)
 
 
 def test_a_zone_that_is_drawn_in_flight() -> None:
