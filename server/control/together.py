@@ -25,14 +25,14 @@ no nearer to its goal aims to the right of it instead, ever further round, and t
 that are drawn: so those that meet pass each other.
 """
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
 
 import numpy as np
 
 from skytether.server.control import apart
 from skytether.server.control.apart import Flown, HalfPlanes
+from skytether.server.control.known import Known, Sent
 from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.planner import FIGURES, Figures
 from skytether.server.control.routes import Routes
@@ -78,48 +78,6 @@ NEARER_M = 1e-3
 """By how much motions may come nearer that are too near already [m]: a solver's tolerance."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
-
-
-class Sent(NamedTuple):
-    """A motion that was sent."""
-
-    step: int
-    """Step of its packet."""
-    motion: Motion
-
-
-class Known:
-    """What is known of one vehicle."""
-
-    def __init__(self) -> None:
-        self.in_force: Sent | None = None
-        """Motion that it flies, with its packet's step; None before the first observation."""
-        self.sent: deque[Sent] = deque(maxlen=64)
-        """Motions sent after that, oldest first, that may still be taken."""
-        self.next: Motion | None = None
-        """Motion to be sent at this step."""
-        self.turned = 0.0
-        """Angle by which it aims to the right of its goal [rad]."""
-        self.heard = False
-        """Whether an observation has come in this session."""
-        self.unknown_until = -1
-        """Step from which on a motion is over that another server has sent."""
-        self.off_m = 0.0
-        """How far outside its tube it may be, as it was seen last [m]."""
-        self.speed_mps = 0.0
-        """How fast it was then [m/s]."""
-        self.detour: Routes | None = None
-        """Ways around others that rest where it was stuck; None before it ever was."""
-        self.detour_until = 0
-        """Step up to which it takes them."""
-        self.waits = ""
-        """What it waits for, as the operator is told; empty: for nothing."""
-
-    def motions(self) -> list[Motion]:
-        """All that may be flown, the one to be sent at this step included."""
-        flown = [self.in_force.motion] if self.in_force else []
-        flown += [each.motion for each in self.sent]
-        return [*flown, self.next] if self.next else flown
 
 
 class Together:
@@ -214,6 +172,7 @@ class Together:
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
+            known.learn(gone.step == newest and k <= observation.since + 1)
         known.heard = True
         return True
 
@@ -259,17 +218,22 @@ class Together:
         for i, (row, k) in enumerate(steps.items()):
             known = self._rows.setdefault(row, Known())
             turn = (k - self._number_of(row)) % SPACING == 0
+            known.again = known.owed(k)
             if known.in_force is not None and known.heard and turn:
                 self._decide(row, known, k)
-                figures["expected_gap"][i] = 0.0 if known.next is None else 1e9
+            if known.next or known.again:
+                figures["expected_gap"][i] = 1e9
         self.planned[: len(rows)] = self._state[rows]
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; the knots of what is sent."""
         for i in event.nonzero()[0].tolist():
             known, k = self._rows[int(rows[i])], int(step[i])
-            motion = known.next
-            if motion is None:
+            if known.again:
+                k, motion = known.again
+            elif known.next:
+                motion = known.next
+            else:
                 assert known.in_force is not None
                 motion = known.in_force.motion
             count = min(max((motion.last - k) // SPACING, 0) + 1, KNOTS_MAX)
@@ -277,7 +241,9 @@ class Together:
             knots = np.stack([p, v], axis=-1).transpose(1, 0, 2).reshape(p.shape[1], -1)
             found.told.knots[i, :, : 2 * count] = knots
             found.told.number[i], found.told.spacing[i] = count, SPACING
-            known.sent.append(Sent(k, motion))
+            found.told.back[i] = int(step[i]) - k
+            if not known.again:
+                known.sent.append(Sent(k, motion))
 
     # -- zones -------------------------------------------------------------------------------------
 

@@ -15,11 +15,14 @@ from scipy import sparse
 
 from skytether.__main__ import main
 from skytether.client.compensator import Compensator
+from skytether.client.reporting import Reporter
 from skytether.lab.benchmarks.together import MortalServer
+from skytether.server.control import known as known_vehicles
 from skytether.server.control import together
 from skytether.server.control.dual import DualSolver
+from skytether.server.control.known import PROMPT, Known, Sent
 from skytether.server.control.motionplan import MotionPlan
-from skytether.server.control.together import LONGEST, Known, Together
+from skytether.server.control.together import LONGEST, Together
 from skytether.shared.core.events import ChangeRefused
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
@@ -186,11 +189,11 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
     made._rows[0] = known
     assert made.observe(0, observation(5, NO_HORIZON, (4.0, 0.0)))
     first, second = resting(10, np.array([4.0, 0.0])), resting(40, np.array([3.0, 0.0]))
-    known.sent.append(together.Sent(10, first))
+    known.sent.append(Sent(10, first))
     assert len(known.motions()) == 2
     made.observe(0, observation(20, 10, (4.0, 0.0)))
     assert known.motions() == [first]
-    known.sent.append(together.Sent(40, second))
+    known.sent.append(Sent(40, second))
     made.observe(0, observation(40 + made._join, 10, (4.0, 0.0)))
     assert len(known.motions()) == 2  # it may have been taken at the very step of the observation
     made.observe(0, observation(41 + made._join, 10, (4.0, 0.0)))
@@ -204,7 +207,7 @@ def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
     made = alone()
     made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
     made.observe(1, observation(100, 70, (-4.0, 0.0)))
-    made._rows[0].in_force = together.Sent(90, resting(100, np.array([4.0, 0.0])))
+    made._rows[0].in_force = Sent(90, resting(100, np.array([4.0, 0.0])))
     for step, plans in ((111, False), (71 + LONGEST + 10, True)):
         made.observe(0, observation(step, 90, (4.0, 0.0)))
         made.observe(1, observation(step, 70, (-4.0, 0.0)))
@@ -224,6 +227,45 @@ def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
     assert refused.value.reason is Drop.TOO_LATE
 
 
+def test_a_motion_is_sent_again_after_losses_until_it_is_acknowledged() -> None:
+    """Not before the first loss; the very motion of that step, within what it may be taken in."""
+    known = Known()
+    known.sent.append(Sent(100, resting(100, np.zeros(2))))
+    assert not any(known.owed(step) for step in range(100, 140))
+    known.learn(prompt=False)
+    assert [step for step in range(100, 140) if known.owed(step)] == [104]
+    for _ in range(5):
+        known.learn(prompt=False)
+    due = [step for step in range(100, 140) if known.owed(step)]
+    assert due == [104, 108]
+    assert due[-1] - 100 < scenario(2).terms().join
+    assert known.owed(104) == known.sent[-1]
+    for _ in range(2 * PROMPT):
+        known.learn(prompt=True)
+    assert known.copies == 1
+    known.learn(prompt=False)
+    known.sent.clear()
+    assert known.owed(104) is None
+
+
+def test_who_gets_a_motion_again_says_so_again() -> None:
+    """Aboard the second copy changes nothing, but an observation is due: the first may be lost."""
+    terms = scenario(2).terms()
+    compensator = Compensator(terms)
+    reporter = Reporter(terms, "deviation(9)", compensator)
+    knots = np.zeros((2, 1, 2), np.float32)
+    told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
+    still, flown = ((0.0, 0.0), (0.0, 0.0)), (0.0, 0.0)
+
+    def is_due(step: int) -> bool:
+        return reporter.is_due(1, step, Mode.TRACK, still, flown, 0)
+
+    assert compensator.offer(told, 102, 90)
+    assert [is_due(step) for step in (102, 103)] == [True, False]
+    assert not compensator.offer(told, 104, 90)
+    assert [is_due(step) for step in (104, 105)] == [True, False]
+
+
 # -- flights ---------------------------------------------------------------------------------------
 
 
@@ -234,6 +276,21 @@ def test_vehicles_swap_places_and_keep_apart(loss: float) -> None:
     assert separation_m(flown) > 0.5
     assert max(left_m(flown, 8)) < 0.3
     assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
+
+
+def test_motions_that_are_sent_again_arrive_where_half_are_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ablation: sent once each, most are lost, or their acknowledgements, and vehicles are slow."""
+
+    def left_over_m() -> float:
+        flown = flight.fly(scenario(4, 0.5, duration=40.0), vehicles=4)
+        assert separation_m(flown) > 0.5
+        return max(left_m(flown, 4))
+
+    assert left_over_m() < 0.3
+    monkeypatch.setattr(known_vehicles, "COPIES_MAX", 1)
+    assert left_over_m() > 3.0
 
 
 def test_a_link_that_is_cut_leaves_them_apart() -> None:

@@ -24,7 +24,7 @@ import numpy as np
 import tyro
 
 from skytether.lab.benchmarks.harness import TextTable, progress
-from skytether.server.control.together import Known
+from skytether.server.control.known import Known
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
