@@ -8,13 +8,19 @@ can be planned; so after such a loss the next ones are sent twice, and then thre
 from collections import deque
 from typing import NamedTuple
 
+from skytether.server.control.aside import Aside
 from skytether.server.control.routes import Routes
+from skytether.shared.law.model import Array
 from skytether.shared.law.motion import Motion
 
 COPIES_MAX = 3
 """Largest number of times that a motion is sent."""
 COPY_STEPS = 4
 """Steps from one time to the next."""
+PATIENCE = 120
+"""Steps without coming nearer to its goal after which a vehicle asks another to step aside."""
+NEARER_M = 0.3
+"""By how much it must come nearer [m]."""
 PROMPT = 8
 """Number of motions in a row, each acknowledged at once, after which they are sent less often."""
 
@@ -51,6 +57,14 @@ class Known:
         """Ways around others that rest where it was stuck; None before it ever was."""
         self.detour_until = 0
         """Step up to which it takes them."""
+        self.goal: Array | None = None
+        """Goal to which it flew last [m]; shape (axes,); None before the first."""
+        self.left_m = 0.0
+        """Shortest way that was ever left to that [m]."""
+        self.nearer_at = 0
+        """Step at which it was that near first, or asked another to step aside last."""
+        self.aside: Aside | None = None
+        """Where it has stepped aside to; None of one that flies to its own goal."""
         self.waits = ""
         """What it waits for, as the operator is told; empty: for nothing."""
 
@@ -78,6 +92,21 @@ class Known:
             self.copies = min(self.copies + 1, COPIES_MAX)
         elif self.prompt % PROMPT == 0:
             self.copies = max(self.copies - 1, 1)
+
+    def is_stuck(self, step: int, goal: Array, left_m: float) -> bool:
+        """Whether it has come no nearer to its goal for PATIENCE steps; said once in that time.
+
+        Args:
+            step: k, of its own.
+            goal: where it flies to [m]; shape (axes,).
+            left_m: length of the way that is left [m].
+        """
+        if self.goal is None or (goal != self.goal).any() or left_m < self.left_m - NEARER_M:
+            self.goal, self.left_m, self.nearer_at = goal, left_m, step
+        elif step - self.nearer_at >= PATIENCE:
+            self.nearer_at = step
+            return True
+        return False
 
     def owed(self, step: int) -> Sent | None:
         """Motion that is to be sent once more at a step; None of none."""

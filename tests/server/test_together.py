@@ -17,11 +17,13 @@ from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
 from skytether.lab.benchmarks.together import MortalServer
+from skytether.server.control import aside
 from skytether.server.control import known as known_vehicles
-from skytether.server.control import together
+from skytether.server.control.aims import Aims
 from skytether.server.control.dual import DualSolver
 from skytether.server.control.known import PROMPT, Known, Sent
 from skytether.server.control.motionplan import MotionPlan
+from skytether.server.control.routes import Routes
 from skytether.server.control.together import LONGEST, Together
 from skytether.shared.core.events import ChangeRefused
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
@@ -492,7 +494,7 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
     table["mission"]["zones"] = "box(-0.5, 0.5, -4, 4)"
     walled = reading.check(table, "walled")
     assert max(left_m(flight.fly(walled, vehicles=2), 2)) < 0.3
-    monkeypatch.setattr(together.Routes, "way", lambda _, __, goal: goal[None])
+    monkeypatch.setattr(Routes, "way", lambda _, __, goal: goal[None])
     flown = flight.fly(walled, vehicles=2)
     assert max(left_m(flown, 2)) > 3.0
     assert clear_m(flown, walled.zones) > 0.0
@@ -501,7 +503,11 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
 def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ablation: where ways lead around zones alone, the gap is tried for ever."""
+    """Ablation: where ways lead around zones alone, the gap is tried for ever.
+
+    Unless a vehicle steps aside, which none does here.
+    """
+    monkeypatch.setattr(Together, "_ask", lambda *_: None)
     (tmp_path / "goals.csv").write_text(
         "vehicle,t,x,y\n1,0,0.2,0\n2,0,2.6,-2\n2,1,2.6,2\n3,0,-0.8,-0.9\n4,0,-0.8,0.9\n"
     )
@@ -516,8 +522,63 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
         return float(np.linalg.norm(each_of(flown)[1]["state"][-1, :, 0] - [2.6, 2.0]))
 
     assert left_over_m() < 0.3
-    monkeypatch.setattr(Together, "_detour", lambda self, *_: self._routes)
+    monkeypatch.setattr(Aims, "_detour", lambda self, *_: self.routes)
     assert left_over_m() > 1.0
+
+
+def test_a_vehicle_at_its_goal_in_a_gap_steps_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And comes back once the other has passed. Ablation: else that one never gets through."""
+    (tmp_path / "goals.csv").write_text("vehicle,t,x,y\n1,0,0,0\n2,0,-3,0\n2,1,3,0\n")
+    table = reading.to_table(scenario(2, duration=50.0))
+    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
+    walls = "box(-0.5, 0.5, 0.6, 4) & box(-0.5, 0.5, -4, -0.6)"
+    table["mission"]["zones"] = f"fence(-5, 5, -3, 3) & {walls}"
+    gap = reading.check(table, "gap")
+
+    def fly() -> tuple[float, float, float]:
+        flown = flight.fly(gap, vehicles=2)
+        one, other = (rows["state"][:, :, 0] for rows in each_of(flown))
+        assert separation_m(flown) > 0.5
+        assert clear_m(flown, gap.zones) > 0.0
+        furthest_m = np.linalg.norm(one, axis=1).max()
+        return furthest_m, float(np.linalg.norm(one[-1])), float(abs(other[-1, 0] - 3.0))
+
+    furthest_m, home_m, left_over_m = fly()
+    assert furthest_m > 1.0
+    assert home_m < 0.3
+    assert left_over_m < 0.3
+    monkeypatch.setattr(Together, "_ask", lambda *_: None)
+    furthest_m, _, left_over_m = fly()
+    assert furthest_m < 0.3
+    assert left_over_m > 3.0
+
+
+@given(st.integers(0, 2**31), st.integers(2, 3))
+def test_a_place_to_step_aside_to_is_off_the_way(seed: int, axes: int) -> None:
+    """And clear of the other vehicles and of zones, or there is none."""
+    rng, apart_m, room_m = np.random.default_rng(seed), 0.9, 0.2
+    home, way = rng.uniform(-3, 3, axes), rng.uniform(-3, 3, (3, axes))
+    others, scale = rng.uniform(-3, 3, (5, axes)), np.array([1.0, 1.0, 0.5])[:axes]
+    kept = zones.parse("fence(-4, 4, -4, 4) & box(-1, 1, 1, 2)", axes)
+    found = aside.place(home, way, others, apart_m, scale, kept, Routes(kept, room_m), room_m)
+    if found is not None:
+        assert aside.off_way(found[None] * scale, way * scale)[0] >= apart_m
+        assert np.linalg.norm((others - found) * scale, axis=1).min() >= apart_m
+        assert kept.clearance(found[None]).min() >= room_m
+
+
+def test_the_first_vehicle_on_a_way_is_asked() -> None:
+    """Not one beside it, nor one that is far ahead."""
+    way = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 9.0]])
+    homes = np.array([[2.5, 1.0], [1.5, 0.5], [1.0, -1.5]])
+    assert aside.off_way(homes, way) == pytest.approx([0.5, 0.5, 1.5])
+    assert aside.first_on(way, homes, 0.9) == 1
+    assert aside.first_on(way, homes[[0, 2]], 0.9) == 0
+    assert aside.first_on(way, homes[2:], 0.9) is None
+    assert aside.first_on(way + np.array([9.0, 0.0]), homes, 0.9) is None
+    assert aside.first_on(way, homes[:0], 0.9) is None
 
 
 # -- missions --------------------------------------------------------------------------------------
