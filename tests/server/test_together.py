@@ -16,6 +16,7 @@ from scipy import sparse
 from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
+from skytether.lab.benchmarks import published
 from skytether.lab.benchmarks.together import MortalServer
 from skytether.server.control import aside
 from skytether.server.control import known as known_vehicles
@@ -529,7 +530,7 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
 def test_a_vehicle_at_its_goal_in_a_gap_steps_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And comes back once the other has passed. Ablation: else that one never gets through."""
+    """It comes back once the other has passed. Ablation: else that one never gets through."""
     (tmp_path / "goals.csv").write_text("vehicle,t,x,y\n1,0,0,0\n2,0,-3,0\n2,1,3,0\n")
     table = reading.to_table(scenario(2, duration=50.0))
     table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
@@ -557,7 +558,7 @@ def test_a_vehicle_at_its_goal_in_a_gap_steps_aside(
 
 @given(st.integers(0, 2**31), st.integers(2, 3))
 def test_a_place_to_step_aside_to_is_off_the_way(seed: int, axes: int) -> None:
-    """And clear of the other vehicles and of zones, or there is none."""
+    """The place is clear of the other vehicles and of zones, or there is none."""
     rng, apart_m, room_m = np.random.default_rng(seed), 0.9, 0.2
     home, way = rng.uniform(-3, 3, axes), rng.uniform(-3, 3, (3, axes))
     others, scale = rng.uniform(-3, 3, (5, axes)), np.array([1.0, 1.0, 0.5])[:axes]
@@ -729,3 +730,29 @@ def test_a_batch_flies_each_mission_alone() -> None:
     batch = flight.fly_batch(swaps, [1, 2])
     assert len(batch) == 2
     assert len(np.unique(one.client["vehicle"])) == 2
+
+
+# -- published tasks ---------------------------------------------------------------------------
+
+
+def test_places_of_published_tasks_are_as_their_authors_have_them(tmp_path: Path) -> None:
+    """Far enough apart by the stretched distance, and the scenario is one that can be flown."""
+    for name, task in published.TASKS.items():
+        begins, ends = published.places(task, np.random.default_rng(1))
+        keep_m = task.separation_m + 2.0 * task.tube_m
+        scale = np.array([1.0, 1.0, 1.0 / task.stretch])
+        for at in (begins, ends):
+            assert at.shape == (task.vehicles, 3), name
+            away = np.linalg.norm((at[:, None] - at) * scale, axis=2)
+            assert away[np.triu_indices(task.vehicles, 1)].min() > keep_m
+        for network in published.NETWORKS:
+            made = published.scenario(task, network, 30.0, 1, tmp_path)
+            assert made.mission.height_m == task.separation_m * task.stretch
+
+
+def test_four_cross_as_published() -> None:
+    """Within the 20 s that a simulation of the authors takes, and the planning is timed."""
+    done = published.fly(published.TASKS["Luis 2020: four cross"], "20 ms", 25.0, 1)
+    assert done.least_m > 0.2
+    assert done.arrived_s < published.TOLD_S
+    assert done.plan_ms > 0.0
