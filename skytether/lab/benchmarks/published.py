@@ -20,15 +20,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import tyro
 
 from skytether.lab.benchmarks.harness import TextTable, progress
+from skytether.server.control.scheme import Foresight
 from skytether.server.control.together import Together
 from skytether.shared.base.chance import stream
-from skytether.shared.law.model import Array
+from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
@@ -153,9 +154,9 @@ def timed() -> Iterator[list[float]]:
     """Time that servers plan meanwhile [s], one item a tick."""
     real, spent = Together.plan, list[float]()
 
-    def plan(self: Together, *args: Any) -> None:
+    def plan(self: Together, rows: Indices, step: Indices, found: Foresight) -> None:
         began = time.perf_counter()
-        real(self, *args)
+        real(self, rows, step, found)
         spent.append(time.perf_counter() - began)
 
     Together.plan = plan  # type: ignore[method-assign]
