@@ -20,9 +20,8 @@ and whichever packets are lost, vehicles are `separation_m` apart, as long as ea
 (docs/together.md has the theorem). From zones it keeps `tube_m`. The motion in force is always a
 way out: it needs no packet.
 
-`motionplan` has the QP, `apart` the distances, `routes` the ways around zones. A vehicle that comes
-no nearer to its goal aims to the right of it instead, ever further round, and then in directions
-that are drawn: so those that meet pass each other.
+`known` has what may be flown, `motionplan` the QP, `apart` the distances, `routes` the ways around
+zones, `aims` what a vehicle flies towards, and `aside` who steps aside for whom.
 """
 
 from collections import Counter
