@@ -87,7 +87,9 @@ class Compensator:
         """Whether the horizon has an input for the step chosen for last; without one the vehicle
         hovers, brakes, or holds the last."""
         self.stale = 0
-        """Number of horizons that came after a newer one."""
+        """Number of horizons that came after a newer one, or once more."""
+        self.repeated = 0
+        """Number of times that the horizon in force came once more: the server may not know."""
 
     def offer(self, horizon: Horizon | Trajectory, step: int, observed: int) -> bool:
         """Take a horizon that came before the input of a step is chosen, unless a newer has come.
@@ -109,6 +111,7 @@ class Compensator:
             raise ProtocolError(Drop.FROM_THE_FUTURE)
         if horizon.step <= self.newest:
             self.stale += 1
+            self.repeated += horizon.step == self.in_force
             return False
         given = self._age_max + self._H
         if self._indexed and isinstance(horizon, Horizon):

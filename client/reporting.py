@@ -68,8 +68,8 @@ class Reporter:
         self._belief = BelievedState(terms, compensator)
         self._session: int | None = None
         """Session in which an observation was sent last; None before the first."""
-        self._known: tuple[int, Mode] | None = None
-        """Horizon in force, and mode, as they were told last."""
+        self._known: tuple[int, Mode, int] | None = None
+        """Horizon in force, mode, and how often a horizon had come once more, as they were told."""
         self._told, self._step = 0, 0
         """Step that was told last, and the one that was asked about last."""
 
@@ -94,7 +94,8 @@ class Reporter:
         """
         if self._always:  # nothing need be known of what the server believes
             return True
-        known, slept = (self._compensator.in_force, mode), step > self._step + 1
+        known = self._compensator.in_force, mode, self._compensator.repeated
+        slept = step > self._step + 1
         due = session != self._session
         if not due:
             is_news, steps = slept or known != self._known, step - self._told

@@ -221,8 +221,8 @@ class Ticker:
 
     def _send_trajectories(self, decisions: Decisions, now_ns: int) -> None:
         sent, told, axes = decisions.sent, decisions.found.told, self._terms.axes
-        rows, step = decisions.rows[sent], decisions.step[sent]
-        age = step - self._controller.observed_step[rows]
+        rows, step = decisions.rows[sent], decisions.step[sent] - told.back[sent]
+        age = np.maximum(step - self._controller.observed_step[rows], 0)
         columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
         server_us = stamp_us(now_ns)
         for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
@@ -307,6 +307,7 @@ class Ticker:
         sent, found = decisions.sent, decisions.found
         step, ahead = decisions.step[sent], found.ahead[sent]
         if self._terms.splines:
+            step = step - found.told.back[sent]
             knots = found.told.knots[sent].astype(np.float64)
             state: Array = knots[:, :, :2]
             inputs: NDArray[Any] = np.empty((len(sent), *self._bounds.shape, self._terms.horizon))

@@ -24,6 +24,9 @@ class Splines(NamedTuple):
     """Number of knots; shape (block,)."""
     spacing: I1
     """Steps from one knot to the next; shape (block,)."""
+    back: I1
+    """Number of steps since the one it was made for: 0, unless it is sent once more; shape
+    (block,)."""
 
 
 class Foresight(NamedTuple):
@@ -91,6 +94,7 @@ def foresight(
             knots=np.zeros((told, axes, 2 * KNOTS_MAX), dtype=np.float32),
             number=np.ones(told, dtype=np.int64),
             spacing=np.ones(told, dtype=np.int64),
+            back=np.zeros(told, dtype=np.int64),
         ),
     )
 

@@ -20,22 +20,23 @@ and whichever packets are lost, vehicles are `separation_m` apart, as long as ea
 (docs/together.md has the theorem). From zones it keeps `tube_m`. The motion in force is always a
 way out: it needs no packet.
 
-`motionplan` has the QP, `apart` the distances, `routes` the ways around zones. A vehicle that comes
-no nearer to its goal aims to the right of it instead, ever further round, and then in directions
-that are drawn: so those that meet pass each other.
+`known` has what may be flown, `motionplan` the QP, `apart` the distances, `routes` the ways around
+zones, `aims` what a vehicle flies towards, and `aside` who steps aside for whom.
 """
 
-from collections import Counter, deque
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
-from skytether.server.control import apart
+from skytether.server.control import apart, aside
+from skytether.server.control.aims import DETOUR_S, TURN_BACK, Aims
 from skytether.server.control.apart import Flown, HalfPlanes
+from skytether.server.control.aside import ASIDE_S, Aside
+from skytether.server.control.known import Known, Sent
 from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.planner import FIGURES, Figures
-from skytether.server.control.routes import Routes
 from skytether.server.control.scheme import Foresight
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
@@ -44,7 +45,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.zones import Zone, Zones
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
@@ -56,20 +57,6 @@ RESTS_MPS = 0.2
 """Measured speed up to which a vehicle rests [m/s]."""
 ARRIVED_M = 0.02
 """Distance from the goal at which a motion ends there [m]."""
-AIM_M = 3.0
-"""Distance of what is aimed at in place of the goal [m]."""
-AHEAD_M = 1.5
-"""How far ahead on a way around zones a vehicle aims [m]."""
-TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
-"""By how much further round a vehicle aims that is stuck, how far at most before directions are
-drawn, and by how much less once it moves [rad]."""
-DETOUR_M, DETOUR_S = 5.0, 20.0
-"""Distance up to which vehicles at rest are flown around by one that was stuck [m], and for how
-long it does so [s]."""
-AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
-"""Corners of an octagon around 0, of radius 1; shape (8, 2)."""
-TRIES = 5
-"""Number of directions that are tried at a time."""
 ROUNDS = 5
 """Number of times that constraints are taken in for one of them."""
 STUCK = 0.3
@@ -78,48 +65,6 @@ NEARER_M = 1e-3
 """By how much motions may come nearer that are too near already [m]: a solver's tolerance."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
-
-
-class Sent(NamedTuple):
-    """A motion that was sent."""
-
-    step: int
-    """Step of its packet."""
-    motion: Motion
-
-
-class Known:
-    """What is known of one vehicle."""
-
-    def __init__(self) -> None:
-        self.in_force: Sent | None = None
-        """Motion that it flies, with its packet's step; None before the first observation."""
-        self.sent: deque[Sent] = deque(maxlen=64)
-        """Motions sent after that, oldest first, that may still be taken."""
-        self.next: Motion | None = None
-        """Motion to be sent at this step."""
-        self.turned = 0.0
-        """Angle by which it aims to the right of its goal [rad]."""
-        self.heard = False
-        """Whether an observation has come in this session."""
-        self.unknown_until = -1
-        """Step from which on a motion is over that another server has sent."""
-        self.off_m = 0.0
-        """How far outside its tube it may be, as it was seen last [m]."""
-        self.speed_mps = 0.0
-        """How fast it was then [m/s]."""
-        self.detour: Routes | None = None
-        """Ways around others that rest where it was stuck; None before it ever was."""
-        self.detour_until = 0
-        """Step up to which it takes them."""
-        self.waits = ""
-        """What it waits for, as the operator is told; empty: for nothing."""
-
-    def motions(self) -> list[Motion]:
-        """All that may be flown, the one to be sent at this step included."""
-        flown = [self.in_force.motion] if self.in_force else []
-        flown += [each.motion for each in self.sent]
-        return [*flown, self.next] if self.next else flown
 
 
 class Together:
@@ -163,7 +108,7 @@ class Together:
         self._apart_m = mission.separation_m + 2.0 * mission.tube_m
         self._scale = np.ones(terms.axes)
         """By what coordinates are multiplied before distances of vehicles are taken."""
-        self._scale[2:] = mission.separation_m / mission.height_m if mission.height_m else 1.0
+        self._scale[2:] = mission.height_scale
         bend_m = apart.bend_m(float(np.sqrt(terms.axes)) * mission.acceleration_mps2, terms.dt_s)
         self._tube_m, self._bend_m, self._dt_s = mission.tube_m, bend_m, terms.dt_s
         self._join = terms.join
@@ -173,14 +118,19 @@ class Together:
         """Steps after which a motion is sent again, before it is too old to be flown."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
         """How fast it comes to rest without a motion [s, m/s²]."""
-        self._detours = round(DETOUR_S / terms.dt_s)
         self._plan = MotionPlan(terms, mission.acceleration_mps2, mission.speed_mps)
-        self._rng = stream(scenario.seed, "together")
+        self._zones = scenario.zones
+        self._aims = Aims(
+            self._zones,
+            self._tube_m,
+            self._apart_m + MARGIN_M,
+            round(DETOUR_S / terms.dt_s),
+            stream(scenario.seed, "together"),
+        )
         self._now, self._ahead = 0, dict[int, int]()
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
         self._flown = Flown(terms.axes)
         """All motions that may be flown at this tick."""
-        self.change_zones(scenario.zones)
 
     def forget(self, row: int) -> None:
         """See `Scheme`; motions stay, for the vehicle goes on with them."""
@@ -214,6 +164,7 @@ class Together:
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
+            known.learn(gone.step == newest and k <= observation.since + 1)
         known.heard = True
         return True
 
@@ -259,17 +210,22 @@ class Together:
         for i, (row, k) in enumerate(steps.items()):
             known = self._rows.setdefault(row, Known())
             turn = (k - self._number_of(row)) % SPACING == 0
+            known.again = known.owed(k)
             if known.in_force is not None and known.heard and turn:
                 self._decide(row, known, k)
-                figures["expected_gap"][i] = 0.0 if known.next is None else 1e9
+            if known.next or known.again:
+                figures["expected_gap"][i] = 1e9
         self.planned[: len(rows)] = self._state[rows]
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; the knots of what is sent."""
         for i in event.nonzero()[0].tolist():
             known, k = self._rows[int(rows[i])], int(step[i])
-            motion = known.next
-            if motion is None:
+            if known.again:
+                k, motion = known.again
+            elif known.next:
+                motion = known.next
+            else:
                 assert known.in_force is not None
                 motion = known.in_force.motion
             count = min(max((motion.last - k) // SPACING, 0) + 1, KNOTS_MAX)
@@ -277,13 +233,16 @@ class Together:
             knots = np.stack([p, v], axis=-1).transpose(1, 0, 2).reshape(p.shape[1], -1)
             found.told.knots[i, :, : 2 * count] = knots
             found.told.number[i], found.told.spacing[i] = count, SPACING
-            known.sent.append(Sent(k, motion))
+            found.told.back[i] = int(step[i]) - k
+            if not known.again:
+                known.sent.append(Sent(k, motion))
 
     # -- zones -------------------------------------------------------------------------------------
 
     def change_zones(self, zones: Zones) -> None:
         """Keep out of other zones from now on, to which `objection` has nothing to say."""
-        self._zones, self._routes = zones, Routes(zones, self._tube_m)
+        self._zones = zones
+        self._aims.change_zones(zones)
 
     def objection(self, zones: Zones) -> str:
         """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
@@ -321,39 +280,105 @@ class Together:
 
     def _decide(self, row: int, known: Known, k: int) -> None:
         """Find the motion to be sent to a vehicle now, if any."""
+        known.waits = ""
+        if self._plans(known, k):
+            self._fly_on(row, known, k)
+
+    def _plans(self, known: Known, k: int) -> bool:
+        """Whether a vehicle may be given another motion; what it waits for, if not."""
         base = known.in_force
         assert base is not None
-        known.waits = ""
         if known.sent:
             # Whether that was taken is not known yet.
             known.waits = "an acknowledgement"
-            return
+            return False
         if base.step < 0:
             if known.speed_mps > RESTS_MPS:
                 known.waits = "coming to rest"
             else:
                 known.next = base.motion  # it has none: first of all the place where it hovers
-            return
+            return False
         if k - base.step > self._again:
             known.next = base.motion  # or it would end aboard, and the vehicle drift
-            return
+            return False
         if self._absent:
             known.waits = f"vehicle {min(self._absent)} to begin"
-            return
+            return False
         for other, each in self._rows.items():
             if each.heard and self.observed_step[other] <= each.unknown_until:
                 known.waits = f"vehicle {self._number_of(other)}, of another server's motion"
-                return
-        sample = self._references(self._number_of(row))
-        goal = sample(np.array(k * self._dt_s))[:, 0]
-        if np.abs(base.motion.position[-1] - goal).max() < ARRIVED_M:
+                return False
+        return True
+
+    def _fly_on(self, row: int, known: Known, k: int) -> None:
+        """Find a motion towards a vehicle's goal, or towards where it steps aside."""
+        assert known.in_force is not None
+        home = self._goal(row)
+        if known.aside and (self._now > known.aside.until or not self._to_pass(known.aside, home)):
+            known.aside = None
+        goal = known.aside.place if known.aside else home
+        if np.abs(known.in_force.motion.position[-1] - goal).max() < ARRIVED_M:
             known.turned = 0.0
+            if known.aside:
+                known.waits = f"vehicle {self._number_of(known.aside.asker)} to pass"
             return
+        way = self._way(row, goal)
+        if known.is_stuck(k, goal, float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())):
+            self._ask(row, way)
         known.next = self._toward(row, known, k, goal)
         if known.next is None:
             self.counts["stuck"] += 1
         else:
             self._flown.add(known.next, self._ahead[row], row, known.off_m)
+
+    def _goal(self, row: int) -> Array:
+        """Where a vehicle wants to be now [m]; shape (axes,)."""
+        k = self._now + self._ahead[row]
+        wanted: Array = self._references(self._number_of(row))(np.array(k * self._dt_s))[:, 0]
+        return wanted
+
+    def _way(self, row: int, goal: Array) -> Array:
+        """Way around zones to a goal from where a vehicle comes to rest, that place first [m]."""
+        known = self._rows[row].in_force
+        assert known is not None
+        place = known.motion.position[-1]
+        return np.concatenate([place[None], self._aims.routes.way(place, goal)])
+
+    def _to_pass(self, left: Aside, home: Array) -> bool:
+        """Whether a vehicle has yet to pass the place that one has left for it."""
+        way = self._way(left.asker, self._goal(left.asker)) * self._scale
+        return bool(aside.off_way(home[None] * self._scale, way)[0] < self._apart_m + MARGIN_M)
+
+    def _ask(self, row: int, way: Array) -> None:
+        """Have the first vehicle at rest at its goal step aside that is in a vehicle's way."""
+        keep_m, ends, homes = self._apart_m + MARGIN_M, list[tuple[int, Array]](), list[int]()
+        for other, each in self._rows.items():
+            if other == row or each.in_force is None or other not in self._ahead:
+                continue
+            flown = each.motions()
+            ends += [(other, motion.position[-1]) for motion in flown]
+            rests = each.in_force.step >= 0 and len(flown) == 1 and each.aside is None
+            if rests and np.abs(flown[0].position[-1] - self._goal(other)).max() < ARRIVED_M:
+                homes.append(other)
+        places = np.array([self._goal(other) for other in homes]).reshape(-1, way.shape[1])
+        first = aside.first_on(way * self._scale, places * self._scale, keep_m)
+        if first is None:
+            return
+        asked, others = homes[first], [end for other, end in ends if other != homes[first]]
+        free = aside.place(
+            places[first],
+            way,
+            np.array([way[0], *others]),
+            keep_m,
+            self._scale,
+            self._zones,
+            self._aims.routes,
+            self._tube_m + MARGIN_M,
+        )
+        if free is not None:
+            self.counts["asides"] += 1
+            until = self._now + round(ASIDE_S / self._dt_s)
+            self._rows[asked].aside = Aside(free, row, until)
 
     def _toward(self, row: int, known: Known, k: int, goal: Array) -> Motion | None:
         """A motion from the one in force towards a goal, apart from all; None where none is found.
@@ -367,7 +392,7 @@ class Together:
         (p0,), (v0,) = base.at(np.array([float(due)]), dt_s)
         kept_p, kept_v = base.at(np.arange(k, due, SPACING, dtype=np.float64), dt_s)
         planes, taken = None, np.zeros(self._flown.count + 1, dtype=np.bool_)
-        for aim in self._aims(row, known, k, p0, goal):
+        for aim in self._aims.of(known, k, p0, goal, partial(self._rests, row)):
             for _ in range(ROUNDS):
                 held = planes.of_some(taken) if planes else None
                 solved = plan.solve(p0, v0, aim, held and held[:3])
@@ -390,48 +415,14 @@ class Together:
             self.counts["refused"] += bool(hit.any())
         return None
 
-    def _aims(self, row: int, known: Known, k: int, place: Array, goal: Array) -> Iterator[Array]:
-        """What to fly to: a point of the way to the goal, its next corner, or right of that."""
-        detour = known.detour if k < known.detour_until else None
-        way = (detour or self._routes).way(place, goal)
-        if not known.turned:
-            if len(way) > 1:
-                yield _along(place, way, AHEAD_M)
-            yield way[0]
-            known.turned = TURN
-            # Stuck: from now on, for a while, around those as well that rest on the way.
-            known.detour, known.detour_until = self._detour(row, place, goal), k + self._detours
-            way = known.detour.way(place, goal)
-            yield _along(place, way, AHEAD_M)
-        ahead = way[0, :2] - place[:2]
-        far = float(np.linalg.norm(ahead))
-        ahead = ahead / far if far > 1e-9 else np.array([1.0, 0.0])
-        reach_m = AIM_M if len(way) > 1 else min(float(np.linalg.norm(goal - place)), AIM_M)
-        for _ in range(TRIES):
-            c, s = np.cos(-known.turned), np.sin(-known.turned)
-            aim = place.copy()
-            aim[:2] += reach_m * np.array(
-                [c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]]
-            )
-            yield aim
-            known.turned += TURN
-            if known.turned > TURN_MAX:
-                known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
-
-    def _detour(self, row: int, place: Array, goal: Array) -> Routes:
-        """Ways around zones and the vehicles that rest near a place, but for those at the goal."""
-        zones, keep_m = list(self._zones.zones), self._apart_m + MARGIN_M - self._tube_m
+    def _rests(self, row: int) -> list[Array]:
+        """Where vehicles other than one rest [m]."""
+        found = []
         for other, each in self._rows.items():
-            now = self._now + self._ahead.get(other, 0)
-            rests = [motion.position[-1] for motion in each.motions() if motion.last <= now]
-            if other == row or len(rests) != len(each.motions()):
-                continue
-            for at in rests[:1]:
-                near_m = float(np.linalg.norm(at - place))
-                if near_m < DETOUR_M and np.linalg.norm(at - goal) > self._apart_m:
-                    radius_m = min(keep_m, near_m - self._tube_m) / np.cos(np.pi / len(AROUND))
-                    zones.append(Zone(f"vehicle {other}", at[:2] + radius_m * AROUND))
-        return Routes(Zones(zones), self._tube_m)
+            motions, now = each.motions(), self._now + self._ahead.get(other, 0)
+            if other != row and motions and all(motion.last <= now for motion in motions):
+                found.append(motions[0].position[-1])
+        return found
 
     def _planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
         """Half-planes of the others' motions, and behind them those of zones."""
@@ -492,16 +483,3 @@ class Together:
         ahead = self._ahead[row]
         common = Motion(motion.first - ahead, motion.position, motion.velocity)
         return apart.least_apart(common, k - ahead, row, self._flown, self._scale, self._dt_s)
-
-
-def _along(place: Array, way: Array, far_m: float) -> Array:
-    """Point of a way that is so far ahead on it, or its end."""
-    for corner in way:
-        step_m = float(np.linalg.norm(corner - place))
-        if step_m >= far_m:
-            break
-        place, far_m = corner, far_m - step_m
-    else:
-        return place
-    there: Array = place + far_m / step_m * (corner - place)
-    return there

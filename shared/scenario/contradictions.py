@@ -14,7 +14,13 @@ from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, margins
 from skytether.shared.scenario.mission import Mission, given, written
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
-from skytether.shared.scenario.schema import TABLES, ControlConfig, DirectionConfig, Scenario
+from skytether.shared.scenario.schema import (
+    TABLES,
+    ControlConfig,
+    DirectionConfig,
+    MissionConfig,
+    Scenario,
+)
 from skytether.shared.scenario.triggers import make_trigger
 from skytether.shared.wire.protocol import INPUTS_MAX
 
@@ -158,7 +164,7 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
     apart_m = mission.separation_m + 2.0 * mission.tube_m
     for vehicle, place in goals.items():
         named = written({vehicle: place})
-        near = [each for each, at in goals.items() if np.linalg.norm(at - place) < apart_m]
+        near = [each for each, at in goals.items() if _away_m(mission, at - place) < apart_m]
         if vehicle not in flown.vehicles:
             yield "mission.goals", named, f"vehicles {', '.join(map(str, flown.vehicles))}"
         elif zone := scenario.zones.in_the_way(place[None], mission.tube_m):
@@ -169,6 +175,11 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
                 named,
                 f"a place {apart_m:g} m from the goal of vehicle {near[0]}",
             )
+
+
+def _away_m(mission: MissionConfig, off: Array) -> float:
+    """Distance of two goals as `mission.height_m` has it [m]."""
+    return math.hypot(*off[:2], *(mission.height_scale * off[2:]))
 
 
 def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
@@ -188,7 +199,7 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
                 yield "mission.zones", zone, expected
                 return
     apart_m = mission.separation_m + 2.0 * mission.tube_m
-    found = goals.nearest(apart_m, mission.height_m and mission.separation_m / mission.height_m)
+    found = goals.nearest(apart_m, mission.height_scale)
     if found:
         one, other, at_s, away_m = found
         goals_of = f"the goals of vehicles {one} and {other} at {at_s:g} s"
@@ -303,6 +314,8 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
     for point in ref.points_m:
         if len(point) != axes:
             yield "reference.points_m", list(point), f"{axes} numbers a point"
+    if ref.shape.partition("(")[0].strip() == "sphere" and axes != 3:
+        yield "model.axes", axes, "3 with the shape sphere"
     if ref.shape in ("circle", "figure-eight", "square"):
         most_m = shapes.FAST_MPS * ref.period_s / 8.0  # a square's round is eight radii long
         if ref.radius_m > most_m:

@@ -17,6 +17,8 @@ from skytether.shared.scenario.reference import FAR_M, Reference, read_table
 
 SWAP_AT_S = 2.0
 """Time at which vehicles that swap places leave [s]."""
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+"""Angle by which points that are spread evenly over a sphere turn from one to the next [rad]."""
 TIMES_MAX = 500
 """Most times at which goals are looked at for being too near to each other."""
 
@@ -180,6 +182,24 @@ def swap(vehicles: int, radius_m: float, axes: int, altitude_m: float = 0.0) -> 
         places[:, 2:] = altitude_m
         goals[number] = times_s, places
     return Mission(goals, axes, 1)
+
+
+def sphere(vehicles: int, radius_m: float, altitude_m: float = 0.0) -> Mission:
+    """Places on a sphere, from which each vehicle goes to the one opposite.
+
+    Vehicles with odd numbers begin on the upper half, spread evenly by the golden angle, and the
+    vehicle with the next number begins opposite to each.
+    """
+    goals, times_s = {}, np.array([0.0, SWAP_AT_S])
+    pairs = -(-vehicles // 2)
+    for number in range(1, vehicles + 1):
+        pair = (number - 1) // 2
+        up, angle = 1.0 - (pair + 0.5) / pairs, GOLDEN_ANGLE * pair
+        level = np.sqrt(1.0 - up * up)
+        off = radius_m * np.array([level * np.cos(angle), level * np.sin(angle), up])
+        off *= 1.0 if number % 2 else -1.0
+        goals[number] = times_s, np.stack([off, -off]) + np.array([0.0, 0.0, altitude_m])
+    return Mission(goals, 3, 1)
 
 
 def mission(path: Path, axes: int) -> Mission:

@@ -21,7 +21,8 @@ class Unreported(NamedTuple):
     """How far the vehicle has left where the server must believe it, see
     `client.reporting.BelievedState` [m]."""
     is_news: bool
-    """Whether another horizon has come into force since the newest observation, or another mode."""
+    """Whether another horizon has come into force since the newest observation, or another mode, or
+    the horizon in force has come once more: then the server may not know that it is."""
     steps: int
     """Number of steps since the newest observation."""
     dt_s: float
@@ -47,7 +48,8 @@ def periodic(now: Unreported, N: Annotated[int, Meta(ge=1, le=PERIOD_MAX)]) -> b
 @REPORTS
 def deviation(now: Unreported, metres: Annotated[float, Meta(ge=0, le=1e9)]) -> bool:
     """Sends where the vehicle has left where the server believes it by more than so many metres,
-    where another horizon has come into force, and where its mode has changed.
+    where another horizon has come into force or the same one has come once more, and where its mode
+    has changed.
     """
     return now.is_news or now.off_m > metres
 

@@ -154,7 +154,7 @@ class ControlConfig(Section, frozen=True):
         return self.scheme == "committed"
 
 
-MISSIONS = ("swap", "mission")
+MISSIONS = ("swap", "sphere", "mission")
 """Shapes of the desired trajectory that are goals of several vehicles, which keep apart."""
 TABLES = ("csv", "mission")
 """Shapes that are read from `reference.file`."""
@@ -175,11 +175,12 @@ class ReferenceConfig(Section, frozen=True):
     """Mean time between turns of a target [s]. Its velocity changes at turns alone, by as much as
     `agility` would have changed it in that time; 0: it changes all the time."""
     radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
-    """Half the width of circle, figure-eight and square, and of the area of a target [m]."""
+    """Half the width of circle, figure-eight, square, swap and sphere, and of the area of a target
+    [m]."""
     period_s: Term[Annotated[float, Meta(ge=0.1, le=86400)]] = 27.5
     """Time for one round of circle, figure-eight or square [s]."""
     altitude_m: Term[Position] = 0.0
-    """Altitude of circle, figure-eight and square in space [m]."""
+    """Altitude of circle, figure-eight, square and swap in space, and of a sphere's centre [m]."""
     points_m: Annotated[
         tuple[tuple[Position, ...], ...], Key(Owner.BOTH, InFlight.POINT, term="points")
     ] = ()
@@ -293,6 +294,11 @@ class MissionConfig(Section, frozen=True):
     zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.ZONES)] = ""
     """Places to keep out of or to stay within, combined with &: box(x0, x1, y0, y1), cylinder(x, y,
     radius), polygon(x, y, …), fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
+
+    @property
+    def height_scale(self) -> float:
+        """Factor of distances along the third axis before they count for `separation_m`."""
+        return self.separation_m / self.height_m if self.height_m else 1.0
 
 
 class SensorConfig(Section, frozen=True):

@@ -96,6 +96,13 @@ def swap(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16)
 
 
 @reference
+def sphere(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
+    """Mission: places on a sphere of `radius_m`; each vehicle goes to the one opposite."""
+    wanted = scenario.reference
+    return missions.sphere(vehicles, wanted.radius_m, wanted.altitude_m)
+
+
+@reference
 def mission(scenario: Scenario) -> Reference:
     """Mission: goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
     return missions.mission(Path(scenario.reference.file), scenario.model.axes)

@@ -266,16 +266,20 @@ def _quantile(values: Array, share: float) -> float | None:
     return float(np.quantile(values, share)) if len(values) else None
 
 
-def least_separation(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> float | None:
+def least_separation(
+    each: Sequence[Rows], began_s: Sequence[float], dt_s: float, height_scale: float = 1.0
+) -> float | None:
     """Smallest distance between two vehicles while both are on a mission [m]; None of none.
 
     See `separations`.
     """
-    _, nearest = separations(each, began_s, dt_s)
+    _, nearest = separations(each, began_s, dt_s, height_scale)
     return float(np.nanmin(nearest)) if np.isfinite(nearest).any() else None
 
 
-def separations(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> tuple[Array, Array]:
+def separations(
+    each: Sequence[Rows], began_s: Sequence[float], dt_s: float, height_scale: float = 1.0
+) -> tuple[Array, Array]:
     """Distance between the two vehicles on a mission that are nearest to each other, over time.
 
     Each vehicle is on it from the first step on at which it follows what the server has sent.
@@ -284,6 +288,7 @@ def separations(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> 
         each: rows of the client's part of each vehicle, by their steps.
         began_s: time at which step 0 of each began, of one clock [s].
         dt_s: length of a step [s].
+        height_scale: factor of distances along the third axis, see `MissionConfig`.
 
     Returns:
         times of that clock [s; shape (n,)], none of fewer than two vehicles, and distances [m],
@@ -294,7 +299,9 @@ def separations(each: Sequence[Rows], began_s: Sequence[float], dt_s: float) -> 
         tracking = np.flatnonzero(rows["mode"] == Mode.TRACK)
         if len(tracking):
             flown = rows[tracking[0] :]
-            tracks.append((began + flown["step"] * dt_s, flown["state"][:, :, 0]))
+            at = flown["state"][:, :, 0].copy()
+            at[:, 2:] *= height_scale
+            tracks.append((began + flown["step"] * dt_s, at))
     if len(tracks) < 2:
         return np.zeros(0), np.zeros(0)
     begin, end = min(times[0] for times, _ in tracks), max(times[-1] for times, _ in tracks)

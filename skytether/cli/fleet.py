@@ -49,8 +49,8 @@ class FleetOptions:
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
     mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """Mission in place of a scenario: swap, rings, corridor, warehouse, or a CSV file with the
-    columns vehicle, t, x, y (and z), as light shows have them."""
+    """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a CSV file with
+    the columns vehicle, t, x, y (and z), as light shows have them."""
     vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Number of vehicles: 20 unless given, or as many as the mission has."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
@@ -357,7 +357,9 @@ def _separations(
         return None
     each = [client[client["vehicle"] == number] for number in numbers]
     began_s = [vehicles[str(number)]["began_s"] for number in numbers]
-    times_s, nearest_m = separations(each, began_s, scenario.control.dt)
+    times_s, nearest_m = separations(
+        each, began_s, scenario.control.dt, scenario.mission.height_scale
+    )
     return (times_s, nearest_m) if np.isfinite(nearest_m).any() else None
 
 

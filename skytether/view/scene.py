@@ -295,7 +295,8 @@ class _Flight:
         self._set(
             self._trail, [segments(trail[:: -(-len(trail) // most) or 1]) for trail in trails]
         )
-        self._set(self._plan, [segments(each.ahead(), dashed=True) for each in tracks])
+        ahead = [segments(path, dashed=True) for each in tracks for path in each.motions()]
+        self._set(self._plan, ahead)
         goal = tracks[0].goal(GOAL_S) if tracks else None
         if self._goal.visible != (goal is not None):
             self._goal.visible = goal is not None

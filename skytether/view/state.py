@@ -45,6 +45,8 @@ VEHICLES_MAX = 64
 """Most vehicles of a flight that are shown."""
 ZONED, GUIDED = "mission.zones", "mission.goals"
 """Keys of the zones of a mission, and of the goals that are given."""
+PLANS_MAX = 8
+"""Number of plans of a vehicle that are kept, copies included."""
 SAID_MAX = 50
 """Most events that are kept."""
 LED = "reference.points_m"
@@ -136,7 +138,8 @@ class VehicleTrack:
         """Number of steps that the server has planned for, as far as they were seen."""
         self.sent = 0
         """Number of horizons that it has sent at them."""
-        self._plan: np.void | None = None
+        self._plans: deque[np.void] = deque(maxlen=PLANS_MAX)
+        """Newest plans that were sent to it, the newest last."""
         self._seen: np.void | None = None
         """Newest row of the server's part; None without any."""
 
@@ -170,8 +173,8 @@ class VehicleTrack:
             self._seen = rows[-1].copy()
 
     def lead(self, rows: Table) -> None:
-        """Take rows of the part "plan", of which the newest is shown."""
-        self._plan = rows[-1].copy()
+        """Take rows of the part "plan", of which the newest are shown."""
+        self._plans.extend(row.copy() for row in rows[-PLANS_MAX:])
 
     def _at(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
         """Index in the ring of each step, emptied where it is new; -1 where it is not kept."""
@@ -245,10 +248,29 @@ class VehicleTrack:
         There are none where no plan is flown.
         """
         axes = self._scenario.model.axes
-        if self._plan is None or (self.row is not None and not self.row["covered"]):
+        if not self._plans or (self.row is not None and not self.row["covered"]):
             return np.empty((0, axes))
-        positions = planned(self._scenario, self._plan)
-        flown = 0 if self.row is None else int(self.row["step"] - self._plan["begins"])
+        return self._along(self._plans[-1])
+
+    def motions(self) -> list[Array]:
+        """Positions along each plan that may be flown, see `ahead`.
+
+        On a mission these are the plan in force and those that may still be accepted.
+        """
+        if not self._scenario.is_mission or self.row is None:
+            return [self.ahead()]
+        in_force, now = self.row["in_force"], self.row["step"]
+        least = now - round(self._scenario.link.join_s / self._scenario.control.dt)
+        begins = {int(plan["begins"]): plan for plan in self._plans}
+        return [
+            self._along(plan)
+            for step, plan in begins.items()
+            if step == in_force or step > max(in_force, least - 1)
+        ]
+
+    def _along(self, plan: np.void) -> Array:
+        positions = planned(self._scenario, plan)
+        flown = 0 if self.row is None else int(self.row["step"] - plan["begins"])
         return positions[min(max(flown, 0), len(positions)) :]
 
     def path(self, points: int) -> Array:

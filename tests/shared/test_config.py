@@ -202,7 +202,7 @@ WRONG = {
         'reference.shape = "ring"',
         (
             "reference.shape: got 'ring', expected a shape; there are circle, figure-eight, "
-            "square, waypoints, hover, csv, target, live, swap, mission"
+            "square, waypoints, hover, csv, target, live, swap, sphere, mission"
         ),
     ),
     "a fourth dimension": ("model.axes = 4", "model.axes: got 4, expected 2 or 3"),

@@ -235,6 +235,28 @@ def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
     assert "vehicle 3" in words.status(state, 1, state.newest_ns)
 
 
+def test_a_mission_s_motions_that_may_be_flown_are_shown() -> None:
+    """The one in force, and one that was sent since; not one that came too late to be accepted."""
+    scenario = reading.load("swap")
+    shape = msgspec.structs.replace(scenario.reference, shape="swap(2)")
+    scenario = msgspec.structs.replace(scenario, duration=6.0, settle=1.0, reference=shape)
+    flown = flight.fly(scenario, vehicles=2)
+    state = state_of(tuple(of_flight(scenario, "swap", flown)))
+    track = next(iter(state.vehicles.values()))
+    ways = track.motions()
+    assert len(ways) in (1, 2)
+    for way in ways:
+        assert np.linalg.norm(way[0] - track.row["state"][:, 0]) < scenario.mission.tube_m
+    newest = flown.plan[flown.plan["vehicle"] == track.number][-1:].copy()
+    join = round(scenario.link.join_s / scenario.control.dt)
+    track.row["in_force"] = 0
+    for ago, shown in ((join, 1), (join + 1, 0)):
+        newest["begins"] = track.row["step"] - ago
+        for _ in range(8):  # copies are one motion
+            track.lead(newest)
+        assert len(track.motions()) == shown
+
+
 def test_what_comes_again_counts_once() -> None:
     """A feed tells its newest frames to whoever connects anew."""
     shown = demo()

@@ -17,14 +17,14 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 import tyro
 
 from skytether.lab.benchmarks.harness import TextTable, progress
-from skytether.server.control.together import Known
+from skytether.server.control.known import Known
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
@@ -69,6 +69,8 @@ class TogetherOptions:
     """Flights of each cell."""
     guaranteed: bool = False
     """Whether to fly only what keeps apart from all that may be flown."""
+    shape: Literal["swap", "sphere"] = "swap"
+    """Whether vehicles on a circle swap places, or on a sphere."""
     vehicles: int = 16
     duration: float = 120.0
     """Length of a flight [s]."""
@@ -190,9 +192,11 @@ def planning(planner: str) -> Iterator[None]:
 
 def scenario(network: str, options: TogetherOptions, seed: int) -> Scenario:
     """A flight of a cell."""
-    swap = reading.load("swap")
+    swap = reading.load(options.shape)
     way = DirectionConfig(impairments=NETWORKS[network])
-    reference = msgspec.structs.replace(swap.reference, shape=f"swap({options.vehicles})")
+    reference = msgspec.structs.replace(
+        swap.reference, shape=f"{options.shape}({options.vehicles})"
+    )
     return msgspec.structs.replace(
         swap,
         seed=seed,
@@ -215,7 +219,7 @@ def fly(options: TogetherOptions, cell: tuple[str, str, int]) -> Swap:
     client, dt_s = record.client, flown.control.dt
     each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
     began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each]
-    least = least_separation(each, began_s, dt_s)
+    least = least_separation(each, began_s, dt_s, flown.mission.height_scale)
     goals = flown.make_reference()
     assert isinstance(goals, Mission)
     assert least is not None
@@ -242,7 +246,7 @@ def table(options: TogetherOptions) -> TextTable:
             flown = list(pool.map(partial(fly, options), cells))
             least = np.array([each.least_m for each in flown])
             arrived = np.array([each.arrived_s for each in flown])
-            asked = reading.load("swap").mission.separation_m
+            asked = reading.load(options.shape).mission.separation_m
             done = arrived[np.isfinite(arrived)]
             rows.append(
                 [

@@ -1,0 +1,117 @@
+"""Where a vehicle aims: at its goal, at a point of the way around zones, or to the right of it.
+
+One that is stuck finds its way around vehicles at rest as well for a while, and aims ever further
+round, at last in directions that are drawn: so vehicles that meet pass each other.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from skytether.server.control.known import Known
+from skytether.server.control.routes import Routes
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.zones import Zone, Zones
+
+AIM_M = 3.0
+"""Distance of what is aimed at in place of the goal [m]."""
+AHEAD_M = 1.5
+"""How far ahead on a way around zones a vehicle aims [m]."""
+TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
+"""By how much further round a vehicle aims that is stuck, how far at most before directions are
+drawn, and by how much less once it moves [rad]."""
+DETOUR_M, DETOUR_S = 5.0, 20.0
+"""Distance up to which vehicles at rest are flown around by one that was stuck [m], and for how
+long it does so [s]."""
+AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
+"""Corners of an octagon around 0, of radius 1; shape (8, 2)."""
+TRIES = 5
+"""Number of directions that are tried at a time."""
+
+
+class Aims:
+    """Where vehicles of a mission aim.
+
+    Args:
+        zones: where they may not be.
+        tube_m: distance that motions keep from zones [m].
+        apart_m: distance that motions keep from each other [m].
+        detours: steps for which a vehicle that was stuck goes around others.
+        rng: directions are drawn from it.
+    """
+
+    def __init__(
+        self, zones: Zones, tube_m: float, apart_m: float, detours: int, rng: np.random.Generator
+    ) -> None:
+        self._tube_m, self._apart_m, self._detours, self._rng = tube_m, apart_m, detours, rng
+        self.change_zones(zones)
+
+    def change_zones(self, zones: Zones) -> None:
+        """Go around other zones from now on."""
+        self._zones, self.routes = zones, Routes(zones, self._tube_m)
+
+    def of(
+        self,
+        known: Known,
+        k: int,
+        place: Array,
+        goal: Array,
+        rests: Callable[[], Sequence[Array]],
+    ) -> Iterator[Array]:
+        """What to fly to: a point of the way to the goal, its next corner, or right of that.
+
+        Args:
+            known: the vehicle.
+            k: its step.
+            place: where its plan begins [m]; shape (axes,).
+            goal: shape (axes,).
+            rests: gives the places at which others rest [m]; shape (axes,) each.
+        """
+        detour = known.detour if k < known.detour_until else None
+        way = (detour or self.routes).way(place, goal)
+        if not known.turned:
+            if len(way) > 1:
+                yield _along(place, way, AHEAD_M)
+            yield way[0]
+            known.turned = TURN
+            # Stuck: from now on, for a while, around those as well that rest on the way.
+            known.detour, known.detour_until = self._detour(place, goal, rests()), k + self._detours
+            way = known.detour.way(place, goal)
+            yield _along(place, way, AHEAD_M)
+        ahead = way[0, :2] - place[:2]
+        far = float(np.linalg.norm(ahead))
+        ahead = ahead / far if far > 1e-9 else np.array([1.0, 0.0])
+        reach_m = AIM_M if len(way) > 1 else min(float(np.linalg.norm(goal - place)), AIM_M)
+        for _ in range(TRIES):
+            c, s = np.cos(-known.turned), np.sin(-known.turned)
+            aim = place.copy()
+            aim[:2] += reach_m * np.array(
+                [c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]]
+            )
+            yield aim
+            known.turned += TURN
+            if known.turned > TURN_MAX:
+                known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
+
+    def _detour(self, place: Array, goal: Array, rests: Sequence[Array]) -> Routes:
+        """Ways around zones and the vehicles that rest near a place, but for those at the goal."""
+        zones, keep_m = list(self._zones.zones), self._apart_m - self._tube_m
+        for at in rests:
+            near_m = float(np.linalg.norm(at - place))
+            if near_m < DETOUR_M and np.linalg.norm(at - goal) > self._apart_m:
+                radius_m = min(keep_m, near_m - self._tube_m) / np.cos(np.pi / len(AROUND))
+                zones.append(Zone("a vehicle", at[:2] + radius_m * AROUND))
+        return Routes(Zones(zones), self._tube_m)
+
+
+def _along(place: Array, way: Array, far_m: float) -> Array:
+    """Point of a way that is so far ahead on it, or its end."""
+    for corner in way:
+        step_m = float(np.linalg.norm(corner - place))
+        if step_m >= far_m:
+            break
+        place, far_m = corner, far_m - step_m
+    else:
+        return place
+    there: Array = place + far_m / step_m * (corner - place)
+    return there

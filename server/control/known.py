@@ -1,0 +1,117 @@
+"""What the server knows of one vehicle on a mission: the motions that it may fly.
+
+A motion that is not acknowledged is sent again, the very same one, while it may still be taken. One
+or its acknowledgement that is lost costs the time until an observation says so, in which nothing
+can be planned; so after such a loss the next ones are sent twice, and then three times.
+"""
+
+from collections import deque
+from typing import NamedTuple
+
+from skytether.server.control.aside import Aside
+from skytether.server.control.routes import Routes
+from skytether.shared.law.model import Array
+from skytether.shared.law.motion import Motion
+
+COPIES_MAX = 3
+"""Largest number of times that a motion is sent."""
+COPY_STEPS = 4
+"""Steps from one time to the next."""
+PATIENCE = 120
+"""Steps without coming nearer to its goal after which a vehicle asks another to step aside."""
+NEARER_M = 0.3
+"""By how much it must come nearer [m]."""
+PROMPT = 8
+"""Number of motions in a row, each acknowledged at once, after which they are sent less often."""
+
+
+class Sent(NamedTuple):
+    """A motion that was sent."""
+
+    step: int
+    """Step of its packet."""
+    motion: Motion
+
+
+class Known:
+    """What is known of one vehicle."""
+
+    def __init__(self) -> None:
+        self.in_force: Sent | None = None
+        """Motion that it flies, with its packet's step; None before the first observation."""
+        self.sent: deque[Sent] = deque(maxlen=64)
+        """Motions sent after that, oldest first, that may still be taken."""
+        self.next: Motion | None = None
+        """Motion to be sent at this step."""
+        self.turned = 0.0
+        """Angle by which it aims to the right of its goal [rad]."""
+        self.heard = False
+        """Whether an observation has come in this session."""
+        self.unknown_until = -1
+        """Step from which on a motion is over that another server has sent."""
+        self.off_m = 0.0
+        """How far outside its tube it may be, as it was seen last [m]."""
+        self.speed_mps = 0.0
+        """How fast it was then [m/s]."""
+        self.detour: Routes | None = None
+        """Ways around others that rest where it was stuck; None before it ever was."""
+        self.detour_until = 0
+        """Step up to which it takes them."""
+        self.goal: Array | None = None
+        """Goal to which it flew last [m]; shape (axes,); None before the first."""
+        self.left_m = 0.0
+        """Shortest way that was ever left to that [m]."""
+        self.nearer_at = 0
+        """Step at which it was that near first, or asked another to step aside last."""
+        self.aside: Aside | None = None
+        """Where it has stepped aside to; None of one that flies to its own goal."""
+        self.waits = ""
+        """What it waits for, as the operator is told; empty: for nothing."""
+
+        self.copies = 1
+        """Largest number of times that a motion is sent to it."""
+        self.prompt = 0
+        """Number of motions in a row that it has acknowledged at once."""
+        self.again: Sent | None = None
+        """Motion that is sent once more at this step."""
+
+    def motions(self) -> list[Motion]:
+        """All that may be flown, the one to be sent at this step included."""
+        flown = [self.in_force.motion] if self.in_force else []
+        flown += [each.motion for each in self.sent]
+        return [*flown, self.next] if self.next else flown
+
+    def learn(self, prompt: bool) -> None:
+        """Send motions more often where one, or its acknowledgement, was lost; less often later.
+
+        Args:
+            prompt: whether a motion was acknowledged at once.
+        """
+        self.prompt = self.prompt + 1 if prompt else 0
+        if not prompt:
+            self.copies = min(self.copies + 1, COPIES_MAX)
+        elif self.prompt % PROMPT == 0:
+            self.copies = max(self.copies - 1, 1)
+
+    def is_stuck(self, step: int, goal: Array, left_m: float) -> bool:
+        """Whether it has come no nearer to its goal for PATIENCE steps; said once in that time.
+
+        Args:
+            step: k, of its own.
+            goal: where it flies to [m]; shape (axes,).
+            left_m: length of the way that is left [m].
+        """
+        if self.goal is None or (goal != self.goal).any() or left_m < self.left_m - NEARER_M:
+            self.goal, self.left_m, self.nearer_at = goal, left_m, step
+        elif step - self.nearer_at >= PATIENCE:
+            self.nearer_at = step
+            return True
+        return False
+
+    def owed(self, step: int) -> Sent | None:
+        """Motion that is to be sent once more at a step; None of none."""
+        if not self.sent:
+            return None
+        since = step - self.sent[-1].step
+        is_due = 0 < since <= (self.copies - 1) * COPY_STEPS and since % COPY_STEPS == 0
+        return self.sent[-1] if is_due else None
