@@ -140,6 +140,8 @@ class World:
         there, or None for a wake; of an action no host and the action."""
         self._scheduled = 0
         """Number of entries so far."""
+        self._arriving: deque[tuple[Host, Datagram]] = deque()
+        """Datagrams that arrive at the present time, in the order in which they were sent."""
 
     def add(
         self,
@@ -263,17 +265,22 @@ class World:
 
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""
-        while self._agenda and not until():
-            if self._agenda[0][0] > limit_ns:
+        agenda, arriving, receive = self._agenda, self._arriving, self._receive
+        while (agenda or arriving) and not until():
+            # What was sent at an earlier time waits on the agenda, and arrives first.
+            if arriving and not (agenda and agenda[0][:2] <= (self.now_ns, ARRIVAL)):
+                receive(*arriving.popleft())
+                continue
+            if agenda[0][0] > limit_ns:
                 return
-            entry = heappop(self._agenda)
+            entry = heappop(agenda)
             self.now_ns = entry[0]
             if entry[3] is None:
                 entry[4]()
             elif entry[4] is None:
                 self._wake(entry[3])
             else:
-                self._receive(entry[3], entry[4])
+                receive(entry[3], entry[4])
 
     def _at(self, time_ns: int, turn: int, host: Host, datagram: Datagram | None) -> None:
         self._scheduled += 1
@@ -284,17 +291,20 @@ class World:
         if due_ns is None:
             host.armed_ns = None
             return
-        time_ns = max(self.now_ns, host.busy_until_ns, host.clock.world(due_ns))
+        time_ns = host.clock.world(due_ns)
+        time_ns = max(time_ns, host.busy_until_ns)
+        time_ns = max(time_ns, self.now_ns)
         if time_ns != host.armed_ns:
             host.armed_ns = time_ns
             self._at(time_ns, host.turn, host, None)
 
     def _wake(self, host: Host) -> None:
-        if host.armed_ns != self.now_ns:
+        now_ns = self.now_ns
+        if host.armed_ns != now_ns:
             return  # it has changed its mind since
         host.armed_ns = None
-        host.endpoint.wake(now_ns=host.clock.local(self.now_ns))
-        host.busy_until_ns = self.now_ns + host.compute_ns
+        host.endpoint.wake(now_ns=host.clock.local(now_ns))
+        host.busy_until_ns = now_ns + host.compute_ns
         self._after(host, host.busy_until_ns)
 
     def _receive(self, host: Host, datagram: Datagram) -> None:
@@ -303,14 +313,19 @@ class World:
 
     def _after(self, host: Host, leaves_ns: int) -> None:
         """Let its datagrams leave, hand on its events, and arm its next wake."""
-        for payload, (name, socket), source in host.endpoint.outbox():
+        endpoint = host.endpoint
+        for payload, (name, socket), source in endpoint.outbox():
             receiver = self._hosts.get(name)
-            if receiver is not None:
-                arrived = Datagram(payload, (host.name, source), socket)
+            if receiver is None:
+                continue
+            arrived = Datagram(payload, (host.name, source), socket)
+            if leaves_ns == self.now_ns:
+                self._arriving.append((receiver, arrived))
+            else:
                 self._at(leaves_ns, ARRIVAL, receiver, arrived)
-        for event in host.endpoint.events():
+        for event in endpoint.events():
             self._on_event(self.now_ns, host.name, event)
         self._arm(host)
-        if host.on_finished is not None and host.endpoint.finished:
+        if host.on_finished is not None and endpoint.finished:
             host.on_finished()
             host.on_finished = None
