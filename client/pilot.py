@@ -230,6 +230,20 @@ class Pilot:
             told=told,
             speed_max=speed_max,
         )
+        return self._settled(flown, told, speed_max, now_ns)
+
+    def _settled(
+        self, flown: list[float] | None, told: Sequence[float], speed_max: float, now_ns: int
+    ) -> Array:
+        """Input that is flown at last, and what follows from it.
+
+        Args:
+            flown: input of each axis that may be flown [m/s]; None where it is not finite.
+            told: part of it that is no feedback, of each axis [m/s].
+            speed_max: bound of the magnitude of that part [m/s].
+            now_ns: time now.
+        """
+        failsafe, compensator = self._failsafe, self.compensator
         if flown is None:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         elif compensator.in_force != NO_HORIZON and not compensator.covered:

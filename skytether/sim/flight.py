@@ -52,6 +52,7 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
+from skytether.sim.aboard import CompiledPilot
 from skytether.sim.world import Clock, World
 
 MIDNIGHT_NS = 86_400 * SECOND_NS
@@ -199,6 +200,7 @@ class Run:
                 boot_id=BOOT_ID,
                 link=_link(keyring, scenario.seed, self._before + vehicle),
                 recorder=recorder,
+                pilot=CompiledPilot,
             )
             for vehicle in range(1, vehicles + 1)
         ]
@@ -333,12 +335,13 @@ def _fly(
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
     plan_changes(world, scenario, {SERVER[0]: server, **runs[0].hosts, **beside}, changes)
-    flown_s, flying = 0, runs.copy()
+    second_ns, flying = SECOND_NS, runs.copy()
 
     def over() -> bool:
-        nonlocal flown_s
-        if world.now_ns // SECOND_NS != flown_s:
+        nonlocal second_ns
+        if world.now_ns >= second_ns:
             flown_s = world.now_ns // SECOND_NS
+            second_ns = (flown_s + 1) * SECOND_NS
             on_second(flown_s)
         while flying and not flying[-1].flying:
             flying.pop()
