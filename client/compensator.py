@@ -64,6 +64,8 @@ class Compensator:
         """The horizon on each axis; without one the input that was flown when it was dropped."""
         self.guides: list[Guide] = []
         """Spline on each axis; empty where inputs are held."""
+        self.feeds_back = False
+        """Whether what is flown is told and feedback on top of that."""
         self.lead: list[tuple[float, float]] = []
         """State x̄ that the horizon leads to, of each axis at stage `lead_stage` [m, m/s]."""
         self.lead_stage = 0
@@ -180,7 +182,7 @@ class Compensator:
                 self._model, inputs, self._bounds, told, strict=True
             )
         ]
-        self.guides = []
+        self.guides, self.feeds_back = [], bool(feedback)
         self._length = length
         self.lead = [(columns[LED_P], columns[LED_V]) for columns in told]
         self.lead_stage = 0
@@ -225,7 +227,7 @@ class Compensator:
                 self._model, knots, last, self._bounds, self._gain.tolist(), strict=True
             )
         ]
-        self._length = length
+        self._length, self.feeds_back = length, True
         self.lead = [(each[0], each[1]) for each in knots]
         self.lead_stage = 0
 
@@ -276,17 +278,15 @@ class Compensator:
         self.covered = self.covers(step)
         return step - self.begins
 
-    def note(self, step: int, told: list[float], lead: list[tuple[float, float]]) -> None:
-        """Note what was chosen for a step elsewhere, as `choose` would have it.
+    def note(self, step: int, told: list[float]) -> None:
+        """Note what was chosen for a step elsewhere; `lead` is left as it was.
 
         Args:
             step: k, never smaller than before.
             told: what is flown but for the feedback, of each axis [m/s].
-            lead: state x̄ of each axis at the step [m, m/s].
         """
-        stage, self.told = self._go_on(step), told
-        if self.guides or (self.feeds_back and stage > self.lead_stage):
-            self.lead, self.lead_stage = lead, stage
+        self._go_on(step)
+        self.told = told
 
     def _follow(
         self, stage: int, state: Sequence[tuple[float, float]], disturbance: Sequence[float]
@@ -320,11 +320,6 @@ class Compensator:
             flown = [rule.step(held, stage, *lead, *x)[0] for held, lead, x in axes]
         flying = zip(self.held, states, flown, strict=True)
         return [advance(held.model, p, v, u + held.disturbance) for held, (p, v), u in flying]
-
-    @property
-    def feeds_back(self) -> bool:
-        """Whether what is flown is told and feedback on top of that."""
-        return bool(self.guides) or self.held[0].feeds_back
 
     def _lead_to(self, stage: int) -> None:
         """Roll x̄ on to a stage, unless it is there already."""

@@ -123,16 +123,12 @@ class Navigation:
             numbers = chain.from_iterable(self.predicted)
             self.is_known = all(-FLOAT_MAX <= number <= FLOAT_MAX for number in numbers)
 
-    def note(
-        self, measured: list[tuple[float, float]], estimate: list[tuple[float, float]]
-    ) -> None:
-        """Note what has come of a step that was computed elsewhere, as `advance` would have it.
+    def note(self, estimate: list[tuple[float, float]]) -> None:
+        """Note the finite estimate of a step that was computed elsewhere, without a leap.
 
-        Args:
-            measured: position [m] and velocity [m/s] of each axis, which no vehicle leapt to.
-            estimate: state of each axis, which is finite; filter and leaps are not told.
+        Filter, leaps and `measured` are left as they were.
         """
-        self.measured, self.leapt = measured, False
+        self.leapt = False
         self.estimate = self.predicted = estimate
 
     @property

@@ -326,16 +326,12 @@ class Pilot:
     def _record(self) -> None:
         if self._recorder is None:
             return
-        compensator, failsafe, known = self.compensator, self._failsafe, self._navigation
-        truth = self._vehicle.truth()
+        compensator, failsafe = self.compensator, self._failsafe
         observed = compensator.observed
         self._recorder.append_row(
             self._number,
             self.flown,
-            *chain.from_iterable(known.estimate if truth is None else truth.tolist()),
-            *chain.from_iterable(known.measured),
-            *chain.from_iterable(known.predicted),
-            *self._input.tolist(),
+            *self._known(),
             compensator.covered,
             compensator.in_force,
             -1 if observed < 0 else (self.flown - observed) * self._dt_ns,
@@ -344,3 +340,10 @@ class Pilot:
             failsafe.mode,
             failsafe.reason,
         )
+
+    def _known(self) -> Sequence[float]:
+        """State, measured and reported state, and input, number by number, for the record."""
+        known, truth = self._navigation, self._vehicle.truth()
+        states = known.estimate if truth is None else truth.tolist()
+        numbers = chain.from_iterable((*states, *known.measured, *known.predicted))
+        return [*numbers, *self._input.tolist()]

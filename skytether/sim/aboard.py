@@ -22,17 +22,19 @@ from skytether.client.failsafe import Failsafe
 from skytether.client.filter import Kalman, Spread
 from skytether.client.navigation import Navigation
 from skytether.client.pilot import STOPPED, Pilot
+from skytether.client.reporting import BelievedState, States
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.client.vehicle import Measurement, Vehicle
 from skytether.server.control.law import advance, lead_to, step
 from skytether.server.control.trajectory import follow, guided_to
-from skytether.shared.base.kernel import F2, R2, kernel, part, record, records, shared
+from skytether.shared.base.kernel import F1, F2, R1, kernel, part, record, records, shared
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law import leap
 from skytether.shared.law.model import Array, Axis
 from skytether.shared.law.rule import Held
 from skytether.shared.law.spline import Guide
+from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.protocol import FLOAT_MAX, Mode
@@ -115,8 +117,6 @@ class AxisState:
     """Disturbance ŵ that the filter has found [m/s]; 0 without a filter."""
     u: float
     """Input that is flown [m/s]."""
-    told: float
-    """Part of it that is no feedback [m/s]."""
     lead_p: float
     """Position to which the horizon leads [m]."""
     lead_v: float
@@ -165,14 +165,14 @@ class AxisPlan:
 AXIS_ABOARD, AXIS_STATE, AXIS_PLAN = record(AxisAboard), record(AxisState), record(AxisPlan)
 Constants = Annotated[NDArray[np.void], records(AXIS_ABOARD, 1)]
 """Constants of a vehicle; shape (axes,)."""
-States = Annotated[NDArray[np.void], records(AXIS_STATE, 1)]
+StatesNow = Annotated[NDArray[np.void], records(AXIS_STATE, 1)]
 """State of a vehicle; shape (axes,)."""
 Plans = Annotated[NDArray[np.void], records(AXIS_PLAN, 1)]
 """Plan of a vehicle; shape (axes,)."""
 
 
 @part
-def measured_on(constants: Constants, now: States, after: States, drawn: R2) -> bool:
+def measured_on(constants: Constants, now: StatesNow, after: StatesNow, drawn: F2) -> bool:
     """Fly the vehicle to the next step, measure it and filter that; see `fly_step`."""
     usual = True
     for i in range(len(constants)):
@@ -204,17 +204,53 @@ def measured_on(constants: Constants, now: States, after: States, drawn: R2) -> 
     return usual
 
 
+@part
+def guide_of(axis: AxisAboard, plan: AxisPlan, knots: R1) -> Guide:
+    """Spline of one axis."""
+    return Guide(
+        Axis(axis.a01, axis.a11, axis.b0, axis.b1),
+        knots,
+        plan.spacing,
+        axis.dt_s,
+        plan.length,
+        plan.last,
+        plan.speed,
+        plan.brake,
+        axis.bound,
+        plan.gain_p,
+        plan.gain_v,
+    )
+
+
+@part
+def held_of(axis: AxisAboard, plan: AxisPlan, inputs: R1) -> Held:
+    """Horizon of one axis."""
+    return Held(
+        Axis(axis.a01, axis.a11, axis.b0, axis.b1),
+        inputs,
+        plan.length,
+        plan.indexed,
+        plan.speed,
+        plan.brake,
+        axis.bound,
+        plan.feeds_back,
+        plan.gain_p,
+        plan.gain_v,
+        plan.disturbance,
+    )
+
+
 @kernel
 def fly_step(
     constants: Constants,
-    now: States,
-    after: States,
-    drawn: R2,
+    now: StatesNow,
+    after: StatesNow,
+    drawn: F2,
     plans: Plans,
     numbers: F2,
     stage: int,
     lead_stage: int,
-    told: F2,
+    told: F1,
 ) -> bool:
     """Fly a vehicle to its next step, and choose the input from there on.
 
@@ -227,59 +263,78 @@ def fly_step(
         numbers: its inputs [m/s] or knots [m, m/s]; shape (axes, n).
         stage: where in the plan the step is.
         lead_stage: stage at which `now` has the state to which the plan leads.
-        told: what is filled in: true position [m] and velocity [m/s], those flown by, disturbance
-            [m/s], input [m/s], part of it that is no feedback [m/s], and the state to which the
-            plan leads [m, m/s]; shape (axes, 9).
+        told: what is filled in, for all axes one after the other: true position [m] and velocity
+            [m/s], those measured, those flown by, then input [m/s], and part of the input that is
+            no feedback [m/s]; shape (8 axes,).
 
     Returns:
         whether all of that is as usual; if not, it counts for nothing.
     """
-    usual = measured_on(constants, now, after, drawn)
-    for i in range(len(constants)):
+    usual, axes = measured_on(constants, now, after, drawn), len(constants)
+    for i in range(axes):
         axis, was, now_is, plan = constants[i], now[i], after[i], plans[i]
-        model = Axis(axis.a01, axis.a11, axis.b0, axis.b1)
         lead_p, lead_v, x_p, x_v = was.lead_p, was.lead_v, now_is.x_p, now_is.x_v
         if plan.is_spline:
-            guide = Guide(
-                model,
-                numbers[i],
-                plan.spacing,
-                axis.dt_s,
-                plan.length,
-                plan.last,
-                plan.speed,
-                plan.brake,
-                axis.bound,
-                plan.gain_p,
-                plan.gain_v,
-            )
+            guide = guide_of(axis, plan, numbers[i])
             lead_p, lead_v = guided_to(guide, lead_stage, stage, lead_p, lead_v)
             u, part_told = follow(guide, stage, lead_p, lead_v, x_p, x_v, now_is.x_w)
         else:
-            held = Held(
-                model,
-                numbers[i],
-                plan.length,
-                plan.indexed,
-                plan.speed,
-                plan.brake,
-                axis.bound,
-                plan.feeds_back,
-                plan.gain_p,
-                plan.gain_v,
-                plan.disturbance,
-            )
+            held = held_of(axis, plan, numbers[i])
             if plan.feeds_back:
                 lead_p, lead_v = lead_to(held, lead_stage, stage, lead_p, lead_v)
             u, part_told, _, _ = step(held, stage, lead_p, lead_v, x_p, x_v)
         usual &= math.isfinite(u) and math.isfinite(part_told)
         part_flown = part_told if plan.feeds_back else u
         u = limited(u, part_flown, 0.0, was.u, axis.change_max, axis.bound)
-        now_is.u, now_is.told, now_is.lead_p, now_is.lead_v = u, part_told, lead_p, lead_v
-        told[i, 0], told[i, 1], told[i, 2], told[i, 3] = now_is.p, now_is.v, x_p, x_v
-        told[i, 4], told[i, 5], told[i, 6] = now_is.x_w, u, part_told
-        told[i, 7], told[i, 8] = lead_p, lead_v
+        now_is.u, now_is.lead_p, now_is.lead_v = u, lead_p, lead_v
+        told[2 * i], told[2 * i + 1] = now_is.p, now_is.v
+        told[2 * (axes + i)], told[2 * (axes + i) + 1] = now_is.p, now_is.v
+        told[2 * (2 * axes + i)], told[2 * (2 * axes + i) + 1] = x_p, x_v
+        told[6 * axes + i], told[7 * axes + i] = u, part_told
     return usual
+
+
+@kernel
+def believe_step(
+    constants: Constants,
+    now: StatesNow,
+    plans: Plans,
+    numbers: F2,
+    stage: int,
+    believed: F2,
+    silent: F2,
+    told: F2,
+    apart: F2,
+) -> None:
+    """Foresee the state of the next step, as `Compensator.foresee` does.
+
+    Args:
+        constants: those of the vehicle.
+        now: its state at the step.
+        plans: the horizon or spline that is held.
+        numbers: its inputs [m/s] or knots [m, m/s]; shape (axes, n).
+        stage: where in the plan the step is.
+        believed: state that the server must take it to be in [m, m/s]; shape (axes, 2).
+        silent: what is filled in: where that leads [m, m/s]; shape (axes, 2).
+        told: what is filled in: where the state leads that is flown by [m, m/s]; shape (axes, 2).
+        apart: what is filled in: how far the vehicle is from `believed` [m, m/s]; shape (axes, 2).
+    """
+    for i in range(len(constants)):
+        axis, at, plan = constants[i], now[i], plans[i]
+        model = Axis(axis.a01, axis.a11, axis.b0, axis.b1)
+        p, v, x_p, x_v = believed[i, 0], believed[i, 1], at.x_p, at.x_v
+        apart[i, 0], apart[i, 1] = p - x_p, v - x_v
+        if plan.is_spline:
+            guide = guide_of(axis, plan, numbers[i])
+            u, _ = follow(guide, stage, at.lead_p, at.lead_v, p, v, 0.0)
+            silent[i, 0], silent[i, 1] = advance(model, p, v, u)
+            u, _ = follow(guide, stage, at.lead_p, at.lead_v, x_p, x_v, 0.0)
+            told[i, 0], told[i, 1] = advance(model, x_p, x_v, u)
+        else:
+            held = held_of(axis, plan, numbers[i])
+            u, _, _, _ = step(held, stage, at.lead_p, at.lead_v, p, v)
+            silent[i, 0], silent[i, 1] = advance(model, p, v, u + plan.disturbance)
+            told[i, 0], told[i, 1] = advance(model, x_p, x_v, at.u + plan.disturbance)
 
 
 class SimpleBody(NamedTuple):
@@ -322,11 +377,20 @@ class _Flying:
         axes = scenario.model.axes
         self._now, self._after = np.zeros(axes, AXIS_STATE), np.zeros(axes, AXIS_STATE)
         self._constants, self._plans = np.zeros(axes, AXIS_ABOARD), np.zeros(axes, AXIS_PLAN)
-        self._numbers, self._told = np.zeros((axes, 1)), np.zeros((axes, 9))
-        self._rows: list[list[float]] = self._told.tolist()
+        self._numbers, self._told = np.zeros((axes, 1)), np.zeros(8 * axes)
+        self._states = slice(0, 2 * axes)
+        self._known = slice(4 * axes, 6 * axes)
+        self._inputs = slice(6 * axes, 7 * axes)
+        self._parts = slice(7 * axes, 8 * axes)
+        """Where in `_told` the true state is, the one flown by, the input, and its part."""
+        self.row: list[float] = []
         """What `fly_step` has told last."""
-        self._at: int | None = None
-        """Step that the arrays are at, where they are newer than the objects."""
+        self.step: int | None = None
+        """Step that the arrays are at; None where they are not to be used."""
+        self._stage = self._lead_stage = 0
+        """Stage that the plan is at, and that up to which its lead was rolled."""
+        self._is_ahead = False
+        """Whether the arrays are newer than the objects."""
         self._is_loaded = False
         """Whether the arrays are at least as new as the objects."""
         self._held: object = None
@@ -371,7 +435,7 @@ class _Flying:
         drawn = weather.draw()
         if weather.calm is not self._calm:
             self._load_air()
-        stage = step - compensator.begins
+        self._stage = stage = step - compensator.begins
         if not fly_step(
             self._constants,
             self._now,
@@ -380,19 +444,35 @@ class _Flying:
             self._plans,
             self._numbers,
             stage,
-            compensator.lead_stage,
+            self._lead_stage,
             self._told,
         ):
             return None
         weather.drawn = None
-        self._now, self._after, self._at = self._after, self._now, step
-        self._rows = rows = self._told.tolist()
-        states = [(row[0], row[1]) for row in rows]
-        known = states if self._kalman is None else [(row[2], row[3]) for row in rows]
-        self._plant.x = states
-        self._navigation.note(states, known)
-        compensator.note(step, [row[6] for row in rows], [(row[7], row[8]) for row in rows])
-        return [row[5] for row in rows]
+        self._now, self._after = self._after, self._now
+        self._lead_stage = max(stage, self._lead_stage)
+        self.step, self._is_ahead = step, True
+        self.row = row = self._told.tolist()
+        self._navigation.note(pairs(row[self._known]))
+        compensator.note(step, row[self._parts])
+        return row[self._inputs]
+
+    def foresee(self, believed: Array, silent: Array, told: Array, apart: Array) -> None:
+        """Foresee the state of the next step from the one that the arrays are at.
+
+        See `believe_step`, whose arguments these are.
+        """
+        believe_step(
+            self._constants,
+            self._now,
+            self._plans,
+            self._numbers,
+            self._stage,
+            believed,
+            silent,
+            told,
+            apart,
+        )
 
     def _load(self, before: Array) -> None:
         """Have the arrays know what the objects know."""
@@ -409,29 +489,46 @@ class _Flying:
 
     def _load_plan(self) -> None:
         """Take on the horizon or spline that is held."""
-        compensator = self._compensator
-        self._held, self._guides = compensator.held, compensator.guides
-        now = self._now
+        compensator, now = self._compensator, self._now
+        self._held, self._guides = held, guides = compensator.held, compensator.guides
         now["lead_p"], now["lead_v"] = zip(*compensator.lead, strict=True)
-        if compensator.guides:
-            self._numbers = np.array([each.knots for each in compensator.guides])
-            rows = [
+        self._lead_stage = compensator.lead_stage
+        if guides:
+            self._numbers = np.array([each.knots for each in guides])
+            self._plans[:] = [
                 (
-                    *(True, each.length, each.spacing, True, each.last, each.speed, each.brake),
-                    *(True, each.gain_p, each.gain_v, 0.0),
+                    True,
+                    g.length,
+                    g.spacing,
+                    True,
+                    g.last,
+                    g.speed,
+                    g.brake,
+                    True,
+                    g.gain_p,
+                    g.gain_v,
+                    0,
                 )
-                for each in compensator.guides
+                for g in guides
             ]
         else:
-            self._numbers = np.array([each.inputs for each in compensator.held])
-            rows = [
+            self._numbers = np.array([each.inputs for each in held])
+            self._plans[:] = [
                 (
-                    *(False, each.length, 1, each.indexed, 0.0, each.speed, each.brake),
-                    *(each.feeds_back, each.gain_p, each.gain_v, each.disturbance),
+                    False,
+                    h.length,
+                    1,
+                    h.indexed,
+                    0,
+                    h.speed,
+                    h.brake,
+                    h.feeds_back,
+                    h.gain_p,
+                    h.gain_v,
+                    h.disturbance,
                 )
-                for each in compensator.held
+                for h in held
             ]
-        self._plans[:] = rows
 
     def _load_air(self) -> None:
         """Take on the air as it is now."""
@@ -445,27 +542,88 @@ class _Flying:
     def leave(self) -> None:
         """Have the objects know what the arrays know, which are to be loaded anew."""
         self.tell()
-        self._is_loaded = False
+        self._is_loaded, self.step = False, None
 
     def tell(self) -> None:
         """Have the objects know what the arrays know."""
-        if self._at is None:
+        if not self._is_ahead:
             return
-        at, self._at = self._at, None
-        rows = self._rows
-        self._vehicle.flown_to(at)
-        position, velocity = [row[0] for row in rows], [row[1] for row in rows]
-        measured = Measurement(self._vehicle.starts_ns(at), position, velocity)
+        assert self.step is not None
+        self._is_ahead = False
+        compensator, now = self._compensator, self._now
+        self._vehicle.flown_to(self.step)
+        states = self._plant.x = self._navigation.measured = pairs(self.row[self._states])
+        position, velocity = [p for p, _ in states], [v for _, v in states]
+        measured = Measurement(self._vehicle.starts_ns(self.step), position, velocity)
         self._navigation.leaps.took(measured)
+        if compensator.held is self._held and compensator.guides is self._guides:
+            compensator.lead = now[["lead_p", "lead_v"]].tolist()
+            compensator.lead_stage = self._lead_stage
         if self._kalman is None:
             self._navigation.filter.take(measured)
             return
-        self._kalman.x = [(row[2], row[3], row[4]) for row in rows]
-        spreads = self._now[list(Spread._fields)].tolist()
-        kinds = self._kalman.kinds
+        self._kalman.x = now[["x_p", "x_v", "x_w"]].tolist()
+        spreads, kinds = now[list(Spread._fields)].tolist(), self._kalman.kinds
         self._kalman.spreads = [
             Spread(*spreads[kinds.index(kind)]) for kind in range(len(self._kalman.spreads))
         ]
+
+
+def pairs(numbers: list[float]) -> list[tuple[float, float]]:
+    """Numbers two by two."""
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
+
+
+class _Belief(BelievedState):
+    """What the server must believe of a vehicle, foreseen by the arrays where they are in use."""
+
+    def __init__(self, terms: Terms, compensator: Compensator, flying: _Flying) -> None:
+        super().__init__(terms, compensator)
+        self._flying = flying
+        self._believed, self._silent, self._told, self._apart = np.zeros((4, terms.axes, 2))
+        self._is_array = False
+        """Whether the state is in `_believed`."""
+        self._foreseen: int | None = None
+        """Step from which the next state has been foreseen by the arrays."""
+
+    def off_m(self, states: States) -> float:
+        """See `BelievedState`."""
+        if self._flying.step is None:
+            self._to_list()
+            return super().off_m(states)
+        if not self._is_array:
+            self._believed[:], self._is_array = self._states, True
+        self._flying.foresee(self._believed, self._silent, self._told, self._apart)
+        self._foreseen = self._flying.step
+        axes = zip(self._tau_s, self._apart.tolist(), strict=True)
+        return math.hypot(*(dp + tau * dv for tau, (dp, dv) in axes))
+
+    def told(self, states: States, flown: Sequence[float]) -> None:
+        """See `BelievedState`."""
+        if self._is_foreseen():
+            self._believed, self._told = self._told, self._believed
+        else:
+            super().told(states, flown)
+
+    def silent(self) -> None:
+        """See `BelievedState`."""
+        if self._is_foreseen():
+            self._believed, self._silent = self._silent, self._believed
+        else:
+            super().silent()
+
+    def _is_foreseen(self) -> bool:
+        """Whether the next state is known; if not, the objects know what it follows from."""
+        if self._flying.step is not None and self._foreseen == self._flying.step:
+            return True
+        self._flying.tell()
+        self._to_list()
+        return False
+
+    def _to_list(self) -> None:
+        """Have the state as `BelievedState` has it."""
+        if self._is_array:
+            self._states, self._is_array = pairs(self._believed.ravel().tolist()), False
 
 
 class CompiledPilot(Pilot):
@@ -492,6 +650,7 @@ class CompiledPilot(Pilot):
                 self._flying = _Flying(
                     scenario, self._navigation, self.compensator, body, self._change_max
                 )
+                self._reporter.belief = _Belief(self._terms, self.compensator, self._flying)
         self._due: int | None = None
         """Step up to whose begin the vehicle is still to be flown and measured."""
 
@@ -501,6 +660,13 @@ class CompiledPilot(Pilot):
         if self._flying is not None:
             self._flying.tell()
         return super().disturbance
+
+    def _known(self) -> Sequence[float]:
+        """See `Pilot`."""
+        flying = self._flying
+        if flying is None or flying.step is None:
+            return super()._known()
+        return flying.row[: 7 * self._terms.axes]
 
     def _navigate(self, step: int) -> None:
         """Take what was measured up to the begin of a step, at once or with its input."""
