@@ -221,7 +221,7 @@ class Pilot:
             if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE][0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
         told = compensator.told if compensator.feeds_back else wanted
-        speed_max = self._speed_max(had_plan)
+        speed_max = self._speed_max(had_plan, compensator.covered)
         flown = clamped(
             wanted,
             self._input.tolist(),
@@ -279,10 +279,15 @@ class Pilot:
         """Whether the fence holds the vehicle back."""
         return self._fence is not None and self._fence.holds
 
-    def _speed_max(self, had_plan: bool) -> float:
-        """Largest speed of what is told [m/s]: without a plan what was flown is braked along."""
+    def _speed_max(self, had_plan: bool, has_plan: bool) -> float:
+        """Largest speed of what is told [m/s]: without a plan what was flown is braked along.
+
+        Args:
+            had_plan: whether there was a plan for the step before.
+            has_plan: whether there is one for this step.
+        """
         brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
-        if self.compensator.covered or not brakes:
+        if has_plan or not brakes:
             return math.inf
         return max(0.0, self._speed - (0.0 if had_plan else self._terms.brake))
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from skytether.client import clamp
 from skytether.client import filter as kalman
+from skytether.client.clamp import ROUNDING
 from skytether.client.compensator import Compensator
 from skytether.client.failsafe import Failsafe
 from skytether.client.filter import Kalman, Spread
@@ -416,12 +417,13 @@ class _Flying:
             for name in ("pp", "pv", "vv", "ww"):
                 to[f"noise_{name}"] = [getattr(noise, name) for noise in noises]
 
-    def fly(self, step: int, before: Array) -> list[float] | None:
+    def fly(self, step: int, before: Array, speed_max: float) -> list[float] | None:
         """Fly to the begin of a step, and choose the input from there on.
 
         Args:
             step: the step after the one that the vehicle is at.
             before: input that is flown until there [m/s]; shape (axes,).
+            speed_max: bound of the magnitude of what is no feedback [m/s].
 
         Returns:
             the input of each axis [m/s]; None where something is not as usual: then nothing was
@@ -448,11 +450,14 @@ class _Flying:
             self._told,
         ):
             return None
+        row = self._told.tolist()
+        if speed_max < math.inf and math.hypot(*row[self._parts]) > speed_max + ROUNDING:
+            return None
         weather.drawn = None
         self._now, self._after = self._after, self._now
         self._lead_stage = max(stage, self._lead_stage)
         self.step, self._is_ahead = step, True
-        self.row = row = self._told.tolist()
+        self.row = row
         self._navigation.note(pairs(row[self._known]))
         compensator.note(step, row[self._parts])
         return row[self._inputs]
@@ -688,17 +693,17 @@ class CompiledPilot(Pilot):
     def _choose(self, now_ns: int) -> Array:
         """See `Pilot`."""
         if self._flying is not None and self._due == self.step and self._is_usual():
-            flown = self._flying.fly(self.step, self._input)
+            covers = self.compensator.covers(self.step)
+            speed_max = self._speed_max(self.compensator.covered, covers)
+            flown = self._flying.fly(self.step, self._input, speed_max)
             if flown is not None:
                 self._due = None
                 told = self.compensator.told if self.compensator.feeds_back else flown
-                return self._settled(flown, told, math.inf, now_ns)
+                return self._settled(flown, told, speed_max, now_ns)
         self._catch_up()
         return super()._choose(now_ns)
 
     def _is_usual(self) -> bool:
-        """Whether the step is flown along a plan, or with an input that is held for ever."""
-        mode, compensator = self._failsafe.mode, self.compensator
-        if mode is Mode.LAND or mode in STOPPED or not self._navigation.is_known:
-            return False
-        return compensator.covers(self.step) or not self._failsafe.brakes
+        """Whether the vehicle flies what is chosen, and its state is known."""
+        mode = self._failsafe.mode
+        return mode is not Mode.LAND and mode not in STOPPED and self._navigation.is_known
