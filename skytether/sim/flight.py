@@ -154,7 +154,6 @@ class Run:
     Args:
         world: where its hosts are added.
         scenario: what to fly, with the run's seed.
-        server: the server of all runs.
         server_rows: gives the number of rows that the server has recorded so far.
         number: number of the run, from 0; its vehicles' numbers follow those of the runs before.
         vehicles: number of its vehicles.
@@ -165,13 +164,12 @@ class Run:
         self,
         world: World,
         scenario: Scenario,
-        server: Endpoint,
         server_rows: Callable[[], int],
         number: int,
         vehicles: int,
         keyring: Keyring | None,
     ) -> None:
-        self._server, self._server_rows = server, server_rows
+        self._server_rows = server_rows
         self._before = number * vehicles
         self._sinks = io.BytesIO(), io.BytesIO()
         recorder = Recorder(client_columns(scenario.model.axes), self._sinks[0])
@@ -231,11 +229,12 @@ class Run:
         if not self.flying:
             self._ends = self._server_rows(), self._sinks[1].tell()
 
-    def flight(self, server_rows: Rows) -> Record:
+    def flight(self, server_rows: Rows, server_figures: Mapping[str, Any]) -> Record:
         """Make its flight, as if it had been alone.
 
         Args:
             server_rows: the server's part of the record, of all runs.
+            server_figures: figures of the server.
         """
         rows_end, bytes_end = self._ends
         client = parse(self._sinks[0].getvalue()).copy()
@@ -250,7 +249,7 @@ class Run:
             failure = msgspec.structs.replace(failure, vehicle=failure.vehicle - self._before)
         told = {str(each.vehicle - self._before): each.told() for each in self._clients}
         figures = {
-            "server": self._server.figures(),
+            "server": server_figures,
             "netem": self.netem.figures(),
             "client": {"by_vehicle": told},
         }
@@ -325,8 +324,7 @@ def _fly(
         return (sink.tell() - header_bytes) // row_bytes
 
     runs = [
-        Run(world, run, server, server_rows, number, vehicles, keyring)
-        for number, run in enumerate(each)
+        Run(world, run, server_rows, number, vehicles, keyring) for number, run in enumerate(each)
     ]
     run_of = {host: run for run in runs for host in run.hosts} | dict.fromkeys(beside, runs[0])
     for name, endpoint in beside.items():
@@ -349,8 +347,8 @@ def _fly(
 
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
     world.run(over, limit_ns=seconds_to_ns(longest_s))
-    recorded = parse(sink.getvalue())
-    return [run.flight(recorded) for run in runs]
+    recorded, figures = parse(sink.getvalue()), server.figures()
+    return [run.flight(recorded, figures) for run in runs]
 
 
 def plan_changes(

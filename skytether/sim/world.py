@@ -105,6 +105,8 @@ class Host:
     """Callback for the end of the endpoint, until it has been called."""
     armed_ns: int | None = None
     """Time of the world at which it is to be woken, or None."""
+    due_ns: int | None = None
+    """Time of its clock that `armed_ns` was found from; None where it is to be found anew."""
 
 
 ACTION, ARRIVAL = -1, 0
@@ -225,7 +227,7 @@ class World:
             for datagram in still.waiting:
                 self._receive(host, datagram)
             if not still.waiting and still.armed_ns is not None:
-                host.armed_ns = max(self.now_ns, still.armed_ns)
+                host.armed_ns, host.due_ns = max(self.now_ns, still.armed_ns), None
                 self._at(host.armed_ns, host.turn, host, None)
 
     def set_clock(self, name: str, *, step_ns: int = 0, drift_ppb: int | None = None) -> None:
@@ -241,6 +243,7 @@ class World:
         """
         host = self._hosts[name]
         host.clock = host.clock.changed(self.now_ns, step_ns=step_ns, drift_ppb=drift_ppb)
+        host.due_ns = None
 
     def set_compute(self, name: str, compute_ns: int) -> None:
         """Change the time that a host works whenever it is woken [ns]."""
@@ -291,6 +294,9 @@ class World:
         if due_ns is None:
             host.armed_ns = None
             return
+        if due_ns == host.due_ns and host.armed_ns is not None:
+            return  # it is armed for that already
+        host.due_ns = due_ns
         time_ns = host.clock.world(due_ns)
         time_ns = max(time_ns, host.busy_until_ns)
         time_ns = max(time_ns, self.now_ns)
