@@ -31,7 +31,7 @@ from skytether.server import secure as server_secure
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.aboard import VehicleEvent
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Endpoint
@@ -62,6 +62,8 @@ BOOT_ID = 2**63 + 2**31
 SERVER: Address = ("server", 0)
 COMPANY_MAX = 100
 """Most runs that share a server; more would be no faster, and a vehicle's number takes one byte."""
+ASK_NS = 10 * MILLISECOND_NS
+"""Time of the world after which it is asked again whether to break a flight off [ns]."""
 EVENTS_MAX = 65_536
 """Events kept of a flight; older ones give way."""
 
@@ -333,10 +335,13 @@ def _fly(
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
     plan_changes(world, scenario, {SERVER[0]: server, **runs[0].hosts, **beside}, changes)
-    second_ns, flying = SECOND_NS, runs.copy()
+    ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
 
     def over() -> bool:
-        nonlocal second_ns
+        nonlocal ask_ns, second_ns
+        if world.now_ns < ask_ns and flying[-1].flying:
+            return False
+        ask_ns = world.now_ns + ASK_NS
         if world.now_ns >= second_ns:
             flown_s = world.now_ns // SECOND_NS
             second_ns = (flown_s + 1) * SECOND_NS
