@@ -52,7 +52,7 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
-from skytether.sim.aboard import CompiledPilot
+from skytether.sim.pilot import CompiledPilot
 from skytether.sim.world import Clock, World
 
 MIDNIGHT_NS = 86_400 * SECOND_NS

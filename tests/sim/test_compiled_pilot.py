@@ -9,33 +9,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import packaged
 from skytether.client.pilot import Pilot
-from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Record
-from skytether.sim import aboard, flight
+from skytether.sim import flight
+from skytether.sim.aboard import fly_step
 from skytether.sim.flight import fly
 
-
-def scenario(name: str, **sections: Any) -> Scenario:
-    """A few seconds of a scenario, with some keys changed."""
-    table = reading.to_table(reading.load(name)) | {"duration": 4.0, "settle": 0.0}
-    for key, value in sections.items():
-        table[key] = table[key] | value if isinstance(value, dict) else value
-    return reading.check(table, "test")
+SHORT = {"duration": 4.0, "settle": 0.0}
+"""A few seconds of a scenario."""
 
 
 @contextmanager
 def counted() -> Iterator[list[bool]]:
     """Whether each step that could be compiled was as usual, one after the other."""
     usual: list[bool] = []
-    fly_step = aboard.fly_step
 
     def counts(*args: Any) -> bool:
         usual.append(fly_step(*args))
         return usual[-1]
 
-    with mock.patch.object(aboard, "fly_step", counts):
+    with mock.patch("skytether.sim.pilot.fly_step", counts):
         yield usual
 
 
@@ -94,13 +89,13 @@ scenarios = st.fixed_dictionaries(
 @given(scenarios)
 def test_flights_are_the_same_as_by_the_pilot(sections: dict[str, Any]) -> None:
     """Flights of any scheme, sensor, wind, report and network equal those of `Pilot`."""
-    assert_as_by_pilot(scenario("paper", **sections))
+    assert_as_by_pilot(packaged("paper", SHORT, **sections))
 
 
 @pytest.mark.parametrize("name", ["paper", "demo"])
 def test_most_steps_of_a_flight_are_compiled(name: str) -> None:
     """Else the other tests here would prove nothing: all but those without a plan."""
-    record, usual = assert_as_by_pilot(scenario(name, duration=8.0))
+    record, usual = assert_as_by_pilot(packaged(name, SHORT, duration=8.0))
     assert all(usual)
     assert len(usual) > 0.7 * len(record.client)
 
@@ -115,20 +110,20 @@ def test_most_steps_of_a_flight_are_compiled(name: str) -> None:
 )
 def test_what_is_not_simple_is_left_to_the_pilot(sections: dict[str, Any]) -> None:
     """A sensor with noise, a dead time, a fence."""
-    _, usual = assert_as_by_pilot(scenario("demo", **sections))
+    _, usual = assert_as_by_pilot(packaged("demo", SHORT, **sections))
     assert not usual
 
 
 def test_wind_may_change_in_flight() -> None:
     """The arrays take on other air, and a step is flown in what was drawn for it."""
     changes = [(1.5, {"vehicle.wind": 0.3}), (2.5, {"vehicle.gust_mps2": 2.0})]
-    _, usual = assert_as_by_pilot(scenario("paper"), changes=changes)
+    _, usual = assert_as_by_pilot(packaged("paper", SHORT), changes=changes)
     assert all(usual)
 
 
 def test_a_step_that_is_not_as_usual_is_flown_by_the_pilot() -> None:
     """A state that leaps brakes the vehicle, in the wind that was drawn for the step."""
     changes = [(5.0, {"vehicle.wind": 30.0})]
-    record, usual = assert_as_by_pilot(scenario("demo", duration=8.0), changes=changes)
+    record, usual = assert_as_by_pilot(packaged("demo", SHORT, duration=8.0), changes=changes)
     assert not all(usual)
     assert Reason.LEAPT in record.client["reason"]
