@@ -58,15 +58,17 @@ class Compensator:
         self._brake, self._join = terms.brake, terms.join
         self._bounds = terms.u_max
         self._model = terms.model.axes()
-        self._begins = 0
+        self.begins = 0
         """Step of stage 0: that which the horizon was made for, or that at which it was dropped."""
-        self._held: list[Held] = []
+        self.held: list[Held] = []
         """The horizon on each axis; without one the input that was flown when it was dropped."""
-        self._guides: list[Guide] = []
+        self.guides: list[Guide] = []
         """Spline on each axis; empty where inputs are held."""
-        self._lead: list[tuple[float, float]] = []
-        """State x̄ that the horizon leads to, of each axis at stage `_lead_stage` [m, m/s]."""
-        self._lead_stage = 0
+        self.feeds_back = False
+        """Whether what is flown is told and feedback on top of that."""
+        self.lead: list[tuple[float, float]] = []
+        """State x̄ that the horizon leads to, of each axis at stage `lead_stage` [m, m/s]."""
+        self.lead_stage = 0
         self._length = 0
         """Number of stages for which the horizon is flown."""
         self._hold([[0.0]] * terms.axes, 1)
@@ -127,7 +129,7 @@ class Compensator:
         self.in_force = self.newest = horizon.step
         self._new = True
         self.observed = observed
-        self._begins = horizon.step
+        self.begins = horizon.step
         if isinstance(horizon, Trajectory):
             knots = horizon.knots.reshape(len(horizon.knots), -1).tolist()
             self._guide(knots, horizon.spacing, length)
@@ -148,7 +150,7 @@ class Compensator:
         """
         self.in_force, self.observed = NO_HORIZON, -1
         self._new = self.covered = False
-        self._begins = step
+        self.begins = step
         self._hold(flown_last[:, None].tolist(), 1)
 
     def _hold(
@@ -165,7 +167,7 @@ class Compensator:
         within = [bounded(u, bound) for u, bound in zip(last, self._bounds, strict=True)]
         speed = math.sqrt(sum(u * u for u in within))
         told = feedback or [[0.0] * FEEDBACK] * len(inputs)
-        self._held = [
+        self.held = [
             Held(
                 model=model,
                 inputs=each,
@@ -183,10 +185,10 @@ class Compensator:
                 self._model, inputs, self._bounds, told, strict=True
             )
         ]
-        self._guides = []
+        self.guides, self.feeds_back = [], bool(feedback)
         self._length = length
-        self._lead = [(columns[LED_P], columns[LED_V]) for columns in told]
-        self._lead_stage = 0
+        self.lead = [(columns[LED_P], columns[LED_V]) for columns in told]
+        self.lead_stage = 0
 
     def rest(self, step: int, state: Sequence[tuple[float, float]]) -> None:
         """Hold the present place until a horizon comes, or what is held is dropped.
@@ -195,13 +197,13 @@ class Compensator:
             step: k, the step whose input is chosen next.
             state: position [m] and velocity [m/s] of each axis.
         """
-        self._begins = step
+        self.begins = step
         self._guide([[position, 0.0] for position, _ in state], 1, FOREVER)
 
     @property
     def rests(self) -> bool:
         """Whether a place is held."""
-        return bool(self._guides) and self.in_force == NO_HORIZON
+        return bool(self.guides) and self.in_force == NO_HORIZON
 
     def _guide(self, knots: list[list[float]], spacing: int, length: int) -> None:
         """Fly along a spline from now on, for so many stages."""
@@ -210,7 +212,7 @@ class Compensator:
             for model, each, bound in zip(self._model, knots, self._bounds, strict=True)
         ]
         speed = math.hypot(*last)
-        self._guides = [
+        self.guides = [
             Guide(
                 model=model,
                 knots=each,
@@ -228,9 +230,9 @@ class Compensator:
                 self._model, knots, last, self._bounds, self._gain.tolist(), strict=True
             )
         ]
-        self._length = length
-        self._lead = [(each[0], each[1]) for each in knots]
-        self._lead_stage = 0
+        self._length, self.feeds_back = length, True
+        self.lead = [(each[0], each[1]) for each in knots]
+        self.lead_stage = 0
 
     def _comes_too_late(self, stage: int, committed: int, length: int) -> bool:
         """Whether a horizon that would come into force at a stage is of no use any more.
@@ -257,30 +259,48 @@ class Compensator:
             disturbance: ŵ that the vehicle itself has found on each axis, of account only along a
                 spline [m/s].
         """
-        if self._new:
-            self.since, self._new = step, False
-        self._chosen = step
-        stage = step - self._begins
-        self.covered = self.in_force != NO_HORIZON and stage < self._length
-        if self._guides:
+        stage = self._go_on(step)
+        if self.guides:
             return self._follow(stage, state, disturbance)
         if self.feeds_back:
             self._lead_to(stage)
-        axes = zip(self._held, self._lead, state, strict=True)
+        axes = zip(self.held, self.lead, state, strict=True)
         flown = [rule.step(held, stage, *lead, *x) for held, lead, x in axes]
         self.told = [told for _, told, _, _ in flown]
         return [u for u, _, _, _ in flown]
+
+    def covers(self, step: int) -> bool:
+        """Whether the horizon has an input for a step."""
+        return self.in_force != NO_HORIZON and step - self.begins < self._length
+
+    def _go_on(self, step: int) -> int:
+        """Go on to a step, and return its stage."""
+        if self._new:
+            self.since, self._new = step, False
+        self._chosen = step
+        self.covered = self.covers(step)
+        return step - self.begins
+
+    def note(self, step: int, told: list[float]) -> None:
+        """Note what was chosen for a step elsewhere; `lead` is left as it was.
+
+        Args:
+            step: k, never smaller than before.
+            told: what is flown but for the feedback, of each axis [m/s].
+        """
+        self._go_on(step)
+        self.told = told
 
     def _follow(
         self, stage: int, state: Sequence[tuple[float, float]], disturbance: Sequence[float]
     ) -> list[float]:
         """Input along the spline at a stage, see `choose`."""
         flown = []
-        for axis, (guide, w) in enumerate(zip(self._guides, disturbance, strict=False)):
-            lead = spline.guided_to(guide, self._lead_stage, stage, *self._lead[axis])
-            self._lead[axis] = lead
+        for axis, (guide, w) in enumerate(zip(self.guides, disturbance, strict=False)):
+            lead = spline.guided_to(guide, self.lead_stage, stage, *self.lead[axis])
+            self.lead[axis] = lead
             flown.append(spline.follow(guide, stage, *lead, *state[axis], w))
-        self._lead_stage = stage
+        self.lead_stage = stage
         self.told = [told for _, told in flown]
         return [u for u, _ in flown]
 
@@ -293,27 +313,22 @@ class Compensator:
             states: position [m] and velocity [m/s] of each axis at that step.
             flown: input flown there [m/s]; None for what the rule of flight makes of the states.
         """
-        stage = self._chosen - self._begins
-        if self._guides:  # what the wind does is flown off
-            led = zip(self._guides, self._lead, states, strict=True)
+        stage = self._chosen - self.begins
+        if self.guides:  # what the wind does is flown off
+            led = zip(self.guides, self.lead, states, strict=True)
             told = [spline.follow(guide, stage, *lead, *x, 0.0)[0] for guide, lead, x in led]
             return [advance(m, *x, u) for m, x, u in zip(self._model, states, told, strict=True)]
         if flown is None:
-            axes = zip(self._held, self._lead, states, strict=True)
+            axes = zip(self.held, self.lead, states, strict=True)
             flown = [rule.step(held, stage, *lead, *x)[0] for held, lead, x in axes]
-        flying = zip(self._held, states, flown, strict=True)
+        flying = zip(self.held, states, flown, strict=True)
         return [advance(held.model, p, v, u + held.disturbance) for held, (p, v), u in flying]
-
-    @property
-    def feeds_back(self) -> bool:
-        """Whether what is flown is told and feedback on top of that."""
-        return bool(self._guides) or self._held[0].feeds_back
 
     def _lead_to(self, stage: int) -> None:
         """Roll x̄ on to a stage, unless it is there already."""
-        if stage > self._lead_stage:
-            self._lead = [
-                rule.lead_to(held, self._lead_stage, stage, *lead)
-                for held, lead in zip(self._held, self._lead, strict=True)
+        if stage > self.lead_stage:
+            self.lead = [
+                rule.lead_to(held, self.lead_stage, stage, *lead)
+                for held, lead in zip(self.held, self.lead, strict=True)
             ]
-            self._lead_stage = stage
+            self.lead_stage = stage

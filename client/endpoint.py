@@ -49,6 +49,7 @@ class Client(Endpoint):
         boot_id: number that no other life of this vehicle has had.
         link: how messages become datagrams.
         recorder: takes one row a step.
+        pilot: class of what flies the vehicle.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Client(Endpoint):
         boot_id: int,
         link: ClientLink | None = None,
         recorder: Recorder | None = None,
+        pilot: type[Pilot] = Pilot,
     ) -> None:
         super().__init__()
         terms = scenario.terms()
@@ -87,7 +89,7 @@ class Client(Endpoint):
             out=self._out,
             events=self._events,
         )
-        self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
+        self._pilot = pilot(scenario, vehicle, flies, self._failsafe, recorder)
         self._not_flown: NotFlown | None = None
         """Event with which a flight ends that has had no plan."""
         self._held_ns = 0

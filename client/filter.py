@@ -102,17 +102,17 @@ class Kalman:
         terms, sensor = scenario.terms(), scenario.sensor
         self._model = terms.model.axes()
         alike = sorted(set(self._model))
-        self._kinds = [alike.index(axis) for axis in self._model]
+        self.kinds = [alike.index(axis) for axis in self._model]
         """Which of the axes that differ each one is like."""
         q, dt = sensor.process_noise, terms.dt_s
-        self._noise = []
+        self.noise = []
         for axis in alike:
             tau_s = terms.tau_s[self._model.index(axis)]
             (a, _), (b, c) = (q * white_acceleration(np.array([tau_s]), dt)[0]).tolist()
             walk = (DRIFT * q) ** 2 * dt
-            self._noise.append(Spread(a * a, a * b, 0.0, b * b + c * c, 0.0, walk))
+            self.noise.append(Spread(a * a, a * b, 0.0, b * b + c * c, 0.0, walk))
         self._alike = alike
-        self._variances = (
+        self.variances = (
             max(sensor.position_noise_m, LEAST) ** 2,
             max(sensor.velocity_noise_mps, LEAST) ** 2,
         )
@@ -135,9 +135,9 @@ class Kalman:
         assert measured.position is not None
         v, w = BEGIN_MPS
         if measured.velocity is not None:
-            v = self._variances[1] ** 0.5
+            v = self.variances[1] ** 0.5
         velocity = measured.velocity or [0.0] * len(self._model)
-        P = Spread(self._variances[0], 0.0, 0.0, v * v, 0.0, w * w)
+        P = Spread(self.variances[0], 0.0, 0.0, v * v, 0.0, w * w)
         self.spreads = [P] * len(self._alike)
         self.x = [(p, v, 0.0) for p, v in zip(measured.position, velocity, strict=True)]
 
@@ -159,7 +159,7 @@ class Kalman:
             self.x = [(p, v, w) for (p, v), (_, _, w) in zip(moved, self.x, strict=True)]
         self.spreads = [
             widened(axis, P, noise)
-            for axis, P, noise in zip(self._alike, self.spreads, self._noise, strict=True)
+            for axis, P, noise in zip(self._alike, self.spreads, self.noise, strict=True)
         ]
 
     def take(self, measured: Measurement) -> None:
@@ -170,10 +170,10 @@ class Kalman:
             self.gains[which] = []
             if values is None:
                 continue
-            variance = self._variances[which]
+            variance = self.variances[which]
             corrected = [correct(P, variance) for P in self.spreads]
             self.spreads = [P for _, P in corrected]
-            gains = self.gains[which] = [corrected[kind][0] for kind in self._kinds]
+            gains = self.gains[which] = [corrected[kind][0] for kind in self.kinds]
             self.x = [
                 (p + kp * off, v + kv * off, w + kw * off)
                 for (p, v, w), (kp, kv, kw), off in (

@@ -64,7 +64,8 @@ class Navigation:
     def __init__(self, scenario: Scenario) -> None:
         known, axes = sensing(scenario), scenario.model.axes
         terms = scenario.terms()
-        self._filter = Kalman(scenario, known.delay) if filters(scenario) else Newest(axes)
+        self.filter = Kalman(scenario, known.delay) if filters(scenario) else Newest(axes)
+        """What makes an estimate of what is measured."""
         late = any(terms.dead_time_s)
         self._inputs = OnTheirWay(terms.model.axes(), terms.dead_times) if late else None
         """Inputs on their way; None where the model has each act at once."""
@@ -72,7 +73,10 @@ class Navigation:
         """Time from measuring to having it that the filter itself reckons with [ns]."""
         self._motions = list(zip(terms.tau_s, terms.gain, strict=True))
         self._begun = False
-        self._leaps = _Leaps(scenario)
+        self.leaps = Leaps(scenario)
+        """What is measured is held against what was measured before."""
+        self.is_simple = known.exact and self._inputs is None
+        """Whether the whole state is measured at each step, and each input acts at once."""
         self.leapt = False
         """Whether what was measured since the last step is what no vehicle can have come to."""
         self._nothing = [math.nan] * axes
@@ -101,28 +105,36 @@ class Navigation:
         if self._inputs is not None:
             due, swing = self._inputs.issue(due)
         if self._begun:
-            self._filter.advance(due, swing)
+            self.filter.advance(due, swing)
         self.leapt = False
         for measured in measurements if self._begun else _newest(measurements):
-            self.leapt |= self._leaps.leaps(measured)
+            self.leapt |= self.leaps.leaps(measured)
             if self._begun:
-                self._filter.take(self._carried(measured, now_ns - self._delay_ns, due))
+                self.filter.take(self._carried(measured, now_ns - self._delay_ns, due))
             else:
-                self._filter.begin(measured)
+                self.filter.begin(measured)
                 self._begun = True
             position, velocity = measured.position or position, measured.velocity or velocity
         self.measured = list(zip(position, velocity, strict=True))
         if self._begun:
-            self.estimate = self.predicted = self._filter.estimate()
+            self.estimate = self.predicted = self.filter.estimate()
             if self._inputs is not None:
-                self.predicted = self._inputs.predict(self.estimate, self._filter.disturbance())
+                self.predicted = self._inputs.predict(self.estimate, self.filter.disturbance())
             numbers = chain.from_iterable(self.predicted)
             self.is_known = all(-FLOAT_MAX <= number <= FLOAT_MAX for number in numbers)
+
+    def note(self, estimate: list[tuple[float, float]]) -> None:
+        """Note the finite estimate of a step that was computed elsewhere, without a leap.
+
+        Filter, leaps and `measured` are left as they were.
+        """
+        self.leapt = False
+        self.estimate = self.predicted = estimate
 
     @property
     def disturbance(self) -> Sequence[float]:
         """Disturbance ŵ that the filter has found on each axis [m/s]; 0 without a filter."""
-        return self._filter.disturbance()
+        return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: list[float]) -> Measurement:
         """A measurement as it would be later, by eq. (1); an earlier time changes nothing.
@@ -138,8 +150,8 @@ class Navigation:
         age = min(to_ns - measured.stamp_ns, CARRIED_NS) / SECOND_NS
         if age <= 0.0:
             return measured
-        known = measured.velocity or [v for _, v in self._filter.estimate()]
-        acting = zip(self._motions, due, self._filter.disturbance(), strict=True)
+        known = measured.velocity or [v for _, v in self.filter.estimate()]
+        acting = zip(self._motions, due, self.filter.disturbance(), strict=True)
         position, velocity = list(measured.position or ()), []
         for i, ((tau, gain), u, w) in enumerate(acting):
             left, steady = math.exp(-age / tau), gain * u + w
@@ -159,13 +171,13 @@ def _newest(measurements: Sequence[Measurement]) -> Sequence[Measurement]:
     return measurements[placed[-1] :] if placed else ()
 
 
-class _Leaps:
+class Leaps:
     """Watch over what is measured: each is held against what was measured before."""
 
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
-        self._noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
-        self._noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
+        self.noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
+        self.noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
         self._position: tuple[int, list[float]] | None = None
         """Newest position [m] of each axis, and its stamp."""
         self._velocity: tuple[int, list[float]] | None = None
@@ -177,19 +189,26 @@ class _Leaps:
         before, found = self._velocity, False
         if velocity is not None:
             if before is not None:
-                time, noise = (stamp_ns - before[0]) / SECOND_NS, self._noise_mps
+                time, noise = (stamp_ns - before[0]) / SECOND_NS, self.noise_mps
                 for v, after_v in zip(before[1], velocity, strict=True):
                     found |= velocity_leaps(v, after_v, time, noise)
             self._velocity = stamp_ns, velocity
         if position is not None:
             if self._position is not None and before is not None:
                 since_ns, elsewhere = self._position
-                time, noise = (stamp_ns - since_ns) / SECOND_NS, self._noise_m
+                time, noise = (stamp_ns - since_ns) / SECOND_NS, self.noise_m
                 states = zip(elsewhere, before[1], position, velocity or before[1], strict=True)
                 for p, v, after_p, after_v in states:
                     found |= position_leaps(p, v, after_p, after_v, time, noise)
             self._position = stamp_ns, position
         return found
+
+    def took(self, measured: Measurement) -> None:
+        """Note a whole state that has not leapt."""
+        stamp_ns, position, velocity = measured
+        assert position is not None
+        assert velocity is not None
+        self._position, self._velocity = (stamp_ns, position), (stamp_ns, velocity)
 
 
 class Newest:

@@ -221,7 +221,7 @@ class Pilot:
             if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE][0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
         told = compensator.told if compensator.feeds_back else wanted
-        speed_max = self._speed_max(had_plan)
+        speed_max = self._speed_max(had_plan, compensator.covered)
         flown = clamped(
             wanted,
             self._input.tolist(),
@@ -230,6 +230,20 @@ class Pilot:
             told=told,
             speed_max=speed_max,
         )
+        return self._settled(flown, told, speed_max, now_ns)
+
+    def _settled(
+        self, flown: list[float] | None, told: Sequence[float], speed_max: float, now_ns: int
+    ) -> Array:
+        """Input that is flown at last, and what follows from it.
+
+        Args:
+            flown: input of each axis that may be flown [m/s]; None where it is not finite.
+            told: part of it that is no feedback, of each axis [m/s].
+            speed_max: bound of the magnitude of that part [m/s].
+            now_ns: time now.
+        """
+        failsafe, compensator = self._failsafe, self.compensator
         if flown is None:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         elif compensator.in_force != NO_HORIZON and not compensator.covered:
@@ -265,10 +279,15 @@ class Pilot:
         """Whether the fence holds the vehicle back."""
         return self._fence is not None and self._fence.holds
 
-    def _speed_max(self, had_plan: bool) -> float:
-        """Largest speed of what is told [m/s]: without a plan what was flown is braked along."""
+    def _speed_max(self, had_plan: bool, has_plan: bool) -> float:
+        """Largest speed of what is told [m/s]: without a plan what was flown is braked along.
+
+        Args:
+            had_plan: whether there was a plan for the step before.
+            has_plan: whether there is one for this step.
+        """
         brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
-        if self.compensator.covered or not brakes:
+        if has_plan or not brakes:
             return math.inf
         return max(0.0, self._speed - (0.0 if had_plan else self._terms.brake))
 
@@ -312,16 +331,12 @@ class Pilot:
     def _record(self) -> None:
         if self._recorder is None:
             return
-        compensator, failsafe, known = self.compensator, self._failsafe, self._navigation
-        truth = self._vehicle.truth()
+        compensator, failsafe = self.compensator, self._failsafe
         observed = compensator.observed
         self._recorder.append_row(
             self._number,
             self.flown,
-            *chain.from_iterable(known.estimate if truth is None else truth.tolist()),
-            *chain.from_iterable(known.measured),
-            *chain.from_iterable(known.predicted),
-            *self._input.tolist(),
+            *self._known(),
             compensator.covered,
             compensator.in_force,
             -1 if observed < 0 else (self.flown - observed) * self._dt_ns,
@@ -330,3 +345,10 @@ class Pilot:
             failsafe.mode,
             failsafe.reason,
         )
+
+    def _known(self) -> Sequence[float]:
+        """State, measured and reported state, and input, number by number, for the record."""
+        known, truth = self._navigation, self._vehicle.truth()
+        states = known.estimate if truth is None else truth.tolist()
+        numbers = chain.from_iterable((*states, *known.measured, *known.predicted))
+        return [*numbers, *self._input.tolist()]

@@ -65,7 +65,8 @@ class Reporter:
         self._compensator = compensator
         self._always = is_always(report)
         self._wants = make_report(report)
-        self._belief = BelievedState(terms, compensator)
+        self.belief = BelievedState(terms, compensator)
+        """State that the server must take the vehicle to be in."""
         self._session: int | None = None
         """Session in which an observation was sent last; None before the first."""
         self._known: tuple[int, Mode, int] | None = None
@@ -99,13 +100,13 @@ class Reporter:
         due = session != self._session
         if not due:
             is_news, steps = slept or known != self._known, step - self._told
-            off_m = self._belief.off_m(states)
+            off_m = self.belief.off_m(states)
             due = 0 < silence <= 2 * steps
             due |= self._wants(Unreported(off_m, is_news, steps, self._dt_s))
         self._step = step
         if due:
             self._session, self._known, self._told = session, known, step
-            self._belief.told(states, flown)
+            self.belief.told(states, flown)
         else:
-            self._belief.silent()
+            self.belief.silent()
         return due

@@ -26,13 +26,15 @@ class FirstOrderPlant:
     def __init__(self, scenario: Scenario, weather: Weather, number: int = 1) -> None:
         tau, late_s = scenario.true_tau_s, scenario.true_dead_time_s.tolist()
         # Plain numbers, of each axis: numpy costs more than it saves on so few.
-        self._model = discretise(tau, scenario.control.dt).axes()
-        self._gain = scenario.true_gain.tolist()
+        self.model = discretise(tau, scenario.control.dt).axes()
+        self.gain = scenario.true_gain.tolist()
         self._late = [
             dead_time(*each, scenario.dt_ns) for each in zip(tau.tolist(), late_s, strict=True)
         ]
-        self._inputs = OnTheirWay(self._model, self._late) if any(late_s) else None
+        self._inputs = OnTheirWay(self.model, self._late) if any(late_s) else None
         """Inputs on their way; None where each acts at once."""
+        self.is_simple = self._inputs is None
+        """Whether each input acts at once."""
         self.weather = weather
         self.x = [(position, 0.0) for position in scenario.start_m(number).tolist()]
         """Position [m] and velocity [m/s] now, in the world frame, of each axis."""
@@ -49,9 +51,9 @@ class FirstOrderPlant:
         if self._inputs is not None:
             due, swing = self._inputs.issue(due)
         for i, u in enumerate(due):
-            self.x[i] = advance(self._model[i], *self.x[i], self._gain[i] * u + push[i])
+            self.x[i] = advance(self.model[i], *self.x[i], self.gain[i] * u + push[i])
         for i, more in enumerate(swing):
-            (p, v), w, (late_p, late_v) = self.x[i], self._gain[i] * more, self._late[i].late
+            (p, v), w, (late_p, late_v) = self.x[i], self.gain[i] * more, self._late[i].late
             self.x[i] = (p + late_p * w, v + late_v * w)
         for i, (shove_p, shove_v) in enumerate(shoves):
             p, v = self.x[i]

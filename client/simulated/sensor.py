@@ -26,7 +26,7 @@ class Sensor:
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
         sensor, self._dt_ns = scenario.sensor, scenario.dt_ns
-        self.delay, self._every_ns, self._exact = sensing(scenario)
+        self.delay, self._every_ns, self.is_exact = sensing(scenario)
         self._noise = sensor.position_noise_m, sensor.velocity_noise_mps
         nothing = (0.0,) * scenario.model.axes
         self._bias = sensor.position_bias_m or nothing, sensor.velocity_bias_mps or nothing
@@ -43,7 +43,7 @@ class Sensor:
             began_ns: begin of step 0 [ns; the client's clock].
         """
         stamp_ns = began_ns + max(0, self._step - self.delay) * self._dt_ns
-        if self._exact:
+        if self.is_exact:
             self._step += 1
             return Measurement(stamp_ns, [p for p, _ in state], [v for _, v in state])
         states = self._states
@@ -53,6 +53,10 @@ class Sensor:
         position, velocity = (self._measure(states[0], which) for which in (0, 1))
         self._step += 1
         return Measurement(stamp_ns, position, velocity)
+
+    def measured_at(self, step: int) -> None:
+        """Note that it has measured elsewhere at all steps up to this one."""
+        self._step = step + 1
 
     def _measure(self, state: list[Sequence[float]], which: int) -> list[float] | None:
         """Position (0) or velocity (1) of a state, where one is due."""

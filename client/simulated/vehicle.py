@@ -71,6 +71,20 @@ class SimulatedVehicle(Vehicle):
             self._measure(told)
         return told
 
+    @property
+    def is_simple(self) -> bool:
+        """Whether the whole state is measured at each step as it is."""
+        return self._sensor.is_exact
+
+    def starts_ns(self, step: int) -> int:
+        """Begin of a step of its flight [ns; the client's clock]."""
+        return self._began_ns + step * self._dt_ns
+
+    def flown_to(self, step: int) -> None:
+        """Note that its plant was flown to a step elsewhere, and measured at each step."""
+        self._step = step
+        self._sensor.measured_at(step)
+
     def _measure(self, told: list[Measurement]) -> None:
         """Add what is had at the step, if that is anything."""
         measured = self._sensor.measure(self.plant.x, began_ns=self._began_ns)

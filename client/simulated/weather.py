@@ -39,32 +39,46 @@ class Weather:
         self._tau = scenario.true_tau_s
         self._gust: Array | None = None
         """Way that the gust blows, of any length; shape (axes,). None between gusts."""
+        self._still = np.zeros((len(self._tau), 2))
+        self.drawn: Array | None = None
+        """What was drawn for the next step and is not flown in yet."""
         self.change(scenario.vehicle)
 
     def change(self, vehicle: VehicleConfig) -> None:
         """Let other winds blow from the next step on."""
         white = vehicle.wind * white_acceleration(self._tau, self._dt_s)
-        self._wind = white.tolist() if vehicle.wind else []
+        self.white = white.tolist() if vehicle.wind else []
         self._gust_mps2 = vehicle.gust_mps2
         self._gust_end_chance = float(-np.expm1(-self._dt_s / vehicle.gust_s))
         self._gust_start_chance = float(-np.expm1(-self._dt_s / vehicle.gust_every_s))
         self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(self._tau)))
         if self._gust_mps2 == 0.0:
             self._gust = None
-        self._calm = self._pushed()
+        self.calm = self._pushed()
         """The air over a step, but for white acceleration."""
 
     def blow(self) -> AirStep:
         """The air over the next step."""
-        self._gusts()
-        if not self._wind:
-            return self._calm
-        drawn = self._rng.standard_normal((len(self._wind), 2)).tolist()
+        drawn, self.drawn = self.draw(), None
+        if not self.white:
+            return self.calm
         shoves = [
             (L[0][0] * n, L[1][0] * n + L[1][1] * m)
-            for L, (n, m) in zip(self._wind, drawn, strict=True)
+            for L, (n, m) in zip(self.white, drawn.tolist(), strict=True)
         ]
-        return AirStep(self._calm.push, shoves)
+        return AirStep(self.calm.push, shoves)
+
+    def draw(self) -> Array:
+        """Normal numbers of the white acceleration over the next step; shape (axes, 2).
+
+        They are the same until `drawn` is None again: until then the air stays as it is.
+        """
+        if self.drawn is None:
+            self._gusts()
+            self.drawn = self._still
+            if self.white:
+                self.drawn = self._rng.standard_normal(self._still.shape)
+        return self.drawn
 
     def _gusts(self) -> None:
         """Gusts begin and end by chance, each blowing one way all along."""
@@ -74,10 +88,10 @@ class Weather:
         if self._gust is not None:
             if chance < self._gust_end_chance:
                 self._gust = None
-                self._calm = self._pushed()
+                self.calm = self._pushed()
         elif chance < self._gust_start_chance:
             self._gust = self._rng.standard_normal(len(self._tau))
-            self._calm = self._pushed()
+            self.calm = self._pushed()
 
     def _pushed(self) -> AirStep:
         """The air now, but for white acceleration."""

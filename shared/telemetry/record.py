@@ -268,7 +268,9 @@ class Recorder:
 
     def append_row(self, *values: float) -> None:
         """Append one row, faster: a value for every column in order, arrays number by number."""
-        self._write(self._row.pack(*values))
+        row = self._row.pack(*values)
+        for sink in self._sinks:
+            sink.write(row)
 
     def _write(self, rows: bytes) -> None:
         for sink in self._sinks:

@@ -31,7 +31,7 @@ from skytether.server import secure as server_secure
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.aboard import VehicleEvent
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Endpoint
@@ -52,6 +52,7 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
+from skytether.sim.pilot import CompiledPilot
 from skytether.sim.world import Clock, World
 
 MIDNIGHT_NS = 86_400 * SECOND_NS
@@ -61,6 +62,8 @@ BOOT_ID = 2**63 + 2**31
 SERVER: Address = ("server", 0)
 COMPANY_MAX = 100
 """Most runs that share a server; more would be no faster, and a vehicle's number takes one byte."""
+ASK_NS = 10 * MILLISECOND_NS
+"""Time of the world after which it is asked again whether to break a flight off [ns]."""
 EVENTS_MAX = 65_536
 """Events kept of a flight; older ones give way."""
 
@@ -153,7 +156,6 @@ class Run:
     Args:
         world: where its hosts are added.
         scenario: what to fly, with the run's seed.
-        server: the server of all runs.
         server_rows: gives the number of rows that the server has recorded so far.
         number: number of the run, from 0; its vehicles' numbers follow those of the runs before.
         vehicles: number of its vehicles.
@@ -164,13 +166,12 @@ class Run:
         self,
         world: World,
         scenario: Scenario,
-        server: Endpoint,
         server_rows: Callable[[], int],
         number: int,
         vehicles: int,
         keyring: Keyring | None,
     ) -> None:
-        self._server, self._server_rows = server, server_rows
+        self._server_rows = server_rows
         self._before = number * vehicles
         self._sinks = io.BytesIO(), io.BytesIO()
         recorder = Recorder(client_columns(scenario.model.axes), self._sinks[0])
@@ -199,6 +200,7 @@ class Run:
                 boot_id=BOOT_ID,
                 link=_link(keyring, scenario.seed, self._before + vehicle),
                 recorder=recorder,
+                pilot=CompiledPilot,
             )
             for vehicle in range(1, vehicles + 1)
         ]
@@ -229,11 +231,12 @@ class Run:
         if not self.flying:
             self._ends = self._server_rows(), self._sinks[1].tell()
 
-    def flight(self, server_rows: Rows) -> Record:
+    def flight(self, server_rows: Rows, server_figures: Mapping[str, Any]) -> Record:
         """Make its flight, as if it had been alone.
 
         Args:
             server_rows: the server's part of the record, of all runs.
+            server_figures: figures of the server.
         """
         rows_end, bytes_end = self._ends
         client = parse(self._sinks[0].getvalue()).copy()
@@ -248,7 +251,7 @@ class Run:
             failure = msgspec.structs.replace(failure, vehicle=failure.vehicle - self._before)
         told = {str(each.vehicle - self._before): each.told() for each in self._clients}
         figures = {
-            "server": self._server.figures(),
+            "server": server_figures,
             "netem": self.netem.figures(),
             "client": {"by_vehicle": told},
         }
@@ -323,8 +326,7 @@ def _fly(
         return (sink.tell() - header_bytes) // row_bytes
 
     runs = [
-        Run(world, run, server, server_rows, number, vehicles, keyring)
-        for number, run in enumerate(each)
+        Run(world, run, server_rows, number, vehicles, keyring) for number, run in enumerate(each)
     ]
     run_of = {host: run for run in runs for host in run.hosts} | dict.fromkeys(beside, runs[0])
     for name, endpoint in beside.items():
@@ -333,12 +335,16 @@ def _fly(
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
     plan_changes(world, scenario, {SERVER[0]: server, **runs[0].hosts, **beside}, changes)
-    flown_s, flying = 0, runs.copy()
+    ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
 
     def over() -> bool:
-        nonlocal flown_s
-        if world.now_ns // SECOND_NS != flown_s:
+        nonlocal ask_ns, second_ns
+        if world.now_ns < ask_ns and flying[-1].flying:
+            return False
+        ask_ns = world.now_ns + ASK_NS
+        if world.now_ns >= second_ns:
             flown_s = world.now_ns // SECOND_NS
+            second_ns = (flown_s + 1) * SECOND_NS
             on_second(flown_s)
         while flying and not flying[-1].flying:
             flying.pop()
@@ -346,8 +352,8 @@ def _fly(
 
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
     world.run(over, limit_ns=seconds_to_ns(longest_s))
-    recorded = parse(sink.getvalue())
-    return [run.flight(recorded) for run in runs]
+    recorded, figures = parse(sink.getvalue()), server.figures()
+    return [run.flight(recorded, figures) for run in runs]
 
 
 def plan_changes(

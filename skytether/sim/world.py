@@ -105,6 +105,8 @@ class Host:
     """Callback for the end of the endpoint, until it has been called."""
     armed_ns: int | None = None
     """Time of the world at which it is to be woken, or None."""
+    due_ns: int | None = None
+    """Time of its clock that `armed_ns` was found from; None where it is to be found anew."""
 
 
 ACTION, ARRIVAL = -1, 0
@@ -140,6 +142,8 @@ class World:
         there, or None for a wake; of an action no host and the action."""
         self._scheduled = 0
         """Number of entries so far."""
+        self._arriving: deque[tuple[Host, Datagram]] = deque()
+        """Datagrams that arrive at the present time, in the order in which they were sent."""
 
     def add(
         self,
@@ -223,7 +227,7 @@ class World:
             for datagram in still.waiting:
                 self._receive(host, datagram)
             if not still.waiting and still.armed_ns is not None:
-                host.armed_ns = max(self.now_ns, still.armed_ns)
+                host.armed_ns, host.due_ns = max(self.now_ns, still.armed_ns), None
                 self._at(host.armed_ns, host.turn, host, None)
 
     def set_clock(self, name: str, *, step_ns: int = 0, drift_ppb: int | None = None) -> None:
@@ -239,6 +243,7 @@ class World:
         """
         host = self._hosts[name]
         host.clock = host.clock.changed(self.now_ns, step_ns=step_ns, drift_ppb=drift_ppb)
+        host.due_ns = None
 
     def set_compute(self, name: str, compute_ns: int) -> None:
         """Change the time that a host works whenever it is woken [ns]."""
@@ -263,17 +268,22 @@ class World:
 
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
         """Let time pass until a condition holds, or until a time of the world."""
-        while self._agenda and not until():
-            if self._agenda[0][0] > limit_ns:
+        agenda, arriving, receive = self._agenda, self._arriving, self._receive
+        while (agenda or arriving) and not until():
+            # What was sent at an earlier time waits on the agenda, and arrives first.
+            if arriving and not (agenda and agenda[0][:2] <= (self.now_ns, ARRIVAL)):
+                receive(*arriving.popleft())
+                continue
+            if agenda[0][0] > limit_ns:
                 return
-            entry = heappop(self._agenda)
+            entry = heappop(agenda)
             self.now_ns = entry[0]
             if entry[3] is None:
                 entry[4]()
             elif entry[4] is None:
                 self._wake(entry[3])
             else:
-                self._receive(entry[3], entry[4])
+                receive(entry[3], entry[4])
 
     def _at(self, time_ns: int, turn: int, host: Host, datagram: Datagram | None) -> None:
         self._scheduled += 1
@@ -284,17 +294,23 @@ class World:
         if due_ns is None:
             host.armed_ns = None
             return
-        time_ns = max(self.now_ns, host.busy_until_ns, host.clock.world(due_ns))
+        if due_ns == host.due_ns and host.armed_ns is not None:
+            return  # it is armed for that already
+        host.due_ns = due_ns
+        time_ns = host.clock.world(due_ns)
+        time_ns = max(time_ns, host.busy_until_ns)
+        time_ns = max(time_ns, self.now_ns)
         if time_ns != host.armed_ns:
             host.armed_ns = time_ns
             self._at(time_ns, host.turn, host, None)
 
     def _wake(self, host: Host) -> None:
-        if host.armed_ns != self.now_ns:
+        now_ns = self.now_ns
+        if host.armed_ns != now_ns:
             return  # it has changed its mind since
         host.armed_ns = None
-        host.endpoint.wake(now_ns=host.clock.local(self.now_ns))
-        host.busy_until_ns = self.now_ns + host.compute_ns
+        host.endpoint.wake(now_ns=host.clock.local(now_ns))
+        host.busy_until_ns = now_ns + host.compute_ns
         self._after(host, host.busy_until_ns)
 
     def _receive(self, host: Host, datagram: Datagram) -> None:
@@ -303,14 +319,19 @@ class World:
 
     def _after(self, host: Host, leaves_ns: int) -> None:
         """Let its datagrams leave, hand on its events, and arm its next wake."""
-        for payload, (name, socket), source in host.endpoint.outbox():
+        endpoint = host.endpoint
+        for payload, (name, socket), source in endpoint.outbox():
             receiver = self._hosts.get(name)
-            if receiver is not None:
-                arrived = Datagram(payload, (host.name, source), socket)
+            if receiver is None:
+                continue
+            arrived = Datagram(payload, (host.name, source), socket)
+            if leaves_ns == self.now_ns:
+                self._arriving.append((receiver, arrived))
+            else:
                 self._at(leaves_ns, ARRIVAL, receiver, arrived)
-        for event in host.endpoint.events():
+        for event in endpoint.events():
             self._on_event(self.now_ns, host.name, event)
         self._arm(host)
-        if host.on_finished is not None and host.endpoint.finished:
+        if host.on_finished is not None and endpoint.finished:
             host.on_finished()
             host.on_finished = None

@@ -186,5 +186,5 @@ def test_without_a_dead_time_nothing_is_predicted() -> None:
     known.advance(simulated(scenario(), 1).measurements(now_ns=0), np.zeros(2), now_ns=0)
     assert known.predicted is known.estimate
     late = scenario(model={"dead_time_s": 0.1})
-    assert isinstance(Navigation(late)._filter, Kalman)
-    assert not isinstance(Navigation(scenario())._filter, Kalman)
+    assert isinstance(Navigation(late).filter, Kalman)
+    assert not isinstance(Navigation(scenario()).filter, Kalman)

@@ -1,0 +1,404 @@
+"""The pilot of a vehicle in virtual time: its usual steps are compiled, see `sim.aboard`.
+
+What is not usual is left to `client.pilot`: a first step, a landing, a fault, a pilot of its own, a
+state that has leapt or is not finite, braking that has to be bounded; and all steps of a vehicle
+with a dead time, a fence, a mission, or a sensor that is not exact.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from skytether.client.clamp import ROUNDING
+from skytether.client.compensator import Compensator
+from skytether.client.failsafe import Failsafe
+from skytether.client.filter import Kalman, Spread
+from skytether.client.navigation import Navigation
+from skytether.client.pilot import STOPPED, Pilot
+from skytether.client.reporting import BelievedState, States
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.vehicle import SimulatedVehicle
+from skytether.client.vehicle import Measurement, Vehicle
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.law.model import Array, Axis
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder
+from skytether.shared.wire.protocol import Mode
+from skytether.sim.aboard import AXIS_ABOARD, AXIS_PLAN, AXIS_STATE, believe_step, fly_step
+
+
+class SimpleBody(NamedTuple):
+    """A vehicle of which all that happens in a usual step is in `fly_step`."""
+
+    vehicle: SimulatedVehicle
+    plant: FirstOrderPlant
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> Self | None:
+        """The vehicle with its plant; None of one that is not as simple."""
+        if type(vehicle) is not SimulatedVehicle or type(vehicle.plant) is not FirstOrderPlant:
+            return None
+        simple = vehicle.is_simple and vehicle.plant.is_simple
+        return cls(vehicle, vehicle.plant) if simple else None
+
+
+class _Flying:
+    """Arrays of a vehicle whose usual steps are compiled, and the objects whose place they take.
+
+    Args:
+        scenario: what is flown.
+        navigation, compensator: those of the pilot.
+        body: what flies.
+        change_max: largest change of the input from step to step [m/s].
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        navigation: Navigation,
+        compensator: Compensator,
+        body: SimpleBody,
+        change_max: float,
+    ) -> None:
+        self._navigation, self._compensator = navigation, compensator
+        self._vehicle, self._plant = body
+        found = navigation.filter
+        self._kalman = found if isinstance(found, Kalman) else None
+        axes = scenario.model.axes
+        self._now, self._after = np.zeros(axes, AXIS_STATE), np.zeros(axes, AXIS_STATE)
+        self._constants, self._plans = np.zeros(axes, AXIS_ABOARD), np.zeros(axes, AXIS_PLAN)
+        self._numbers, self._told = np.zeros((axes, 1)), np.zeros(8 * axes)
+        self._states = slice(0, 2 * axes)
+        self._known = slice(4 * axes, 6 * axes)
+        self._inputs = slice(6 * axes, 7 * axes)
+        self._parts = slice(7 * axes, 8 * axes)
+        """Where in `_told` the true state is, the one flown by, the input, and its part."""
+        self.row: list[float] = []
+        """What `fly_step` has told last."""
+        self.step: int | None = None
+        """Step that the arrays are at; None where they are not to be used."""
+        self._stage = self._lead_stage = 0
+        """Stage that the plan is at, and that up to which its lead was rolled."""
+        self._is_ahead = False
+        """Whether the arrays are newer than the objects."""
+        self._is_loaded = False
+        """Whether the arrays are at least as new as the objects."""
+        self._held: object = None
+        self._guides: object = None
+        self._calm: object = None
+        """Horizon, spline and air that the arrays have."""
+        self._set_constants(scenario, change_max)
+
+    def _set_constants(self, scenario: Scenario, change_max: float) -> None:
+        """Fill in what does not change in flight."""
+        terms, to, leaps = scenario.terms(), self._constants, self._navigation.leaps
+        for name, numbers in zip(Axis._fields, zip(*self._plant.model, strict=True), strict=True):
+            to[f"true_{name}"] = numbers
+        for name, field in terms.model._asdict().items():
+            to[name] = field
+        to["true_gain"], to["bound"] = self._plant.gain, terms.u_max
+        to["change_max"], to["dt_s"] = change_max, terms.dt_ns / SECOND_NS
+        to["noise_m"], to["noise_mps"] = leaps.noise_m, leaps.noise_mps
+        if self._kalman is not None:
+            to["filters"] = True
+            to["variance_p"], to["variance_v"] = self._kalman.variances
+            noises = [self._kalman.noise[kind] for kind in self._kalman.kinds]
+            for name in ("pp", "pv", "vv", "ww"):
+                to[f"noise_{name}"] = [getattr(noise, name) for noise in noises]
+
+    def fly(self, step: int, before: Array, speed_max: float) -> list[float] | None:
+        """Fly to the begin of a step, and choose the input from there on.
+
+        Args:
+            step: the step after the one that the vehicle is at.
+            before: input that is flown until there [m/s]; shape (axes,).
+            speed_max: bound of the magnitude of what is no feedback [m/s].
+
+        Returns:
+            the input of each axis [m/s]; None where something is not as usual: then nothing was
+            done.
+        """
+        compensator, weather = self._compensator, self._plant.weather
+        if not self._is_loaded:
+            self._load(before)
+        if compensator.held is not self._held or compensator.guides is not self._guides:
+            self._load_plan()
+        drawn = weather.draw()
+        if weather.calm is not self._calm:
+            self._load_air()
+        self._stage = stage = step - compensator.begins
+        if not fly_step(
+            self._constants,
+            self._now,
+            self._after,
+            drawn,
+            self._plans,
+            self._numbers,
+            stage,
+            self._lead_stage,
+            self._told,
+        ):
+            return None
+        row = self._told.tolist()
+        if speed_max < math.inf and math.hypot(*row[self._parts]) > speed_max + ROUNDING:
+            return None
+        weather.drawn = None
+        self._now, self._after = self._after, self._now
+        self._lead_stage = max(stage, self._lead_stage)
+        self.step, self._is_ahead = step, True
+        self.row = row
+        self._navigation.note(pairs(row[self._known]))
+        compensator.note(step, row[self._parts])
+        return row[self._inputs]
+
+    def foresee(self, believed: Array, silent: Array, told: Array, apart: Array) -> None:
+        """Foresee the state of the next step from the one that the arrays are at.
+
+        See `believe_step`, whose arguments these are.
+        """
+        believe_step(
+            self._constants,
+            self._now,
+            self._plans,
+            self._numbers,
+            self._stage,
+            believed,
+            silent,
+            told,
+            apart,
+        )
+
+    def _load(self, before: Array) -> None:
+        """Have the arrays know what the objects know."""
+        now, self._is_loaded = self._now, True
+        now["p"], now["v"] = zip(*self._plant.x, strict=True)
+        now["x_p"], now["x_v"] = zip(*self._navigation.estimate, strict=True)
+        now["u"] = before
+        self._held = None
+        if self._kalman is not None:
+            now["x_w"] = self._kalman.disturbance()
+            spreads = [self._kalman.spreads[kind] for kind in self._kalman.kinds]
+            for name, numbers in zip(Spread._fields, zip(*spreads, strict=True), strict=True):
+                now[name] = numbers
+
+    def _load_plan(self) -> None:
+        """Take on the horizon or spline that is held."""
+        compensator, now = self._compensator, self._now
+        self._held, self._guides = held, guides = compensator.held, compensator.guides
+        now["lead_p"], now["lead_v"] = zip(*compensator.lead, strict=True)
+        self._lead_stage = compensator.lead_stage
+        if guides:
+            self._numbers = np.array([each.knots for each in guides])
+            self._plans[:] = [
+                (
+                    True,
+                    g.length,
+                    g.spacing,
+                    True,
+                    g.last,
+                    g.speed,
+                    g.brake,
+                    True,
+                    g.gain_p,
+                    g.gain_v,
+                    0,
+                )
+                for g in guides
+            ]
+        else:
+            self._numbers = np.array([each.inputs for each in held])
+            self._plans[:] = [
+                (
+                    False,
+                    h.length,
+                    1,
+                    h.indexed,
+                    0,
+                    h.speed,
+                    h.brake,
+                    h.feeds_back,
+                    h.gain_p,
+                    h.gain_v,
+                    h.disturbance,
+                )
+                for h in held
+            ]
+
+    def _load_air(self) -> None:
+        """Take on the air as it is now."""
+        weather, to = self._plant.weather, self._constants
+        self._calm, to["push"], to["windy"] = weather.calm, weather.calm.push, bool(weather.white)
+        if weather.white:
+            white = np.array(weather.white)
+            to["shove_p"], to["shove_vp"] = white[:, 0, 0], white[:, 1, 0]
+            to["shove_v"] = white[:, 1, 1]
+
+    def leave(self) -> None:
+        """Have the objects know what the arrays know, which are to be loaded anew."""
+        self.tell()
+        self._is_loaded, self.step = False, None
+
+    def tell(self) -> None:
+        """Have the objects know what the arrays know."""
+        if not self._is_ahead:
+            return
+        assert self.step is not None
+        self._is_ahead = False
+        compensator, now = self._compensator, self._now
+        self._vehicle.flown_to(self.step)
+        states = self._plant.x = self._navigation.measured = pairs(self.row[self._states])
+        position, velocity = [p for p, _ in states], [v for _, v in states]
+        measured = Measurement(self._vehicle.starts_ns(self.step), position, velocity)
+        self._navigation.leaps.took(measured)
+        if compensator.held is self._held and compensator.guides is self._guides:
+            compensator.lead = list(
+                zip(now["lead_p"].tolist(), now["lead_v"].tolist(), strict=True)
+            )
+            compensator.lead_stage = self._lead_stage
+        if self._kalman is None:
+            self._navigation.filter.take(measured)
+            return
+        known = (now[name].tolist() for name in ("x_p", "x_v", "x_w"))
+        self._kalman.x = list(zip(*known, strict=True))
+        spreads, kinds = now[list(Spread._fields)].tolist(), self._kalman.kinds
+        self._kalman.spreads = [
+            Spread(*spreads[kinds.index(kind)]) for kind in range(len(self._kalman.spreads))
+        ]
+
+
+def pairs(numbers: list[float]) -> list[tuple[float, float]]:
+    """Numbers two by two."""
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
+
+
+class _Belief(BelievedState):
+    """What the server must believe of a vehicle, foreseen by the arrays where they are in use."""
+
+    def __init__(self, terms: Terms, compensator: Compensator, flying: _Flying) -> None:
+        super().__init__(terms, compensator)
+        self._flying = flying
+        self._believed, self._silent, self._told, self._apart = np.zeros((4, terms.axes, 2))
+        self._is_array = False
+        """Whether the state is in `_believed`."""
+        self._foreseen: int | None = None
+        """Step from which the next state has been foreseen by the arrays."""
+
+    def off_m(self, states: States) -> float:
+        """See `BelievedState`."""
+        if self._flying.step is None:
+            self._to_list()
+            return super().off_m(states)
+        if not self._is_array:
+            self._believed[:], self._is_array = self._states, True
+        self._flying.foresee(self._believed, self._silent, self._told, self._apart)
+        self._foreseen = self._flying.step
+        axes = zip(self._tau_s, self._apart.tolist(), strict=True)
+        return math.hypot(*(dp + tau * dv for tau, (dp, dv) in axes))
+
+    def told(self, states: States, flown: Sequence[float]) -> None:
+        """See `BelievedState`."""
+        if self._is_foreseen():
+            self._believed, self._told = self._told, self._believed
+        else:
+            super().told(states, flown)
+
+    def silent(self) -> None:
+        """See `BelievedState`."""
+        if self._is_foreseen():
+            self._believed, self._silent = self._silent, self._believed
+        else:
+            super().silent()
+
+    def _is_foreseen(self) -> bool:
+        """Whether the next state is known; if not, the objects know what it follows from."""
+        if self._flying.step is not None and self._foreseen == self._flying.step:
+            return True
+        self._flying.tell()
+        self._to_list()
+        return False
+
+    def _to_list(self) -> None:
+        """Have the state as `BelievedState` has it."""
+        if self._is_array:
+            self._states, self._is_array = pairs(self._believed.ravel().tolist()), False
+
+
+class CompiledPilot(Pilot):
+    """Pilot of a simulated vehicle whose usual steps are compiled.
+
+    In usual steps the arrays of `fly_step` are newer than what the objects of a `Pilot` know; the
+    objects are brought up to date before any other step.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        number: int,
+        vehicle: Vehicle,
+        failsafe: Failsafe,
+        recorder: Recorder | None,
+    ) -> None:
+        super().__init__(scenario, number, vehicle, failsafe, recorder)
+        self._flying: _Flying | None = None
+        """What flies usual steps; None where these are not compiled."""
+        if self._fence is None and not self._terms.join and self._navigation.is_simple:
+            body = SimpleBody.of(vehicle)
+            if body is not None:
+                self._flying = _Flying(
+                    scenario, self._navigation, self.compensator, body, self._change_max
+                )
+                self._reporter.belief = _Belief(self._terms, self.compensator, self._flying)
+        self._due: int | None = None
+        """Step up to whose begin the vehicle is still to be flown and measured."""
+
+    @property
+    def disturbance(self) -> Sequence[float]:
+        """See `Pilot`."""
+        if self._flying is not None:
+            self._flying.tell()
+        return super().disturbance
+
+    def _known(self) -> Sequence[float]:
+        """See `Pilot`."""
+        flying = self._flying
+        if flying is None or flying.step is None:
+            return super()._known()
+        return flying.row[: 7 * self._terms.axes]
+
+    def _navigate(self, step: int) -> None:
+        """Take what was measured up to the begin of a step, at once or with its input."""
+        if self._due is not None:
+            self._catch_up()
+        if step and self._flying is not None:
+            self._due = step
+        else:
+            super()._navigate(step)
+
+    def _catch_up(self) -> None:
+        """Leave it to the objects to fly on, from where the arrays are."""
+        if self._flying is not None:
+            self._flying.leave()
+        if self._due is not None:
+            due, self._due = self._due, None
+            super()._navigate(due)
+
+    def _choose(self, now_ns: int) -> Array:
+        """See `Pilot`."""
+        if self._flying is not None and self._due == self.step and self._is_usual():
+            covers = self.compensator.covers(self.step)
+            speed_max = self._speed_max(self.compensator.covered, covers)
+            flown = self._flying.fly(self.step, self._input, speed_max)
+            if flown is not None:
+                self._due = None
+                told = self.compensator.told if self.compensator.feeds_back else flown
+                return self._settled(flown, told, speed_max, now_ns)
+        self._catch_up()
+        return super()._choose(now_ns)
+
+    def _is_usual(self) -> bool:
+        """Whether the vehicle flies what is chosen, and its state is known."""
+        mode = self._failsafe.mode
+        return mode is not Mode.LAND and mode not in STOPPED and self._navigation.is_known

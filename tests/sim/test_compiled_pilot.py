@@ -1,0 +1,129 @@
+"""Compiled steps of vehicles in virtual time: the same flights as by `Pilot`, to the last bit."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest import mock
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from helpers import packaged
+from skytether.client.pilot import Pilot
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason, Record
+from skytether.sim import flight
+from skytether.sim.aboard import fly_step
+from skytether.sim.flight import fly
+
+SHORT = {"duration": 4.0, "settle": 0.0}
+"""A few seconds of a scenario."""
+
+
+@contextmanager
+def counted() -> Iterator[list[bool]]:
+    """Whether each step that could be compiled was as usual, one after the other."""
+    usual: list[bool] = []
+
+    def counts(*args: Any) -> bool:
+        usual.append(fly_step(*args))
+        return usual[-1]
+
+    with mock.patch("skytether.sim.pilot.fly_step", counts):
+        yield usual
+
+
+def assert_as_by_pilot(flown: Scenario, **keys: Any) -> tuple[Record, list[bool]]:
+    """The record of a flight that is the same by `Pilot`; and which steps were compiled."""
+    with counted() as usual:
+        compiled = fly(flown, **keys)
+    with mock.patch.object(flight, "CompiledPilot", Pilot), counted() as none:
+        plain = fly(flown, **keys)
+    assert not none
+    assert compiled.client.tobytes() == plain.client.tobytes()
+    assert compiled.trace_hash() == plain.trace_hash()
+    assert compiled.events == plain.events
+    assert compiled.figures["client"] == plain.figures["client"]
+    return compiled, usual
+
+
+NOTHING = {"delay": "none", "loss": 0.0}
+NOISY = {"position_noise_m": 0.05, "velocity_noise_mps": 0.1}
+scenarios = st.fixed_dictionaries(
+    {
+        "control": st.fixed_dictionaries(
+            {
+                "scheme": st.sampled_from(["predictive", "committed", "trajectory"]),
+                "feedback": st.booleans(),
+                "epsilon": st.sampled_from([0.01, 0.5]),
+                "trigger": st.sampled_from(["always", "periodic", "heartbeat"]),
+            }
+        ).filter(lambda control: control["feedback"] or control["scheme"] != "trajectory"),
+        "model": st.fixed_dictionaries(
+            {"axes": st.sampled_from([2, 3]), "dead_time_s": st.sampled_from([[0.0], [0.08]])}
+        ),
+        "vehicle": st.fixed_dictionaries(
+            {
+                "wind": st.sampled_from([0.0, 0.3]),
+                "gust_mps2": st.sampled_from([0.0, 0.5]),
+                "exhausted": st.sampled_from(["hold", "brake"]),
+                "report": st.sampled_from(["always", "deviation(0.05)", "silence(0.5)"]),
+                "tau_s": st.sampled_from([[], [0.7]]),
+            }
+        ),
+        "sensor": st.sampled_from([{}, {}, NOISY, {"delay_s": 0.1}, {"filter": "none"}]),
+        "network": st.fixed_dictionaries(
+            {
+                "uplink": st.sampled_from([NOTHING, {"delay": "poisson", "loss": 0.5}]),
+                "downlink": st.sampled_from([NOTHING, {"delay": "poisson", "loss": 0.1}]),
+            }
+        ),
+        "link": st.just({"heartbeat_s": 0.2, "timeout_s": 0.5}),
+    }
+)
+
+
+@pytest.mark.long
+@settings(max_examples=60)
+@given(scenarios)
+def test_flights_are_the_same_as_by_the_pilot(sections: dict[str, Any]) -> None:
+    """Flights of any scheme, sensor, wind, report and network equal those of `Pilot`."""
+    assert_as_by_pilot(packaged("paper", SHORT, **sections))
+
+
+@pytest.mark.parametrize("name", ["paper", "demo"])
+def test_most_steps_of_a_flight_are_compiled(name: str) -> None:
+    """Else the other tests here would prove nothing: all but those without a plan."""
+    record, usual = assert_as_by_pilot(packaged(name, SHORT, duration=8.0))
+    assert all(usual)
+    assert len(usual) > 0.7 * len(record.client)
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {"sensor": NOISY},
+        {"model": {"dead_time_s": [0.12]}},
+        {"fence": {"radius_m": 6.0}},
+    ],
+)
+def test_what_is_not_simple_is_left_to_the_pilot(sections: dict[str, Any]) -> None:
+    """A sensor with noise, a dead time, a fence."""
+    _, usual = assert_as_by_pilot(packaged("demo", SHORT, **sections))
+    assert not usual
+
+
+def test_wind_may_change_in_flight() -> None:
+    """The arrays take on other air, and a step is flown in what was drawn for it."""
+    changes = [(1.5, {"vehicle.wind": 0.3}), (2.5, {"vehicle.gust_mps2": 2.0})]
+    _, usual = assert_as_by_pilot(packaged("paper", SHORT), changes=changes)
+    assert all(usual)
+
+
+def test_a_step_that_is_not_as_usual_is_flown_by_the_pilot() -> None:
+    """A state that leaps brakes the vehicle, in the wind that was drawn for the step."""
+    changes = [(5.0, {"vehicle.wind": 30.0})]
+    record, usual = assert_as_by_pilot(packaged("demo", SHORT, duration=8.0), changes=changes)
+    assert not all(usual)
+    assert Reason.LEAPT in record.client["reason"]
