@@ -5,10 +5,14 @@ from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
+import pytest
+
+from skytether.client.pilot import Pilot
 from skytether.shared.core.endpoint import Address
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell.driver import Shell
+from skytether.sim import flight
 
 LOOPBACK: Address = ("127.0.0.1", 0)
 
@@ -30,6 +34,15 @@ def packaged(name: str, *layers: Mapping[str, Any], **changes: Any) -> Scenario:
         for key, value in layer.items():
             table[key] = table[key] | value if isinstance(value, dict) else value
     return reading.check(table, "test")
+
+
+def uncompile(patch: pytest.MonkeyPatch) -> None:
+    """Have vehicles in virtual time fly each step by the methods of `client`.
+
+    Usual steps are one compiled call otherwise (`sim.pilot`), in which a method that a test
+    replaces is never called: the test would fly as if it had replaced nothing.
+    """
+    patch.setattr(flight, "CompiledPilot", Pilot)
 
 
 @asynccontextmanager

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers import uncompile
 from skytether.client.compensator import Compensator
 from skytether.lab.courses import FollowedCourse, PlannedCourse
 from skytether.server.control import trajectory
@@ -134,6 +135,7 @@ def flown_mismatches(flown: Scenario) -> tuple[int, int]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scheme, "remember", spy)
         patch.setattr(Compensator, "choose", look)
+        uncompile(patch)
         client = fly(flown).client
     steps, differ, courses = 0, 0, {}
     change = flown.vehicle.slew_mps2 * terms.dt_s

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skytether.sim.flight
-from helpers import packaged
+from helpers import packaged, uncompile
 from skytether.client.session import ServerSession
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.netem.proxy import Proxy
@@ -448,6 +448,7 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
         if next(steps) == 400:
             self.x = [(p + 300.0, v) for p, v in self.x]
 
+    uncompile(monkeypatch)
     monkeypatch.setattr(FirstOrderPlant, "advance", leaping)
     flight = fly(
         reading.check(reading.to_table(reading.load("demo-committed")) | {"duration": 40.0}, "test")

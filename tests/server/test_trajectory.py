@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import skytether
+from helpers import uncompile
 from skytether.client.compensator import Compensator
 from skytether.client.navigation import Navigation
 from skytether.server.control import trajectory
@@ -763,6 +764,7 @@ def test_a_vehicle_along_a_spline_reports_where_it_leaves_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In still air the server foresees it, and hears little; ablation: foreseen to stand still."""
+    uncompile(monkeypatch)
     silent = {"wind": 0.0, "report": "deviation(0.01) | silence(1)"}
     table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
     table["control"]["scheme"] = "trajectory"

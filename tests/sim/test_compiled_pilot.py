@@ -9,11 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers import packaged
-from skytether.client.pilot import Pilot
+from helpers import packaged, uncompile
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Record
-from skytether.sim import flight
 from skytether.sim.aboard import fly_step
 from skytether.sim.flight import fly
 
@@ -38,7 +36,8 @@ def assert_as_by_pilot(flown: Scenario, **keys: Any) -> tuple[Record, list[bool]
     """The record of a flight that is the same by `Pilot`; and which steps were compiled."""
     with counted() as usual:
         compiled = fly(flown, **keys)
-    with mock.patch.object(flight, "CompiledPilot", Pilot), counted() as none:
+    with pytest.MonkeyPatch.context() as patch, counted() as none:
+        uncompile(patch)
         plain = fly(flown, **keys)
     assert not none
     assert compiled.client.tobytes() == plain.client.tobytes()
