@@ -18,6 +18,7 @@ from skytether.lab.benchmarks import (
     accuracy,
     flood,
     footprint,
+    growth,
     least,
     link,
     netem,
@@ -51,6 +52,7 @@ TINY = MappingProxyType(
         "netem": netem.NetemBenchmarkOptions(runs=1, seconds=1, rate=1000),
         "solvers": solvers.SolversCounts(hot=6, paced=2, tuning=3),
         "tick": tick.TickCounts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
+        "growth": growth.GrowthCounts((10, 20), (2,), (1, 4), 2),
         "wire": wire.WireCounts(each=10),
         "accuracy": accuracy.AccuracyCounts(ticks=3, random=2, horizons=(1, 30)),
         "link": link.LinkCounts(
@@ -103,6 +105,13 @@ def test_every_table_has_its_place_in_the_document(
     after = json.loads(file.read_text())
     assert after["wire"]["nothing"] == {"p50_us": 1.0, "p99_us": 2.0}
     assert {**after, "wire": 0} == {**before, "wire": 0}
+
+
+def test_a_line_is_fitted_through_the_costs_of_horizons() -> None:
+    """Costs on a line give that line; one that is off says by what share of itself."""
+    line = growth.fit([10, 20, 40], [7.0, 9.0, 13.0])
+    assert line == pytest.approx((5.0, 0.2, 0.0), abs=1e-9)
+    assert growth.fit([10, 20, 40], [7.0, 18.0, 13.0]).off > 0.1
 
 
 def test_the_exact_solver_is_found_exact(results: Mapping[str, Any]) -> None:

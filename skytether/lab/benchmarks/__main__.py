@@ -13,18 +13,31 @@ from typing import Any, Literal
 
 import tyro
 
-from skytether.lab.benchmarks import accuracy, flood, link, netem, restarts, solvers, tick, wire
+from skytether.lab.benchmarks import (
+    accuracy,
+    flood,
+    growth,
+    link,
+    netem,
+    restarts,
+    solvers,
+    tick,
+    wire,
+)
 from skytether.lab.benchmarks.harness import CONSOLE, TextTable, machine, refresh
 from skytether.shared.base import files
 
 ROOT = Path(__file__).parents[3]
 RESULTS = Path(__file__).with_name("results.json")
 DOCUMENT = ROOT / "docs" / "performance.md"
-Section = Literal["netem", "solvers", "tick", "wire", "accuracy", "link", "flood", "restarts"]
+Section = Literal[
+    "netem", "solvers", "tick", "growth", "wire", "accuracy", "link", "flood", "restarts"
+]
 SECTIONS: dict[Section, ModuleType] = {
     "netem": netem,
     "solvers": solvers,
     "tick": tick,
+    "growth": growth,
     "wire": wire,
     "accuracy": accuracy,
     "link": link,

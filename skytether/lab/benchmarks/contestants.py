@@ -220,6 +220,28 @@ class Piqp:
         return inputs, np.array([solved])
 
 
+class QpOases:
+    """qpOASES, condensed, as it comes with CasADi: a workspace an axis, its active set kept."""
+
+    def __init__(self, problem: Problem) -> None:
+        import casadi
+
+        quiet = {"print_time": False, "printLevel": "none", "error_on_fail": False}
+        self._axes = []
+        for hessian, bound in by_axis(problem):
+            P, none = casadi.DM(hessian), casadi.Sparsity(0, len(hessian))
+            solver = casadi.conic("qp", "qpoases", {"h": P.sparsity(), "a": none}, quiet)
+            self._axes.append((solver, {"h": P, "lbx": -bound, "ubx": bound}))
+
+    def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
+        """See `Solver`; of one vehicle."""
+        inputs, solved = np.empty_like(gradient), True
+        for axis, (solver, given) in enumerate(self._axes):
+            inputs[0, axis] = np.asarray(solver(g=gradient[0, axis], **given)["x"])[:, 0]
+            solved = solved and solver.stats()["success"]
+        return inputs, np.array([solved])
+
+
 class Hpipm:
     """HPIPM, a Riccati interior point, as it comes with CasADi: all axes in one problem."""
 
@@ -308,6 +330,7 @@ def contestants(tuned: Tuning) -> dict[str, Factory]:
     extra: dict[str, tuple[str, Factory]] = {
         "quadprog": ("quadprog", Quadprog),
         "PIQP": ("piqp", Piqp),
+        "qpOASES": ("casadi", QpOases),
         "HPIPM": ("casadi", Hpipm),
         "IPOPT": ("casadi", Ipopt),
     }
