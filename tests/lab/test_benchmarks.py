@@ -245,6 +245,18 @@ def test_a_folder_that_is_no_checkout_is_not_compared(
     assert capsys.readouterr().err == expected
 
 
+def test_a_commit_is_compared_in_a_folder_that_goes_at_the_end() -> None:
+    """A checkout is named by its commit or its folder; what is neither is said in one line."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("no repository here")
+    with versions.checkout("HEAD") as folder:
+        assert (folder / "pyproject.toml").exists()
+    assert not folder.exists()
+    expected = "nowhere-at-all: got no folder and no commit"
+    with pytest.raises(ValueError, match=expected), versions.checkout("nowhere-at-all"):
+        pass
+
+
 def test_a_table_without_a_place_is_an_error() -> None:
     """The document and the benchmarks have drifted apart."""
     table = TextTable(["a", "b"], [["1", "2"]])

@@ -1,6 +1,8 @@
 """Before and after: this checkout against another one on the same machine, in one run.
 
-    python -m skytether.lab.benchmarks.versions ../before
+    python -m skytether.lab.benchmarks.versions HEAD~10
+
+A commit is checked out into a temporary folder, which goes at the end; a folder is taken as it is.
 
 Each checkout has a process of its own, its `versions_worker.py`. Only one of them works at
 a time, in short turns whose order is drawn anew, so that a busy machine hits both alike. Time is
@@ -11,8 +13,9 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -82,8 +85,8 @@ QUICK = VersionsCounts(20, 6, (200, 1000), 4, 2500, 3, 2, 2.0, tick.QUICK)
 class VersionsBenchmarkOptions:
     """Options of a comparison."""
 
-    other: Annotated[Path, tyro.conf.Positional]
-    """Folder of the other checkout, as a git worktree of an earlier commit."""
+    other: Annotated[str, tyro.conf.Positional]
+    """Commit to compare with, or the folder of another checkout."""
     quick: bool = False
     """Measure with counts too small to decide anything."""
     json: Path | None = None
@@ -131,7 +134,34 @@ def contests(counts: VersionsCounts) -> list[Contest]:
     return found
 
 
-def measure(other: Path, counts: VersionsCounts) -> dict[str, Any]:
+@contextmanager
+def checkout(other: str) -> Iterator[Path]:
+    """Folder of a checkout: `other` itself, or the commit of that name in a temporary worktree.
+
+    Raises:
+        ValueError: `other` is neither a folder nor a commit.
+    """
+    if Path(other).is_dir():
+        yield Path(other)
+        return
+    git = ("git", "-C", str(ROOT), "worktree")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "before"
+        added = subprocess.run(
+            [*git, "add", "--quiet", "--detach", str(folder), other],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if added.returncode:
+            raise ValueError(f"{other}: got no folder and no commit: {added.stderr.strip()}")
+        try:
+            yield folder
+        finally:
+            subprocess.run([*git, "remove", "--force", str(folder)], check=False)
+
+
+def measure(other: str, counts: VersionsCounts) -> dict[str, Any]:
     """Figures of both checkouts, and of planning against OSQP.
 
     Raises:
@@ -139,9 +169,10 @@ def measure(other: Path, counts: VersionsCounts) -> dict[str, Any]:
     """
     rng = np.random.default_rng(1)
     with ExitStack() as stack:
+        before = stack.enter_context(checkout(other))
         workers = {
             side: stack.enter_context(_start(folder.resolve()))
-            for side, folder in zip(SIDES, (other, ROOT), strict=True)
+            for side, folder in zip(SIDES, (before, ROOT), strict=True)
         }
         machines = {side: _ask(worker, "where") for side, worker in workers.items()}
         figures = {contest.title: _compete(contest, workers, rng) for contest in contests(counts)}
