@@ -442,6 +442,24 @@ def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
     assert ("brake", "the server sends malformed messages") in hand.changes
 
 
+def test_what_has_been_counted_towards_a_new_session_counts_no_more() -> None:
+    """Ten horizons for impossible times end a session; the next ten are needed to end another."""
+    met: list[Reason] = []
+    guard = Failsafe(
+        TABLE, armed=True, timeout_ns=SECOND_NS, land_after_ns=SECOND_NS, changed=lambda *_: None
+    )
+
+    def meet(cause: Reason, *, now_ns: int) -> None:
+        met.append(cause)
+        assert now_ns % (failsafe.FUTURE_MAX * MILLISECOND_NS) == 0
+
+    guard.meet = meet  # type: ignore[method-assign]
+    for count in range(1, 3 * failsafe.FUTURE_MAX):
+        guard.future(now_ns=count * MILLISECOND_NS)
+        assert len(met) == count // failsafe.FUTURE_MAX
+    assert set(met) == {Reason.RESYNC}
+
+
 def with_input_out_of_range(hand: Hand) -> Horizon:
     """A horizon that asks for more than u_max."""
     inputs = np.full((2, H), 1.01 * hand.terms.u_max[0], np.float32)

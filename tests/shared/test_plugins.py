@@ -713,7 +713,14 @@ def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    "mistake", ["raise RuntimeError('no')", "fate.delay_ns = -1", "fate.delay_ns = None"]
+    "mistake",
+    [
+        "raise RuntimeError('no')",
+        "fate.delay_ns = -1",
+        "fate.delay_ns = None",
+        "fate.copies = 101",
+        "fate.flipped = 1.0",
+    ],
 )
 def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path) -> None:
     """It changes nothing, and is told once a flow and direction."""
