@@ -226,8 +226,8 @@ class QpOases:
     def __init__(self, problem: Problem) -> None:
         import casadi
 
-        quiet = {"print_time": False, "printLevel": "none", "error_on_fail": False}
-        self._axes = []
+        quiet: dict[str, Any] = {"print_time": False, "printLevel": "none", "error_on_fail": False}
+        self._axes: list[tuple[Any, dict[str, Any]]] = []
         for hessian, bound in by_axis(problem):
             P, none = casadi.DM(hessian), casadi.Sparsity(0, len(hessian))
             solver = casadi.conic("qp", "qpoases", {"h": P.sparsity(), "a": none}, quiet)
@@ -269,7 +269,14 @@ class Hpipm:
         options |= {"print_time": False, "error_on_fail": False}
         self._solver = casadi.conic("qp", "hpipm", {"h": P.sparsity(), "a": C.sparsity()}, options)
         self._g = np.zeros(columns)
-        self._given = {"h": P, "a": C, "lba": 0.0, "uba": 0.0, "lbx": -limit, "ubx": limit}
+        self._given: dict[str, Any] = {
+            "h": P,
+            "a": C,
+            "lba": 0.0,
+            "uba": 0.0,
+            "lbx": -limit,
+            "ubx": limit,
+        }
         # Where the inputs are; shape (axes, H).
         self._inputs = np.arange(H) * width + states + np.arange(axes)[:, None]
 
@@ -298,7 +305,7 @@ class Ipopt:
         self._solver = casadi.nlpsol("mpc", "ipopt", program, quiet)
         limit = np.full(columns, np.inf)
         limit[:inputs] = np.repeat(problem.mpc.bounds, H)
-        self._given = {"lbx": -limit, "ubx": limit, "lbg": 0.0, "ubg": 0.0}
+        self._given: dict[str, Any] = {"lbx": -limit, "ubx": limit, "lbg": 0.0, "ubg": 0.0}
         self._z = np.zeros(columns)
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
