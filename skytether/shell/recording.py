@@ -25,7 +25,7 @@ SLOW = "the disk is too slow"
 
 
 class RecordFile:
-    """A recorder and its file; what the file does not take is missing in it, and known of.
+    """Recorder and its file; rows that the file does not take are lost and counted.
 
     Args:
         name: what the operator knows the file by.
