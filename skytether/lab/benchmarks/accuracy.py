@@ -72,7 +72,7 @@ class AccuracyTask:
         changes["settle"] = 0.0
         if self.reference == "square":
             changes["reference"] = SATURATED
-        # no delay bound: the paper's network has longer delays than such horizons bridge
+        # the paper's delays are longer than so short a horizon bridges
         if self.horizon * self.dt_s < 0.5:
             none = {"delay": "none"}
             changes["network"] = {"uplink": none, "downlink": none}

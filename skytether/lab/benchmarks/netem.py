@@ -90,7 +90,7 @@ class NetemBenchmarkOptions:
         return self.rate * self.seconds
 
     def is_bounded(self) -> bool:
-        """Whether the packets of a run fit every buffer."""
+        """Whether all numbers are small enough for one machine."""
         few = 1 <= self.runs <= 100 and 1 <= self.seconds <= 60 and 1 <= self.rate <= 100_000
         return few and HEAD.size <= self.size <= 65_507
 
