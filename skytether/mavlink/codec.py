@@ -9,7 +9,7 @@ from typing import Any
 from skytether.mavlink.dialect import dialect
 
 Message = Any
-"""pymavlink's message, which is untyped: its fields are its attributes."""
+"""Message of pymavlink, which is untyped: its fields are its attributes."""
 
 FRAME_BYTES_MAX = 280
 """Longest frame [B]: 10 of header, 255 of payload, 2 of checksum and 13 of signature."""

@@ -96,7 +96,7 @@ BLUE, RED, GREY, GREEN = (
 
 
 def log(time_ns: int, process: str, message: str, level: int) -> Json:
-    """foxglove.Log message: a sentence of a process."""
+    """Message foxglove.Log: a sentence of a process."""
     return {
         "timestamp": _time(time_ns),
         "level": level,
@@ -108,7 +108,7 @@ def log(time_ns: int, process: str, message: str, level: int) -> Json:
 
 
 def pose_in_frame(time_ns: int, state: Array) -> Json:
-    """foxglove.PoseInFrame message: a vehicle, heading in its direction of motion.
+    """Message foxglove.PoseInFrame: a vehicle, heading in its direction of motion.
 
     Args:
         state: position [m] and velocity [m/s]; shape (axes, 2).
@@ -117,7 +117,7 @@ def pose_in_frame(time_ns: int, state: Array) -> Json:
 
 
 def transform(time_ns: int, vehicle: str, state: Array) -> Json:
-    """foxglove.FrameTransform message: a vehicle's own frame, so that a view may follow the
+    """Message foxglove.FrameTransform: a vehicle's own frame, so that a view may follow the
     vehicle.
     """
     pose = _pose(state)
@@ -131,7 +131,7 @@ def transform(time_ns: int, vehicle: str, state: Array) -> Json:
 
 
 def vehicle(time_ns: int, name: str, state: Array) -> Json:
-    """foxglove.SceneUpdate message: a vehicle as a sphere, with an arrow as long as it flies in 1
+    """Message foxglove.SceneUpdate: a vehicle as a sphere, with an arrow as long as it flies in 1
     s.
     """
     pose, speed = _pose(state), float(math.hypot(*state[:2, 1]))
@@ -147,12 +147,12 @@ def vehicle(time_ns: int, name: str, state: Array) -> Json:
 
 
 def point(time_ns: int, name: str, state: Array) -> Json:
-    """foxglove.SceneUpdate message: a vehicle's desired position."""
+    """Message foxglove.SceneUpdate: a vehicle's desired position."""
     return _scene(time_ns, name, spheres=[_sphere(_pose(state), POINT_M, RED)])
 
 
 def line(time_ns: int, name: str, positions: Array, color: Json) -> Json:
-    """foxglove.SceneUpdate message: a path.
+    """Message foxglove.SceneUpdate: a path.
 
     Args:
         positions: its points [m]; shape (n, axes).

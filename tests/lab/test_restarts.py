@@ -48,7 +48,7 @@ def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -
 
 
 def verdict(flown: ProcessLife, outage: Outage = GONE) -> restarts.RestartVerdict:
-    """What is said of a flight."""
+    """Verdict on a flight."""
     return judge(outage, [flown], restarts.scenario())
 
 

@@ -339,7 +339,7 @@ def test_a_guard_that_is_switched_off_is_caught(
     faults: tuple[ScheduledFault, ...],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By its invariant; with the guard the same flight goes well."""
+    """Its invariant is violated; with the guard the same flight passes."""
     trial = Trial(PLANS, faults)
     assert not fly(trial).failure
     switch_off(monkeypatch)

@@ -223,7 +223,7 @@ TURN = 60
 
 
 def turning(scale: float) -> Reference:
-    """A target that goes on from TURN in a way of its own."""
+    """Target that changes its motion at TURN."""
 
     def sample(t: Array) -> Array:
         t = np.asarray(t, dtype=np.float64)
@@ -435,7 +435,9 @@ def test_a_leap_makes_no_velocity_that_no_vehicle_can_fly() -> None:
 
 
 def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a centimetre, 50 times a second; ablation: the difference of two alone is useless."""
+    """Errors are 1 cm at 50 moves a second; ablation: the difference of two moves alone is
+    useless.
+    """
 
     def spread() -> float:
         rng, moved, velocities = np.random.default_rng(1), point(), []

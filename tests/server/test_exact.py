@@ -181,7 +181,7 @@ def test_a_problem_that_is_not_finite_fails_alone() -> None:
 
 
 def test_a_batch_equals_its_singles_on_every_run() -> None:
-    """To the last bit, in any company."""
+    """Every problem in a batch has the same solution as alone, to the last bit."""
     problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=3)
     solver = ExactSolver(problem)

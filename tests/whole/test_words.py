@@ -32,7 +32,7 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[ast.Constant, bool]]:
 
 
 def fault(text: str, *, of_attribute: bool) -> str:
-    """What is wrong with a docstring; empty where nothing is."""
+    """Fault of a docstring; empty for none."""
     text = text.strip()
     if text[:1].islower():
         return "begins with a small letter"
