@@ -178,7 +178,7 @@ def test_what_is_not_installed_does_not_compete() -> None:
 def test_the_reference_is_the_same_whoever_finds_it(
     monkeypatch: pytest.MonkeyPatch, saturated: RecordedProblems
 ) -> None:
-    """quadprog and scipy find the same optimum, which is proved."""
+    """Both quadprog and scipy find the same optimum, which is proved."""
     reference = Reference(saturated.problem.hessian[0], saturated.problem.mpc.bounds[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]

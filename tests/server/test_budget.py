@@ -291,7 +291,7 @@ def test_random_loss_costs_no_budget() -> None:
 
 
 @pytest.mark.long
-def test_a_run_with_a_budget_is_the_same_in_any_company() -> None:
+def test_a_run_with_a_budget_equals_the_same_run_alone() -> None:
     """Runs of a batch share a server, and no budget."""
     scenario = crowd({**AUTO, "duration": 4.0, "settle": 1.0})
     for seed, together in zip((1, 2), fly_batch(scenario, (1, 2)), strict=True):

@@ -763,7 +763,7 @@ def test_steady_wind_is_taken_off_by_the_vehicle_itself(
 def test_a_vehicle_along_a_spline_reports_where_it_leaves_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In still air the server predicts the vehicle, so few reports come; ablation: it expects rest."""
+    """In still air the server predicts the vehicle, so reports are few; ablation: it stands."""
     uncompile(monkeypatch)
     silent = {"wind": 0.0, "report": "deviation(0.01) | silence(1)"}
     table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
