@@ -22,7 +22,6 @@ import skytether.client.pilot
 import skytether.client.secure
 import skytether.lab.commands.torture
 import skytether.lab.torture
-import skytether.server.plausibility
 import skytether.shared.wire.channel
 from skytether.__main__ import main
 from skytether.client.failsafe import LOCKING, TABLE
@@ -268,12 +267,6 @@ def no_latch(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(
         skytether.client.endpoint, "TABLE", {**TABLE, (Mode.LAND, Reason.HORIZON): Mode.TRACK}
     )
-
-
-def no_plausibility(patch: pytest.MonkeyPatch) -> None:
-    """No doubt of observations at the server."""
-    judge = lambda *_: skytether.server.plausibility.BELIEVED  # noqa: E731
-    patch.setattr(skytether.server.plausibility.Plausibility, "judge", judge)
 
 
 def no_home(patch: pytest.MonkeyPatch) -> None:
