@@ -60,7 +60,7 @@ class AutopilotOptions:
     """Listen even where other machines can reach it: MAVLink has no keys, anybody there can fly
     it."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Form of printed events: sentences, or lines of JSON for a program."""
     record: Path | None = None
     """File for the autopilot's part of the record: the vehicle's true state every 5 ms."""
     json: Path | None = None

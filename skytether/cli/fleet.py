@@ -143,7 +143,7 @@ class FleetFlight:
     cpu_s: float | None = None
     """CPU time of everything together [s], in virtual time."""
     server: Rows | None = None
-    """What the server recorded, in virtual time."""
+    """Rows of the server, in virtual time."""
     vehicles: dict[str, Any] = field(default_factory=dict)
     """Figures of each vehicle, by its number."""
 

@@ -34,7 +34,7 @@ class StationOptions(LawOptions):
     insecure: bool = False
     """Listen even where other machines can reach it: MAVLink has no keys."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Form of printed events: sentences, or lines of JSON for a program."""
     record: Path | None = None
     """File for the station's part of the record: what it heard and sent at each step."""
     json: Path | None = None

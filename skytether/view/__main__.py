@@ -37,7 +37,7 @@ class PageOptions:
     """HOST:PORT to serve the page on; if the port is taken, the next free one. Visitors from other
     machines may only look, unless they know the printed token."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Form of printed events: sentences, or lines of JSON for a program."""
     plugin: command.Plugins = ()
 
 

@@ -67,7 +67,7 @@ class ReportedFlight:
     """Data for the figures: one vehicle's flight, and the network."""
 
     scenario: Scenario
-    """What was flown."""
+    """Scenario that was flown."""
     client: Rows
     """Rows of the vehicle."""
     server: Rows
