@@ -67,7 +67,8 @@ class Tap(Endpoint):
         self.deaf = self.dumb = False
         """Whether nothing comes to it, or nothing of it leaves."""
         self.alter: Callable[[Message], bytes | None] | None = None
-        """What is sent in place of each of its messages; None leaves it as it is."""
+        """Function that returns the bytes sent in place of a message; None sends messages
+        unchanged."""
         self.extra: list[bytes] = []
         """Datagrams that are sent beside its own."""
         self._reader = Codec(9, 9)
@@ -147,7 +148,7 @@ class Air:
     ) -> None:
         self.scenario = scenario(**table)
         self.truth = io.BytesIO()
-        """Where the vehicle truly was: rows of TRUTH_COLUMNS."""
+        """True states of the vehicle: rows of TRUTH_COLUMNS."""
         self.autopilot = Autopilot(
             self.scenario,
             flavour,
@@ -210,7 +211,7 @@ class Air:
         assert self.client.finished, self.said("client")[-5:]
 
     def rows(self) -> Rows:
-        """What the client recorded."""
+        """Rows that the client recorded."""
         return parse(self._sink.getvalue())
 
     def said(self, host: str = "client") -> list[str]:
@@ -235,7 +236,7 @@ class Air:
         return [each for _, each in self.heard("COMMAND_LONG") if each.command == command]
 
     def figures(self) -> dict[str, Any]:
-        """What the client counts of its autopilot."""
+        """Figures of the client about its autopilot."""
         return self.client.told()["autopilot"]
 
     def rmse(self, settle_s: float = 5.0) -> float:

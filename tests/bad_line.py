@@ -253,7 +253,7 @@ def is_in_order(part: list[Any], whole: list[Any]) -> bool:
 
 
 class Figures(NamedTuple):
-    """What came of a flight."""
+    """Figures of a flight."""
 
     flavour: FlavourName
     seed: int

@@ -61,7 +61,7 @@ class Companion:
 
     @property
     def flight(self) -> Any:
-        """What flies, as it truly is."""
+        """True state of the vehicle."""
         return self.autopilot.flight
 
     def send(self, message: Message, *, address: tuple[str, int] = ADDRESS) -> None:
@@ -155,7 +155,7 @@ class Companion:
         return [message for _, message in self.heard if message.get_type() == name]
 
     def texts(self) -> list[str]:
-        """What it has said."""
+        """Texts that the autopilot has sent."""
         texts = Texts()
         said = [texts.take(message) for message in self.all("STATUSTEXT")]
         return [text for text in said if text is not None]

@@ -1,4 +1,4 @@
-"""What tests need of the machine."""
+"""Requirements of the tests on the machine."""
 
 import os
 import signal

@@ -40,7 +40,7 @@ class Gusts(Weather):
         self._towards = 1.0
 
     def blow(self) -> tuple[list[float], list[tuple[float, float]]]:
-        """What acts like an input, of each axis [m/s]; nothing shoves."""
+        """Disturbance that acts like an input, of each axis [m/s], without noise."""
         if self._rng.random() < 0.05:
             self._towards = self._rng.choice([-1.0, 1.0, 1.0])
         wind = [float(np.sign(p)) * self._wind * self._towards / 2**0.5 for p, _ in self.x]
@@ -71,7 +71,9 @@ def random_scenario(rng: np.random.Generator) -> Scenario:
 
 
 def furthest_m(seed: int, *, fences: type[Fence] = Fence) -> float:
-    """How far over its fence hostile inputs get a vehicle [m]; negative where they do not."""
+    """Largest distance beyond the fence that hostile inputs reach [m]; negative if they stay
+    inside.
+    """
     flown = random_scenario(np.random.default_rng(seed))
     rng = np.random.default_rng(seed)
     plant = FirstOrderPlant(flown, Weather(flown, stream(1, "wind")))

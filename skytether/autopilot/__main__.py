@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # before the imports below, which take a while
+if __name__ == "__main__":  # first, before the imports below, which take a while
     sys.exit(run("skytether.autopilot.__main__:pilot", "autopilot"))
 
 from collections.abc import Sequence
@@ -33,18 +33,18 @@ class AutopilotOptions:
     """Options of `skytether autopilot`."""
 
     scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file; of it, `vehicle.frame`,
+    """A scenario's name (see `skytether scenarios`) or a .toml file, of which only `vehicle.frame`,
     `vehicle.battery`, `vehicle.steady_wind_mps`, `vehicle.turbulence_mps` and `seed` are used."""
     flavour: FlavourName = "ardupilot"
-    """Autopilot to be like: ArduCopter 4.5 or PX4 1.17."""
+    """Autopilot to simulate: ArduCopter 4.5 or PX4 1.17."""
     bind: str | None = None
-    """HOST:PORT to hear MAVLink at, 127.0.0.1:14550 unless given, or a free port with --to. Whoever
-    sends MAVLink there is answered."""
+    """HOST:PORT to receive MAVLink at: 127.0.0.1:14550 unless given, or a free port with --to. Each
+    sender of MAVLink there is answered."""
     to: str | None = None
     """HOST:PORT to send heartbeats to from the start, for a companion computer that waits for the
-    autopilot to speak first, as 127.0.0.1:14540 with PX4."""
+    autopilot to speak first: 127.0.0.1:14540 for PX4."""
     ready: Annotated[float | None, Argument(metavar="SECONDS")] = None
-    """Time from the start until it may be armed [s]: 41.5 of ArduCopter and 4.6 of PX4 unless
+    """Time from the start until it may be armed [s]: 41.5 for ArduCopter and 4.6 for PX4 unless
     given."""
     fault: Annotated[
         tuple[str, ...],
@@ -60,24 +60,25 @@ class AutopilotOptions:
     """Listen even where other machines can reach it: MAVLink has no keys, anybody there can fly
     it."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Form of printed events: sentences, or lines of JSON for a program."""
     record: Path | None = None
-    """File for the autopilot's part of the record: where the vehicle truly is, each 5 ms."""
+    """File for the autopilot's part of the record: the vehicle's true state every 5 ms."""
     json: Path | None = None
-    """File for what was counted, and the CPU time it took."""
+    """File for counters and the CPU time used."""
     control: Path | None = None
-    """Unix socket to make, through which the wind changes in flight, see `skytether set`."""
+    """Unix socket to create, through which the wind can be changed in flight, see `skytether
+    set`."""
     metrics: str | None = None
-    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
+    """HTTP address for metrics, HOST:PORT, for Prometheus, and /healthz."""
     plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
 
 def pilot(argv: Sequence[str]) -> None:
-    """Be a vehicle with an autopilot that speaks MAVLink, until SIGINT or SIGTERM.
+    """Simulate a vehicle with an autopilot that speaks MAVLink, until SIGINT or SIGTERM.
 
-    It answers velocities, silence, commands and parameters as ArduCopter or PX4 were measured to,
-    around a simulated quadrotor. SIGUSR1 prints what was counted so far.
+    It responds to velocities, lost set-points, commands and parameters as measured on ArduCopter or
+    PX4, around a simulated quadrotor. SIGUSR1 prints what was counted so far.
     """
     options = command.parse(AutopilotOptions(), argv, "skytether autopilot", pilot.__doc__)
     if options.ready is not None and not 0.0 <= options.ready <= 3600.0:
@@ -116,6 +117,6 @@ def pilot(argv: Sequence[str]) -> None:
 
 
 def _ready() -> None:
-    """Have what flies in memory before somebody waits for it."""
+    """Import and compile everything that flies before a peer waits for it."""
     command.prepare(kernel.missing())
     kernel.load()

@@ -1,4 +1,4 @@
-"""ArduCopter 4.5, as far as it is measured: it stands when setpoints stop, and stays in GUIDED."""
+"""ArduCopter 4.5, as measured: it stops when set-points stop, and stays in GUIDED."""
 
 from math import hypot
 
@@ -14,9 +14,9 @@ from skytether.quadrotor.loops import Gains
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
-"""Least value that a gain or a limit has, whatever its parameter says."""
+"""Smallest value of a gain or limit, whatever its parameter says."""
 LANDED_S = 2.0
-"""Time on the ground after which a landing is over [s], as measured."""
+"""Time on the ground after which a landing ends [s], as measured."""
 STATION_ACTIONS = {
     1: FlightMode.RETURN,
     3: FlightMode.RETURN,
@@ -58,7 +58,7 @@ class ArduPilot(PilotedVehicle):
         return ""
 
     def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
-        """See `PilotedVehicle`; the first part is all of it."""
+        """See `PilotedVehicle`; the mode number is the first part."""
         return main
 
     def takes_setpoints(self) -> bool:
@@ -66,11 +66,11 @@ class ArduPilot(PilotedVehicle):
         return self.mode is FlightMode.GUIDED
 
     def altitude_of(self, told: float) -> float | None:
-        """See `PilotedVehicle`; it is above home."""
+        """See `PilotedVehicle`; the altitude is above home."""
         return told
 
     def enter_takeoff(self) -> bool:
-        """See `PilotedVehicle`; GUIDED climbs by itself."""
+        """See `PilotedVehicle`; GUIDED itself climbs."""
         return self.mode is FlightMode.GUIDED
 
     def limits(self) -> OwnSpeeds:

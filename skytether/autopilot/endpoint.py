@@ -1,7 +1,7 @@
 """The autopilot as an endpoint: MAVLink in datagrams, and a quadrotor that flies meanwhile.
 
-Whoever sends a message of MAVLink is a peer from then on and hears it; those that it is told of
-hear it from the start. Each peer has streams of its own, as a link of an autopilot has.
+Each sender of a MAVLink message becomes a peer, to which the autopilot sends; peers given at the
+start are sent to at once. Each peer has its own streams, as each link of a real autopilot has.
 """
 
 from collections import Counter
@@ -34,32 +34,33 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 SYSTEM, COMPONENT = 1, int(dialect.MAV_COMP_ID_AUTOPILOT1)
-"""Numbers of this system and this component."""
+"""System and component id of the autopilot."""
 PEERS_MAX = 8
-"""Most peers at once; the one that was silent longest gives way to a new one."""
+"""Most peers at once; a new one replaces the one that was silent longest."""
 PATIENCE_NS = SECOND_NS
-"""Silence after which a peer may give way [ns]."""
+"""Silence after which a peer may be replaced [ns]."""
 BEHIND_MAX_NS = SECOND_NS
-"""Longest time that is flown after the event [ns]: a process that has slept longer goes on."""
+"""Longest time that is simulated at once after a late wake [ns]; beyond it, the flight skips
+time."""
 LISTED_EACH_TICK = 2
-"""Parameters of a list that are sent in a tick."""
+"""Number of parameters of a list that are sent per tick."""
 FORCE = 21196.0
-"""Number that forces an arming or disarming."""
+"""Magic number that forces arming or disarming."""
 
 PILOTS: dict[FlavourName, type[PilotedVehicle]] = {"ardupilot": ArduPilot, "px4": PX4}
 POSITION_IGNORED, VELOCITY_IGNORED = 0b111, 0b111000
-"""Bits of the type mask of a setpoint; those of acceleration are 0b111000000."""
+"""Bits of a set-point's type mask; those of acceleration are 0b111000000."""
 ACCELERATION_IGNORED = 0b111000000
 
 
 class Peer:
-    """Somebody who hears the autopilot.
+    """Peer to which the autopilot sends.
 
     Args:
-        address: where.
-        pinned: whether it stays, however long it is silent.
-        rates: rates of its streams at the start [Hz], by number of the message.
-        now_ns: time now, by the autopilot's clock.
+        address: its address.
+        pinned: whether the peer is never replaced, however long it is silent.
+        rates: initial rates of its streams [Hz], by message id.
+        now_ns: time now, on the autopilot's clock.
     """
 
     def __init__(
@@ -69,19 +70,19 @@ class Peer:
         self.codec = Codec(SYSTEM, COMPONENT)
         self.heard_ns = now_ns
         self.listed: int | None = None
-        """Number of parameters sent of a list that it has asked for; None: of none."""
+        """Number of parameters sent of a requested list; None without a request."""
         self.streams: dict[int, tuple[int, int]] = {}
-        """Interval of each stream [ns] and the time of its next message, by number."""
+        """Interval of each stream [ns] and time of its next message, by message id."""
         for number, rate in {HEARTBEAT: 1.0, **rates}.items():
             self.streams[number] = round(SECOND_NS / rate), now_ns
 
     def every(self, number: int, interval_ns: int, now_ns: int) -> None:
-        """Have a message sent at an interval from now on, and never more than once a tick."""
+        """Send a message at an interval from now on, at most once per tick."""
         interval_ns = max(interval_ns, TICK_NS)
         self.streams[number] = interval_ns, now_ns + interval_ns
 
     def due(self, now_ns: int) -> list[int]:
-        """Messages that are due now; their next ones are put on the list."""
+        """Messages that are due now; each is scheduled again."""
         found = [number for number, (_, next_ns) in self.streams.items() if next_ns <= now_ns]
         for number in found:
             interval_ns, next_ns = self.streams[number]
@@ -90,15 +91,15 @@ class Peer:
 
 
 class Autopilot(Endpoint):
-    """A vehicle that speaks MAVLink.
+    """Simulated vehicle that speaks MAVLink.
 
     Args:
-        scenario: frame, battery, wind and seed of it are used.
-        flavour: which autopilot.
-        peers: who hears it from the start.
-        ready_s: time until it may be armed [s]; None: as long as its flavour takes.
-        faults: what goes wrong.
-        recorder: takes the true state at each tick, rows of `record.TRUTH_COLUMNS`.
+        scenario: scenario, of which frame, battery, wind and seed are used.
+        flavour: autopilot to simulate.
+        peers: addresses that it sends to from the start.
+        ready_s: time until it may be armed [s]; None for its flavour's.
+        faults: scripted faults.
+        recorder: takes the true state at each tick, as rows of `record.TRUTH_COLUMNS`.
     """
 
     changeable = keys_of(InFlight.WIND)
@@ -130,16 +131,16 @@ class Autopilot(Endpoint):
         self.flight = PILOTS[flavour](self._flavour, quadrotor, ready_s)
         self._telling = Telling(self.flight)
         self.script = Script(faults)
-        """What goes wrong."""
+        """Scripted faults."""
         self._recorder = recorder
         self._began_ns: int | None = None
-        """Time at which its own clock began [ns; the driver's]."""
+        """Time at which the autopilot's own clock began [ns; the driver's clock]."""
         self._peers: dict[Address, Peer] = {}
         for address in peers:
             self._meet(address, pinned=True)
         self._reader = Codec(SYSTEM, COMPONENT)
         self._texts = 0
-        """Number of the newest text."""
+        """Id of the newest text."""
         self._counts: Counter[str] = Counter()
         self._handlers: dict[str, Callable[[Message, Peer, int], None]] = {
             "HEARTBEAT": self._on_heartbeat,
@@ -153,7 +154,7 @@ class Autopilot(Endpoint):
             "SET_POSITION_TARGET_LOCAL_NED": self._on_setpoint,
         }
 
-    # The driver's side
+    # Driver interface
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Endpoint`."""
@@ -161,7 +162,7 @@ class Autopilot(Endpoint):
         messages = self._reader.decode(datagram.payload)
         peer = self._peers.get(datagram.peer)
         for message in messages:
-            if message.get_srcSystem() == SYSTEM:  # an echo, or somebody with our number
+            if message.get_srcSystem() == SYSTEM:  # our own echo, or another system with our id
                 self._counts["foreign"] += 1
                 continue
             peer = peer or self._meet(datagram.peer)
@@ -182,11 +183,11 @@ class Autopilot(Endpoint):
         self._fly(now_ns)
 
     def next_wake_ns(self) -> int:
-        """See `Endpoint`: the next tick."""
+        """See `Endpoint`: the time of the next tick."""
         return 0 if self._began_ns is None else self._began_ns + self.flight.now_ns + TICK_NS
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
-        """See `Endpoint`; another wind blows."""
+        """See `Endpoint`; the wind changes."""
         vehicle = scenario.vehicle
         self.flight.quadrotor.blow(vehicle.steady_wind_mps, vehicle.turbulence_mps)
 
@@ -204,10 +205,10 @@ class Autopilot(Endpoint):
             "position_m": {"x": x, "y": y, "z": z},
         }
 
-    # Flying and telling
+    # Flight and telemetry
 
     def _fly(self, now_ns: int) -> None:
-        """Fly until now, tick by tick, and send what is due at each."""
+        """Fly until now, tick by tick, and send the messages due at each tick."""
         if self._began_ns is None:
             self._began_ns = now_ns
         behind_ns = now_ns - self._began_ns - self.flight.now_ns
@@ -231,7 +232,7 @@ class Autopilot(Endpoint):
             self._recorder.append_row(time_ns, x, vx, y, vy, z, vz)
 
     def _meet(self, address: Address, *, pinned: bool = False) -> Peer | None:
-        """Have a new peer; None where there is no room for one."""
+        """Add a peer; None where there is no room for it."""
         now_ns = self.flight.now_ns
         if len(self._peers) == PEERS_MAX:
             others = [peer for peer in self._peers.values() if not peer.pinned]
@@ -244,13 +245,13 @@ class Autopilot(Endpoint):
         return peer
 
     def _send(self, peer: Peer, message: Message) -> None:
-        """Send a message to a peer, unless nothing is sent."""
+        """Send a message to a peer, unless a fault silences the autopilot."""
         if not self.script.silent:
             self._counts["sent"] += 1
             self.send(peer.codec.encode(message), peer.address)
 
     def _tell(self, peer: Peer, number: int) -> bool:
-        """Send a peer a message of the vehicle's state; returns whether there is such a message."""
+        """Send a peer a message of the vehicle's state; returns whether that message exists."""
         make = STREAMS.get(number)
         message = make(self._telling) if make else None
         if message is not None:
@@ -258,7 +259,7 @@ class Autopilot(Endpoint):
         return make is not None
 
     def _speak(self) -> None:
-        """Send all peers what the flight has said, and say it in the log."""
+        """Send all peers the flight's new texts, and log them."""
         for severity, text in self.flight.said:
             self.tell(AutopilotSaid(text=text, severity=int(severity)))
             self._texts = self._texts % 65535 + 1
@@ -268,7 +269,7 @@ class Autopilot(Endpoint):
         self.flight.said.clear()
 
     def _list(self, peer: Peer) -> None:
-        """Send the next parameters of a list."""
+        """Send the next parameters of a requested list."""
         if peer.listed is None:
             return
         names = list(self.flight.parameters)
@@ -278,7 +279,7 @@ class Autopilot(Endpoint):
         if peer.listed >= len(names):
             peer.listed = None
 
-    # What peers send
+    # Incoming messages
 
     def _on_heartbeat(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         if self.flight.is_station(message.get_srcSystem(), message.type):
@@ -347,12 +348,12 @@ class Autopilot(Endpoint):
         self._acknowledge(peer, message, message.command, result)
 
     def _obey(self, command: int, given: tuple[float, float, float, float], peer: Peer) -> Result:
-        """Do what a command says, if it can be done.
+        """Execute a command, if possible.
 
         Args:
             command: MAV_CMD.
             given: its parameters 1, 2, 3 and 7.
-            peer: who has sent it.
+            peer: sender of the command.
         """
         first, second, third, seventh = given
         flight = self.flight
@@ -376,7 +377,9 @@ class Autopilot(Endpoint):
         return result
 
     def _set_interval(self, number: int, interval_us: float, peer: Peer) -> Result:
-        """Have a message sent to a peer at an interval [µs]; 0: as at the start, below: never."""
+        """Set the interval of a message to a peer [µs]; 0 restores the default, below 0 stops
+        it.
+        """
         if number not in STREAMS or not isfinite(interval_us):
             return Result.DENIED
         if interval_us == 0.0:
@@ -400,12 +403,12 @@ class Autopilot(Endpoint):
 
 
 def _is_ours(message: Message) -> bool:
-    """Whether a message is for this system, or for all."""
+    """Whether a message is addressed to this system, or to all."""
     system = getattr(message, "target_system", 0)
     component = getattr(message, "target_component", 0)
     return system in (0, SYSTEM) and component in (0, COMPONENT)
 
 
 def _whole(value: float) -> int:
-    """Whole number that a float of a command stands for; -1 of none."""
+    """Integer in a command's float parameter; -1 where it is none."""
     return int(value) if isfinite(value) and value == int(value) else -1

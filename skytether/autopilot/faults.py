@@ -1,4 +1,4 @@
-"""Faults that are scripted: what goes wrong, and when, counted from when the vehicle was armed."""
+"""Scripted faults: what fails, and when, counted from arming."""
 
 import re
 from collections.abc import Sequence
@@ -15,25 +15,25 @@ NAMES: tuple[str, ...] = get_args(FaultName)
 LASTING = ("silence", "estimate")
 """Faults that may end."""
 LOW_CHARGE = 0.05
-"""Charge that `battery` leaves."""
+"""Charge that is left by the fault `battery`."""
 
 
 class ScriptedFault(NamedTuple):
-    """Something that goes wrong."""
+    """Scripted fault."""
 
     name: str
-    """What: one of NAMES."""
+    """Name, one of NAMES."""
     from_ns: int
-    """When, counted from arming."""
+    """Time at which it begins, counted from arming."""
     until_ns: int | None
-    """When it is over; None: never."""
+    """Time at which it ends; None for never."""
 
 
 def parse(text: str) -> ScriptedFault:
-    """ScriptedFault from NAME@SECONDS, or NAME@SECONDS-SECONDS of one that ends.
+    """Scripted fault from NAME@SECONDS, or NAME@SECONDS-SECONDS for one that ends.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the text is no fault.
     """
     number = r"(\d+(?:\.\d+)?)"
     found = re.fullmatch(rf"(\w+)@{number}(?:-{number})?", text)
@@ -52,20 +52,20 @@ def parse(text: str) -> ScriptedFault:
 
 
 class Script:
-    """Faults of a flight.
+    """Scripted faults of a flight.
 
     Args:
-        faults: what goes wrong.
+        faults: the faults.
     """
 
     def __init__(self, faults: Sequence[ScriptedFault]) -> None:
         self._waiting = sorted(faults, key=lambda fault: fault.from_ns)
         self._lasting: list[ScriptedFault] = []
         self.silent = False
-        """Whether nothing is sent."""
+        """Whether the autopilot sends nothing."""
 
     def play(self, flight: PilotedVehicle) -> None:
-        """Have go wrong what is due."""
+        """Apply the faults that are due."""
         if flight.armed_ns is None:
             return
         past_ns = flight.now_ns - flight.armed_ns

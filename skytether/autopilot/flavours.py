@@ -1,7 +1,7 @@
-"""Flavours: what ArduCopter and PX4 do differently, as tables.
+"""Flavours: the differences between ArduCopter and PX4, as tables.
 
-Parameters have the names, types and defaults of ArduCopter 4.5 and PX4 1.17. A parameter is here
-where it decides something in `flight.py`, or where who flies the vehicle should read it.
+Parameters have the names, types and defaults of ArduCopter 4.5 and PX4 1.17. The tables contain the
+parameters that affect `flight.py`, and those that a companion should read.
 """
 
 from dataclasses import dataclass
@@ -13,64 +13,64 @@ from skytether.quadrotor.loops import ARDUPILOT, PX4, Gains
 
 FlavourName = Literal["ardupilot", "px4"]
 Parameters = dict[str, int | float]
-"""Values of parameters by name; those of whole numbers are ints."""
+"""Values of parameters by name; ints for integer parameters."""
 
 
 class FlightMode(Enum):
-    """What the vehicle is doing, whatever its autopilot calls it."""
+    """Mode of the vehicle, under a name common to both autopilots."""
 
     PILOT = auto()
-    """A pilot flies; with sticks at rest, it stays where it is."""
+    """Flown by a pilot; with sticks centred, the vehicle stays where it is."""
     HOLD = auto()
-    """It brakes, and stays where it is."""
+    """Brakes, and stays where it is."""
     GUIDED = auto()
-    """It flies what a companion computer tells it: GUIDED, OFFBOARD."""
+    """Follows a companion computer: GUIDED, OFFBOARD."""
     TAKEOFF = auto()
-    """It climbs to where it was told."""
+    """Climbs to a commanded altitude."""
     RETURN = auto()
-    """It flies home, and lands."""
+    """Flies home, and lands."""
     LAND = auto()
-    """It lands where it is."""
+    """Lands where it is."""
 
 
 @dataclass(frozen=True)
 class SimulatedFlavour:
-    """An autopilot."""
+    """Flavour of the simulated autopilot."""
 
     title: str
-    """Name for people."""
+    """Display name."""
     version: tuple[int, int, int]
-    """Version that was measured."""
+    """Version on which the behaviour was measured."""
     autopilot: int
-    """MAV_AUTOPILOT in its heartbeat."""
+    """MAV_AUTOPILOT in the heartbeat."""
     bytewise: bool
     """Whether a parameter's bits are sent, see `mavlink.parameters`."""
     gains: Gains
-    """Gains of its loop of velocity."""
+    """Gains of the velocity loop."""
     frame: str
-    """Frame that its own simulator flies, or the nearest to it."""
+    """Frame in the autopilot's own simulator, or the nearest one."""
     ready_s: float
-    """Time from its start until it may be armed: position and filters settle [s]."""
+    """Time from the start until it may be armed, in which position and filters settle [s]."""
     spool_s: float
-    """Time from the command to take off until it climbs [s]."""
+    """Time from the take-off command until it climbs [s]."""
     home: tuple[float, float, float]
-    """Latitude and longitude [°], and altitude above the sea [m], where it starts."""
+    """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]
-    """Name and meaning of each of its modes, by the number in its heartbeat."""
+    """Name and meaning of each mode, by the number in the heartbeat."""
     first: int
-    """Mode that it starts in."""
+    """Mode at the start."""
     streams: dict[int, float]
-    """Rates of the messages that a link has without asking [Hz], by number."""
+    """Default rates of a link's messages [Hz], by message id."""
     parameters: Parameters
-    """Its parameters when it starts."""
+    """Parameters at the start."""
 
     def number(self, mode: FlightMode) -> int:
-        """Number of its first mode of a kind."""
+        """Number of the first mode with this meaning."""
         return next(number for number, (_, kind) in self.modes.items() if kind is mode)
 
 
 def _px4(main: int, sub: int = 0) -> int:
-    """Number of a mode of PX4."""
+    """Number of a PX4 mode in a heartbeat."""
     return main << 16 | sub << 24
 
 

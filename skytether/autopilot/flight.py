@@ -1,8 +1,8 @@
-"""A flight of a scripted autopilot: arming, modes, what each of them flies, and what ends them.
+"""Flight of a simulated autopilot: arming, modes, the motion in each mode, and what ends it.
 
-Both flavours share what is in here; `ardupilot.py` and `px4.py` have what they do differently.
-Positions are x north, y east, altitude up, from where it was started. Times are those of its own
-clock [ns], which begins at 0.
+Both flavours share this module; their differences are in `ardupilot.py` and `px4.py`. Positions are
+x north, y east, altitude up, from where it was started. Times are those of its own clock [ns],
+which begins at 0.
 """
 
 from abc import ABC, abstractmethod
@@ -21,18 +21,18 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 TICK_NS = 5_000_000
 """Time between two rounds of all loops [ns]."""
 LANDED_NS = SECOND_NS
-"""Time for which it stands still until it takes itself for landed [ns]."""
+"""Time at rest after which the vehicle counts as landed [ns]."""
 THERE_M = 0.1
-"""Distance within which it is there [m]."""
+"""Distance within which a target counts as reached [m]."""
 STILL_MPS = 0.1
-"""Speed below which it stands [m/s]."""
+"""Speed below which the vehicle counts as at rest [m/s]."""
 
 Vector = tuple[float, float, float]
 REST: Vector = (0.0, 0.0, 0.0)
 
 
 class Result(IntEnum):
-    """Answer to a command: MAV_RESULT."""
+    """Result of a command: MAV_RESULT."""
 
     ACCEPTED = dialect.MAV_RESULT_ACCEPTED
     REJECTED = dialect.MAV_RESULT_TEMPORARILY_REJECTED
@@ -42,7 +42,7 @@ class Result(IntEnum):
 
 
 class Severity(IntEnum):
-    """Severity of what it says: MAV_SEVERITY."""
+    """Severity of a text: MAV_SEVERITY."""
 
     CRITICAL = dialect.MAV_SEVERITY_CRITICAL
     WARNING = dialect.MAV_SEVERITY_WARNING
@@ -50,7 +50,7 @@ class Severity(IntEnum):
 
 
 class Landed(Enum):
-    """Whether it is on the ground: MAV_LANDED_STATE."""
+    """Landed state: MAV_LANDED_STATE."""
 
     ON_GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
     IN_AIR = dialect.MAV_LANDED_STATE_IN_AIR
@@ -59,21 +59,21 @@ class Landed(Enum):
 
 
 class CompanionSetpoint(NamedTuple):
-    """What a companion computer wants flown."""
+    """Set-point of a companion computer."""
 
     velocity: Vector
-    """Velocity, or what is added to the way to the position [m/s]."""
+    """Velocity, or with a position the feed-forward velocity [m/s]."""
     position: Vector | None
-    """Position [m]; None: the velocity alone."""
+    """Position [m]; None: only the velocity is set."""
     came_ns: int
-    """Time at which it came."""
+    """Time of arrival."""
 
 
 class OwnSpeeds(NamedTuple):
-    """How fast it flies by itself."""
+    """Limits and gains of the autopilot's own flight."""
 
     speed: float
-    """Largest speed in the plane [m/s]."""
+    """Largest horizontal speed [m/s]."""
     up: float
     """Largest speed upwards [m/s]."""
     down: float
@@ -81,54 +81,55 @@ class OwnSpeeds(NamedTuple):
     land: float
     """Speed of landing [m/s]."""
     p: float
-    """Speed over the distance from a point in the plane [1/s]."""
+    """Gain from horizontal distance to speed [1/s]."""
     p_up: float
-    """Speed over the distance from an altitude [1/s]."""
+    """Gain from altitude error to speed [1/s]."""
     acceleration: float
-    """Deceleration towards a point in the plane [m/s²]."""
+    """Horizontal deceleration towards a point [m/s²]."""
     acceleration_up: float
-    """Deceleration towards an altitude [m/s²]."""
+    """Vertical deceleration towards an altitude [m/s²]."""
 
 
 class PilotedVehicle(ABC):
-    """A vehicle with an autopilot.
+    """Vehicle with an autopilot.
 
     Args:
-        flavour: which autopilot.
-        quadrotor: what it flies, standing on the ground at the origin.
+        flavour: autopilot to simulate.
+        quadrotor: its body, standing on the ground at the origin.
         ready_s: time from the start until it may be armed [s].
     """
 
     low = 0.15
-    """Charge of the battery below which it is low."""
+    """Charge of the battery below which the low-battery failsafe acts."""
 
     def __init__(self, flavour: SimulatedFlavour, quadrotor: Quadrotor, ready_s: float) -> None:
         self.flavour, self.quadrotor = flavour, quadrotor
         self.parameters: Parameters = dict(flavour.parameters)
         self.number = flavour.first
-        """Number of its mode."""
+        """Number of the present mode."""
         self.armed = False
         self.armed_ns: int | None = None
-        """Time at which it was armed first."""
+        """Time of the first arming."""
         self.flying = False
-        """Whether it has left the ground."""
+        """Whether the vehicle has left the ground."""
         self.estimates = True
-        """Whether it knows where it is, once it is ready."""
+        """Whether its position estimate is valid, once it is ready."""
         self.said: list[tuple[Severity, str]] = []
-        """What it says, until that is sent."""
+        """Texts not sent yet."""
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the newest heartbeat of its ground station; None: there is none to be lost."""
+        """Time of the ground station's newest heartbeat; None before any: then there is none to
+        lose."""
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
-        """Altitude to climb to [m], while it does."""
+        """Altitude to climb to [m]; None while not climbing."""
         self._climb_ns = 0
-        """Time from which it climbs."""
+        """Time at which the climb begins."""
         self._held: Vector | None = None
-        """Point at which it stays, once it has come to rest."""
+        """Point that is held after coming to rest."""
         self._stood_ns = 0
-        """Time since which it stands on the ground."""
+        """Time since which the vehicle has been at rest on the ground."""
         self._landing = False
         """Whether a return has become a landing."""
         self._told: set[str] = set()
@@ -137,22 +138,22 @@ class PilotedVehicle(ABC):
 
     @property
     def mode(self) -> FlightMode:
-        """What it is doing."""
+        """Present mode."""
         return self.flavour.modes[self.number][1]
 
     @property
     def mode_name(self) -> str:
-        """Its autopilot's name for that."""
+        """The autopilot's name for the present mode."""
         return self.flavour.modes[self.number][0]
 
     @property
     def ready(self) -> bool:
-        """Whether it knows where it is."""
+        """Whether the position is known."""
         return self.estimates and self.now_ns >= self._ready_ns
 
     @property
     def landed(self) -> Landed:
-        """Whether it is on the ground."""
+        """Whether the vehicle is on the ground."""
         if not self.flying:
             return Landed.ON_GROUND
         if self._climb is not None:
@@ -161,13 +162,13 @@ class PilotedVehicle(ABC):
         return Landed.LANDING if landing else Landed.IN_AIR
 
     def say(self, text: str, severity: Severity = Severity.INFO) -> None:
-        """Say something to whoever listens."""
+        """Send a text to all peers."""
         self.said.append((severity, text))
 
-    # What it is told
+    # Commands
 
     def arm(self) -> Result:
-        """Turn its rotors on, where nothing speaks against that."""
+        """Arm, unless a check forbids it."""
         if self.armed:
             return Result.ACCEPTED
         why = self.why_not_armed()
@@ -182,7 +183,7 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def disarm(self, *, force: bool = False) -> Result:
-        """Turn its rotors off; in the air only if it must."""
+        """Disarm; in the air only if forced."""
         if self.flying and not force:
             return self.refusal
         if self.armed:
@@ -192,7 +193,7 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def switch(self, number: int) -> Result:
-        """Go into the mode with this number, where that is possible now."""
+        """Enter the mode with this number, if it is possible now."""
         if number not in self.flavour.modes:
             return Result.DENIED
         name, kind = self.flavour.modes[number]
@@ -209,7 +210,7 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def enter(self, number: int) -> None:
-        """Be in the mode with this number from now on."""
+        """Enter the mode with this number unconditionally."""
         if number == self.number:
             return
         self.number = number
@@ -221,20 +222,20 @@ class PilotedVehicle(ABC):
             self.disarm()
 
     def set(self, name: str, value: float) -> None:
-        """Give a parameter another value."""
+        """Set a parameter."""
         self.parameters[name] = value
         self.quadrotor.gains = self.gains()
 
     def act(self, mode: FlightMode, why: str, severity: Severity = Severity.CRITICAL) -> None:
-        """Have a failsafe act: say why, and go into a mode unless it is in it."""
+        """Trigger a failsafe: announce the reason, and enter a mode unless in it already."""
         self.say(why, severity)
         self.enter(self.flavour.number(mode))
 
     def take_off(self, altitude: float) -> Result:
-        """Climb to an altitude, armed and on the ground.
+        """Take off and climb to an altitude; the vehicle must be armed and on the ground.
 
         Args:
-            altitude: as its autopilot counts it, see `altitude_of` [m].
+            altitude: altitude in the autopilot's convention, see `altitude_of` [m].
         """
         to = self.altitude_of(altitude)
         if not self.armed or self.flying or to is None or to <= 0.0 or not self.enter_takeoff():
@@ -243,31 +244,31 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def want(self, velocity: Vector, position: Vector | None) -> None:
-        """Take a setpoint of a companion computer."""
+        """Accept a set-point of a companion computer."""
         if not self.takes_setpoints():
             return
         if self.mode is FlightMode.GUIDED:
-            self._climb = self._held = None  # it ends a climb, as ArduCopter has it
+            self._climb = self._held = None  # a set-point ends a climb, as in ArduCopter
         self._setpoint = CompanionSetpoint(velocity, position, self.now_ns)
 
     def forget(self) -> None:
-        """Forget what a companion computer wanted before."""
+        """Forget the companion computer's earlier set-points."""
         self._setpoint = None
 
-    # What differs between flavours
+    # Differences between flavours
 
     refusal: Result
-    """Answer to a command that cannot be obeyed now."""
+    """Result of a command that cannot be executed now."""
     arming_word: str
-    """Word for arming in what it says; empty for another sentence."""
+    """Text announced at arming; empty for another sentence."""
 
     @abstractmethod
     def why_not_armed(self) -> str:
-        """Sentence that says why it cannot be armed; empty where it can."""
+        """Reason why it cannot be armed; empty where it can."""
 
     @abstractmethod
     def why_not_guided(self) -> str:
-        """Sentence that says why it cannot be guided; empty where it can."""
+        """Reason why it cannot be guided; empty where it can."""
 
     @abstractmethod
     def mode_number(self, main: int, sub: int) -> int:
@@ -275,23 +276,23 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def takes_setpoints(self) -> bool:
-        """Whether it heeds setpoints in its mode."""
+        """Whether it follows set-points in its present mode."""
 
     @abstractmethod
     def altitude_of(self, told: float) -> float | None:
-        """Altitude above home of one that a command tells [m]; None where it is none."""
+        """Altitude above home for a commanded altitude [m]; None for an invalid one."""
 
     @abstractmethod
     def enter_takeoff(self) -> bool:
-        """Go into the mode that climbs; returns whether it can."""
+        """Enter the mode that climbs; returns whether this is possible."""
 
     @abstractmethod
     def limits(self) -> OwnSpeeds:
-        """How fast it flies by itself, by its parameters."""
+        """Limits and gains of its own flight, from its parameters."""
 
     @abstractmethod
     def gains(self) -> Gains:
-        """Gains of its loop of velocity, by its parameters."""
+        """Gains of its velocity loop, from its parameters."""
 
     @abstractmethod
     def is_station(self, system: int, kind: int) -> bool:
@@ -303,20 +304,20 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """Whether setpoints have stopped, after which it does what its parameters say."""
+        """Check whether set-points have stopped, and act as the parameters say."""
 
     @abstractmethod
     def watch(self) -> None:
-        """Failsafes of battery, ground station and fence."""
+        """Check the failsafes of battery, ground station and fence."""
 
     @abstractmethod
     def idle_s(self) -> float:
-        """Time on the ground after which it disarms [s]; less where it was to land."""
+        """Time on the ground after which it disarms [s]; shorter after a landing."""
 
-    # What it flies
+    # Motion
 
     def tick(self) -> None:
-        """Fly for TICK_NS."""
+        """Simulate TICK_NS."""
         self.now_ns += TICK_NS
         if self.armed:
             if self.flying:
@@ -333,13 +334,13 @@ class PilotedVehicle(ABC):
             self._settle(velocity)
 
     def once(self, failsafe: str) -> bool:
-        """Whether a failsafe acts now for the first time in a flight."""
+        """Whether a failsafe acts for the first time in this flight."""
         new = failsafe not in self._told
         self._told.add(failsafe)
         return new
 
     def _lift(self, velocity: Vector) -> None:
-        """Leave the ground where it is to climb."""
+        """Leave the ground, if the mode climbs."""
         if self.flying:
             return
         climbs = self._climb is not None and self.now_ns >= self._climb_ns
@@ -347,10 +348,10 @@ class PilotedVehicle(ABC):
             self.flying = True
 
     lifts_off_by_setpoint: bool
-    """Whether a setpoint that points upwards is enough to leave the ground."""
+    """Whether a set-point with an upward velocity suffices to leave the ground."""
 
     def _settle(self, velocity: Vector) -> None:
-        """Find out that it has landed, and disarm after a time on the ground."""
+        """Detect the landing, and disarm after a time on the ground."""
         if not self.quadrotor.stands() or velocity[2] > 0.0 or self._climb is not None:
             self._stood_ns = self.now_ns
         elif self.flying and self.now_ns - self._stood_ns >= LANDED_NS:
@@ -359,7 +360,7 @@ class PilotedVehicle(ABC):
             self.disarm()
 
     def _guide(self) -> Vector:
-        """Velocity that it wants now [m/s]."""
+        """Desired velocity now [m/s]."""
         if self._climb is not None:
             return self._climbing(self._climb)
         match self.mode:
@@ -383,7 +384,7 @@ class PilotedVehicle(ABC):
         return self._toward((*self._stay_xy(), altitude))
 
     def _stay_xy(self) -> tuple[float, float]:
-        """Point of the ground above which it climbs or lands."""
+        """Horizontal point at which it climbs or lands."""
         if self._held is None:
             self._held = self.quadrotor_wants()
         return self._held[:2]
@@ -395,14 +396,15 @@ class PilotedVehicle(ABC):
         if self.silence(setpoint):
             if self.mode is not FlightMode.GUIDED:
                 return self._guide()
-            # A velocity ends with its stream; a position is flown to, whoever is still there.
+            # A velocity expires with its stream; a position is flown to even if the companion is
+            # gone.
             return REST if setpoint.position is None else self._toward(setpoint.position)
         if setpoint.position is None:
             return setpoint.velocity
         return self._toward(setpoint.position, setpoint.velocity)
 
     def _staying(self) -> Vector:
-        """Brake, and stay where it has come to rest."""
+        """Brake, and hold the point where it comes to rest."""
         if self._held is None:
             if hypot(*self.velocity()) > STILL_MPS:
                 return REST
@@ -430,7 +432,7 @@ class PilotedVehicle(ABC):
         return x, y, -(limits.land if z < 10.0 else limits.down)
 
     def _toward(self, point: Vector, velocity: Vector = REST) -> Vector:
-        """Velocity towards a point, slower near it; on top of a velocity with which it moves."""
+        """Velocity towards a point, slower near it, added to a feed-forward velocity."""
         limits = self.limits()
         x, y, z = (to - now for to, now in zip(point, self.quadrotor_wants(), strict=True))
         distance = hypot(x, y)
@@ -440,7 +442,7 @@ class PilotedVehicle(ABC):
         up = min(up, limits.up) if z > 0.0 else -min(up, limits.down)
         return share * x + velocity[0], share * y + velocity[1], up + velocity[2]
 
-    # Where it is
+    # State
 
     def position(self) -> Vector:
         """Position [m]."""
@@ -453,13 +455,13 @@ class PilotedVehicle(ABC):
         return x, y, z
 
     def quadrotor_wants(self) -> Vector:
-        """Position where its loops want it to be now [m]: where it is, or where it should be."""
+        """Desired position of its loops [m]: the true one, or that of the shaped velocity."""
         x, y, z = self.quadrotor.wanted_position().tolist()
         return x, y, z
 
 
 def _approach(distance: float, p: float, acceleration: float) -> float:
-    """Speed with which a distance is made nothing: p times it, or its root far away."""
+    """Speed towards a target: proportional to the distance near it, to its square root far away."""
     near = acceleration / (p * p)
     if distance <= near:
         return p * distance

@@ -1,4 +1,4 @@
-"""PX4 1.17, as far as it is measured: it leaves OFFBOARD when setpoints stop, and flies home."""
+"""PX4 1.17, as measured: it leaves OFFBOARD when set-points stop, and flies home."""
 
 from math import hypot, isfinite, radians, tan
 
@@ -15,11 +15,11 @@ from skytether.quadrotor.loops import Gains
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
-"""Least value that a gain has, whatever its parameter says."""
+"""Smallest value of a gain, whatever its parameter says."""
 SILENCE_LAG_S = 0.2
-"""Time from the end of COM_OF_LOSS_T until it acts [s], as measured."""
+"""Time from the end of COM_OF_LOSS_T until PX4 acts [s], as measured."""
 OFFBOARD_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.HOLD}
-"""Modes by the value of COM_OBL_RC_ACT; all others return, where nobody has a remote control."""
+"""Modes by the value of COM_OBL_RC_ACT; all others mean RETURN, as there is no remote control."""
 STATION_ACTIONS = {1: FlightMode.HOLD, 2: FlightMode.RETURN, 3: FlightMode.LAND}
 """Modes by the value of NAV_DLL_ACT."""
 BATTERY_ACTIONS = {2: FlightMode.LAND, 3: FlightMode.RETURN}
@@ -46,14 +46,14 @@ class PX4(PilotedVehicle):
         return ""
 
     def why_not_guided(self) -> str:
-        """See `PilotedVehicle`; setpoints must be coming already."""
+        """See `PilotedVehicle`; set-points must already be arriving."""
         setpoint = self._setpoint
         if setpoint is None or self._past_s(setpoint) > self.parameters["COM_OF_LOSS_T"]:
             return "Switching to mode 'Offboard' is currently not possible"
         return ""
 
     def forget(self) -> None:
-        """See `PilotedVehicle`; the stream that let it into OFFBOARD is what it flies."""
+        """See `PilotedVehicle`; the stream that allowed OFFBOARD is kept, and flown."""
 
     def mode_number(self, main: int, sub: int) -> int:
         """See `PilotedVehicle`."""
@@ -64,7 +64,7 @@ class PX4(PilotedVehicle):
         return True
 
     def altitude_of(self, told: float) -> float | None:
-        """See `PilotedVehicle`; it is told above the sea, or not at all."""
+        """See `PilotedVehicle`; commanded altitudes are above the sea, or missing."""
         if isfinite(told):
             return told - self.flavour.home[2]
         return self.parameters["MIS_TAKEOFF_ALT"]
@@ -110,7 +110,7 @@ class PX4(PilotedVehicle):
         return min(self.parameters["RTL_RETURN_ALT"], cone)
 
     def _past_s(self, setpoint: CompanionSetpoint) -> float:
-        """Time since a setpoint came [s]."""
+        """Time since the newest set-point [s]."""
         return (self.now_ns - setpoint.came_ns) / SECOND_NS
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:

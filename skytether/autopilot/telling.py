@@ -1,4 +1,4 @@
-"""What an autopilot tells of itself: messages of MAVLink, made of a flight."""
+"""Telemetry: MAVLink messages made from a flight."""
 
 from collections.abc import Callable
 
@@ -16,18 +16,18 @@ SENSORS = int(
     | dialect.MAV_SYS_STATUS_SENSOR_BATTERY
     | dialect.MAV_SYS_STATUS_PREARM_CHECK
 )
-"""Parts whose health SYS_STATUS tells."""
+"""Sensors whose health SYS_STATUS reports."""
 KNOWS_ALL, KNOWS_ATTITUDE = 831, 167
-"""Flags of an estimate with its position, and of one without: as ArduPilot's and PX4's."""
+"""Flags of an estimate with position, and of one without, as sent by ArduPilot and PX4."""
 UNKNOWN_MV = 65535
-"""Voltage of a cell that is not there [mV]."""
+"""Voltage sent for a missing cell [mV]."""
 
 
 class Telling:
-    """Makes messages of the state of a flight.
+    """Maker of telemetry messages.
 
     Args:
-        flight: whose state.
+        flight: flight that is reported.
     """
 
     def __init__(self, flight: PilotedVehicle) -> None:
@@ -38,7 +38,7 @@ class Telling:
         return self._flight.now_ns // MILLISECOND_NS
 
     def heartbeat(self) -> Message:
-        """Mode and whether it is armed."""
+        """Heartbeat: mode, and whether it is armed."""
         flight = self._flight
         base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if flight.armed else 0
@@ -48,7 +48,7 @@ class Telling:
         )
 
     def local_position(self) -> Message | None:
-        """Position and velocity; none where they are not known."""
+        """Position and velocity; None while unknown."""
         if not self._flight.ready:
             return None
         position = turned(self._flight.position())
@@ -64,7 +64,7 @@ class Telling:
         )
 
     def attitude(self) -> Message:
-        """Attitude and rates."""
+        """Attitude and angular rates."""
         roll, pitch, yaw, rates = self._flight.quadrotor.attitude()
         return dialect.MAVLink_attitude_message(
             self._boot_ms, roll, pitch, yaw, rates[0], rates[1], rates[2]
@@ -95,7 +95,7 @@ class Telling:
         )
 
     def battery_status(self) -> Message:
-        """Battery, as one cell."""
+        """Battery state, as of one cell."""
         battery = self._flight.quadrotor.battery()
         voltages = [round(1000.0 * battery.voltage)] + [UNKNOWN_MV] * 9
         return dialect.MAVLink_battery_status_message(
@@ -111,14 +111,14 @@ class Telling:
         )
 
     def extended_state(self) -> Message:
-        """Whether it is on the ground."""
+        """Landed state."""
         landed: Landed = self._flight.landed
         return dialect.MAVLink_extended_sys_state_message(
             dialect.MAV_VTOL_STATE_UNDEFINED, landed.value
         )
 
     def home(self) -> Message | None:
-        """Position where it was started; none before it knows that."""
+        """Home position; None while unknown."""
         if not self._flight.ready:
             return None
         latitude, longitude, altitude = self._flight.flavour.home
@@ -136,7 +136,7 @@ class Telling:
         )
 
     def version(self) -> Message:
-        """What it can do."""
+        """Version and capabilities."""
         can = dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
         can |= dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
         can |= dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
@@ -152,7 +152,7 @@ class Telling:
         )
 
     def estimate(self) -> Message:
-        """What it knows of its position, as its flavour tells it."""
+        """State of the position estimate, in the flavour's message."""
         knows = KNOWS_ALL if self._flight.ready else KNOWS_ATTITUDE
         if self._flight.flavour.bytewise:
             return dialect.MAVLink_estimator_status_message(
@@ -161,7 +161,7 @@ class Telling:
         return dialect.MAVLink_ekf_status_report_message(knows, 0.05, 0.05, 0.05, 0.05, 0.0)
 
     def parameter(self, name: str) -> Message:
-        """Value of a parameter."""
+        """Parameter value."""
         values = self._flight.parameters
         value, bytewise = values[name], self._flight.flavour.bytewise
         return dialect.MAVLink_param_value_message(
@@ -185,4 +185,4 @@ STREAMS: dict[int, Callable[[Telling], Message | None]] = {
     int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): Telling.estimate,
     int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Telling.estimate,
 }
-"""Messages of its state, by number: sent at an interval, or once."""
+"""Telemetry messages by id, which can be streamed or requested once."""

@@ -1,1 +1,1 @@
-"""Commands that fly, show and mend flights; the laboratory has its own."""
+"""Commands that fly, show and repair flights; `skytether.lab` has commands of its own."""

@@ -36,13 +36,14 @@ class DuelOptions:
     one: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     other: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
-    """Another one; it has the network, duration and seed of the first."""
+    """Second scenario: a name or a .toml file; it takes the network, duration and seed of the
+    first."""
     duration: float | None = None
     """Length of both flights [s]; the first scenario's unless given."""
     seed: int | None = None
     """Seed of both flights; the first scenario's unless given."""
     virtual: bool = False
-    """Fly in virtual time, and show the flights afterwards, until Ctrl-C."""
+    """Fly in virtual time; the page shows both flights afterwards, until Ctrl-C."""
     page: str = HOST_PORT
     """HOST:PORT to serve the page on; where that is taken, the next free port."""
     plugin: command.Plugins = ()
@@ -51,8 +52,8 @@ class DuelOptions:
 def duel(argv: Sequence[str]) -> None:
     """Fly two scenarios side by side, and show both on one page.
 
-    They meet the same network, wind and seed, and are changed together by what is moved on the
-    page. Ctrl-C ends both.
+    Both meet the same network, wind and seed; what is changed on the page changes for both. Ctrl-C
+    ends both.
     """
     missing = DuelOptions(tyro.MISSING, tyro.MISSING)
     options = read(missing, argv, "skytether duel", duel.__doc__)
@@ -78,7 +79,7 @@ def both(options: DuelOptions) -> tuple[Scenario, Scenario]:
     """The two scenarios, with the same network, duration and seed.
 
     Raises:
-        ConfigError: one of them cannot be flown.
+        ConfigError: a scenario cannot be flown.
     """
     given = {"duration": options.duration, "seed": options.seed}
     asked = {key: value for key, value in given.items() if value is not None}
@@ -89,28 +90,29 @@ def both(options: DuelOptions) -> tuple[Scenario, Scenario]:
 
 
 def checked(scenario: Scenario, name: str) -> Scenario:
-    """A scenario, as it can be flown.
+    """Scenario, checked to be flyable.
 
     Raises:
-        ConfigError: it cannot.
+        ConfigError: the scenario cannot be flown.
     """
     return reading.check(reading.to_table(scenario), name)
 
 
 def titles(one: str, other: str) -> tuple[str, str]:
-    """Short names of two scenarios, which differ."""
+    """Short names of two scenarios, made different where both have the same name."""
     names = Path(one).stem, Path(other).stem
     return names if names[0] != names[1] else (f"{names[0]} 1", f"{names[1]} 2")
 
 
 def _really(scenarios: Sequence[Scenario], names: Sequence[str], folder: Path, page: str) -> None:
-    """Fly both over UDP at once, each with processes of its own."""
+    """Fly both scenarios over UDP at once, each with its own processes."""
     sockets, parts = [folder / name for name in names], [folder / f"{name}.d" for name in names]
     for each in (*sockets, *parts):
         each.mkdir(mode=0o700)
 
     def say(line: object) -> None:
-        with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
+        # The terminal may be gone: this is no reason to end the flight.
+        with contextlib.suppress(OSError):
             print(line, file=sys.stderr)
 
     def fly(place: int, on_second: Callable[[float], None]) -> None:

@@ -1,4 +1,4 @@
-"""`skytether export`: a recording as tables for other programs."""
+"""`skytether export`: convert a recording to CSV or Parquet tables for other programs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,19 +26,20 @@ class ExportOptions:
     csv: Path | None = None
     """Folder for the tables as CSV."""
     parquet: Path | None = None
-    """Folder for the tables as Parquet; takes pyarrow."""
+    """Folder for the tables as Parquet; needs pyarrow."""
     traces: Path | None = None
-    """Folder for traces of what netem did to packets, one a direction and flow, which `trace(FILE)`
-    replays; see docs/network.md."""
+    """Folder for traces of what netem did to packets, one file per direction and flow, which
+    `trace(FILE)` replays; see docs/network.md."""
     pcap: Path | None = None
-    """File for what came out of netem, as a capture: made-up headers, true lengths, no contents."""
+    """File for a packet capture (pcap) of what left netem: made-up headers, true lengths, no
+    payload."""
     plugin: command.Plugins = ()
 
 
 def export(argv: Sequence[str]) -> None:
-    """Write a recording as tables, one a part: client, server, plan, netem, and the events.
+    """Write a recording as tables, one per part: client, server, plan, netem, and the events.
 
-    A column has its unit in its name, as in position_x_m; the folder is made where there is none.
+    Each column has its unit in its name, as in position_x_m. The folder is created if necessary.
     """
     options = read(ExportOptions(tyro.MISSING), argv, "skytether export", export.__doc__)
     if not (options.csv or options.parquet or options.traces or options.pcap):
@@ -63,10 +64,10 @@ def export(argv: Sequence[str]) -> None:
 
 
 def _traffic(options: ExportOptions, recorded: Recorded) -> None:
-    """Write traces and a capture of what passed netem.
+    """Write delay traces and a packet capture of what passed netem.
 
     Raises:
-        CommandError: netem has no part in the recording, or a file cannot be written.
+        CommandError: the recording has no netem part, or a file cannot be written.
     """
     packets = recorded.parts().get("netem")
     if packets is None or not len(packets):
@@ -81,10 +82,10 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a table, and say where it is.
+    """Write a table, and print where it is.
 
     Raises:
-        CommandError: it cannot be written.
+        CommandError: the file cannot be written.
     """
     try:
         files.write(path, content)

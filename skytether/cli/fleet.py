@@ -35,11 +35,11 @@ from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 
 VEHICLES = 20
-"""Number of vehicles unless it is given."""
+"""Default number of vehicles."""
 AFTER_S = 30.0
-"""Time that is flown after the last goal of a mission's table [s]."""
+"""Time flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
-"""Stages of the server's work, in their order; `record`, the price of watching, is left out."""
+"""Stages of the server's work, in their order; `record`, the cost of recording, is left out."""
 
 
 @dataclass(frozen=True)
@@ -50,18 +50,19 @@ class FleetOptions:
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
     mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a CSV file with
-    the columns vehicle, t, x, y (and z), as light shows have them."""
+    the columns vehicle, t, x, y (and z), the format of light shows."""
     vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Number of vehicles: 20 unless given, or as many as the mission has."""
+    """Number of vehicles: unless given, 20, or as many as the mission has."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Number of the server's processes, which share the vehicles."""
+    """Number of server processes, which share the vehicles."""
     secure: bool = False
-    """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
+    """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
+    on loopback are plaintext."""
     virtual: bool = False
-    """Fly in virtual time: everything in this process, as fast as it can."""
+    """Fly in virtual time: everything in one process, as fast as possible."""
     page: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """HOST:PORT of a page with all of the vehicles, as `skytether fly` has one; none unless given,
-    for what is measured here is what the flight costs. Not in virtual time."""
+    """HOST:PORT of a page with all vehicles, as `skytether fly` has one. No page unless given:
+    `fleet` measures what the flight costs, and a page costs CPU time. Not in virtual time."""
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
@@ -71,7 +72,7 @@ class FleetOptions:
 
 
 class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """Summary of a fleet's flight, and of what it cost; None is what was not measured."""
+    """Summary of a fleet's flight and its CPU costs; None for what was not measured."""
 
     scenario: str
     seed: int
@@ -99,27 +100,29 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     lost: int
     """Packets that the network lost, both ways."""
     dropped: int
-    """Packets that kernels and full queues dropped, which no scenario asks for."""
+    """Packets that the kernels' and netem's full queues dropped, which no scenario asks for."""
     tick_ms_p50: float
-    """Time that a tick of the server took, all vehicles together, in the slowest worker [ms]."""
+    """Median time that a server's tick took, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float
-    """Time that one tick in a hundred exceeded, in the slowest worker [ms]."""
+    """99th percentile of the time that a server's tick took, in the slowest worker [ms]."""
     server_missed: int
-    """Ticks that workers slept through."""
+    """Ticks that the server's workers missed because they woke too late."""
     client_missed: int
-    """Steps that vehicles slept through."""
+    """Steps that vehicles missed because their process woke too late."""
     machine_missed: int | None
-    """Steps that a thread which only sleeps slept through in the same time."""
+    """Steps that a thread which only sleeps missed in the same time: what the machine alone
+    costs."""
     machine_late_ms_max: float | None
-    """Largest delay with which that thread woke [ms]."""
+    """Largest delay with which the sleeping thread woke [ms]."""
     server_cpu_us: dict[str, float]
-    """Time of the server for a vehicle and step [µs]: stages on the wall clock, `total` of CPU."""
+    """CPU time of the server per vehicle and step [µs]: `total`; the stages are measured on the
+    wall clock."""
     client_cpu_us: float | None
-    """CPU time of the vehicles' process for a vehicle and step [µs]."""
+    """CPU time of the vehicles' process per vehicle and step [µs]."""
     netem_cpu_us: float | None
-    """CPU time of netem for a packet [µs]."""
+    """CPU time of netem per packet [µs]."""
     vehicle_steps_per_core_s: float | None
-    """Steps of vehicles flown in a second of CPU time, everything included; in virtual time."""
+    """Vehicle steps flown per second of CPU time, everything included; in virtual time only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,19 +131,19 @@ class FleetFlight:
 
     client: Rows
     servers: list[dict[str, Any]]
-    """Figures of each worker of the server."""
+    """Figures of each server worker."""
     netem: dict[str, Any]
     """Figures of netem."""
     processes: dict[str, dict[str, Any]]
-    """Figures of "client" and "netem", where these are processes."""
+    """Figures of the processes "client" and "netem", where there are such processes."""
     failure: Event | None = None
-    """Event of the first vehicle that was not flown, or not to the end."""
+    """Event of the first vehicle that did not fly, or did not fly to the end."""
     machine: "Metronome | None" = None
-    """Measure of what the machine took, over real UDP."""
+    """Measure of how late the machine woke a sleeping thread, over real UDP."""
     cpu_s: float | None = None
     """CPU time of everything together [s], in virtual time."""
     server: Rows | None = None
-    """What the server recorded, in virtual time."""
+    """Rows of the server, in virtual time."""
     vehicles: dict[str, Any] = field(default_factory=dict)
     """Figures of each vehicle, by its number."""
 
@@ -148,10 +151,10 @@ class FleetFlight:
 def fleet(argv: Sequence[str]) -> None:
     """Fly many vehicles on one server, each over a network of its own.
 
-    Server, netem and all vehicles are three processes on loopback, or everything flies in virtual
-    time in one. The cost of the server's work is shown for one vehicle and one step. Every key of
-    the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight and still shows
-    what was flown.
+    Server, netem and all vehicles run as three processes on loopback, or in virtual time in one
+    process. The cost of the server's work is shown per vehicle and step. Every key of the scenario
+    is a flag, as in `--control.trigger always`. Ctrl-C ends the flight and still shows what was
+    flown.
     """
     argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
@@ -191,10 +194,10 @@ def fleet(argv: Sequence[str]) -> None:
 
 
 def _with_mission(argv: Sequence[str]) -> list[str]:
-    """A command line in which `--mission` is the scenario, with the flags of a table of goals.
+    """Command line in which `--mission` became the scenario, with flags from its table of goals.
 
     Raises:
-        CommandError: there is a scenario as well, or the table is none.
+        CommandError: a scenario is given as well, or the file is no table of goals.
     """
     parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--mission")
@@ -252,7 +255,7 @@ def _virtually(
 
 @contextmanager
 def _paged(options: FleetOptions) -> Iterator[Path | None]:
-    """Serve a page, if there is to be one; yields the folder of its sockets."""
+    """Serve a page if one is asked for; yields the folder of its sockets."""
     if options.page is None:
         yield None
         return
@@ -300,7 +303,7 @@ def _really(
 
 
 class Metronome:
-    """A thread that only sleeps, step by step: whatever it misses, the machine has taken."""
+    """Thread that only sleeps, step by step: the steps it misses are the machine's fault."""
 
     def __init__(self, options: FleetOptions) -> None:
         self._dt_s = options.config.control.dt
@@ -335,7 +338,7 @@ def _vehicles(options: FleetOptions) -> int:
     """Number of vehicles.
 
     Raises:
-        CommandError: the mission has another.
+        CommandError: the mission has another number.
     """
     if not options.config.is_mission:
         return VEHICLES if options.vehicles is None else options.vehicles
@@ -351,7 +354,7 @@ def _vehicles(options: FleetOptions) -> int:
 def _separations(
     scenario: Scenario, client: Rows, vehicles: Mapping[str, Any]
 ) -> tuple[Array, Array] | None:
-    """Distances of a mission over time, see `separations`; None where they are not known."""
+    """Distances between a mission's vehicles over time, see `separations`; None where unknown."""
     numbers = np.unique(client["vehicle"]).tolist()
     if not scenario.is_mission or any("began_s" not in vehicles.get(str(n), {}) for n in numbers):
         return None
@@ -454,7 +457,7 @@ def _show(summary: FleetSummary, title: str) -> None:
     table = Table(title=title, title_justify="left", show_header=False)
     for name, value in rows:
         if value is not None:
-            table.add_row(Text(name), value)  # as text: "[m]" would be markup
+            table.add_row(Text(name), value)  # Rendered as text: rich would take "[m]" for markup.
     Console().print(table)
 
 

@@ -35,11 +35,11 @@ from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 
 TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, Fault
-"""Events that are shown while it flies."""
+"""Events that are printed during the flight."""
 POLL_S = 0.2
-"""Time after which Ctrl-C ends a page that lingers [s]."""
+"""Interval at which Ctrl-C is checked while the page stays open [s]."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
-"""Names of the modes before the first plan is flown, which are not worth a word."""
+"""Names of the modes before the first plan is flown, which are not printed."""
 
 
 @dataclass(frozen=True)
@@ -49,33 +49,35 @@ class FlyOptions:
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     secure: bool = False
-    """Seal the link, with keys that are made for this flight; on loopback it is plaintext else."""
+    """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
+    on loopback are plaintext."""
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
     set_parameters: bool = False
-    """Set the autopilot's parameters that decide what it does in silence, where they are not safe;
-    without it, they are told, and nothing is armed."""
+    """Set those parameters of the autopilot to safe values that decide what it does when
+    set-points stop. Without --set-parameters, unsafe values are only reported, and the vehicle
+    is not armed."""
     control: Path | None = None
     """Folder for sockets called server, netem and client, through which keys change in flight, see
-    `skytether set`; it is made where there is none. Not in virtual time."""
+    `skytether set`; created if necessary. Not in virtual time."""
     page: str = os.environ.get(page_process.VARIABLE, HOST_PORT)
-    """HOST:PORT of the page on which the flight can be watched, and played with; on the next free
-    port where that is taken. Where other machines can reach it, they need the token that is printed
-    to do more than look. Not in virtual time."""
+    """HOST:PORT of the page that shows the flight and changes it; if the port is taken, the next
+    free one. Visitors from other machines need the printed token to change anything. Not in virtual
+    time."""
     no_page: bool = False
     """Fly without a page."""
     linger: bool = False
-    """Keep the page when the flight is over, until Ctrl-C."""
+    """Keep the page open after the flight, until Ctrl-C."""
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
     """File for a picture of the flight (.png, .pdf or .svg)."""
     record: Path | None = None
-    """File for a recording of the flight (.mcap): all that its processes record and say, written
-    while it flies. See `skytether report`, `replay`, `export` and `recover`; Foxglove and
-    Lichtblick show it, too."""
+    """File for a recording of the flight (.mcap): all rows and events of its processes, written
+    during the flight. See `skytether report`, `replay`, `export` and `recover`; Foxglove and
+    Lichtblick can show the file."""
     beside: str | None = None
-    """Another scenario to compare with, flown in virtual time with the same duration and seed."""
+    """Second scenario to compare with, flown in virtual time with the same duration and seed."""
     plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
@@ -102,7 +104,7 @@ def fly(argv: Sequence[str]) -> None:
     if not options.virtual:
         for warning in command.flight_warnings(scenario):
             page_process.say(warning)
-    vehicles.make(scenario, 0)  # it has kernels of its own, or cannot be made
+    vehicles.make(scenario, 0)  # compiles the vehicle's own kernels; fails now if it cannot be made
     with _paged(options) as sockets:
         command.prepare(kernel.missing())
         with (
@@ -127,10 +129,10 @@ def _show(
     unrecorded: str | None,
     beside: Scenario | None,
 ) -> None:
-    """Show what was flown, in words and as a picture.
+    """Print the flight's summary, and write its picture.
 
     Raises:
-        CommandError: it was nothing, or not all of what was to be.
+        CommandError: nothing was flown, or not everything could be written or recorded.
     """
     scenario = options.config
     if flown.failure and not len(flown.client):
@@ -159,7 +161,7 @@ def _show(
 
 @contextlib.contextmanager
 def _paged(options: FlyOptions) -> Iterator[Path | None]:
-    """Serve a page of the flight, unless there is to be none; yields the folder of its sockets."""
+    """Serve a page of the flight, unless none is wanted; yields the folder of its sockets."""
     if options.virtual or options.no_page or options.page == page_process.NONE:
         yield options.control
         return
@@ -171,10 +173,10 @@ def _paged(options: FlyOptions) -> Iterator[Path | None]:
 
 
 def _make_folder(folder: Path, *, virtual: bool) -> None:
-    """Make the folder of the sockets, for its owner alone.
+    """Create the folder of the sockets, accessible to its owner only.
 
     Raises:
-        CommandError: it cannot be, or nobody could reach the sockets in time.
+        CommandError: the folder cannot be created, or the flight is in virtual time.
     """
     if virtual:
         said = "--control: got a folder, expected none with --virtual, which nobody can follow"
@@ -203,7 +205,7 @@ def _summarise(scenario: Scenario, name: str, flown: Record, *, secure: bool = F
 def _virtually(
     options: FlyOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
 ) -> tuple[Record, str | None]:
-    """Fly in virtual time; returns the flight, and what is wrong with its recording."""
+    """Fly in virtual time; returns the flight, and the fault of its recording, if any."""
     scenario, secure = options.config, options.secure
     flown = flight.fly(scenario, secure=secure, on_second=on_second, stopped=interrupted)
     for each in flown.events:
@@ -224,7 +226,7 @@ def _really(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> tuple[Record, str | None]:
-    """Fly over UDP; returns the flight, and what is missing in its recording."""
+    """Fly over UDP; returns the flight, and a sentence on what its recording lacks."""
     with temporary.folder() as parts, ExitStack() as stack:
         scenario = options.config
         feeds = sockets or (parts if options.record else None)
@@ -260,7 +262,9 @@ def _really(
 
 
 def _missing(scenario: Scenario, flown: Record) -> str | None:
-    """What could not be recorded, and how much of the flight could; None where all was."""
+    """Sentence on what could not be recorded, and how much of the flight could; None if
+    complete.
+    """
     if not flown.incomplete:
         return None
     reasons = "; ".join(f"{part.file}: {part.reason}" for part in flown.incomplete)
@@ -270,7 +274,7 @@ def _missing(scenario: Scenario, flown: Record) -> str | None:
 
 
 def _tell(event: Event) -> None:
-    """Show what may happen to the link and the record in flight, above the progress bar."""
+    """Print events of the link and of the record above the progress bar."""
     begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
     if isinstance(event, TOLD) and not begins:
         page_process.say(event)

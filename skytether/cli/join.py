@@ -1,4 +1,4 @@
-"""`skytether join`: recordings of server, netem and client, as one."""
+"""`skytether join`: merge recordings of server, netem and client into one."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -22,17 +22,17 @@ class JoinOptions:
     """Options of `skytether join`."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
-    """The recordings (.mcap), one of each process."""
+    """Recordings (.mcap), one from each process."""
     out: Path
     """File for the recording of the flight (.mcap)."""
     plugin: command.Plugins = ()
 
 
 def join(argv: Sequence[str]) -> None:
-    """Make one recording of those that server, netem and client have written by hand.
+    """Merge the recordings of a server, netem and client that were started by hand.
 
-    They are put in the order of the time of day: computers that are apart must agree on it. The
-    summary is that of the first vehicle.
+    Messages are ordered by the time of day: computers that are apart must agree on it. The summary
+    is that of the first vehicle.
     """
     options = read(JoinOptions((), tyro.MISSING), argv, "skytether join", join.__doc__)
     if len(options.files) < 2:

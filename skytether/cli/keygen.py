@@ -1,4 +1,4 @@
-"""`skytether keygen`: make keys for vehicles, in a file that nobody else can read."""
+"""`skytether keygen`: make keys for vehicles, in a file that only its owner can read."""
 
 import os
 import secrets
@@ -31,20 +31,19 @@ class KeygenOptions:
     first: Annotated[int, tyro.conf.arg(metavar="ID")] = 1
     """Number of the first vehicle (0 to 65535); the others follow."""
     key_id: Annotated[int | None, tyro.conf.arg(metavar="K")] = None
-    """Number of the new keys (0 to 255). Unless given, the one after the highest that the vehicle
-    has, and 1 for its first."""
+    """Number of the new keys (0 to 255). Unless given, one more than the vehicle's highest, and 1
+    for its first key."""
     add: bool = False
-    """Add to a file that is there: keys of more vehicles, or the next key of those that have
-    one."""
+    """Add to an existing file: keys of more vehicles, or the next key of vehicles that have one."""
     if_missing: bool = False
-    """Leave a file that is there as it is, and end well."""
+    """Keep an existing file as it is, and exit with 0."""
 
 
 def keygen(argv: Sequence[str]) -> None:
-    """Make a key for each of some vehicles, in a new file that only its owner can read.
+    """Make one key per vehicle, in a new file that only its owner can read.
 
-    The server needs the keys of all vehicles, a vehicle only its own line. A vehicle uses the key
-    with the highest number. docs/security.md tells how keys are copied, exchanged and revoked.
+    The server needs the keys of all vehicles, a vehicle only its own line. A vehicle uses its key
+    with the highest number. docs/security.md describes how keys are copied, exchanged and revoked.
     """
     options = read(KeygenOptions(tyro.MISSING), argv, "skytether keygen", keygen.__doc__)
     command.check_count("--vehicles", options.vehicles, len(VEHICLES))
@@ -70,14 +69,14 @@ def keygen(argv: Sequence[str]) -> None:
 def make(
     file: Path, vehicles: Sequence[int], number: int | None = None, *, add: bool = False
 ) -> None:
-    """Make a key for each of some vehicles, in a new file or at the end of one that is there.
+    """Make one key per vehicle, in a new file or at the end of an existing one.
 
     Args:
         number: number of the new keys; unless given, the next of each vehicle.
 
     Raises:
-        CommandError: a vehicle cannot have one more, or the file cannot be written.
-        ConfigError: the file that is there is none of keys.
+        CommandError: a vehicle cannot have another key, or the file cannot be written.
+        ConfigError: the existing file holds no keys.
     """
     present = keys.load(file) if add else keys.Keyring(str(file), {})
     lines = []
@@ -91,7 +90,7 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
     """Number of the new key of a vehicle.
 
     Raises:
-        CommandError: it cannot have one more, or not with this number.
+        CommandError: the vehicle cannot have another key, or none with this number.
     """
     numbers = present.numbers(vehicle)
     what = f"{present.name}: vehicle {vehicle}"
@@ -115,10 +114,10 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
 
 
 def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
-    """Write lines to a new file of mode 0600, or to the end of one that is there.
+    """Write lines to a new file of mode 0600, or to the end of an existing one.
 
     Raises:
-        CommandError: it is there and should not be, or cannot be written.
+        CommandError: the file exists and must not, or cannot be written.
     """
     flags = os.O_RDWR | os.O_APPEND if add else os.O_WRONLY | os.O_CREAT | os.O_EXCL
     flags |= os.O_CLOEXEC | os.O_NOFOLLOW

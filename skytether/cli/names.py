@@ -1,4 +1,4 @@
-"""`skytether triggers`, `reports` and so on: what a scenario can name, a sentence each."""
+"""`skytether triggers`, `skytether reports` and so on: list what a scenario can name."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from skytether.shell import command, options
 
 @dataclass(frozen=True)
 class ListingOptions:
-    """Options of these commands."""
+    """Options of the commands that list names."""
 
     plugin: command.Plugins = ()
 
 
 def names(title: str, table: registry.PluginTable, about: str, argv: Sequence[str]) -> None:
-    """Print how each entry of a table is written, and below it what it is, and whose."""
+    """Print how each entry of a table is written, and below it what it does and who adds it."""
     options.read(ListingOptions(), argv, f"skytether {title}", about)
     for name, entry in table.items():
         source = "" if entry.is_ours else f" (from {entry.source})"

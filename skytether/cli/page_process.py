@@ -1,4 +1,4 @@
-"""The page of a flight, as a process beside those that fly: whether it lives is nothing to them."""
+"""Page of a flight, in a process of its own: the flight goes on if the page fails."""
 
 import contextlib
 import subprocess
@@ -12,7 +12,7 @@ from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
 
 STOP_S = 5.0
-"""Longest time that the page may take to end once it is told to [s]."""
+"""Longest time that the page may take to end after SIGTERM [s]."""
 VARIABLE = "SKYTETHER_PAGE"
 """Environment variable with HOST:PORT of the page, or `none`."""
 NONE = "none"
@@ -25,7 +25,7 @@ def beside(folders: Sequence[Path], at: str, say: Callable[[str], None]) -> Iter
     Args:
         folders: folders of the flights.
         at: HOST:PORT.
-        say: told, in a thread, the address of the page, or why there is none.
+        say: called in a thread with the page's address, or with the reason why there is no page.
     """
     arguments = [*map(str, folders), "--page", at, "--log", "json", *plugins.flags()]
     child = subprocess.Popen(
@@ -68,6 +68,7 @@ def beside(folders: Sequence[Path], at: str, say: Callable[[str], None]) -> Iter
 
 
 def say(line: object) -> None:
-    """Tell somebody who may be gone, on stderr."""
-    with contextlib.suppress(OSError):  # a terminal that is gone is no reason to end
+    """Print a line on stderr, whether or not anybody can read it."""
+    # The terminal may be gone: this is no reason to end the flight.
+    with contextlib.suppress(OSError):
         print(line, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""`skytether probe`: measure a real path, and fly over what was measured."""
+"""`skytether probe`: measure a real network path, and fit models of it that a scenario can fly."""
 
 import io
 import secrets
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 SECONDS_MAX, RATE_MAX = 86_400.0, 1000.0
-"""Longest measurement [s], and largest rate [1/s]."""
+"""Longest measurement [s], and largest packet rate [1/s]."""
 SECRET_BYTES = 32
 MODELS_SHOWN = 3
-"""Number of models of a direction's delays, and of its losses, that are shown."""
+"""Number of fitted models that are printed, of each direction's delays and of its losses."""
 
 
 @dataclass(frozen=True)
@@ -45,40 +45,40 @@ class ProbeOptions:
     """Options of `skytether probe`."""
 
     target: Annotated[str, Argument(metavar="HOST:PORT", positional=True)] = ""
-    """The other end, where `skytether probe --listen` runs; an IPv6 host in brackets."""
+    """Address of the other end, where `skytether probe --listen` runs; an IPv6 host in brackets."""
     listen: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
-    """Be the other end: answer probes at this address until Ctrl-C."""
+    """Run as the listening end: answer probes at this address until Ctrl-C."""
     seconds: float = 60.0
     """Length of the measurement [s]."""
     rate: float = 20.0
-    """Packets a second, each way."""
+    """Packets per second, each way."""
     bytes: int = 400
     """UDP payload of each packet [B]."""
     keys: Path | None = None
-    """File with the vehicle's key, or those of all vehicles where it listens, made by `skytether
-    keygen`: packets are sealed. Without it they are plaintext, which is refused beyond this
+    """File with the vehicle's key, or at the listener those of all vehicles, made by `skytether
+    keygen`: packets are encrypted. Without it they are plaintext, which is refused beyond this
     machine."""
     number: Annotated[int, Argument(name="id")] = 1
     """Number of the vehicle whose key is used."""
     insecure: bool = False
-    """Do without keys even beyond this machine: anybody on the way can alter what is measured."""
+    """Allow plaintext beyond this machine: anybody on the path can alter the measurement."""
     out: Path = Path("probed")
     """Folder for the traces, uplink.csv and downlink.csv."""
     json: Path | None = None
-    """File for all figures."""
+    """File for all figures, as JSON."""
     figure: Path | None = None
     """Picture of the delays, .png, .svg or .pdf."""
     record: Path | None = None
-    """File for a row a packet, as netem records them."""
+    """File for one row per packet, in netem's format."""
 
 
 def probe(argv: Sequence[str]) -> None:
-    """Measure a path over UDP: delays each way, losses, bursts, order, rate, and models of them.
+    """Measure a path over UDP: delays each way, loss, bursts, reordering, rate, and models of them.
 
-    One end listens, the other sends numbered packets, which are answered, and tells what came of
-    them. Run it where the vehicle will be, and the listener where the server will be: then packets
-    that it sends go by the downlink, and answers by the uplink. Ctrl-C ends it, and what was
-    measured is told.
+    One end listens; the other sends numbered packets, which are answered, and prints the results.
+    Run it where the vehicle will be, and the listener where the server will be: then its packets
+    take the downlink, and the answers the uplink. Ctrl-C ends the measurement and prints what was
+    measured.
     """
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
     if bool(options.target) == (options.listen is not None):
@@ -95,10 +95,10 @@ def probe(argv: Sequence[str]) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Name the file or folder that cannot be written, in one line.
+    """Turn an OSError within the block into one line that names the file or folder.
 
     Raises:
-        CommandError: something within it raised an OSError.
+        CommandError: the block raised an OSError.
     """
     try:
         yield
@@ -146,7 +146,7 @@ def _listen(options: ProbeOptions, bind: Address) -> None:
 
 
 def _probe(options: ProbeOptions, listener: Address) -> None:
-    """Measure, and tell what came of it."""
+    """Measure the path, and print and write the results."""
     _check(options)
     link: ClientLink = PlainLink()
     if options.keys:
@@ -192,10 +192,10 @@ def _say(event: Event) -> None:
 
 
 def _check(options: ProbeOptions) -> None:
-    """Refuse what cannot be measured, and files that cannot be written.
+    """Refuse impossible measurements, and files that cannot be written.
 
     Raises:
-        CommandError: with the flag, what it was given and what was expected.
+        CommandError: with the flag, its value and what was expected.
     """
     for flag, given, least, most in (
         ("--seconds", options.seconds, 1.0, SECONDS_MAX),
@@ -223,7 +223,7 @@ def _check(options: ProbeOptions) -> None:
 
 
 def _write(options: ProbeOptions, found: Outcome) -> None:
-    """Write traces, figures and picture.
+    """Write the traces, the figures and the picture.
 
     Raises:
         CommandError: a file cannot be written.
@@ -241,7 +241,7 @@ def _write(options: ProbeOptions, found: Outcome) -> None:
 
 
 def _record(path: Path, packets: Rows) -> None:
-    """Write a row a packet.
+    """Write one row per packet.
 
     Raises:
         CommandError: the file cannot be written.
@@ -254,7 +254,7 @@ def _record(path: Path, packets: Rows) -> None:
 
 
 def _tell(options: ProbeOptions, found: Outcome) -> None:
-    """Print tables of both directions, what is in doubt, and what to fly."""
+    """Print tables of both directions, doubts about them, and the network text to fly."""
     told = found.told
     ways = {"downlink": told.downlink, "uplink": told.uplink}
     command.show(_table(ways))
@@ -280,7 +280,7 @@ def _tell(options: ProbeOptions, found: Outcome) -> None:
 
 
 def _figures(way: WayTold) -> dict[str, str]:
-    """Figures of a direction, as they are shown."""
+    """Figures of a direction, formatted for printing."""
     found = {
         "packets sent, arrived": f"{way.sent}, {way.came}",
         "lost [%], 95 % interval": f"{100 * way.loss:.3g} ({100 * way.loss_low:.3g} to "
@@ -304,7 +304,7 @@ def _figures(way: WayTold) -> dict[str, str]:
 
 
 def _models(ways: dict[str, WayTold]) -> "Table":
-    """The best models of both directions, and by how much they are behind the best."""
+    """Best models of both directions, each with its distance from the best in BIC."""
     from rich.table import Table
     from rich.text import Text
 
@@ -320,7 +320,7 @@ def _models(ways: dict[str, WayTold]) -> "Table":
 
 
 def _table(ways: dict[str, WayTold]) -> "Table":
-    """Figures of both directions side by side."""
+    """Table of both directions' figures, side by side."""
     from rich.table import Table
     from rich.text import Text
 

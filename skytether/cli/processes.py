@@ -1,10 +1,10 @@
 """A flight over real UDP: server, netem and client as three processes on loopback.
 
-Each process writes its events as JSON on its standard output (`--log json`); they are all that is
-known here of what goes on in it. Anything else that it prints, a traceback or its one line for a
-mistake, is kept for its last words.
+Each process writes its events as JSON on its standard output (`--log json`); this module knows of a
+process only its events. Other output, a traceback or the one line of an error, is kept to say why
+the process failed.
 
-The loop is asyncio's own: uvloop's would start them with signals that are no longer ignored.
+The loop is asyncio's own: uvloop would reset signals that the children must go on ignoring.
 """
 
 import asyncio
@@ -47,51 +47,51 @@ from skytether.shell.log import LogLine, line_of
 from skytether.shell.workers import die_with_parent
 
 ANYWHERE = ("--bind", "127.0.0.1:0")
-"""Arguments with which a process listens on any free port of loopback."""
+"""Arguments that make a process listen on any free port of loopback."""
 NAMES = ("client", "server", "netem")
 """Names of the processes, and of their parts of the record."""
 
 START_S = 120.0
-"""Longest time that a process may take until it listens [s]: it may have to compile first."""
+"""Longest time that a process may take until it listens [s]; it may have to compile first."""
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
 STOP_S = 5.0
-"""Longest time that a process may take to end once it is told to [s]."""
+"""Longest time that a process may take to end after SIGTERM [s]."""
 POLL_S = 0.2
-"""Time after which Ctrl-C is noticed [s]."""
+"""Interval at which Ctrl-C is checked [s]."""
 LINES_MAX = 20
-"""Number of last lines kept of what a process said, for when it fails."""
+"""Number of a process's last lines that are kept, to be printed if it fails."""
 
 OnEvent = Callable[[LogLine], None]
 Shortfall = RecordIncomplete | NotFlown
-"""Events of a flight that goes on, and of which there is something to show."""
+"""Events of a flight that goes on, but with a loss that is reported at the end."""
 
 
 @dataclass(slots=True)
 class Child:
-    """A process that was started, and what it has said."""
+    """Process that was started, and what it has printed."""
 
     name: str
     process: asyncio.subprocess.Process
     reader: "asyncio.Task[None]" = field(init=False)
-    """Task that takes in what it says, until it has said all."""
+    """Task that reads the process's output until its end."""
     said: deque[str] = field(default_factory=lambda: deque(maxlen=LINES_MAX))
-    """Last lines, those of events as sentences."""
+    """Last lines of its output, events as sentences."""
     address: Address = ("", 0)
-    """Address that it listens on."""
+    """Address that the process listens on."""
     failed: bool = False
-    """Whether it has told of something after which it could not fly."""
+    """Whether the process has reported an event after which it could not fly."""
     fell_short: bool = False
-    """Whether it has told of a shortfall, for which it ends with 1."""
+    """Whether the process has reported a shortfall, for which its exit code is 1."""
 
     async def end(self) -> int:
-        """Exit code, once it has ended and all that it said is known."""
+        """Exit code, once the process has ended and all its output was read."""
         code = await self.process.wait()
         await asyncio.wait((self.reader,), timeout=STOP_S)
         return code
 
     def last_words(self) -> str:
-        """Why it ended, in its own words."""
+        """Why the process ended, from its own output."""
         if self.said:
             return self.said[-1]
         code = self.process.returncode
@@ -103,7 +103,7 @@ class Child:
 async def started(
     name: str, *arguments: str, on_event: OnEvent = lambda _: None
 ) -> AsyncIterator[Child]:
-    """Start a process that listens; at the end of the block it is told to end, then killed.
+    """Start a process that listens; at the end of the block it gets SIGTERM, then SIGKILL.
 
     Args:
         name: process to run: server, netem, client, station or autopilot.
@@ -111,11 +111,11 @@ async def started(
         on_event: called with each of its events, as a line of its log.
 
     Raises:
-        CommandError: it ended, or did not come to listen.
+        CommandError: the process ended, or did not listen in time.
     """
     process = await asyncio.create_subprocess_exec(
         sys.executable,
-        "-P",  # a folder called like one of ours, where the user happens to be, is not ours
+        "-P",  # -P: a folder in the user's working directory must not shadow our package.
         "-m",
         f"skytether.{name}",
         *arguments,
@@ -123,7 +123,7 @@ async def started(
         "json",
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
-        # Ctrl-C is for the command alone: it ends its children in order.
+        # Ctrl-C is for the command alone: the command ends its children in order.
         start_new_session=True,
         preexec_fn=die_with_parent,
     )
@@ -167,7 +167,7 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
     while True:
         try:
             line = await stream.readline()
-        except ValueError:  # longer than the stream has room for
+        except ValueError:  # A line longer than the stream's limit is skipped.
             continue
         if not line:
             return
@@ -175,13 +175,13 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
         if said is None:
             child.said.append(line.decode(errors="replace").rstrip())
             continue
-        if not isinstance(said.event, Counted):  # numbers are no reason for an end
+        if not isinstance(said.event, Counted):  # Counted figures do not say why a process ended.
             child.said.extend(f"{said.process}: {said.event}".splitlines())
         on_event(said)
 
 
 def feeds_in(folder: Path) -> dict[str, Path]:
-    """Sockets of the feeds in a folder, by the names of the processes, see `run`."""
+    """Feed sockets in a folder, by the names of their processes, see `run`."""
     return {name: folder / f"{name}.feed" for name in NAMES}
 
 
@@ -200,10 +200,10 @@ def run(
     control: Path | None = None,
     feeds: Path | None = None,
 ) -> list[Shortfall]:
-    """Fly a scenario until its end, or Ctrl-C; what was flown until then comes to lie in a folder.
+    """Fly a scenario until its end, or Ctrl-C; the record of the flight is left in a folder.
 
-    Whoever calls it has Ctrl-C and SIGTERM under control (`command.interruptible`). Returns what
-    the flight or its record fell short of, as the processes tell it; nothing in a good one.
+    The caller must handle Ctrl-C and SIGTERM (`command.interruptible`). Returns the shortfalls of
+    the flight or its record that the processes reported; none for a good flight.
 
     Args:
         scenario: what to fly.
@@ -275,7 +275,7 @@ def fly_chain(
     interrupted: Callable[[], bool],
     on_event: OnEvent,
 ) -> None:
-    """Run processes until one of them ends, or Ctrl-C.
+    """Run processes, each connected to the one before, until one of them ends, or Ctrl-C.
 
     Args:
         chain: name and arguments of each process; the last argument of each but the first is the
@@ -285,7 +285,7 @@ def fly_chain(
         on_second, interrupted, on_event: see `run`.
 
     Raises:
-        CommandError: a process failed, or the time is over.
+        CommandError: a process failed, or the time ran out.
     """
 
     async def main() -> None:
@@ -304,11 +304,11 @@ def fly_chain(
 def record_of(
     parts: Path, scenario: Scenario, shortfalls: Sequence[Shortfall], said: Sequence[LogLine] = ()
 ) -> Record:
-    """Record of a flight, from what its processes have left; time counts from their first event on.
+    """Record of a flight, from the files of its processes; time counts from their first event on.
 
     Args:
         parts: see `run`.
-        shortfalls: what `run` has returned.
+        shortfalls: return value of `run`.
         said: the processes' events, as their lines came; the record has them by their times.
     """
     axes = scenario.model.axes
@@ -330,7 +330,7 @@ def record_of(
 
 
 def _rows(part: Path, columns: np.dtype[np.void]) -> Rows:
-    """Rows of a part of the record; none where the disk had no room for its first line."""
+    """Rows of a part of the record; none where the disk was too full even for the file's header."""
     try:
         return read(part)
     except ValueError:
@@ -373,7 +373,7 @@ async def _fly(
                 task.cancel()
         for child in children:
             code = child.process.returncode
-            # What it fell short of is told at the end, beside what was flown.
+            # Shortfalls are reported at the end, together with the flight's summary.
             flown = child.name == flies and (code == 0 or (child.fell_short and not child.failed))
             if code is not None and not flown:
                 raise CommandError(child.last_words())

@@ -1,4 +1,4 @@
-"""Recordings of flights: of one over UDP from the feeds of its processes, while it flies."""
+"""Recorders of flights: over UDP from the feeds of the processes, during the flight."""
 
 import sys
 import threading
@@ -29,16 +29,16 @@ from skytether.view.frames import of_flight
 from skytether.view.recording import About, Recording
 
 FLUSH_S = 0.25
-"""Time after which what has come is written [s]; as much is lost of a process that is killed."""
+"""Interval at which new frames are written [s]; a killed process loses at most this much."""
 PATIENCE_S = 3.0
 """Longest time to wait at the end for the rest of the feeds [s]."""
 
 
 def check(path: Path, flag: str = "--record") -> None:
-    """Refuse a file that is not called as a recording is, before anything is flown.
+    """Refuse a file without a recording's suffix before anything is flown.
 
     Raises:
-        CommandError: with what would do.
+        CommandError: with the suffix that is expected.
     """
     if path.suffix != RECORDING:
         said = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
@@ -46,7 +46,7 @@ def check(path: Path, flag: str = "--record") -> None:
 
 
 def write(path: Path, scenario: Scenario, name: str, flown: Record, summary: Summary) -> str | None:
-    """Record a flight in virtual time once it is over; returns what is wrong with the recording."""
+    """Record a flight in virtual time after its end; returns the recording's fault, or None."""
     about = _about(scenario, name, began=None, offset_ns=0, secure=summary.secure)
     try:
         with files.create(path) as file:
@@ -73,7 +73,7 @@ def _about(
 
 
 def beside() -> int:
-    """Record the feed of a process as it tells on stdin (`RecorderOrder`), until stdin ends."""
+    """Record the feed of a process as ordered on stdin (`RecorderOrder`), until stdin ends."""
     told = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
     plugins.load(told.plugins)
     scenario = checked(tomllib.loads(told.scenario))
@@ -89,21 +89,21 @@ def beside() -> int:
 
 @dataclass(slots=True)
 class _Source:
-    """A feed, and how far it has been recorded."""
+    """Feed, and how far it has been recorded."""
 
     begun: bool = False
-    """Whether anything has come of it."""
+    """Whether any frame has come."""
     ended: bool = False
-    """Whether it has ended, for now."""
+    """Whether the feed has ended, for now."""
     resumed: bool = False
-    """Whether what comes next may have come before."""
+    """Whether the next frames may repeat earlier ones."""
     last_ns: int = 0
     """Time of the newest frame [ns]."""
     newest: list[Frame] = field(default_factory=list)
-    """Frames of that time."""
+    """Frames with the time `last_ns`."""
 
     def is_new(self, frame: Frame) -> bool:
-        """Whether a frame has not come before; a feed that begins anew repeats its last."""
+        """Whether a frame is new: a feed that is opened again repeats its last frames."""
         if frame.time_ns < self.last_ns or frame in self.newest:
             return False
         if frame.time_ns > self.last_ns:
@@ -114,10 +114,10 @@ class _Source:
 
 
 class Live:
-    """Records a flight over UDP, in threads of its own; it is never in the flight's way.
+    """Recorder of a flight over UDP, in threads of its own: the flight never waits for it.
 
-    A disk that is too slow blocks these threads alone: the feeds that they do not read in time are
-    dropped by their processes, and the recording is known to be incomplete.
+    A slow disk blocks only these threads: processes then drop feeds that are not read in time, and
+    the recording is reported as incomplete.
 
     Args:
         path: its file.
@@ -141,12 +141,12 @@ class Live:
         self._path = path
         self._tell = tell
         self._fault: str | None = None
-        """What was missing first."""
+        """First fault: what is missing in the recording."""
         self._file: BinaryIO | None = None
         self._recording: Recording | None = None
-        """Recording, for as long as the file takes it."""
+        """Recording; None once its file has failed."""
         self._rows: dict[str, int] = {}
-        """Number of bytes of rows of each part that have come."""
+        """Bytes of rows received so far, by part."""
         self._sources = {process: _Source() for process in feeds}
         self._changed = threading.Condition()
         self._closed = threading.Event()
@@ -162,9 +162,9 @@ class Live:
         self._subscriber = Subscriber(feeds, self._take, self._lost)
 
     def finish(self, summary: Summary | None = None, flown: Record | None = None) -> str | None:
-        """End the file, once the processes have ended; returns what is missing in it, as a line.
+        """End the file after the processes have ended; returns what is missing in it, as a line.
 
-        Called again, it only says that again.
+        A second call only returns the same again.
 
         Args:
             summary: of the flight, where it came to one.
@@ -180,7 +180,7 @@ class Live:
                 self._compare(flown)
             self._write(lambda recording: recording.finish(summary))
             if self._file:
-                with suppress(OSError):  # what its buffer still holds
+                with suppress(OSError):  # Closing raises where the file's buffer cannot be written.
                     self._file.close()
         return f"{self._path}: {self._fault}" if self._fault else None
 
@@ -188,7 +188,7 @@ class Live:
         return all(source.ended or not source.begun for source in self._sources.values())
 
     def _compare(self, flown: Record) -> None:
-        """Find out whether every row of the record has come."""
+        """Check that every row of the record has been received."""
         for part, rows in (
             ("client", flown.client),
             ("server", flown.server),
@@ -225,7 +225,7 @@ class Live:
             self._write(Recording.flush)
 
     def _write(self, action: Callable[[Recording], None]) -> None:
-        """Do something to the recording, as long as the file takes it."""
+        """Call a method of the recording, unless its file has failed before."""
         with self._changed:
             if self._recording is None:
                 return
@@ -234,11 +234,12 @@ class Live:
             except OSError as error:
                 self._recording = None
                 self._miss(error.strerror or str(error))
-            except ValueError as error:  # a process says one thing and does another
+            # The process's rows do not match the columns that it announced.
+            except ValueError as error:
                 self._miss(str(error))
 
     def _miss(self, reason: str) -> None:
-        """Remember that something is missing, and tell it the first time."""
+        """Remember the first fault, and report it once."""
         if self._fault is None:
             self._fault = reason
             self._tell(RecordIncomplete(file=str(self._path), reason=reason))

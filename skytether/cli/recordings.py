@@ -1,4 +1,4 @@
-"""Recordings as commands take them: opened, or refused in one line."""
+"""Recordings as commands open them: with one line for what is wrong."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ def opened(path: Path) -> Iterator[Recorded]:
     """Open a recording, for as long as the block takes.
 
     Raises:
-        CommandError: it cannot be read, or is none.
+        CommandError: the file cannot be read, or is no recording.
     """
     with refused(path), Recorded(path) as recorded:
         yield recorded
@@ -22,10 +22,10 @@ def opened(path: Path) -> Iterator[Recorded]:
 
 @contextmanager
 def refused(path: Path) -> Iterator[None]:
-    """Make one line of what is wrong with a recording.
+    """Turn errors of a recording within the block into one line.
 
     Raises:
-        CommandError: what is done in the block has found it.
+        CommandError: the block found the recording to be damaged.
     """
     try:
         yield

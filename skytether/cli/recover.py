@@ -1,4 +1,4 @@
-"""`skytether recover`: give a recording an end that a killed flight has left without one."""
+"""`skytether recover`: repair a recording that lacks its end because its flight was killed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,16 +21,17 @@ class RecoverOptions:
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
     out: Path | None = None
-    """File for what is recovered; left out: the recording itself, once all is done."""
+    """File for the recovered recording; if left out, the recording itself is replaced at the
+    end."""
     plugin: command.Plugins = ()
 
 
 def recover(argv: Sequence[str]) -> None:
-    """Mend a recording that has no end, because its flight was killed or its disk was full.
+    """Repair a recording without an end: its flight was killed, or its disk was full.
 
-    All that is whole is kept, the last second may be missing, and summary and index are made anew.
-    It does no harm to a recording that is whole: the file is replaced once the new one was read and
-    holds no fewer rows.
+    Everything intact is kept, except that the last second may be missing; summary and index are
+    made anew. An intact recording is not harmed: the file is replaced only after the new one was
+    read and found to hold at least as many rows.
     """
     options = read(RecoverOptions(tyro.MISSING), argv, "skytether recover", recover.__doc__)
     command.check_output("--out", options.out)

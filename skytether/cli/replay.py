@@ -1,4 +1,4 @@
-"""`skytether replay`: a recording, on the page that showed the flight."""
+"""`skytether replay`: play a recording on the page that shows flights."""
 
 from collections.abc import Sequence
 from contextlib import closing

@@ -1,4 +1,4 @@
-"""`skytether report`: a recording as a page with figures."""
+"""`skytether report`: make an HTML page with figures of a recording."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ class ReportOptions:
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
     out: Path = Path("report.html")
-    """File for the page."""
+    """File for the HTML page."""
     plugin: command.Plugins = ()
 
 
 def report(argv: Sequence[str]) -> None:
-    """Write a page about a recorded flight that opens in any browser, offline.
+    """Write an HTML page about a recorded flight that opens in any browser, offline.
 
-    It shows the path, what happened over time, the summary, the events and the scenario.
+    The page shows the path, plots over time, the summary, the events and the scenario.
     """
     options = read(ReportOptions(tyro.MISSING), argv, "skytether report", report.__doc__)
     command.check_output("--out", options.out)

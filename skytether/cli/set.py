@@ -1,4 +1,4 @@
-"""`skytether set`: change keys of a scenario while it is flown."""
+"""`skytether set`: change keys of a scenario in flight."""
 
 import json
 import tomllib
@@ -21,16 +21,16 @@ class SetOptions:
     """Options of `skytether set`."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """The socket that server, netem or client were given as --control."""
+    """Socket that server, netem or client was given as --control."""
     changes: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="KEY=VALUE")]
-    """Keys and their values, as in network.uplink.loss=0.3; a value is TOML, or else a text."""
+    """Keys and values, as in network.uplink.loss=0.3; a value is TOML, or else a string."""
 
 
 def set_keys(argv: Sequence[str]) -> None:
-    """Give keys of a scenario other values while it is flown: all of them at once, or none.
+    """Change keys of a scenario in flight: all of them at once, or none.
 
-    Without any it lists the keys that may change there, and their present values. The exit code is
-    2 where nothing was changed because it cannot be, and 1 where nobody answers.
+    Without arguments, list the keys that may change there, and their present values. The exit code
+    is 2 if the change was refused, and 1 if no process answers.
     """
     options = read(SetOptions(tyro.MISSING, ()), argv, "skytether set", set_keys.__doc__)
     values = parsed(options.changes)
@@ -51,10 +51,10 @@ def set_keys(argv: Sequence[str]) -> None:
 
 
 def parsed(changes: Sequence[str]) -> dict[str, Any]:
-    """Values by key, of texts such as `control.epsilon=2`.
+    """Values by key, parsed from texts such as `control.epsilon=2`.
 
     Raises:
-        CommandError: a text is none such, a key comes twice, or all are too long for a request.
+        CommandError: a text is no assignment, a key comes twice, or all together exceed a request.
     """
     values: dict[str, Any] = {}
     for change in changes:
@@ -73,7 +73,7 @@ def parsed(changes: Sequence[str]) -> dict[str, Any]:
 
 
 def value(text: str) -> Any:
-    """What a text is in TOML, as far as JSON knows it, too; any other is itself."""
+    """Value of a text as TOML if JSON can express it too; any other text is a string itself."""
     try:
         table = tomllib.loads(f"value = {text}")
         return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text

@@ -1,4 +1,6 @@
-"""`skytether straight`: a flight as people fly an autopilot today, through the same network."""
+"""`skytether straight`: a flight by set-points alone, as autopilots are usually flown, through the
+same network.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +23,7 @@ from skytether.station.joined import joined, summary_of
 from skytether.station.laws import Law, LawOptions
 
 TOLD = AutopilotRefused, AutopilotText, Fault
-"""Events that are shown while it flies."""
+"""Events that are printed during the flight."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,10 @@ class StraightOptions(LawOptions):
     scenario: ScenarioName = "autopilot"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     flavour: FlavourName = "ardupilot"
-    """Autopilot that is flown, see `skytether autopilot`."""
+    """Autopilot that is simulated, see `skytether autopilot`."""
     udp: bool = False
-    """Fly over real UDP, with ground station, netem and autopilot as processes on loopback, in
-    place of virtual time."""
+    """Fly over real UDP, with ground station, netem and autopilot as processes on loopback, instead
+    of virtual time."""
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
@@ -74,7 +76,7 @@ def straight(argv: Sequence[str]) -> None:
 
 
 def _words(law: Law) -> str:
-    """Law in words, as far as it has numbers."""
+    """Description of a law, with the numbers that it uses."""
     lead = [] if law.lead_s is None else [f"lead {law.lead_s:g} s"]
     gain = [] if law.gain is None else [f"gain {law.gain:g}"]
     return f"{law.name} ({', '.join(lead + gain)})"
@@ -102,7 +104,7 @@ def _really(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> Record:
-    """Fly over UDP; what was flown until Ctrl-C is there."""
+    """Fly over UDP; returns also what was flown before a Ctrl-C."""
     scenario = options.config
     with temporary.folder() as parts:
         file = parts / "scenario.toml"
@@ -130,6 +132,6 @@ def _really(
 
 
 def _tell(event: Event) -> None:
-    """Show what may happen to the vehicle, above the progress bar."""
+    """Print events of the vehicle above the progress bar."""
     if isinstance(event, TOLD):
         page_process.say(event)

@@ -1,1 +1,1 @@
-"""Pictures, tables and pages made of flights, for commands, recordings and the laboratory."""
+"""Pictures, tables and pages of flights, for commands, recordings and the laboratory."""

@@ -1,4 +1,4 @@
-"""Colours of modes and of what is said of a flight: the same on the page and in a report."""
+"""Colours of modes and states, shared by the page and reports."""
 
 from collections.abc import Mapping
 

@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS = (".png", ".pdf", ".svg")
-"""Suffixes of files that a picture can be written to."""
+"""Suffixes of picture files that can be written."""
 
 
 def check(path: Path) -> None:
-    """Refuse a file that is none of a picture, before anything is flown.
+    """Refuse a file that is no picture, before anything is flown.
 
     Raises:
-        ConfigError: with what would do.
-        ModuleNotFoundError: there is nothing to draw with.
+        ConfigError: with the suffixes that are accepted.
+        ModuleNotFoundError: matplotlib is not installed.
     """
     if path.suffix not in FORMATS:
         raise ConfigError(f"{path}: expected a file in {', '.join(FORMATS)}")
@@ -43,14 +43,14 @@ def save(figure: "Figure", path: Path, *, dpi: int) -> None:
     """Write a figure to a file in one of FORMATS.
 
     Raises:
-        OSError: the file cannot be written, or is no plain one.
+        OSError: the file cannot be written, or is no regular file.
     """
     with files.create(path) as file:
         figure.savefig(file, format=path.suffix[1:], dpi=dpi)
 
 
 def drawn(flown: Mapping[str, tuple[Scenario, Record]]) -> "Figure":
-    """Flights side by side: the path over the reference, and below it when packets went up.
+    """Flights side by side: the path over the reference, and below it the times of uplink packets.
 
     Args:
         flown: scenario and record of each flight, by title.
@@ -87,11 +87,11 @@ def draw_reference(
 ) -> None:
     """Draw the reference, red and dashed, over the steps of a vehicle.
 
-    A closed curve is drawn for one round only, so that the dashes of the next do not fill its gaps.
+    A closed curve is drawn for one round only, because the dashes of a second would fill the gaps.
 
     Args:
         client: rows of the vehicle.
-        server: rows of the server, which alone knows where a live point was.
+        server: rows of the server; only they have the positions of a live point.
     """
     if scenario.reference.shape in ("circle", "figure-eight", "square"):
         time_s = client["step"] * scenario.control.dt
@@ -108,14 +108,14 @@ def fleet(
     server: Rows | None = None,
     separations: tuple[Array, Array] | None = None,
 ) -> None:
-    """Draw a fleet: all paths over the reference, and how the tracking error spreads.
+    """Draw a fleet: all paths over the reference, and the spread of the tracking error.
 
-    Of a mission it is paths among zones, and how near two vehicles came over time.
+    For a mission: paths among zones, and the smallest distance of two vehicles over time.
 
     Args:
         path: file to write, in one of FORMATS.
         client: rows of all vehicles' records.
-        server: rows of the server, which alone knows where a live point was.
+        server: rows of the server; only they have the positions of a live point.
         separations: times and distances of a mission, see `summary.separations`.
     """
     from matplotlib.figure import Figure
@@ -151,7 +151,7 @@ def fleet(
 
 
 def _draw_separations(axes: "Axes", scenario: Scenario, times_s: Array, nearest_m: Array) -> None:
-    """Draw how near two vehicles came, beside what was asked for."""
+    """Draw the smallest distance of two vehicles, and the required one."""
     axes.plot(times_s - times_s[:1], nearest_m, "k-", linewidth=0.8, label="nearest two vehicles")
     asked_m = scenario.mission.separation_m
     axes.axhline(asked_m, color="tab:red", linestyle="--", label=f"asked for: {asked_m:g} m")
@@ -164,7 +164,7 @@ def _draw_separations(axes: "Axes", scenario: Scenario, times_s: Array, nearest_
 def _draw_errors(
     spread: "Axes", scenario: Scenario, flights: Sequence[Rows], server: Rows | None
 ) -> None:
-    """Draw how the tracking error spreads over the vehicles."""
+    """Draw the spread of the tracking error over the vehicles."""
     settled = [rows[rows["step"] * scenario.control.dt >= scenario.settled_s] for rows in flights]
     errors = [
         np.sqrt((position_error(scenario, rows, server)[:, :2] ** 2).sum(axis=1).mean())

@@ -1,4 +1,4 @@
-"""The page of a report: tables and figures in one file that opens offline."""
+"""Page of a report: tables and figures in one file that opens offline."""
 
 import base64
 from collections.abc import Sequence
@@ -9,47 +9,47 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table of a report: its numbers as CSV, and as they are shown."""
+    """Table of a report: its numbers as CSV, and as shown."""
 
     name: str
     """Name of the table's file."""
     title: str
     """Heading above the table."""
     says: str
-    """A few sentences on what the numbers come to."""
+    """Explanation of the numbers: a few sentences."""
     csv: str
-    """Numbers in full."""
+    """Numbers as CSV, with all digits."""
     heading: Sequence[str]
-    """Headings of the columns that are shown."""
+    """Headings of the shown columns."""
     rows: Sequence[Sequence[str]]
-    """Cells that are shown, row by row."""
+    """Shown cells, row by row."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure of a page."""
+    """Figure of a page."""
 
     name: str
-    """Name by which the page, and a file, refers to it."""
+    """Name of the figure in the page, and of its file."""
     title: str
     """Heading above it."""
     says: str
-    """One or two sentences on what it shows."""
+    """Caption: one or two sentences."""
     png: bytes
-    """Drawing for the screen."""
+    """Drawing as PNG."""
 
 
 def as_text(value: Any, spec: str) -> str:
-    """A number as a table shows it, and a dash for none."""
+    """Number as shown in a table, with a dash for an unknown one."""
     return "–" if value is None else format(value, spec)
 
 
 def rendered(template: str, **values: Any) -> str:
-    """A page made from a template.
+    """Page made from a template.
 
     Args:
         template: its package and file; it may extend another one.
-        values: what it is given.
+        values: values for the template.
     """
     from jinja2 import Environment, FunctionLoader, StrictUndefined  # takes a tenth of a second
 

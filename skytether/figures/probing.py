@@ -1,4 +1,4 @@
-"""The picture of a measured path: delays over time, and how they are distributed."""
+"""Picture of a measured path: delays over time, and their distribution."""
 
 from typing import TYPE_CHECKING
 
@@ -17,8 +17,9 @@ DOTS_MAX = 20_000
 
 
 def drawn(outcome: Outcome) -> "Figure":
-    """Delays of both directions over time, lost packets marked, and beside them their distribution
-    with that of the best model.
+    """Delays of both directions over time, lost packets marked, and their distributions.
+
+    The best model is drawn over each distribution.
     """
     from matplotlib.figure import Figure  # takes half a second to import
 

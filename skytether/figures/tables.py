@@ -6,19 +6,21 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 FORMULA = ("=", "+", "-", "@", "\t")
-"""Characters with which a cell begins that a spreadsheet computes."""
+"""First characters of a cell that make spreadsheets compute it."""
 
 
 def _plain(value: Any) -> Any:
-    """A value as CSV has it: true and false as in TOML, nothing for None, text that is no formula.
+    """Value for a CSV cell: true and false as in TOML, nothing for None, texts made safe.
 
-    A text that a spreadsheet would compute is led by an apostrophe; a number stays one.
+    A text that a spreadsheet would take for a formula gets an apostrophe in front; a number does
+    not.
     """
     if isinstance(value, bool):
         return str(value).lower()
     if not isinstance(value, str):
         return value
-    line = value.replace("\r", " ")  # which `csv` leaves bare, and many take for the end of a row
+    # `csv` does not quote it, and many programs take it for the end of a row
+    line = value.replace("\r", " ")
     return f"'{line}" if line.startswith(FORMULA) and not _is_number(line) else line
 
 
@@ -31,12 +33,12 @@ def _is_number(text: str) -> bool:
 
 
 def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """A table as CSV text, of rows that have all columns by name; empty where there are none."""
+    """Table as CSV text, from rows with equal keys; empty where there are none."""
     return to_csv(list(rows[0]), [list(row.values()) for row in rows]) if rows else ""
 
 
 def to_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table as CSV text."""
+    """Table as CSV text."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(header)

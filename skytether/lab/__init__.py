@@ -1,1 +1,1 @@
-"""What is made of flights: figures and comparisons."""
+"""Laboratory: figures, comparisons and searches made from many flights."""

@@ -1,4 +1,4 @@
-"""What stands beside the contenders of a case: floors, and flights that need no network."""
+"""Baselines beside the contenders of a case: floors, and flights that need no network."""
 
 from typing import Any
 
@@ -16,13 +16,13 @@ from skytether.shared.telemetry.summary import Summary
 from skytether.sim.flight import fly_batch
 
 PERIODS = (1, 3, 10, 30)
-"""Steps between two packets at which the floor is drawn."""
+"""Steps between two packets at which the floor is computed."""
 RUNS = 4
-"""Number of flights for a point of the floor."""
+"""Number of flights for one point of the floor."""
 
 
 class Floor(msgspec.Struct, frozen=True):
-    """A point of a floor, for packets that are sent by a clock."""
+    """Point of a floor, for packets that are sent at fixed times."""
 
     packets_per_s: float
     """Packets up per second."""
@@ -31,20 +31,21 @@ class Floor(msgspec.Struct, frozen=True):
 
 
 class Baselines(msgspec.Struct, frozen=True):
-    """What stands beside the contenders of a case."""
+    """Baselines beside the contenders of a case."""
 
     floor: list[Floor] = []
-    """Points of the floor: of all where only the server sees the target, and in wind of those
-    without feedback aboard."""
+    """Points of the floor: for all contenders if only the server sees the target; in wind, for
+    those without feedback aboard."""
     aboard: list[Summary] = []
-    """Flights with the reference aboard, and no packets; none where only the server knows it."""
+    """Flights with the reference aboard, and no packets; none if only the server knows the
+    reference."""
 
 
 class Work:
-    """What is flown beside the contenders of a case.
+    """Flights for the baselines of a case.
 
     Args:
-        plan: what they fly.
+        plan: plan of the contenders.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -53,13 +54,13 @@ class Work:
             replace(scenario, control=replace(scenario.control, trigger="periodic", period=period))
             for period in PERIODS
         ]
-        """What is flown for each point of the floor."""
+        """Scenarios for the points of the floor."""
         first, runs = scenario.seed, 0 if _is_unknown(scenario) else plan.runs
         self.aboard = [replace(scenario, seed=seed) for seed in range(first, first + runs)]
-        """What is flown with the reference aboard."""
+        """Scenarios with the reference aboard."""
 
     def settings(self) -> dict[str, Any]:
-        """All that the results follow from, as plain values."""
+        """Settings that determine the results, as plain values."""
         return {
             "files": digests(self.regular),
             "periods": list(PERIODS),
@@ -73,7 +74,7 @@ def _is_unknown(scenario: Scenario) -> bool:
 
 
 def floor_of(scenario: Scenario) -> Floor:
-    """Floor of a scenario, from the ages of a few flights; called in a worker."""
+    """Floor of a scenario, from the ages in a few flights; called in a worker."""
     flights = fly_batch(scenario, range(scenario.seed, scenario.seed + RUNS))
     floor_m = floor.target_floor_m if _is_unknown(scenario) else floor.wind_floor_m
     packets = sum(int((flight.netem["direction"] == UPLINK).sum()) for flight in flights)

@@ -1,7 +1,7 @@
-"""What a search is after: the paper's Table 1, or the smallest error within some limits.
+"""Objectives of searches: the paper's Table 1, or the smallest error within some limits.
 
-An objective (see `lab.search.Objective`) flies a point of a search, a scenario, with the same seeds
-as every other point, and scores what came out: the smaller the score, the better.
+An objective (see `lab.search.Objective`) flies every point of a search, a scenario, with the same
+seeds, and scores the flights: the smaller the score, the better.
 """
 
 import math
@@ -22,7 +22,7 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
     "compensation": {"trigger": "always"},
     "compensation and trigger": {},
 }
-"""Keys of `control` that each column of Table 1 changes; all else is the same."""
+"""Keys of `control` that each column of Table 1 changes; all others are equal."""
 
 TABLE_1: Mapping[str, Mapping[str, float]] = {
     "no compensation": {"rmse_x": 0.3724, "rmse_y": 0.3719, "rmse_xy": 0.5263},
@@ -34,12 +34,12 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
         "event_ratio": 0.1,
     },
 }
-"""The paper's Table 1 [m], and the event ratio that its "10 times smaller" means."""
+"""Paper's Table 1 [m], and the event ratio that its "10 times smaller" means."""
 
 TOLERANCE = 0.1
-"""Largest relative deviation of an entry that counts as reproduced; twice that for event ratios."""
+"""Largest relative deviation of an entry that counts as reproduced; twice this for event ratios."""
 UNFLYABLE = 1e9
-"""Score of a point of which a flight fails."""
+"""Score of a point with a failed flight."""
 
 
 FREE = (
@@ -53,19 +53,19 @@ FREE = (
     Free("model.u_max.0", 0.8, 5.0),
     Free("reference.radius_m", 0.5, 5.0),
 )
-"""Keys that a search for Table 1 changes unless others are asked for (E4)."""
+"""Default keys of a search for Table 1 (E4)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table1:
-    """The objective that every entry of Table 1 comes out as in the paper."""
+    """Objective to reproduce every entry of Table 1."""
 
     def settings(self) -> Mapping[str, Any]:
         """Name of the objective, as plain values."""
         return {"objective": "table1"}
 
     def free(self) -> Sequence[Free]:
-        """Keys to change unless others are asked for."""
+        """Default keys of the search."""
         return FREE
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
@@ -79,7 +79,7 @@ class Table1:
         return values
 
     def score(self, values: Values) -> float:
-        """Sum of squared deviations, each ten times as heavy where it is out of tolerance."""
+        """Sum of squared deviations; those out of tolerance weigh ten times as much."""
         off = deviations(values)
         if not np.isfinite(list(off.values())).all():
             return UNFLYABLE
@@ -101,7 +101,7 @@ def deviations(values: Values) -> dict[tuple[str, str], float]:
 
 
 def within(name: str, deviation: float) -> bool:
-    """Whether an entry of this name with this deviation is within tolerance."""
+    """Whether a deviation of an entry is within tolerance."""
     return abs(deviation) <= TOLERANCE * (2.0 if name == "event_ratio" else 1.0)
 
 
@@ -117,30 +117,31 @@ WEIGHTS = (
     Free("control.input_weight", 1e-4, 1e4),
     Free("control.change_weight", 1e-4, 1e4),
 )
-"""Weights that are searched for; only ratios matter, so the position's keeps its value."""
+"""Weights that are searched for; only their ratios matter, so the position's is fixed."""
 REGULATOR = (WEIGHTS[0], WEIGHTS[3])
-"""Those of them that make the gain aboard, where nothing is planned."""
+"""Weights that determine the feedback gain, where nothing is planned."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
-"""Key of a trajectory that is seen ahead."""
+"""Key of a trajectory that the server knows ahead."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (Free("control.epsilon", 1e-4, 1e8), Free("control.decay_rate", 1e-2, 1e2)),
     "cost_gap": (Free("control.cost_gap", 1e-6, 1e6),),
     "expected_gap": (Free("control.cost_gap", 1e-6, 1e6),),
     "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
 }
-"""Keys of each policy that looks at the flight, so that weights decide what it sends, too."""
+"""Keys of each policy that looks at the state, which are searched for so that weights and policy
+together decide what is sent."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
 """Keys of the schemes that have a disturbance observer."""
 OBSERVE = ("committed", "predictive")
-"""Those schemes."""
+"""Schemes that have a disturbance observer."""
 MEANS = ("rmse_xy", "event_ratio", "effort_mps", "saturated")
-"""Figures of a point whose means over the seeds are kept."""
+"""Figures of a point that are averaged over the seeds."""
 HERE = "here"
-"""Name of the one column of a point that is flown as it is."""
+"""Name of the single column of an objective without columns."""
 
 
 def trigger_keys(trigger: str) -> Sequence[Free]:
-    """Keys of the policies in a trigger; a policy with numbers of its own has none."""
+    """Keys of the policies in a trigger; none for a policy whose numbers stand in the trigger."""
     bare = (each.name for each in policies.policies(policies.parse(trigger)) if not each.values)
     keys = (key for name in bare for key in TRIGGER_KEYS.get(name, ()))
     return list(dict.fromkeys(keys))
@@ -148,10 +149,10 @@ def trigger_keys(trigger: str) -> Sequence[Free]:
 
 @dataclass(frozen=True, slots=True)
 class SearchLimits:
-    """What may be spent on a small error."""
+    """Limits within which the error is minimised."""
 
     packets: float = 1.0
-    """Largest share of steps that may send; it binds only a trigger that looks at the flight."""
+    """Largest share of steps that may send; it binds only triggers that look at the state."""
     effort_mps: float = math.inf
     """Largest effort, the RMS change of the command from step to step [m/s]."""
     saturated: float = 1.0
@@ -160,10 +161,10 @@ class SearchLimits:
 
 @dataclass(frozen=True, slots=True)
 class Rmse:
-    """The objective of the smallest RMSE xy within some limits."""
+    """Objective of the smallest RMSE xy within limits."""
 
     scenario: Scenario
-    """What is flown, but for the keys that are searched for."""
+    """Scenario that is flown, except for the keys that are searched for."""
     limits: SearchLimits
 
     def settings(self) -> Mapping[str, Any]:
@@ -171,7 +172,9 @@ class Rmse:
         return {"objective": "rmse", **asdict(self.limits)}
 
     def free(self) -> Sequence[Free]:
-        """Weights, and the keys of scheme and trigger; what is 0 is switched off and stays so."""
+        """Weights, and the keys of scheme and trigger; a key that is 0 means "off" and is not
+        searched for.
+        """
         control, table = self.scenario.control, plain(self.scenario)
         weights = REGULATOR if control.scheme == "trajectory" else WEIGHTS
         observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
@@ -190,7 +193,7 @@ class Rmse:
         return {HERE: {**found, "event_ratio_most": most}}
 
     def score(self, values: Values) -> float:
-        """RMSE xy [m], times the cube of how many times too much of anything limited is spent."""
+        """RMSE xy [m], times the cube of the ratio by which each limit is exceeded."""
         here = values[HERE]
         rmse, most = here["rmse_xy"], here["event_ratio_most"]
         effort, saturated = here["effort_mps"], here["saturated"]
@@ -202,12 +205,12 @@ class Rmse:
         return rmse * math.prod(max(1.0, each) ** 3 for each in over)
 
     def _binds(self) -> bool:
-        """Whether the share of packets follows from what is flown."""
+        """Whether the share of packets depends on the flight."""
         named = policies.policies(policies.parse(self.scenario.control.trigger))
         return any(each.name in TRIGGER_KEYS for each in named)
 
 
 def _mean(runs: Sequence[Summary], name: str) -> float | None:
-    """Mean of a figure, or None where it is missing in a run, which did not fly."""
+    """Mean of a figure; None if it is missing in a run that failed."""
     values = [getattr(run, name) for run in runs]
     return None if None in values else float(np.mean(values))

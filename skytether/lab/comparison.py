@@ -1,4 +1,4 @@
-"""What comes out of a comparison of contenders: tables, ratios that are claimed, curves."""
+"""Results of a comparison of contenders: tables, claimed ratios, curves."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -51,20 +51,20 @@ FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A claim that one contender's RMSE xy is at most so many times another's."""
+    """Claim that one contender's RMSE xy is at most so many times another's."""
 
     ours: str
-    """Name of the one contender."""
+    """Name of the contender that the claim favours."""
     theirs: str
-    """Name of the other."""
+    """Name of the contender it is compared with."""
     share: float = 1.0
-    """Largest share of their packets that ours may spend, both ways."""
+    """Largest share of the other's packets that ours may send, both ways."""
     at_most: Mapping[str, float] = field(default_factory=dict)
-    """Largest ratio, by case; in cases that it lacks the ratio is reported and not asked for."""
+    """Largest ratio, by case; in other cases the ratio is only reported."""
 
 
 OURS = "trajectory-expected"
-"""The contender for which most is claimed."""
+"""Contender for which most is claimed."""
 CLAIMS = (
     Claim(OURS, "paper-every-step", 0.12, {"target": 0.95, "turns": 0.8}),
     Claim(OURS, "feedback-gap", 0.5),
@@ -74,10 +74,10 @@ CLAIMS = (
 
 @dataclass(frozen=True, slots=True)
 class ContenderRuns:
-    """The runs of a contender in a case, at one threshold and with one way of reporting."""
+    """Runs of a contender in a case, at one threshold and with one way of reporting."""
 
     what: FlownContender
-    """What was flown."""
+    """Contender, threshold and way of reporting."""
     runs: Sequence[Summary]
     """Summary of each flight, by seed."""
 
@@ -86,42 +86,42 @@ class ContenderRuns:
         return interval(self.values(figure))
 
     def values(self, figure: str) -> list[float]:
-        """One of FIGURES of every run that has it."""
+        """Values of one of FIGURES in every run that has it."""
         flew = (run for run in self.runs if run.rmse_xy is not None)
         values = (getattr(run, figure) for run in flew)
         return [value for value in values if value is not None]
 
     def mean(self, figure: str) -> float:
-        """Mean of one of FIGURES; NaN where nothing has flown."""
+        """Mean of one of FIGURES; NaN if no run has it."""
         mean, _ = self.estimate(figure)
         return math.nan if mean is None else mean
 
     def median(self) -> float | None:
-        """Median RMSE xy [m], which a few runs that went astray do not move; None of no runs."""
+        """Median RMSE xy [m], robust against a few failed runs; None without runs."""
         values = self.values(RMSE)
         return float(np.median(values)) if values else None
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedCase:
-    """What has flown in a case."""
+    """Results of a case."""
 
     case: Case
     bought: Mapping[tuple[str, float], ContenderRuns]
-    """Runs of what each contender flies within each budget, by its name and the budget [1/s]."""
+    """Runs of each contender's choice within each budget, by its name and the budget [1/s]."""
     tuned: Sequence[FlownContender] = ()
-    """Each contender at the threshold that was searched for."""
+    """Each contender at the threshold that the search found."""
     floor: Sequence[Floor] = ()
     """Points of a floor."""
 
     @property
     def contenders(self) -> list[Contender]:
-        """Contenders that fly within any budget."""
+        """Contenders that fly within at least one budget."""
         names = {name for name, _ in self.bought}
         return [each for each in (*CONTENDERS, ABOARD) if each.name in names]
 
     def curve(self, contender: str) -> list[ContenderRuns]:
-        """What a contender flies, with rising budget; each point once."""
+        """Choices of a contender with rising budget; each point once."""
         points = (self.bought.get((contender, budget)) for budget in BUDGETS)
         return list({id(each): each for each in points if each is not None}.values())
 
@@ -133,12 +133,12 @@ def compared(
     done: Results,
     beside: Baselines,
 ) -> ComparedCase:
-    """What has flown of a plan, and beside it.
+    """Results of a plan, and of its baselines.
 
     Args:
-        chosen: what each contender flies within each budget.
+        chosen: choice of each contender within each budget.
         sweep: flights of these points.
-        done: what came of them.
+        done: results of the sweep.
     """
     cells = {name: cell for cell, (name,) in enumerate(sweep.cells)}
     flown = {
@@ -154,9 +154,9 @@ def compared(
 
 
 def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, float] | None:
-    """Mean RMSE xy of ours over theirs, and both ends of its 95 % interval.
+    """Ratio of the mean RMSE xy of ours to theirs, and its 95 % interval.
 
-    The interval is a bootstrap over pairs of the same seed. The result is None where fewer than two
+    The interval is a bootstrap over pairs of the same seed. The result is None if fewer than two
     seeds have flown in both.
     """
     errors = [
@@ -179,42 +179,43 @@ def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, flo
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A claim, judged in a case."""
+    """Claim, judged in a case."""
 
     claim: Claim
-    """What is claimed."""
+    """Claim that is judged."""
     case: Case
     """Case in which it is judged."""
     ours: ContenderRuns
-    """Runs of our contender, within the largest budget in which it spends no more than it may."""
+    """Runs of our contender, within the largest budget in which it sends no more than the claim
+    allows."""
     theirs: ContenderRuns
     """Runs of the other contender, within the largest budget."""
     ratio: tuple[float, float, float] | None
-    """Ratio of both mean RMSE xy, with both ends of its interval; None where too little flew."""
+    """Ratio of both mean RMSE xy, with its interval; None if too few flights succeeded."""
     sparse: bool
-    """Whether ours spends no more than it may."""
+    """Whether ours sends no more than the claim allows."""
 
     @property
     def medians(self) -> float | None:
-        """Ratio of both median RMSE xy; None where either has not flown."""
+        """Ratio of both median RMSE xy; None if either has not flown."""
         ours, theirs = self.ours.median(), self.theirs.median()
         return ours / theirs if ours and theirs else None
 
     @property
     def at_most(self) -> float | None:
-        """Largest ratio that is asked for; None where none is."""
+        """Largest claimed ratio; None if none is claimed in the case."""
         return self.claim.at_most.get(self.case.name)
 
     @property
     def holds(self) -> bool | None:
-        """Whether all of the interval is below what is asked for; None where nothing is asked."""
+        """Whether the whole interval is below the claimed ratio; None if none is claimed."""
         if self.at_most is None:
             return None
         return self.sparse and self.ratio is not None and self.ratio[2] <= self.at_most
 
 
 def judge(claim: Claim, compared: ComparedCase) -> Judged | None:
-    """Judge a claim; None where either has not flown."""
+    """Judge a claim; None if either contender has not flown."""
     ours, theirs = compared.curve(claim.ours), compared.curve(claim.theirs)
     if not (ours and theirs):
         return None
@@ -227,10 +228,10 @@ def judge(claim: Claim, compared: ComparedCase) -> Judged | None:
 
 
 def draw(results: Sequence[ComparedCase]) -> Drawn:
-    """The report of a comparison.
+    """Report of a comparison.
 
     Args:
-        results: what has flown, case by case.
+        results: results, case by case.
     """
     own = [each for each in results if not each.case.weights]
     judged = [found for claim in CLAIMS for each in results if (found := judge(claim, each))]
@@ -259,7 +260,7 @@ ABOUT = (
 
 
 def budgets_table(results: Sequence[ComparedCase]) -> Table:
-    """Table of what each contender flies within each budget."""
+    """Table of the choice of each contender within each budget."""
     rows, lines = [], []
     for each in results:
         best = {budget: _ranked(each, budget)[:1] for budget in BUDGETS}
@@ -289,13 +290,13 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
-    """Runs within a budget by their mean RMSE xy; those that have not flown come last."""
+    """Runs within a budget by mean RMSE xy; failed ones come last."""
     flown = [runs for (_, within), runs in compared.bought.items() if within == budget]
     return sorted(flown, key=lambda each: (math.isnan(each.mean(RMSE)), each.mean(RMSE)))
 
 
 def leaders_table(results: Sequence[ComparedCase]) -> Table:
-    """Table of our contender over the best of the others within each budget."""
+    """Table of the ratio of our contender to the best of the others within each budget."""
     rows, lines = [], []
     for each in results:
         for budget in BUDGETS:
@@ -350,7 +351,7 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _row(each: ContenderRuns) -> dict[str, Any]:
-    """Point that was flown, number of runs and of those that flew, and every figure."""
+    """Point, number of runs and of successful ones, and every figure."""
     flew = sum(run.rmse_xy is not None for run in each.runs)
     counts = {
         "threshold": each.what.threshold,
@@ -362,7 +363,7 @@ def _row(each: ContenderRuns) -> dict[str, Any]:
 
 
 def ratios_table(judged: Sequence[Judged]) -> Table:
-    """Table of the ratios that are claimed."""
+    """Table of the claimed ratios."""
     rows, lines = [], []
     for each in judged:
         ours, theirs = each.ours.what.contender, each.theirs.what.contender
@@ -422,7 +423,7 @@ def ratios_table(judged: Sequence[Judged]) -> Table:
 
 
 def weights_table(results: Sequence[ComparedCase]) -> Table:
-    """Table of the weights and threshold of each contender in each case."""
+    """Table of each contender's weights and threshold in each case."""
     flown = [(each.case, point) for each in results for point in each.tuned]
     keys = list(
         dict.fromkeys(
@@ -446,19 +447,19 @@ def weights_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _weights(value: Any) -> str:
-    """A number, or several between commas; an empty text for None."""
+    """Number as text, or several between commas; empty for None."""
     parts = () if value is None else np.atleast_1d(value)
     return ", ".join(f"{part:.4g}" for part in parts)
 
 
 COLOURS = ("#c1272d", "0.5", "black", "#009e73")
-"""Colours of the schemes, in their order."""
+"""Colours of the schemes, in order."""
 MARKERS = "sovD^P<*"
-"""Markers of the triggers, in their order, which tell curves apart without colour."""
+"""Markers of the triggers, in order; curves can be told apart without colour."""
 
 
 def _style(contender: Contender) -> tuple[str, str]:
-    """Colour and marker of a contender, the same in every figure."""
+    """Colour and marker of a contender, used in every figure."""
     if contender is ABOARD:
         return "0.3", ""
     schemes = list(dict.fromkeys(each.scheme for each in CONTENDERS))
@@ -468,7 +469,7 @@ def _style(contender: Contender) -> tuple[str, str]:
 
 
 def curves(compared: ComparedCase) -> Plate:
-    """Figure of what a packet buys in a case: RMSE xy over what each contender spends."""
+    """Figure of a case: RMSE xy over the packets that each contender sends."""
     case = compared.case
     found = {each.name: compared.curve(each.name) for each in compared.contenders}
     rows = [

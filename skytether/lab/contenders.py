@@ -1,11 +1,10 @@
-"""The contenders and cases of `skytether compare`, and the file of the weights that each flies at.
+"""Contenders and cases of `skytether compare`, and the file of each contender's weights.
 
 The best weights of a contender in a case are a table of that file, found by a search
-(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. With them
-the contender flies at several thresholds and with several ways of reporting, on the seeds of the
-search; of those within a budget of packets, both ways, the best flies in the comparison. Other
-cases are flown at the weights of one that was searched: they show what weights are worth where they
-were not meant to be.
+(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. With these
+weights the contender flies at several thresholds and with several ways of reporting, on the seeds
+of the search; within each budget of packets, both ways, the best choice flies in the comparison.
+Some cases are flown with the weights of another case: they show how well the weights transfer.
 """
 
 import json
@@ -26,20 +25,20 @@ from skytether.shared.scenario.dotted import flat, lay
 from skytether.shared.scenario.schema import Scenario
 
 SEARCH_SEED = 1001
-"""First seed of a search; the seeds that are compared begin at the plant's own."""
+"""First seed of a search; the compared seeds begin at the plant's own."""
 PACKETS = 0.1
-"""Largest share of steps that may send, for a contender whose trigger looks at the flight."""
+"""Largest share of steps that may send, for a contender whose trigger looks at the state."""
 
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
-"""Budgets: largest numbers of packets per second, both ways and with heartbeats."""
+"""Budgets: largest numbers of packets per second, both ways and including heartbeats."""
 SCOUTS = 8
-"""Number of flights, with seeds of the search, by which points are chosen for the budgets."""
+"""Number of flights, on seeds of the search, by which points are chosen for the budgets."""
 EFFORT_ROOM = 1.05
-"""How many times the effort of a case a point that is chosen may take."""
+"""Factor by which a chosen point may exceed the effort limit of a case."""
 NEAR = (0.1, 0.3, 0.6, 1, 2, 4, 10)
-"""Factors of a threshold with which what is seen of a flight is compared."""
+"""Factors of a threshold on a figure of the flight, each one point."""
 PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
-"""Factors of a period of ten steps."""
+"""Factors of a period of ten steps, each one point."""
 REPORTS: Mapping[str, Mapping[str, Any]] = {
     "every step": {"vehicle.report": "always"},
     "by event": {"vehicle.report": "deviation(0.05) | silence(1)"},
@@ -51,14 +50,14 @@ REPORTS: Mapping[str, Mapping[str, Any]] = {
         "link.age_max_s": 10.0,
     },
 }
-"""Ways of reporting to the server: keys of the scenario that each changes."""
+"""Ways of reporting to the server, and the keys that each changes."""
 EVERY = "every step"
-"""The way of reporting with which weights are searched for."""
+"""Way of reporting with which weights are searched for."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """A scheme with a trigger."""
+    """Scheme with a trigger."""
 
     name: str
     """Short name, in tables, files and scenarios."""
@@ -67,9 +66,9 @@ class Contender:
     trigger: str
     """Name of the trigger as a reader of the report sees it."""
     control: Mapping[str, Any]
-    """Keys of `control` that make up the contender, with the weights its search starts from."""
+    """Keys of `control` that define the contender, with the initial weights of its search."""
     threshold: str = ""
-    """Key of `control` that decides how many packets are sent; empty where there is none."""
+    """Key of `control` that determines how many packets are sent; empty if there is none."""
 
     @property
     def title(self) -> str:
@@ -78,7 +77,7 @@ class Contender:
 
     @property
     def factors(self) -> Sequence[float]:
-        """Multiples of the threshold found, each a point of the curve."""
+        """Multiples of the found threshold, each one point of the curve."""
         if not self.threshold:
             return ()
         return PERIODS if self.threshold == "period" else NEAR
@@ -90,14 +89,15 @@ LOOSE = {
     "input_weight": 5.0,
     "change_weight": 200.0,
 }
-"""Start of a search with the paper's scheme, whose plans should hardly change from step to step."""
+"""Initial weights of a search with the paper's scheme, whose plans should change little from step
+to step."""
 TIGHT = {
     "state_weight": [7.1, 1.0],
     "terminal_weight": [50.0, 20.0],
     "input_weight": 0.3,
     "change_weight": 0.01,
 }
-"""Start of a search with committed inputs, which need no S-term."""
+"""Initial weights of a search with committed inputs, which need no S-term."""
 
 PAPER = {"scheme": "predictive", "feedback": False, "observer_s": 0.0, "horizon": 40} | LOOSE
 """The paper's scheme, with the horizon that reproduces its table."""
@@ -107,7 +107,8 @@ COMMITTED = {
     "observer_s": 4.0,
     "horizon": 60,
 } | TIGHT
-"""Committed inputs; the observer's time constant is searched for and may come out very long."""
+"""Scheme with committed inputs; the observer's time constant is searched for and may come out very
+long."""
 FEEDBACK = COMMITTED | {"feedback": True}
 TRAJECTORY = {
     "scheme": "trajectory",
@@ -118,7 +119,7 @@ TRAJECTORY = {
     "input_weight": 1.0,
     "change_weight": 0.0,
 }
-"""No inputs are sent, but a trajectory, along which the vehicle regulates itself."""
+"""Scheme that sends no inputs, but a trajectory, along which the vehicle regulates itself."""
 
 ALWAYS = {"trigger": "always"}
 PERIODIC = {"trigger": "periodic", "period": 10}
@@ -127,7 +128,7 @@ COST_GAP = {"trigger": "cost_gap", "cost_gap": 300.0}
 EXPECTED_GAP = {"trigger": "expected_gap", "cost_gap": 300.0}
 SILENT = {"trigger": "cost_gap | silence(1)", "cost_gap": 3.0}
 ACKNOWLEDGED = {"trigger": "expected_gap | heartbeat", "cost_gap": 3.0}
-"""Triggers of a trajectory, whose gap is the cost of a moment, and not that of a horizon."""
+"""Triggers of a trajectory, whose gap is the cost of an instant, not of a horizon."""
 
 
 def _contenders() -> tuple[Contender, ...]:
@@ -154,31 +155,32 @@ def _contenders() -> tuple[Contender, ...]:
 
 CONTENDERS = _contenders()
 BESIDE = "feedback-gap"
-"""Contender at whose weights it is flown with the reference aboard, and a floor is measured."""
+"""Contender whose weights are used for the reference aboard, and for the floor."""
 ABOARD = Contender("aboard", "reference aboard", "no packets", {})
-"""Stands beside the contenders where the reference is known before the flight."""
+"""Baseline for cases in which the reference is known before the flight."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is flown: a scenario, and what the server of it is not told."""
+    """Case: a scenario, part of which is hidden from the server."""
 
     name: str
     """Short name, in tables, files and scenarios."""
     title: str
     """Name as a reader of the report sees it."""
     plant: str
-    """Name of the scenario whose vehicle, trajectory and network all contenders fly."""
+    """Name of the scenario with the vehicle, trajectory and network of all contenders."""
     keys: Mapping[str, Any]
-    """Keys of the scenario, with dots, that differ from the plant's."""
+    """Keys of the scenario, with dots, that differ from the plant."""
     effort_mps: float = math.inf
     """Largest effort in a search, the RMS change of the command from step to step [m/s]."""
     weights: str = ""
-    """Name of the case whose weights are flown; empty where the case has its own."""
+    """Name of the case whose weights are used; empty if the case has its own."""
     contenders: Sequence[str] = ()
-    """Names of those who fly it; empty for all."""
+    """Names of the contenders that fly the case; empty for all."""
     start: Mapping[str, float] = field(default_factory=dict)
-    """Keys of `control` from whose values searches start here, where a contender has them."""
+    """Keys of `control` and their initial values in searches of this case, for contenders that have
+    them."""
 
 
 TARGET = {
@@ -188,21 +190,21 @@ TARGET = {
     "vehicle.report": "always",
     "duration": 35.0,
 }
-"""Keys of every case with a target: as few heartbeats as in the paper's scenario, and plans weighed
-about the target's velocity (`control.input_reference`)."""
+"""Keys of every case with a target: as few heartbeats as in the paper's scenario, and plans
+weighted around the target's velocity (`control.input_reference`)."""
 CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap", "trajectory-expected")
-"""Contenders on a trajectory that is known for ever, for which no network is needed."""
+"""Contenders on a trajectory that is known in advance, for which no network is needed."""
 
 
 def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
-    """A case that is flown at the weights of the case `target`."""
+    """Case that is flown with the weights of the case `target`."""
     return Case(name, title, "target", {**TARGET, **keys}, weights="target")
 
 
 def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -> Case:
-    """A case that flies the paper's circle, where costs are hundreds of times smaller."""
+    """Case that flies the paper's circle, where costs are hundreds of times smaller."""
     small = {"cost_gap": 1.0, "epsilon": 300.0}
-    round_ = {**keys, "duration": 32.5}  # a whole one, after what RMSE leaves out
+    round_ = {**keys, "duration": 32.5}  # one full circle after the time that RMSE leaves out
     return Case(name, title, "paper", round_, effort_mps, contenders=CIRCLE, start=small)
 
 
@@ -213,7 +215,7 @@ def _network(**keys: Any) -> Mapping[str, Any]:
 
 
 def _noise(position_m: float) -> Mapping[str, Any]:
-    """Keys of the sensor's noise; that of a velocity, in m/s, is 2.5 times that of a position."""
+    """Keys of the sensor's noise; the velocity's, in m/s, is 2.5 times the position's."""
     return {
         "sensor.position_noise_m": position_m,
         "sensor.velocity_noise_mps": 2.5 * position_m,
@@ -255,11 +257,11 @@ CASES = (
     _circle("wind-0.3", "circle, wind of 0.3 m/s per √s", {"vehicle.wind": 0.3}, 0.35),
     _circle("gusts", "circle, gusts of 1 m/s²", GUSTS, 0.1),
 )
-"""Every case; the first is the benchmark."""
+"""All cases; the first is the benchmark."""
 
 
 def cases(names: Sequence[str]) -> Sequence[Case]:
-    """Cases by name; all where none is named.
+    """Cases by name; all if no name is given.
 
     Raises:
         ConfigError: there is no such case.
@@ -273,11 +275,11 @@ def cases(names: Sequence[str]) -> Sequence[Case]:
 
 @dataclass(frozen=True, slots=True)
 class ComparisonSize:
-    """How much a comparison flies; what is not given is as in those that are reported."""
+    """Size of a comparison; defaults are those of the reported ones."""
 
     runs: int
-    """Number of flights of each point that is chosen; half as many where the case has no weights of
-    its own."""
+    """Number of flights of each chosen point; half as many if the case has no weights of its
+    own."""
     generations: int
     """Number of generations of a search."""
     population: int = 8
@@ -291,9 +293,9 @@ class ComparisonSize:
     contenders: Sequence[Contender] = CONTENDERS
     """Contenders that fly, in those cases that they are in."""
     scouts: int = SCOUTS
-    """Number of flights of each point by which it is chosen."""
+    """Number of flights of each point by which points are chosen."""
     every: int = 1
-    """Stride over a contender's factors; it meets the middle one, a factor of 1."""
+    """Stride over a contender's factors, which always includes the factor 1."""
     duration: float = math.inf
     """Largest length of a flight [s]."""
 
@@ -319,7 +321,7 @@ LOOKED_AT = ("paper-every-step", "paper-event", "feedback-gap", "trajectory-expe
 
 
 def quick(scale: ComparisonSize) -> ComparisonSize:
-    """Scale of a first look, with no more than is asked for."""
+    """Size of a first look, at most as large as requested."""
     few = [case for case in scale.cases if case.name in ("target", "loss-0.5")]
     return ComparisonSize(
         runs=min(scale.runs, 3),
@@ -349,27 +351,27 @@ def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Sce
 
 
 def entry(contender: Contender, case: Case) -> str:
-    """Name of a contender in a case: of its table in the file of weights."""
+    """Name of a contender in a case, as a table in the file of weights."""
     return f"{contender.name}-{case.weights or case.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What the search for a contender's weights in a case has found."""
+    """Result of the search for a contender's weights in a case."""
 
     contender: Contender
     case: Case
     scenario: Scenario
     """Scenario with the weights."""
     says: str
-    """What it came to on the seeds of the search, in a line."""
+    """Summary of the result on the seeds of the search, in a line."""
 
 
 def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
-    """The file of weights: a table for each contender in each case, with what the plant has not.
+    """File of weights: one table per contender and case, with keys that differ from the plant.
 
     Args:
-        scale: what the searches took, which the file says.
+        scale: size of the searches, noted in the file.
     """
     says = (
         "Scenarios of each contender of `skytether compare` in each case, with the weights and "
@@ -397,41 +399,41 @@ def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
 
 
 def _told(found: Found) -> dict[str, Any]:
-    """Keys of what was found: the contender's own, and those that differ from the plant's."""
+    """Keys of a result: the contender's own, and those that differ from the plant."""
     here = dict(flat(reading.to_table(found.scenario)))
     own = {f"control.{key}": here[f"control.{key}"] for key in found.contender.control}
     return own | differences(found.scenario, found.case.plant)
 
 
 def _inline(value: Any) -> str:
-    """A value as TOML has it in a line; numbers, texts and lists are the same in JSON."""
+    """Value as TOML on one line; JSON's form of numbers, texts and lists is valid TOML."""
     if isinstance(value, dict):
         return f"{{ {', '.join(f'{key} = {_inline(each)}' for key, each in value.items())} }}"
     return json.dumps(value, ensure_ascii=False)
 
 
 def differences(scenario: Scenario, plant: str) -> dict[str, Any]:
-    """Keys in the sections of a scenario that differ from its plant's, with dots, and values."""
+    """Keys in the sections of a scenario that differ from its plant, with dots, and values."""
     here, there = (dict(flat(reading.to_table(each))) for each in (scenario, reading.load(plant)))
     return {key: value for key, value in here.items() if "." in key and value != there[key]}
 
 
-# -- what is flown -------------------------------------------------------------------------------
+# -- flights -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class FlownContender:
-    """A contender in a case, at one threshold and with one way of reporting."""
+    """Contender in a case, at one threshold and with one way of reporting."""
 
     contender: Contender
     threshold: float | None
-    """Value of the contender's threshold; None where it has none."""
+    """Value of the contender's threshold; None without one."""
     report: str
-    """Name of the way of reporting, of REPORTS."""
+    """Way of reporting, a key of REPORTS."""
     tuned: bool
-    """Whether the threshold is the one that the search has found."""
+    """Whether the threshold is the one that the search found."""
     keys: Mapping[str, Any]
-    """Keys that differ from the plant's, with dots, and their values."""
+    """Keys that differ from the plant, with dots, and their values."""
 
     @property
     def name(self) -> tuple[str, float | None, str]:
@@ -442,7 +444,7 @@ class FlownContender:
 def flying(
     contender: Contender, case: Case, tuned: Scenario, scale: ComparisonSize
 ) -> list[FlownContender]:
-    """A contender with every way of reporting at all its thresholds, in rising order."""
+    """Contender with every way of reporting at all its thresholds, in rising order."""
     keys, key = differences(tuned, case.plant), contender.threshold
     keys = {path: value for path, value in keys.items() if path not in case.keys}
     values: list[float | None] = [None]
@@ -466,23 +468,23 @@ def flying(
 
 
 Chosen = Mapping[tuple[str, float], FlownContender]
-"""What each contender flies within each budget, by its name and the budget [1/s]."""
+"""Choice of each contender within each budget, by its name and the budget [1/s]."""
 
 
 class Plan:
-    """What all contenders fly in one case.
+    """Flights of all contenders in one case.
 
     Args:
-        weights: COMPARED, or the path of a file that `to_file` has made.
+        weights: COMPARED, or the path of a file made by `to_file`.
 
     Raises:
-        ConfigError: the file cannot be read, or a contender is missing there, or wrong.
+        ConfigError: the file cannot be read, or a contender is missing or invalid in it.
     """
 
     def __init__(self, case: Case, weights: str, scale: ComparisonSize) -> None:
         self.case = case
         self.points: list[FlownContender] = []
-        """Every contender at every threshold with every way of reporting."""
+        """All contenders at all thresholds with all ways of reporting."""
         known = reading.names(weights)
         for contender in scale.who(case):
             name = entry(contender, case)
@@ -491,7 +493,7 @@ class Plan:
                 raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
             self.points += flying(contender, case, reading.load(f"{weights}/{name}"), scale)
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
-        """Number of flights of each point that is chosen."""
+        """Number of flights of each chosen point."""
         plant = reading.to_table(reading.load(case.plant))
         lay(case.keys, plant)
         plant["duration"] = min(plant["duration"], scale.duration)
@@ -505,18 +507,18 @@ class Plan:
         return Sweep(self.case.name, scenario, [GridAxis("contender", names, changes)], runs)
 
     def comparison(self, points: Iterable[FlownContender]) -> Sweep:
-        """Flights of some points, each once."""
+        """Flights of some points, without duplicates."""
         each = {point.name: point for point in points}
         return self._sweep(self._scenario, list(each.values()), self.runs)
 
     def choose(self, done: Results) -> Chosen:
         """Point with the least RMSE xy within each budget, by contender and budget.
 
-        A contender of which no point is within a budget, and none of whose flights failed, or takes
-        more effort than the case allows, has no entry there.
+        A contender has no entry for a budget if no point is within the budget and the case's effort
+        limit without a failed flight.
 
         Args:
-            done: what came of the scouts.
+            done: results of the scouting flights.
         """
         most = EFFORT_ROOM * self.case.effort_mps
         found: dict[tuple[str, float], tuple[float, FlownContender]] = {}
@@ -536,7 +538,7 @@ class Plan:
         return {name: point for name, (_, point) in found.items()}
 
     def tuned(self, name: str) -> Scenario:
-        """What a contender flies at the threshold that was found, reporting at every step."""
+        """Points of a contender at the found threshold, reporting at every step."""
         (point,) = (
             each
             for each in self.points

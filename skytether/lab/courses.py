@@ -1,9 +1,10 @@
-"""What a vehicle must fly by a horizon or a trajectory, worked out anew and by the compiled rule.
+"""Expected inputs of a vehicle under a horizon or trajectory, computed independently and by the
+compiled rule.
 
-A course is what one message tells one vehicle. It says what is flown twice: by the equations of
-`shared.law.rule` and `shared.law.spline`, written here in other words, which must be met within
-rounding; and by those functions themselves, compiled as the server has them, which must be met to
-the last bit.
+A course is the motion that one message prescribes. Its inputs are computed twice: by the equations
+of `shared.law.rule` and `shared.law.spline`, written here a second time, which must agree within
+rounding; and by those functions themselves, compiled as in the server, which must agree to the last
+bit.
 """
 
 import math
@@ -36,7 +37,7 @@ class PlannedCourse:
 
     Args:
         horizon: the horizon.
-        length: number of its inputs that may be flown.
+        length: number of usable inputs.
         terms: the rule of flight.
     """
 
@@ -49,7 +50,7 @@ class PlannedCourse:
         self._model, self._brake = terms.model, terms.brake
         feedback = horizon.feedback.astype(float)
         self.feeds_back = feedback.size > 0
-        """Whether it brings feedback."""
+        """Whether the horizon contains feedback gains."""
         if not self.feeds_back:
             feedback = np.zeros((terms.axes, FEEDBACK))
         self._feedback = feedback
@@ -57,17 +58,17 @@ class PlannedCourse:
         self._led, self._stage = feedback[:, LED], 0
 
     def told(self, stage: int) -> Array:
-        """What it tells at a stage: its input, and after the last the braking curve [m/s]."""
+        """Prescribed input at a stage, and after the last stage the braking curve [m/s]."""
         length = self._inputs.shape[1]
         u: Array = self._inputs[:, min(max(stage, 0), length - 1)]
         left = self._speed - max(stage - length + 1, 0) * self._brake
         return u * (max(0.0, left) / self._speed) if self._speed else 0.0 * u
 
     def back(self, stage: int, state: Array, found: Sequence[float]) -> Array:  # noqa: ARG002
-        """Feedback at a stage, no earlier than those before, in a state of (axes, 2) [m/s].
+        """Feedback at a stage for a state of shape (axes, 2) [m/s]; stages must not decrease.
 
         Args:
-            found: disturbance that the vehicle's filter has found, of no account here [m/s].
+            found: disturbance estimate of the vehicle's filter, unused here [m/s].
         """
         if stage < 0 or not self.feeds_back:
             return np.zeros(len(self._inputs))
@@ -112,7 +113,7 @@ class FollowedCourse:
 
     Args:
         trajectory: the trajectory.
-        length: number of stages at which it may be flown.
+        length: number of usable stages.
         terms: the rule of flight.
         gain: K of the vehicle's regulator; shape (axes, 2).
     """
@@ -142,13 +143,13 @@ class FollowedCourse:
         return np.stack([after_p + basis @ ends, slope @ ends / T], axis=1)
 
     def _along(self, stage: int) -> Array:
-        """Input under which the model's velocity follows the spline at a stage [m/s]."""
+        """Input with which the model's velocity follows the spline at a stage [m/s]."""
         v, ahead = self._state(stage)[:, 1], self._state(stage + 1)[:, 1]
         u: Array = (ahead - self._model.A[:, 1, 1] * v) / self._model.B[:, 1]
         return np.clip(u, -self._bound, self._bound)
 
     def told(self, stage: int) -> Array:
-        """What it tells at a stage: ū, and after the last the braking curve [m/s]."""
+        """Prescribed input ū at a stage, and after the last stage the braking curve [m/s]."""
         if stage < self._length or not self._terms.brake:
             return self._along(stage)
         speed = float(np.linalg.norm(self._last))
@@ -156,11 +157,11 @@ class FollowedCourse:
         return self._last * (max(0.0, left) / speed) if speed else 0.0 * self._last
 
     def back(self, stage: int, state: Array, found: Sequence[float]) -> Array:
-        """Feedback less the disturbance at a stage, no earlier than those before [m/s].
+        """Feedback minus the disturbance at a stage [m/s]; stages must not decrease.
 
         Args:
             state: state of the vehicle [m, m/s]; shape (axes, 2).
-            found: disturbance that the vehicle's filter has found on each axis [m/s].
+            found: disturbance estimate of the vehicle's filter on each axis [m/s].
         """
         led = self._state(stage)
         if stage > self._length and self._terms.brake:
@@ -244,7 +245,7 @@ def _by_inputs(
 def _last_along(
     model: Axis, knots: F1, spacing: int, dt_s: float, length: int, bound: float
 ) -> float:
-    """Input ū on one axis at the last stage at which a trajectory is flown [m/s]."""
+    """Input ū on one axis at the last usable stage of a trajectory [m/s]."""
     return bounded(along(model, knots, spacing, dt_s, length - 1), bound)
 
 

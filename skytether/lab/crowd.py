@@ -1,8 +1,8 @@
-"""How many vehicles fly on one shared air: flights of more and more of them, scheme by scheme.
+"""Crowds: flights with more and more vehicles on one shared network, scheme by scheme.
 
-All vehicles of a flight share one network, whose finite rate is the scenario's. They fly where all
-of them fly to the end, none brakes once it has settled, and the root mean square of the distances
-of all of them from their targets is within a limit.
+All vehicles of a flight share one network with the scenario's finite rate. A number of vehicles
+flies if all of them fly to the end, none brakes after `settle`, and the root mean square of all
+distances from the targets is within a limit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,53 +29,55 @@ TITLES: Mapping[Scheme, str] = {
     "threshold": "trajectories, a threshold for each vehicle",
     "budget": "trajectories, one budget for all vehicles",
 }
-"""Schemes that are compared, and how a reader sees them."""
+"""Schemes that are compared, and their display names."""
 PAPER = f"{reading.COMPARED}/paper-every-step-target"
 """Scenario with the best weights of the paper's scheme (docs/compare.md)."""
 STEP = 4.0 / 3.0
-"""Ratio of one number of vehicles to the next, until they no longer fly."""
+"""Ratio of one number of vehicles to the next, until they fail."""
 EXACT = 0.05
-"""Share of the vehicles by which the number that flies may be larger than the one that is found."""
+"""Largest relative error of the number of vehicles that is found."""
 
 
 class CrowdPoint(msgspec.Struct, frozen=True):
-    """Flight of so many vehicles; an entry of the journal. A way is up or down, over all of it."""
+    """Flight of a number of vehicles; an entry of the journal. Figures of a direction cover all
+    packets.
+    """
 
     scheme: Scheme
     vehicles: int
     rmse_m: float | None
-    """Root mean square of the distances of all vehicles from their targets [m], from `settle` on;
-    None where one did not fly as far."""
+    """Root mean square distance of all vehicles from their targets [m], from `settle` on; None if a
+    vehicle did not fly so long."""
     rmse_worst_m: float | None
-    """Largest of the vehicles' own [m]."""
+    """Largest RMSE of a single vehicle [m]."""
     ended: int
     """Number of vehicles that did not fly to the end."""
     braked: int
     """Number of vehicles that braked, from `settle` on."""
     up_queueing_ms_p50: float
-    """Time that a packet to a vehicle takes to pass the finite rate [ms], median."""
+    """Median queueing delay of a packet up at the finite rate [ms]."""
     up_queueing_ms_p99: float
     down_queueing_ms_p50: float
     down_queueing_ms_p99: float
     up_lost: float
-    """Share of packets lost by chance, or dropped by a full queue."""
+    """Share of packets up lost at random, or dropped by a full queue."""
     down_lost: float
     up_bytes_per_s: float
-    """Bytes that entered, with headers [B/s]."""
+    """Bytes per second up, with headers [B/s]."""
     down_bytes_per_s: float
 
     def flies(self, limit_m: float) -> bool:
-        """Whether all vehicles fly, within so large an error [m]."""
+        """Whether all vehicles fly, within this error [m]."""
         return not (self.ended or self.braked) and (self.rmse_m or np.inf) <= limit_m
 
 
 @dataclass(frozen=True, slots=True)
 class Crowd:
-    """A scenario that crowds fly.
+    """Scenario flown by crowds.
 
     Args:
         name: its name.
-        scenario: what every vehicle flies, and the air that all share.
+        scenario: scenario of every vehicle, with the shared network.
         udp: whether they fly over real UDP.
     """
 
@@ -148,31 +150,31 @@ def judge(
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Points of one scheme, with fewer vehicles first."""
+    """Points of one scheme, in order of the number of vehicles."""
 
     points: tuple[CrowdPoint, ...]
     limit_m: float
-    """Largest error with which vehicles fly [m]."""
+    """Largest error of vehicles that count as flying [m]."""
 
     @classmethod
     def of(cls, points: Sequence[CrowdPoint], scheme: Scheme, limit_m: float) -> Self:
-        """Those of a scheme among points of any."""
+        """Points of a scheme among all points."""
         own = sorted((each for each in points if each.scheme == scheme), key=lambda p: p.vehicles)
         return cls(tuple(own), limit_m)
 
     @property
     def too_many(self) -> int | None:
-        """Smallest number of vehicles that does not fly; None where all do."""
+        """Smallest number of vehicles that fails; None if all fly."""
         return next((p.vehicles for p in self.points if not p.flies(self.limit_m)), None)
 
     @property
     def flying(self) -> int:
-        """Largest number of vehicles below `too_many` that flies; 0 for none."""
+        """Largest number of vehicles below `too_many` that flies; 0 if none does."""
         below = self.too_many or np.inf
         return max((p.vehicles for p in self.points if p.vehicles < below), default=0)
 
     def next(self, most: int) -> int | None:
-        """Number of vehicles to fly next, `most` at most; None once the largest is known."""
+        """Number of vehicles to fly next, at most `most`; None once the largest number is known."""
         low, high = self.flying, self.too_many
         if high is None:
             return None if low >= most else min(ceil(low * STEP) or 1, most)

@@ -1,19 +1,20 @@
-"""The envelope of a scenario: which networks and settings it bears, by flights at random points.
+"""Envelope of a scenario: networks and settings under which it flies, tested at random points.
 
 A point is the scenario with other delays, losses, step, horizon and scheme, which follow from the
-seed and the point's number alone. What came of it is judged from the scenario and the client's
-record, whatever the controller meant to do. A vehicle without a planned input since time s, when
-its command was u and its velocity v, must keep to the braking curve (a: brake_mps2, g: gain):
+seed and the point's number alone. The outcome is judged from the scenario and the client's record
+alone. A vehicle without a planned input since time s, when its command was u and its velocity v,
+must follow the braking curve (a: brake_mps2, g: gain):
 
     |u(t)| ≤ |u| - a (t - s)                                                   what is commanded
     |p(t) - p(s)| ≤ τ |v| + g (|u|²/2a + |u| Δt)                               how far that takes it
     |v(t)| ≤ |v| e^(-(t - s)/τ) + g |u| e^(-(t - s - |u|/a - Δt)/τ)            how fast it still is
 
-With feedback aboard a horizon that has ended is still held, and leads the vehicle to where it
-brakes to: then the second line alone binds, 1 m wider, until the horizon is dropped.
+With feedback aboard, a finished horizon still leads the vehicle to the end point of its braking:
+then only the second line applies, relaxed by 1 m, until the horizon is dropped.
 
-In all, it must stay within a disc: that around the reference, 1 m and the way to stop wider. And it
-must have come near the reference once it flies a plan that was made of what it did under plans.
+The vehicle must always stay within a disc around the reference, enlarged by 1 m and the stopping
+distance. And it must be near the reference once it flies a plan based on an observation made under
+earlier plans.
 """
 
 import math
@@ -39,32 +40,32 @@ from skytether.shared.telemetry.summary import position_error
 from skytether.sim import flight
 
 DELAY_MAX_S = 3.0
-"""Largest of the smallest delays of a direction that are drawn [s]."""
+"""Largest minimum delay of a direction that is drawn [s]."""
 LOSSES_MAX = (0.5, 0.99)
-"""Largest loss of a direction, in one half of the points and in the other."""
+"""Largest loss of a direction, in each half of the points."""
 DT_MIN_S, DT_MAX_S = 0.005, 0.5
 """Shortest and longest step that is drawn [s]."""
 HORIZON_MAX = 120
 """Longest horizon that is drawn; the shortest is 1."""
 NEAR_M = 1.0
-"""Distance from the reference within which a vehicle flies it [m]."""
+"""Distance from the reference up to which a vehicle counts as on it [m]."""
 SIGMAS = 6.0
-"""Number of standard deviations of white wind that are no fault of the vehicle."""
+"""Number of standard deviations of white wind that are attributed to wind."""
 ROUNDING = 1e-6
-"""Rounding of a distance [m] or of a speed [m/s]."""
+"""Rounding tolerance of a distance [m] or a speed [m/s]."""
 
 Outcome = Literal[
     "flown", "interrupted", "hovering", "unanswered", "refused", "astray", "flyaway", "crashed"
 ]
-"""What came of a point, as docs/envelope.md explains it."""
+"""Outcome of a point, as explained in docs/envelope.md."""
 BAD: tuple[Outcome, ...] = ("crashed", "flyaway")
-"""Outcomes that must not be, the worst first."""
+"""Forbidden outcomes, the worst first."""
 WRONG: tuple[Outcome, ...] = (*BAD, "astray")
-"""Outcomes that tell of a fault, the worst first."""
+"""Outcomes that indicate a fault, the worst first."""
 
 
 def draw(seed: int, number: int) -> dict[str, Any]:
-    """Keys of a point and their values, which follow from the seed and the point's number."""
+    """Keys and values of a point, drawn from the seed and the point's number."""
     rng = stream(seed, "envelope", number)
     loss_max = float(rng.choice(LOSSES_MAX))
     keys: dict[str, Any] = {}
@@ -81,29 +82,29 @@ def draw(seed: int, number: int) -> dict[str, Any]:
 
 
 def _short(value: float) -> float:
-    """A number of four digits, which a command line can show."""
+    """Number rounded to four digits, for a short command line."""
     return float(f"{value:.4g}")
 
 
 class EnvelopePoint(msgspec.Struct, frozen=True):
-    """What came of a point; an entry of an envelope's journal."""
+    """Outcome of a point; an entry of an envelope's journal."""
 
     number: int
     """Number of the point, from 0 on."""
     outcome: Outcome
     error_max: float | None = None
-    """Largest distance from the reference after settling [m]; None where none was settled."""
+    """Largest distance from the reference after settling [m]; None if it never settled."""
     covered: float | None = None
-    """Share of the steps with a planned input; None where none was flown."""
+    """Share of the steps with a planned input; None if no step was flown."""
     outside_m: float | None = None
     """Largest distance from the disc around the reference [m]; 0 within it."""
     line: str = ""
-    """Why it was refused, found unsafe, or ended early."""
+    """Reason why it was refused, judged unsafe, or ended early."""
 
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """A scenario, of which points are flown."""
+    """Scenario whose points are flown."""
 
     name: str
     """Name of the scenario, for command lines and messages."""
@@ -115,9 +116,9 @@ class Envelope:
         return {"name": self.name, "files": files, "scenario": table}
 
     def keys(self, number: int) -> dict[str, Any]:
-        """Keys of a point and their values; see `draw`."""
+        """Keys and values of a point; see `draw`."""
         keys = draw(self.scenario.seed, number)
-        if self.scenario.terms().splines:  # nothing else leads a vehicle along a trajectory
+        if self.scenario.terms().splines:  # a trajectory requires feedback aboard
             keys["control.feedback"] = True
         return keys
 
@@ -143,7 +144,7 @@ class Envelope:
         try:
             flown = flight.fly(scenario)
             verdict = judge(scenario, flown.client)
-        except Exception as error:  # whatever it is, it is what the point has shown
+        except Exception as error:  # any exception is the outcome of the point
             return EnvelopePoint(number, "crashed", line=f"{type(error).__name__}: {error}")
         line = verdict.line or (str(flown.failure) if flown.failure else "")
         return EnvelopePoint(number, *verdict._replace(line=line))
@@ -157,7 +158,7 @@ class Envelope:
         return shlex.join(["skytether", "fly", self.name, "--virtual", *flags])
 
     def csv(self, points: Iterable[EnvelopePoint]) -> str:
-        """CSV table with a row for each point: the keys drawn, and what came of it."""
+        """CSV table with a row for each point: drawn keys, and the outcome."""
         names = EnvelopePoint.__struct_fields__
         rows = [
             [point.number, *self.keys(point.number).values(), *msgspec.structs.astuple(point)[1:]]
@@ -178,7 +179,7 @@ def _flag(key: str, value: Any) -> Iterator[str]:
 
 
 def worst_first(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
-    """Points that went wrong: crashes, flyaways by how far they went, and what went astray."""
+    """Points that went wrong: crashes, flyaways by distance, and those astray."""
     wrong = [point for point in points if point.outcome in WRONG]
     return sorted(
         wrong,
@@ -191,7 +192,7 @@ def worst_first(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
 
 
 class PointVerdict(NamedTuple):
-    """What came of a flight; the fields are those of `EnvelopePoint`."""
+    """Outcome of a flight, with fields as in `EnvelopePoint`."""
 
     outcome: Outcome
     error_max: float | None = None
@@ -201,10 +202,10 @@ class PointVerdict(NamedTuple):
 
 
 def settling_s(scenario: Scenario) -> float:
-    """Time that a vehicle may take to the reference from anywhere in its disc [s].
+    """Time that a vehicle may take to reach the reference from anywhere in its disc [s].
 
-    Twice the time across at full speed, since the reference moves on meanwhile, and five time
-    constants.
+    Twice the time across the disc at full speed, because the reference moves meanwhile, plus five
+    time constants.
     """
     _, radius_m = disc(scenario)
     across_s = 2.0 * radius_m / float(scenario.u_max.min())
@@ -212,7 +213,7 @@ def settling_s(scenario: Scenario) -> float:
 
 
 def disc(scenario: Scenario) -> tuple[Array, float]:
-    """Centre [m; shape (axes,)] and radius [m] of a disc, or ball, around reference and start."""
+    """Centre [m; shape (axes,)] and radius [m] of a disc or ball around reference and start."""
     times_s = np.arange(scenario.steps) * scenario.control.dt
     points = scenario.make_reference()(times_s)[..., 0]
     if scenario.vehicle.start_m:
@@ -222,10 +223,10 @@ def disc(scenario: Scenario) -> tuple[Array, float]:
 
 
 def judge(scenario: Scenario, client: Rows) -> PointVerdict:
-    """What came of a flight.
+    """Outcome of a flight.
 
     Args:
-        scenario: what was flown.
+        scenario: scenario that was flown.
         client: rows of its one vehicle, a row for every step.
     """
     if not len(client):
@@ -254,7 +255,7 @@ def judge(scenario: Scenario, client: Rows) -> PointVerdict:
 def _faults(
     scenario: Scenario, client: Rows, error_m: Array, outside_m: Array, radius_m: float
 ) -> Iterator[tuple[int, str]]:
-    """First step that breaks each rule of safety, and a sentence on it."""
+    """First step that breaks each safety rule, and a sentence about it."""
     vehicle, dt, covered = scenario.vehicle, scenario.control.dt, client["covered"]
     tau_s, brake = float(scenario.true_tau_s.max()), vehicle.brake_mps2
     gain, late_s = float(scenario.true_gain.max()), float(scenario.true_dead_time_s.max())
@@ -262,15 +263,15 @@ def _faults(
     time_s = client["step"] * dt
     position, velocity = client["state"][..., 0], client["state"][..., 1]
     speed, command = np.linalg.norm(velocity, axis=1), np.linalg.norm(client["input"], axis=1)
-    # It holds a horizon that has ended, and comes to rest where that leads.
+    # A finished horizon is still in force; the vehicle comes to rest where the horizon leads.
     led = ~covered & (client["age_ns"] >= 0) & scenario.control.feedback
     blind = ~covered & ~led
     begun = _begun(covered, led)
     since_s = time_s - time_s[begun]
     age_s = client["age_ns"] / SECOND_NS
-    # Nobody answers the wind before it has been seen.
+    # Wind cannot be compensated before it has been observed.
     pushed_m, pushed_mps = _wind(scenario, np.where(covered, np.maximum(0.0, age_s), since_s))
-    # A command flown before is still on its way for as long as the dead time.
+    # A command sent earlier acts only after the dead time.
     on_its_way = np.where(late_s > 0.0, top_mps, command[begun])
     stopping_s = on_its_way / brake + dt + late_s
 
@@ -284,7 +285,7 @@ def _faults(
     travelled_m = np.linalg.norm(position - position[begun], axis=1)
     curve_mps = speed[begun] * left(since_s)
     curve_mps += gain * on_its_way * left(since_s - stopping_s)
-    # Time under plans that the vehicle was last seen at by whoever made the plan it flies.
+    # Newest time under plans that the maker of the plan in force had observed.
     seen_s = np.where(age_s >= 0.0, since_s - age_s, -1.0)
     rules: tuple[tuple[str, Flags, Array, Any], ...] = (
         (
@@ -330,17 +331,19 @@ def _faults(
 
 
 def _begun(covered: Flags, led: Flags) -> Any:
-    """Row at which the stretch with planned inputs, led on, or without, began; shape (steps,)."""
+    """Row at which the present stretch began, with planned inputs, led on, or without; shape
+    (steps,).
+    """
     rows, kind = np.arange(len(covered)), covered + 2 * led
     changed = np.concatenate([[True], kind[1:] != kind[:-1]])
     return np.maximum.accumulate(np.where(changed, rows, 0))
 
 
 def _wind(scenario: Scenario, blind_s: Array) -> tuple[Array, float]:
-    """How far [m], and at what speed [m/s], wind may carry a vehicle that nobody leads back.
+    """Distance [m] and speed [m/s] that wind may cause without a correction.
 
     Args:
-        blind_s: for how long nobody does [s]; shape (steps,).
+        blind_s: time without a correction [s]; shape (steps,).
     """
     vehicle, tau_s = scenario.vehicle, float(scenario.true_tau_s.max())
     blown_mps = float(np.linalg.norm(vehicle.steady_wind_mps)) + tau_s * vehicle.gust_mps2

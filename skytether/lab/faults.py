@@ -1,7 +1,7 @@
-"""Faults: what happens to a flight under torture, as a schedule drawn from a seed.
+"""Faults of a flight under torture, as a schedule drawn from a seed.
 
-A schedule is data: what is done to which host or direction, from when to when, and how badly. The
-same generator draws the same schedule. One after which a flight fails is shrunk to the shortest
+A schedule is data: each fault has a kind, a host or direction, a time, a length and an amount.
+Equal seeds draw equal schedules. A schedule with which a flight fails is shrunk to the shortest
 that still fails, and kept as a line of JSON with the seed of the flight.
 """
 
@@ -18,50 +18,50 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 
 
 class Kind(StrEnum):
-    """What a fault does while it lasts."""
+    """Kind of a fault."""
 
     LOSS = "loss"
-    """Packets are lost, a share of them."""
+    """Loss of a share of the packets."""
     BURST = "burst"
-    """Packets are lost in a row, as many at a time."""
+    """Loss of several packets in a row, again and again."""
     DUPLICATES = "duplicates"
-    """Packets come twice, a share of them."""
+    """Duplication of a share of the packets."""
     REORDERING = "reordering"
-    """Packets come later, by a time drawn for each, at most so many seconds."""
+    """Extra delay of each packet, random up to the amount [s]."""
     PARTITION = "partition"
-    """No packet passes either way."""
+    """Partition: no packet passes either way."""
     STEP = "step"
-    """A host's clock is set, by so many seconds, once and for all."""
+    """Step of a host's clock by the amount [s], permanent."""
     SKEW = "skew"
-    """A host's clock runs faster, by so many ppm."""
+    """Skew: a host's clock runs faster by the amount [ppm]."""
     RESTART = "restart"
-    """A host is down, and then begins another life."""
+    """Restart of a host after a down time."""
     FREEZE = "freeze"
-    """A host stands still, as after SIGSTOP."""
+    """Freeze of a host, as by SIGSTOP."""
     SOLVER = "solver"
-    """The solver fails, in a share of its solves."""
+    """Failure of the solver in a share of its solves."""
     OVERLOAD = "overload"
-    """The server computes for so many steps whenever it is woken."""
+    """Overload: the server computes for the amount [steps] at each wake."""
     REPLAY = "replay"
-    """An attacker sends packets again, so many seconds after they were sent."""
+    """Attacker that replays packets after a delay of the amount [s]."""
     DELAY = "delay"
-    """An attacker holds packets back for so many seconds."""
+    """Attacker that holds packets back for the amount [s]."""
     CORRUPTION = "corruption"
-    """An attacker flips a bit, in a share of the packets."""
+    """Attacker that flips a bit in a share of the packets."""
     FLOOD = "flood"
-    """A stranger sends forged packets, so many a second."""
+    """Stranger that sends forged packets, as many per second as the amount."""
     COPY = "copy"
-    """An attacker copies a share of the packets, sends the copies to either end from addresses of
-    his own, sooner or later than the packets come, and hands on what he is answered there."""
+    """Attacker that copies a share of the packets, sends the copies to either end from his own
+    addresses, before or after the originals, and forwards the answers."""
     KEYS = "keys"
-    """The server begins another life with other keys, and then one with the right ones again."""
+    """Restart of the server with other keys, then with the right ones again."""
 
 
 HARMLESS = frozenset({Kind.COPY, Kind.DUPLICATES, Kind.REPLAY, Kind.FLOOD})
-"""Faults that must keep no vehicle from flying: every packet passes."""
+"""Faults that must not keep any vehicle from flying, because every packet passes."""
 
 NETWORK = ("uplink", "downlink", "both")
-"""Directions in which packets suffer."""
+"""Directions in which packets are affected."""
 HOSTS = ("server", "client")
 
 SHARE = (0.05, 1.0)
@@ -69,16 +69,16 @@ SHARE = (0.05, 1.0)
 
 @dataclass(frozen=True)
 class Range:
-    """What may be drawn for a kind of fault."""
+    """Range from which a kind of fault is drawn."""
 
     where: tuple[str, ...]
-    """Hosts or directions that it may befall."""
+    """Hosts or directions that may be affected."""
     length_s: tuple[float, float]
-    """Shortest and longest time that it lasts [s], drawn evenly on a scale of logarithms."""
+    """Shortest and longest duration [s]; drawn log-uniformly."""
     amount: tuple[float, float] = (1.0, 1.0)
-    """Least and most of it, drawn likewise; the unit is that of the kind."""
+    """Smallest and largest amount, drawn log-uniformly; the unit is that of the kind."""
     signed: bool = False
-    """Whether the amount may be negative as well."""
+    """Whether the amount may also be negative."""
 
 
 RANGES = {
@@ -105,22 +105,22 @@ RANGES = {
 EVERY_NS = 5 * SECOND_NS
 """Mean time from one fault of a schedule to the next [ns]."""
 SHORTEST_NS = MILLISECOND_NS
-"""Length below which `shrink` shortens a fault no further [ns]."""
+"""Length below which `shrink` does not shorten a fault any further [ns]."""
 
 
 @dataclass(frozen=True)
 class ScheduledFault:
-    """One fault."""
+    """Scheduled fault."""
 
     kind: Kind
     where: str
-    """Host or direction that it befalls, one of its range's."""
+    """Host or direction that is affected, one of those in its range."""
     start_ns: Annotated[int, msgspec.Meta(ge=0)]
     """Time of the world at which it begins [ns]."""
     length_ns: Annotated[int, msgspec.Meta(ge=0)]
-    """Time that it lasts [ns]; of what has no end, 0."""
+    """Duration [ns]; 0 for a permanent fault."""
     amount: float
-    """How badly, in the unit of its kind."""
+    """Amount, in the unit of its kind."""
 
     @property
     def end_ns(self) -> int:
@@ -129,17 +129,17 @@ class ScheduledFault:
 
     @property
     def over_ns(self) -> int:
-        """Time of the world at which the last packet comes that it has held back."""
+        """Time of the world at which the last packet that it has held back arrives."""
         held = self.kind in (Kind.REORDERING, Kind.DELAY)
         return self.end_ns + (seconds_to_ns(self.amount) if held else 0)
 
 
 def schedule(rng: np.random.Generator, duration_ns: int) -> tuple[ScheduledFault, ...]:
-    """Draw the faults of a flight, one at least, by the time at which they begin.
+    """Draw the faults of a flight, at least one, in order of time.
 
     Args:
-        rng: source of chance.
-        duration_ns: time within which they begin and end [ns].
+        rng: random generator.
+        duration_ns: time within which all faults begin and end [ns].
     """
     count = 1 + rng.poisson(duration_ns / EVERY_NS)
     kinds = list(Kind)
@@ -149,10 +149,10 @@ def schedule(rng: np.random.Generator, duration_ns: int) -> tuple[ScheduledFault
 
 
 def _hides(step: ScheduledFault, drawn: Sequence[ScheduledFault]) -> bool:
-    """Whether a clock is set while its host is frozen, or a moment after it was set before.
+    """Whether a clock is set while its host is frozen, or shortly after another step.
 
-    Then nobody aboard can know for how long it stood still. The clock that hosts live by,
-    CLOCK_MONOTONIC, cannot be set by anybody.
+    The host then cannot know how long it was frozen. Real hosts do not have this problem:
+    CLOCK_MONOTONIC cannot be set.
     """
     if step.kind is not Kind.STEP:
         return False
@@ -179,7 +179,7 @@ def _draw(rng: np.random.Generator, kind: Kind, duration_ns: int) -> ScheduledFa
 
 
 def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
-    """A number between two, drawn evenly on a scale of logarithms."""
+    """Random number between two, log-uniform."""
     low, high = bounds
     return low if low == high else float(low * (high / low) ** rng.random())
 
@@ -187,14 +187,14 @@ def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
 def shrink(
     faults: Sequence[ScheduledFault], fails: Callable[[tuple[ScheduledFault, ...]], bool]
 ) -> tuple[ScheduledFault, ...]:
-    """Shrink a schedule to one that still fails, but with none of its faults left out.
+    """Shrink a schedule to one that still fails, and no longer does without any one of its faults.
 
-    Delta debugging: faults are left out, many at a time at first and one by one at last; then each
-    is halved in length for as long as the rest of it fails.
+    Delta debugging: faults are left out, first many at a time and finally one by one; then each is
+    halved in length while the schedule still fails.
 
     Args:
         faults: schedule that fails.
-        fails: whether a schedule does; asked often, of the empty one as well.
+        fails: tells whether a schedule fails; called often, also with the empty one.
     """
     kept = tuple(faults)
     size, dropped = len(kept), True
@@ -217,16 +217,16 @@ def shrink(
 
 @dataclass(frozen=True)
 class Trial:
-    """A flight under torture."""
+    """Flight under torture."""
 
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**32 - 1)]
-    """Seed of everything else that is drawn."""
+    """Seed of all other random numbers."""
     faults: tuple[ScheduledFault, ...]
-    """What happens to it."""
+    """Faults of the flight."""
 
     @property
     def end_ns(self) -> int:
-        """Time of the world from which on nothing that is left of a fault happens any more."""
+        """Time of the world after which no effect of a fault remains."""
         return max((fault.over_ns for fault in self.faults), default=0)
 
 
@@ -239,7 +239,7 @@ def loads(line: str) -> Trial:
     """Trial in a line of JSON.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the line is no trial.
     """
     try:
         trial = msgspec.json.decode(line, type=Trial)

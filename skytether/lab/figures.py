@@ -1,4 +1,4 @@
-"""Pictures of sweeps, of envelopes and of crowds."""
+"""Pictures of sweeps, envelopes and crowds."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -27,11 +27,11 @@ OUTCOMES: Mapping[Outcome, Mapping[str, Any]] = {
 }
 """Colour and marker of each outcome of a point, in the order in which they are drawn."""
 RATIOS = np.geomspace(1 / 16, 16, 17)
-"""Bounds of the bars of `envelope`: what a horizon covers, in round trips."""
+"""Bin edges of `envelope`: length of a horizon in round trips."""
 
 
 def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
-    """Draw what came of the points of an envelope, over delays, losses and the length of a plan.
+    """Draw the outcomes of an envelope's points, over delays, losses and the length of a plan.
 
     Args:
         path: file to write, in one of FORMATS.
@@ -97,13 +97,13 @@ def _mean_delays_s(scenario: Scenario, way: str, keys: Sequence[Mapping[str, Any
 
 
 def _size(outcome: Outcome, points: int) -> float:
-    """Area of an outcome's marker among so many [points²]; what went wrong can be seen."""
+    """Marker area of an outcome with so many points [points²]; failures stay visible."""
     area = float(np.clip(20_000.0 / points, 5.0, 30.0))
     return max(25.0, area) if outcome in WRONG else area
 
 
 def _stack(plane: Any, ratios: Array, shown: Mapping[Outcome, Flags]) -> None:
-    """Draw the share of each outcome over how many round trips a horizon covers."""
+    """Draw the share of each outcome over the horizon's length in round trips."""
     bins = np.digitize(np.clip(ratios, RATIOS[0], RATIOS[-1] * (1.0 - 1e-9)), RATIOS) - 1
     total = np.maximum(1, np.bincount(bins, minlength=len(RATIOS) - 1))
     below = np.zeros(len(total))
@@ -139,7 +139,7 @@ OTHER_UNITS = {
 
 
 def label(key: str) -> str:
-    """Label of a key of the scenario, with the unit where there is one."""
+    """Label of a key of the scenario, with its unit, if any."""
     unit = OTHER_UNITS.get(key) or ("_" in key and UNITS.get(key.rsplit("_", 1)[1]))
     return f"{key} [{unit}]" if unit else key
 
@@ -182,7 +182,7 @@ def heat_map(
 
     Args:
         path: file to write, in one of FORMATS.
-        axes: the axis that runs across, and the axis that runs up.
+        axes: horizontal axis, and vertical axis.
         name: label of the figure that was measured, with its unit.
         means: mean in each cell, NaN for none; shape (values across, values up).
     """
@@ -215,7 +215,7 @@ def crowd(path: Path, title: str, flown: Mapping[Scheme, Flown], limit_m: float)
     Args:
         path: file to write, in one of FORMATS.
         flown: points of each scheme.
-        limit_m: largest error with which vehicles fly [m].
+        limit_m: largest error of vehicles that count as flying [m].
     """
     from matplotlib.figure import Figure
 
@@ -263,7 +263,7 @@ def _most(flown: Mapping[Scheme, Flown]) -> int:
 
 
 def _is_scale(axis: GridAxis) -> bool:
-    """Whether an axis has numbers that rise, and not names."""
+    """Whether an axis has increasing numbers, and not names."""
     numbers = all(type(value) in (int, float) for value in axis.values)
     return numbers and all(low < high for low, high in pairwise(axis.values))
 

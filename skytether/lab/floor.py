@@ -1,17 +1,16 @@
-"""Floors: how near vehicles can come to their trajectory at all, and a flight without any packets.
+"""Floors: lower bounds of the tracking error over a network, and flights without any packets.
 
-What a vehicle flies follows from an observation of its own and from a plan, and both are of some
-age by the time that an input has done its work. What has happened since, nobody has answered. For
-white accelerations its variance is known in closed form, and the record has the ages: so a flight
-has a floor, which no other planner, solver or weight would have flown below with packets that came
-as these did.
+An input depends on an observation and on a plan, and both have some age when the input takes
+effect. Disturbances since then are uncompensated. For white accelerations their variance is known
+in closed form, and the record contains the ages: so each flight has a floor, below which no other
+planner, solver or weight could have flown with the same packet timing.
 
-Ages tell less of a sender that looks, as an event trigger does: it sends where the error is large,
-age and error are then correlated, and some flights come below their floor. It holds for what is
-sent at every step, periodically, or by a clock.
+The floor does not hold for event triggers: they send when the error is large, so age and error are
+correlated, and some flights come below the floor. It holds for packets sent at every step,
+periodically, or at fixed times.
 
-The other end of the scale is a flight that needs no network: the reference and a regulator aboard.
-It is possible where the trajectory is known before the flight.
+The opposite baseline is a flight without a network: the reference and a regulator are aboard. This
+is possible if the trajectory is known before the flight.
 """
 
 import math
@@ -30,18 +29,19 @@ from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 UNKNOWN = ("target", "live")
-"""Shapes of a reference that only the server knows, while it is flown."""
+"""Shapes of a reference that only the server knows during the flight."""
 
 
 def wind_floor_m(scenario: Scenario, client: Rows) -> float:
-    """Floor of RMSE xy [m], from `settle` on, of plans that are flown as they are, in white wind.
+    """Floor of RMSE xy [m], from `settle` on, for plans flown without feedback aboard, in white
+    wind.
 
-    An input cannot answer what the wind did after the observation that it was planned from. Steps
-    that were flown without a plan count as if there had been no wind. Gusts are not reckoned with;
-    feedback aboard answers the wind by itself, and has no such floor.
+    An input cannot compensate wind after the observation that it was planned from. Steps flown
+    without a plan count as if there had been no wind. Gusts are not included; feedback aboard
+    compensates wind itself, and has no such floor.
 
     Args:
-        client: rows of one vehicle, whose ages count.
+        client: rows of one vehicle, with the ages.
     """
     before = _inputs(scenario, client)
     ages_s = (before["age_ns"] * 1e-9 + scenario.control.dt)[before["age_ns"] >= 0]
@@ -54,12 +54,12 @@ def wind_floor_m(scenario: Scenario, client: Rows) -> float:
 def target_floor_m(scenario: Scenario, client: Rows) -> float:
     """Floor of RMSE xy [m], from `settle` on, for a target that only the server sees.
 
-    A vehicle cannot know what the target did after its plan was made: a walk of white acceleration,
-    of the strength `reference.agility`, but for what the server sees ahead. Its bounds, which hold
-    it back, are left out. Steps that were flown without a plan count as if it had stood still.
+    A vehicle cannot know the target's motion after its plan was made: white acceleration of the
+    strength `reference.agility`, except for what the server sees ahead. The target's bounds are
+    ignored. Steps flown without a plan count as if the target had stood still.
 
     Args:
-        client: rows of one vehicle, of whose plans the ages count.
+        client: rows of one vehicle, with the ages of its plans.
     """
     before, preview = _inputs(scenario, client), scenario.reference.preview
     if preview == "all":
@@ -85,9 +85,9 @@ def fly_aboard(scenario: Scenario) -> Rows:
 
         u(k) = u_ff(k) + K (x_ref(k) - x(k))
 
-    u_ff takes the model's velocity along the reference. K is the gain that the server sends for
-    feedback aboard, and inputs pass the same clamp. The vehicle meets the same winds, and the same
-    noise, as one of this seed that is planned for.
+    u_ff moves the model along the reference. K is the gain that the server sends for feedback
+    aboard, and inputs pass the same clamp. Winds and noise equal those of a networked flight with
+    this seed.
 
     Raises:
         ValueError: only the server knows the reference.
@@ -122,8 +122,9 @@ def fly_aboard(scenario: Scenario) -> Rows:
 
 
 def _due(scenario: Scenario) -> Array:
-    """Desired states at which the input of each step meets the vehicle [m, m/s]; one more than
-    there are steps; shape (steps + 1, axes, 2).
+    """Desired states for the inputs' arrival at the vehicle [m, m/s]; shape (steps + 1, axes, 2).
+
+    There is one more state than there are steps.
     """
     sample, times_s = scenario.make_reference(), np.arange(scenario.steps + 1) * scenario.control.dt
     late_s = scenario.terms().dead_time_s
@@ -131,7 +132,7 @@ def _due(scenario: Scenario) -> Array:
 
 
 def summarise_aboard(scenario: Scenario, name: str) -> Summary:
-    """Summary of `fly_aboard`: no packet, and none at any step.
+    """Summary of `fly_aboard`, with no packets.
 
     Args:
         name: of the scenario.

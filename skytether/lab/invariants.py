@@ -1,11 +1,10 @@
-"""What must hold at every step of every vehicle under torture, and who looks.
+"""Invariants of every step of every vehicle under torture, and their checks.
 
-A `WatchedLife` stands between one life of a client and its link, and takes its record: it sees
-every message that the vehicle believes, and every input that it flies. A `Gatekeeper` stands
-likewise between one life of the server and its gate. Both keep a `Ledger` of what was really
-sealed, so that nothing is believed that nobody has said. Time is counted in steps of the vehicle
-where the vehicle must act (nobody acts while asleep), and in the world's time where the world must
-agree.
+A `WatchedLife` wraps the link of one run of a client, and takes its record: it sees every message
+that the vehicle accepts, and every input that it flies. A `Gatekeeper` wraps the gate of one run of
+the server. Both keep a `Ledger` of all messages that were really sent, to check that no other is
+accepted. Deadlines of the vehicle are counted in its own steps (a frozen vehicle cannot act), all
+others in the world's time. A "life" is one run of an endpoint, from start to restart.
 """
 
 import io
@@ -41,7 +40,7 @@ from skytether.shared.wire.protocol import (
 WELCOME, OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY = 2, 3, 4, 5, 7
 """Numbers of types of messages on the wire, see `shared.wire.protocol`."""
 ONCE = frozenset({OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY})
-"""Types of which each message is unlike all others, and so is believed once at most."""
+"""Message types of which each message is unique, and so may be accepted once at most."""
 REMEMBERED = 8192
 """Number of newest messages of a direction that are remembered; none is under way for longer."""
 STEPS_REMEMBERED = 4096
@@ -49,15 +48,15 @@ STEPS_REMEMBERED = 4096
 HELD_MAX = 1024
 """Number of newest horizons of a life that are remembered."""
 ROUNDING = 1e-6
-"""What arithmetic may add to a speed [m/s]: horizons travel as float32."""
+"""Rounding tolerance of a speed [m/s], as horizons travel as float32."""
 MARGIN_M = 2.0
-"""What the bound of the position leaves to wind and to the dynamics of the vehicle [m]."""
+"""Margin of the position's bound for wind and the vehicle's dynamics [m]."""
 FLYING = (Mode.TRACK, Mode.COAST)
 """Modes in which a horizon is flown."""
 
 
 class Violation(Exception):
-    """An invariant that does not hold."""
+    """Error: an invariant is violated."""
 
     def __init__(self, invariant: str, what: str) -> None:
         super().__init__(f"{invariant}: {what}")
@@ -66,11 +65,11 @@ class Violation(Exception):
 
 
 class Ledger:
-    """Messages of one direction: by whom each was sealed, and how often."""
+    """Ledger of the messages of one direction: their senders, and how often each was sent."""
 
     def __init__(self) -> None:
         self._sealed: OrderedDict[tuple[int, bytes], list[int]] = OrderedDict()
-        """Life of the sender, times sealed and times believed, by vehicle and message."""
+        """Sender's life, times sent and times accepted, by vehicle and message."""
 
     def seal(self, vehicle: int, payload: bytes, life: int) -> None:
         """Note a message that is sent."""
@@ -80,10 +79,10 @@ class Ledger:
             self._sealed.popitem(last=False)
 
     def believe(self, vehicle: int, payload: bytes, kind: int | None) -> None:
-        """Note a message that is believed.
+        """Note a message that is accepted.
 
         Raises:
-            Violation: nobody has sent it, or not as often.
+            Violation: the message was not sent, or not as often.
         """
         entry = self._sealed.get((vehicle, payload))
         if entry is None:
@@ -93,17 +92,17 @@ class Ledger:
             raise Violation("once", f"a message of type {kind} is believed again")
 
     def life(self, vehicle: int, payload: bytes) -> int:
-        """Life of the sender of a message, or -1 of none."""
+        """Sender's life of a message, or -1 if it was not sent."""
         return self._sealed.get((vehicle, payload), (-1,))[0]
 
 
 class Gatekeeper:
-    """Gate of one life of the server, around the real one.
+    """Wrapper around the real gate of one life of the server.
 
     Args:
-        gate: the real one.
+        gate: the real gate.
         life: number of the server's life.
-        up, down: what the server sends, and what vehicles send.
+        up, down: ledgers of the server's and of the vehicles' messages.
     """
 
     def __init__(self, gate: Gate, life: int, up: Ledger, down: Ledger) -> None:
@@ -132,7 +131,7 @@ class Gatekeeper:
 
 
 class _Noted:
-    """Way back that notes what is sealed."""
+    """Wrapper around a way back that notes all messages."""
 
     __slots__ = ("_life", "_up", "_vehicle", "inner")
 
@@ -147,18 +146,19 @@ class _Noted:
 
 
 class WatchedLife(Recorder):
-    """One life of a vehicle: its link, around the real one, and what takes its record.
+    """Wrapper around the real link of one life of a vehicle, which also checks its record.
 
     Args:
         link: the real link.
-        scenario: what is flown.
+        scenario: scenario that is flown.
         vehicle: number of the vehicle.
-        number: number of this life of it.
-        up, down: what the server sends, and what vehicles send.
-        clock: tells the world's time [ns].
-        overdue: tells whether nothing has happened for so long that the vehicle must fly.
-        rekey_ns: time after which it wants new keys, if that is sooner than the link does [ns].
-        drifted_m: how far it may have flown while asleep, in the lives before [m].
+        number: number of this life.
+        up, down: ledgers of the server's and of the vehicles' messages.
+        clock: returns the world's time [ns].
+        overdue: returns whether faults have been over for so long that the vehicle must fly.
+        rekey_ns: time after which the vehicle wants new keys, if earlier than the link's own time
+            [ns].
+        drifted_m: distance that it may have flown while frozen, in earlier lives [m].
     """
 
     def __init__(  # noqa: PLR0915 - a docstring counts for a statement
@@ -193,9 +193,9 @@ class WatchedLife(Recorder):
         self._adopted_ns = 0
         """Time at which the newest keys were adopted [vehicle's clock]."""
         self._welcome: tuple[int, int] | None = None
-        """Session and life of the server of the WELCOME that was opened last."""
+        """Session and server's life of the newest WELCOME that was opened."""
         self._session: tuple[int, int] | None = None
-        """Those that were adopted."""
+        """Session and server's life that were adopted."""
         self._heard = False
         """Whether a packet of the session has come since the last step."""
         self._silent = 0
@@ -207,30 +207,31 @@ class WatchedLife(Recorder):
         self._times_ns: OrderedDict[int, int] = OrderedDict()
         """Time of the world of each step that was flown."""
         self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HELD_MAX)
-        """Session, life of the server and message of each horizon that was opened."""
+        """Session, server's life and message of each horizon that was opened."""
         self._held: tuple[int, int, Horizon | Trajectory] | None = None
-        """The one in force, decoded."""
+        """Horizon or trajectory in force, decoded."""
         self._observed = -1
-        """Step of the observation that it was made from."""
+        """Step of the observation that the plan in force was made from."""
         self._course: Course | None = None
-        """What it tells."""
+        """Course of the plan in force."""
         self._covered = False
-        """Whether it had an input for the last step."""
+        """Whether the plan in force had an input for the last step."""
         self._speed = 0.0
-        """Magnitude of what was flown last but for the feedback [m/s]."""
+        """Magnitude of the last input without feedback [m/s]."""
         self.drifted_m = drifted_m
-        """How far it may have flown while asleep, in this life and those before [m]."""
+        """Distance that the vehicle may have flown while frozen, in this life and earlier ones
+        [m]."""
         self.disturbance: Callable[[], Sequence[float]] = tuple
-        """Tells the disturbance that its filter has found, of each axis [m/s]."""
+        """Function that returns the filter's disturbance estimate, of each axis [m/s]."""
         self.input = [0.0] * self._terms.axes
-        """Input flown now, of each axis [m/s]."""
+        """Input in force, of each axis [m/s]."""
         self.mode = Mode.INIT
-        """What the vehicle does."""
+        """Mode of the vehicle."""
         self.step, self.steps, self.missed = -1, 0, 0
-        """Its newest step, number of steps flown, and slept through."""
+        """Newest step, number of steps flown, and number of steps missed."""
         self.planned, self.followed = 0, 0
-        """Number of steps flown by a horizon of inputs, and along a trajectory, each of them as the
-        compiled rule has it."""
+        """Number of steps flown by a horizon of inputs, and along a trajectory, that equal the
+        compiled rule."""
         self.row_ns = -1
         """Time of the world of its newest step, or -1."""
 
@@ -292,7 +293,7 @@ class WatchedLife(Recorder):
         """Take one row of the record, and check it.
 
         Raises:
-            Violation: something in it must not be.
+            Violation: the row violates an invariant.
         """
         axes = self._terms.axes
         step, now_ns = int(values[1]), self._clock()
@@ -319,7 +320,7 @@ class WatchedLife(Recorder):
         self.row_ns = now_ns
 
     def _listen(self) -> None:
-        """Count the silence."""
+        """Count the silence of the link."""
         self._silent = 0 if self._heard else self._silent + 1
         self._heard = False
         if self._silent == self._timeout + 1:
@@ -327,7 +328,7 @@ class WatchedLife(Recorder):
             self._speed_lost = math.hypot(*self.input)
 
     def _check_input(self, flown: list[float]) -> None:
-        """It is finite, within its bound, and changes no faster than it may."""
+        """Check that the input is finite, within its bound, and changes no faster than allowed."""
         for u, before, most in zip(flown, self.input, self._terms.u_max, strict=True):
             if not math.isfinite(u):
                 raise Violation("finite", f"an input of {u}")
@@ -337,7 +338,9 @@ class WatchedLife(Recorder):
                 raise Violation("slew", f"from {before:.4f} to {u:.4f} m/s in a step")
 
     def _check_mode(self, mode: Mode, *, covered: bool, now_ns: int) -> None:
-        """It is one that the table leads to, and does not fly on after sleep."""
+        """Check that the mode is reachable in the table, and does not go on flying after a
+        freeze.
+        """
         if mode not in REACHED[self.mode]:
             raise Violation("table", f"from {self.mode} to {mode}")
         if mode is Mode.FAULT:
@@ -349,16 +352,18 @@ class WatchedLife(Recorder):
             raise Violation("asleep", f"{mode} on waking {late_ns / SECOND_NS:.2f} s late")
 
     def check_change(self, before: str, after: str) -> None:
-        """Check a change of mode that the vehicle has told.
+        """Check a reported change of mode.
 
         Raises:
-            Violation: the table has no such move.
+            Violation: the table has no such transition.
         """
         if (before, after) not in MOVES:
             raise Violation("table", f"from {before} to {after} at once")
 
     def _check_horizon(self, step: int, in_force: int, age_ns: int, now_ns: int) -> None:
-        """It was sent by the present life of the server for this session, and is not too old."""
+        """Check that the horizon was sent by the server's present life for this session, and is not
+        too old.
+        """
         if in_force == NO_HORIZON:
             self._held = self._course = None
             return
@@ -384,7 +389,7 @@ class WatchedLife(Recorder):
                 self._course = PlannedCourse(horizon, min(horizon.inputs.shape[1], last), terms)
 
     def _find(self, made_for: int) -> tuple[int, int, Horizon | Trajectory]:
-        """The horizon in force, by the step that it was made for and its observation."""
+        """Find the horizon in force, by the step that it was made for and its observation."""
         for session, life, payload in reversed(self._horizons):
             horizon = decode(payload, self._terms)
             assert isinstance(horizon, Horizon | Trajectory)
@@ -393,10 +398,11 @@ class WatchedLife(Recorder):
         raise Violation("foreign", f"a horizon for step {made_for} that has not come")
 
     def _check_follows(self, step: int, state: Array, flown: list[float], *, covered: bool) -> None:
-        """It flies what its horizon tells, as fast as it may change, and none that is too old.
+        """Check that the input follows the horizon, within the rate limit, and that no old one is
+        used.
 
-        After the last input that is the braking curve, and no faster than what was told before,
-        whatever feedback adds.
+        After the horizon's last input, the vehicle must follow the braking curve, and not exceed
+        the prescribed speed before feedback.
         """
         course, before = self._course, np.array(self.input)
         if course is None:
@@ -425,7 +431,9 @@ class WatchedLife(Recorder):
         self._covered = covered
 
     def _check_rule(self, wanted: list[float], flown: list[float]) -> None:
-        """To the last bit it flies what the compiled rule wants, as fast as it may change."""
+        """Check that the input equals the compiled rule's to the last bit, within the rate
+        limit.
+        """
         change, axes = self._change_max, zip(wanted, self.input, self._terms.u_max, strict=True)
         should = [
             min(max(min(max(u, last - change), last + change), -most), most)
@@ -435,7 +443,7 @@ class WatchedLife(Recorder):
             raise Violation("rule", f"{flown} m/s flown, and {should} by the compiled rule")
 
     def _check_age(self, step: int, observed: int) -> None:
-        """An input is flown no later after the observation behind it than it may be."""
+        """Check that no input is flown later after its observation than allowed."""
         limit_ns = self._terms.age_max * self._dt_ns
         old_ns = max(self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns)
         if old_ns > limit_ns + 2 * self._dt_ns or step - observed > self._terms.age_max:
@@ -444,7 +452,7 @@ class WatchedLife(Recorder):
             )
 
     def _check_silence(self, mode: Mode, flown: list[float]) -> None:
-        """It has braked as long as it has lost the link, and descends at most."""
+        """Check that the vehicle brakes while the link is lost, and at most descends."""
         lost = self._silent - self._timeout - 1
         if lost < 0:
             return
@@ -458,11 +466,13 @@ class WatchedLife(Recorder):
             raise Violation("brakes", f"{speed:.3f} m/s after {silent_s:.2f} s of silence")
 
     def _check_place(self, position: tuple[float, ...], asleep: int) -> None:
-        """It is where the reference is, or where it may have come from there without a plan."""
+        """Check that the vehicle is near the reference, or where unplanned flight may have taken
+        it.
+        """
         away = max(
             max(low - p, p - high) for p, (low, high) in zip(position, self._extent, strict=True)
         )
-        if away <= MARGIN_M:  # it is back
+        if away <= MARGIN_M:  # the vehicle is back at the reference
             self.drifted_m = 0.0
         self.drifted_m += _speed_max(self._terms) * asleep * self._terms.dt_s
         if away > self._reach_m + self.drifted_m:
@@ -473,11 +483,11 @@ MOVES = frozenset(
     {(str(mode), str(after)) for (mode, _), after in TABLE.items()}
     | {(str(mode), str(mode)) for mode in Mode}
 )
-"""Names of modes, and of those that the table leads to from there at once."""
+"""Names of modes, and of those that the table reaches from them in one transition."""
 
 
 def _reached(mode: Mode) -> frozenset[Mode]:
-    """Modes to which the table leads from one, in any number of moves."""
+    """Modes that the table reaches from one, in any number of transitions."""
     reached = {mode}
     while True:
         more = {after for (before, _), after in TABLE.items() if before in reached} - reached
@@ -490,7 +500,7 @@ REACHED = {mode: _reached(mode) for mode in Mode}
 
 
 def _session(payload: bytes) -> int:
-    """Number of the session that a message of the server names."""
+    """Session number in a message of the server."""
     session: int = msgpack.unpackb(payload)[3]
     return session
 
@@ -501,7 +511,7 @@ def _speed_max(terms: Terms) -> float:
 
 
 def _reach_m(age_max_s: float, terms: Terms) -> float:
-    """How far outside of the reference a vehicle may come [m]."""
+    """Largest distance of a vehicle from the region of the reference [m]."""
     return _speed_max(terms) * (age_max_s + 1.0 + max(terms.dead_time_s)) + MARGIN_M
 
 
@@ -515,18 +525,18 @@ def _extent(scenario: Scenario) -> list[tuple[float, float]]:
 # -- bounds of containers --------------------------------------------------------------------
 
 LARGE = {"_heap": 65536, "_by_bin": 4096, "_agenda": 10**9}
-"""Bounds of containers by the name of their attribute, where it is another than BOUND."""
+"""Bounds of containers by attribute name, where they differ from BOUND."""
 BOUND = max(EVENTS_MAX, 2048)
-"""Largest number of things in a container of an endpoint."""
+"""Largest number of items in a container of an endpoint."""
 OURS = tuple(f"skytether.{room}." for room in ("server", "client", "netem", "shared"))
-"""Packages whose objects are looked into."""
+"""Packages whose objects are searched for containers."""
 
 
 def check_bounds(name: str, endpoint: object) -> None:
-    """Check that no container within an endpoint is larger than its bound.
+    """Check that no container within an endpoint exceeds its bound.
 
     Raises:
-        Violation: one is.
+        Violation: a container does.
     """
     for attribute, size in _sizes(endpoint, name, set()):
         bound = LARGE.get(attribute.rpartition(".")[2], BOUND)
@@ -535,7 +545,7 @@ def check_bounds(name: str, endpoint: object) -> None:
 
 
 def _sizes(thing: Any, name: str, seen: set[int]) -> Iterator[tuple[str, int]]:
-    """Names and sizes of all containers within something."""
+    """Names and sizes of all containers within an object."""
     if id(thing) in seen:
         return
     seen.add(id(thing))

@@ -1,9 +1,9 @@
-"""The journal of a long piece of work: its settings, and what is done of it, safe from any end.
+"""Journal of a long computation: its settings, and finished entries, safe against crashes.
 
-A journal is a folder. `settings.toml` holds all that the results follow from, `journal.jsonl` a
-line for each entry: its checksum (CRC-32) and the entry itself. A line is on the disk before the
-next is begun. Half a line at the end, left by a writer that was killed, is overwritten; a line that
-was changed is refused. Files that the results follow from stand in the settings by their digests.
+A journal is a folder. `settings.toml` holds all settings that determine the results,
+`journal.jsonl` one line per entry: a checksum (CRC-32) and the entry itself. Each line is on disk
+before the next one is written. An incomplete last line, left by a killed writer, is overwritten; an
+altered line is an error. Files that the results depend on are in the settings by their digests.
 """
 
 import fcntl
@@ -29,15 +29,16 @@ E = TypeVar("E")
 
 
 class Journal(Generic[E]):
-    """The entries of one piece of work, in a folder that is made where it is missing.
+    """Entries of one computation, in a folder that is created if missing.
 
     Args:
         folder: where the journal is kept.
-        settings: all that the entries follow from, as plain values; the version is added.
+        settings: all settings that determine the entries, as plain values; the version is added.
         kind: type of an entry.
 
     Raises:
-        ConfigError: the folder holds other work or a line that is no entry, or somebody writes.
+        ConfigError: the folder holds another computation or an invalid line, or another process
+            writes.
         OSError: the folder cannot be written.
     """
 
@@ -45,9 +46,9 @@ class Journal(Generic[E]):
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self.files: Mapping[str, str] = settings.get("files", {})
-        """Digest of every file that the entries follow from, by its path."""
+        """Digest of every file that the entries depend on, by its path."""
         self.entries: list[E] = []
-        """Everything done so far, in the order in which it was done."""
+        """Finished entries, in order."""
         self._file = os.fdopen(os.open(folder / ENTRIES, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
         try:
             try:
@@ -61,7 +62,7 @@ class Journal(Generic[E]):
             raise
 
     def _agree(self, settings: Mapping[str, Any]) -> None:
-        """Write the settings down, or compare them with those that are there."""
+        """Write the settings, or compare them with existing ones."""
         path = self.folder / SETTINGS
         text = msgspec.toml.encode(settings)
         if not path.exists():
@@ -81,7 +82,7 @@ class Journal(Generic[E]):
                 )
 
     def _read(self, decoder: msgspec.json.Decoder[E]) -> None:
-        """Take the entries that are there, so that the next line comes behind them."""
+        """Read existing entries, and set the position for the next line."""
         whole = 0
         for number, line in enumerate(self._file, start=1):
             if not line.endswith(b"\n"):
@@ -99,19 +100,19 @@ class Journal(Generic[E]):
         self._file.truncate()
 
     def append(self, entry: E) -> None:
-        """Keep an entry, whatever happens next."""
+        """Append an entry, and write it to disk."""
         self._file.write(sealed(msgspec.json.encode(entry)))
         self._file.flush()
         os.fsync(self._file.fileno())
         self.entries.append(entry)
 
     def close(self) -> None:
-        """Let another command write to the folder."""
+        """Release the folder for other commands."""
         self._file.close()
 
 
 def sealed(content: bytes) -> bytes:
-    """A line of a journal: a JSON list of the checksum and of what it is the checksum of."""
+    """Line of a journal: a JSON list of the checksum and the entry."""
     return b'["%08x",%b]\n' % (zlib.crc32(content), content)
 
 
@@ -119,7 +120,7 @@ def write(path: Path, content: bytes) -> None:
     """Write a file as a whole, or not at all.
 
     Raises:
-        OSError: it cannot be written, or something else than a plain file is there.
+        OSError: the file cannot be written, or the path is no regular file.
     """
     files.check(path)
     part = path.with_name(f"{path.name}.part")
@@ -131,7 +132,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
-    """Digest of every file and plug-in that some scenarios name: a part of their settings."""
+    """Digests of all files and plug-ins that some scenarios name, as a part of the settings."""
     files = {each.reference.file for each in scenarios if each.reference.shape in TABLES}
     entries = (entry for each in scenarios for entry in each.entries())
     plugged = {entry.source: entry.version for entry in entries if not entry.is_ours}
@@ -139,5 +140,5 @@ def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
 
 
 def digest(content: bytes) -> str:
-    """Short text that differs where the content of a file does."""
+    """Digest of the content of a file."""
     return hashlib.blake2b(content, digest_size=8).hexdigest()

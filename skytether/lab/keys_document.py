@@ -1,7 +1,7 @@
 """Text of docs/keys.md, made from `shared/scenario/schema.py`; `make keys` writes it.
 
-Each key's sentence is its docstring in the source, as in `--help`; the unit is what stands there
-in brackets.
+The text of each key is its docstring in the source, as in `--help`; the unit is taken from the
+docstring's brackets.
 """
 
 import ast
@@ -30,12 +30,12 @@ it is a live one. Values are written as in TOML; *list of numbers, 0 to 1* bound
 
 
 def document() -> str:
-    """The whole text."""
+    """Complete text of the document."""
     return "\n".join([HEAD, *_tables(Scenario, "", inspect.getdoc(Scenario) or "")])
 
 
 def _tables(section: type[Section], prefix: str, about: str) -> Iterator[str]:
-    """Table of a section's keys, and then of each section within it."""
+    """Tables of a section's keys, and of its nested sections."""
     told = sentences(section)
     rows: list[str] = []
     within: list[str] = []
@@ -54,7 +54,7 @@ def _tables(section: type[Section], prefix: str, about: str) -> Iterator[str]:
 
 
 def _row(name: str, field: msgspec.structs.FieldInfo, sentence: str) -> str:
-    """Row of a key; its unit has a column of its own."""
+    """Row of a key; its unit has its own column."""
     key = KEYS[name]
     cells = (
         f"`{name}`",
@@ -69,7 +69,7 @@ def _row(name: str, field: msgspec.structs.FieldInfo, sentence: str) -> str:
 
 
 def values(kind: Any) -> str:
-    """Values of a key's type, in words."""
+    """Allowed values of a key's type, in words."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         metas = [each for each in parts if isinstance(each, msgspec.Meta)]
@@ -95,18 +95,18 @@ def _bounded(kind: type, meta: msgspec.Meta) -> str:
 
 
 def _number(value: float | None) -> str:
-    """Bound of a number, as short as it can be written."""
+    """Bound of a number, in its shortest form."""
     assert value is not None  # every number of a scenario has bounds
     return str(value) if isinstance(value, int) else f"{value:g}".replace("e+0", "e")
 
 
 def _toml(value: object) -> str:
-    """A value as TOML and JSON have it."""
+    """Value in the form that TOML and JSON share."""
     return msgspec.json.encode(value).decode()
 
 
 def sentences(section: type[Section]) -> dict[str, str]:
-    """Docstring of each key of a section that has one, in one line."""
+    """Docstring of each documented key of a section, in one line."""
     (definition,) = ast.parse(inspect.getsource(section)).body
     assert isinstance(definition, ast.ClassDef)
     return {

@@ -1,9 +1,9 @@
-"""The closed loop where no bound is active: linear, given which packet arrives when.
+"""Closed loop without active bounds: linear, for a given timing of packets.
 
-Every push, a step's wind or a measurement's noise, is followed through vehicle, observations,
-horizons in flight and disturbance observer along the timing of a flight, as a column of numbers.
-What each does by itself is what `server.control.committed`, `server.control.planner`,
-`client.compensator` and `client.simulated.plant` do, without bounds.
+The effect of each push, that is a step's wind or a measurement's noise, is propagated through
+vehicle, observations, horizons in flight and disturbance observer along the timing of a flight, as
+one column of numbers. Each component is that of `server.control.committed`,
+`server.control.planner`, `client.compensator` and `client.simulated.plant`, without bounds.
 """
 
 import math
@@ -35,14 +35,14 @@ from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import committed_max
 
 WIND, NOISE = 2, 2
-"""Columns of a step's wind on an axis, and of its measurement."""
+"""Number of random inputs per step and axis: of the wind, and of the measurement."""
 COMMITTED, PREDICTIVE, NONE, TRAJECTORY = range(4)
 SCHEMES = ("committed", "predictive", "none", "trajectory")
-"""The schemes, as kernels take them."""
+"""Schemes, by the numbers that kernels use."""
 
 
 class Timing(NamedTuple):
-    """Which packets of a flight arrived when, as both ends recorded it."""
+    """Timing of a flight's packets, as both ends recorded it."""
 
     in_force: I1
     """Step that the horizon in force at each step was made for, or -1; shape (steps,)."""
@@ -57,94 +57,97 @@ class Timing(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """The loop on one axis, with all that is linear in it."""
+    """Linear loop on one axis."""
 
     model: Axis
-    """Eq. (4) as both ends know it."""
+    """Eq. (4) of the model that both ends know."""
     true: Axis
-    """Eq. (4) of the vehicle that flies, its gain in b0 and b1."""
+    """Eq. (4) of the true vehicle, with its gain in b0 and b1."""
     late: F1
-    """What of b0 and b1 is still the input's flown a step before, by its dead time; shape (2,)."""
+    """Part of b0 and b1 that belongs to the input of the previous step, due to the dead time; shape
+    (2,)."""
     dead_steps: int
-    """Whole steps of its dead time."""
+    """Whole steps of the vehicle's dead time."""
     known_late: F1
-    """As `late`, of the dead time that both ends know; shape (2,)."""
+    """Like `late`, for the dead time that both ends know; shape (2,)."""
     known_dead_steps: int
-    """Whole steps of that."""
+    """Whole steps of the dead time that both ends know."""
     rest: Axis
-    """Eq. (4) as both ends know it, over what is left of that; over no time without a rest."""
+    """Eq. (4) of the model over the fractional step of the known dead time; over zero time without
+    one."""
     push: F2
     """Square root of a step's covariance under white acceleration of strength 1; shape (2, 2)."""
     sensor_delay: int
-    """Time from measuring to having the measurement [steps]."""
+    """Time from a measurement until it is available [steps]."""
     corrections: F3
-    """What a measured position, and a measured velocity, corrects of the filter's position,
-    velocity and disturbance at each step; 0 where there is none; shape (steps, 2, 3). Without steps
-    the state is known as it is."""
+    """Gains of the filter at each step, from measured position and velocity to position, velocity
+    and disturbance; 0 without a measurement; shape (steps, 2, 3). With no steps, the state is known
+    exactly."""
     predicts: bool
-    """Whether the filter moves its state on by the model between measurements."""
+    """Whether the filter predicts its state by the model between measurements."""
     scheme: int
     """COMMITTED, PREDICTIVE, NONE or TRAJECTORY."""
     plan: F2
-    """Inputs of a plan for position and velocity where it begins, and for ŵ; shape (H, 3)."""
+    """Gains from position and velocity at the plan's start, and from ŵ, to the plan's inputs; shape
+    (H, 3)."""
     before: F2
-    """Inputs of a plan for those of the plan before, shifted; shape (H, H), or (0, 0)."""
+    """Gains from the shifted previous plan to the plan's inputs; shape (H, H), or (0, 0)."""
     feeds_back: bool
     """Whether there is feedback aboard."""
     back: F1
-    """Its gain, on position [1/s] and velocity; shape (2,)."""
+    """Gains of the feedback aboard, on position [1/s] and velocity; shape (2,)."""
     decay: float
-    """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
+    """Share of its error that the disturbance observer keeps per step; 1 without an observer."""
     holds: bool
-    """Whether the last input of a horizon is held for ever, rather than braked along."""
+    """Whether the last input of a horizon is held for ever, instead of braking."""
     age_max: int
-    """Largest age of an observation that counts [steps]."""
+    """Largest usable age of an observation [steps]."""
     dt_ns: int
     """Length of a step [ns]."""
 
 
 class Past(NamedTuple):
-    """What the loop remembers; the last axis of each array has a column for each push."""
+    """Memory of the loop; the last axis of each array has one column per push."""
 
     true: F3
     """State at each step, a ring; shape (reach, 2, columns)."""
     filtered: F2
-    """Position, velocity and disturbance of the filter aboard; shape (3, columns)."""
+    """State of the filter aboard: position, velocity and disturbance; shape (3, columns)."""
     reported: F3
-    """State that each step reports, a ring; shape (reach, 2, columns)."""
+    """State reported at each step, a ring; shape (reach, 2, columns)."""
     flown: F2
     """Input of each step, a ring; shape (reach, columns)."""
     first: F2
-    """First input of the plan of each step, û of eq. (12), a ring; shape (reach, columns)."""
+    """First input of each step's plan, û of eq. (12), a ring; shape (reach, columns)."""
     made: I1
-    """Step that each horizon that was sent was made for, a ring; shape (room,)."""
+    """Step that each sent horizon was made for, a ring; shape (room,)."""
     due: I1
-    """Step at which it is in force, or lost; shape (room,)."""
+    """Step at which each sent horizon comes into force, or is lost; shape (room,)."""
     length: I1
-    """How many inputs of it are flown; shape (room,)."""
+    """Number of usable inputs of each sent horizon; shape (room,)."""
     inputs: F3
-    """Its inputs; shape (room, most + H, columns)."""
+    """Inputs of each sent horizon; shape (room, most + H, columns)."""
     origins: F3
-    """Position, velocity and ŵ that it leads on from; shape (room, 3, columns)."""
+    """Predicted position, velocity and ŵ at the start of each horizon; shape (room, 3, columns)."""
     plan: F2
-    """Inputs planned last; shape (H, columns)."""
+    """Inputs of the newest plan; shape (H, columns)."""
     scratch: F2
-    """Inputs that are being planned; shape (H, columns)."""
+    """Inputs of the plan being computed; shape (H, columns)."""
     disturbance: F1
     """Disturbance ŵ; shape (columns,)."""
     led: F2
-    """State x̄ of the horizon in force; shape (2, columns)."""
+    """Predicted state x̄ of the horizon in force; shape (2, columns)."""
     commands: F2
-    """Inputs of a roll; shape (longest, columns)."""
+    """Inputs of a simulated stretch; shape (longest, columns)."""
     track: F3
-    """States of a roll; shape (longest + 1, 2, columns)."""
+    """States of a simulated stretch; shape (longest + 1, 2, columns)."""
     marks: I1
-    """Numbers that change, by the names below; shape (5,)."""
+    """Scalar state, indexed by the names below; shape (5,)."""
 
 
 SENT, BASE, START, LED_MADE, LED_STAGE = range(5)
-"""Number of horizons sent; step of the observation that the observer knows; where the plan before
-began; and the horizon and the stage that x̄ belongs to."""
+"""Indices into `marks`: number of horizons sent; step of the observation that the observer has
+used; start of the previous plan; and the horizon and stage that x̄ belongs to."""
 
 
 # -- one flight's timing ---------------------------------------------------------------------------
@@ -164,7 +167,7 @@ def _number(past: Past, made_for: int) -> int:
 
 @making_part
 def _first_under_way(past: Past, in_force: int, observed: int) -> int:
-    """Number of the first horizon made after the one in force, and not due yet."""
+    """Number of the first horizon made after the one in force that is not due yet."""
     room, sent = len(past.made), past.marks[SENT]
     number = sent
     while number > max(sent - room, 0):
@@ -177,14 +180,16 @@ def _first_under_way(past: Past, in_force: int, observed: int) -> int:
 
 @making_part
 def _move(axis: Axis, x: F2, u: F1, w: F1, to: F2) -> None:
-    """Advance all columns a step, from `x` to `to`, which may be the same."""
+    """Advance all columns by a step, from `x` to `to`, which may be the same array."""
     for c in range(x.shape[1]):
         to[0, c], to[1, c] = advance(axis, x[0, c], x[1, c], u[c] + w[c])
 
 
 @inline
 def _held(loop: Loop, past: Past, number: int, column: int) -> Held:
-    """A horizon in one column, as `shared.law.rule` has it: without bounds, braked at once."""
+    """Inputs of a horizon in one column, by `shared.law.rule` without bounds; braking is
+    immediate.
+    """
     slot = number % len(past.made)
     return Held(
         loop.model,
@@ -203,7 +208,7 @@ def _held(loop: Loop, past: Past, number: int, column: int) -> Held:
 
 @making_part
 def _flown(loop: Loop, past: Past, number: int, stage: int, led: F2, x: F2, u: F1) -> None:
-    """Fill in what is flown at a stage of a horizon, and lead x̄ on to the next."""
+    """Compute the input at a stage of a horizon, and advance x̄ to the next stage."""
     for c in range(len(u)):
         held = _held(loop, past, number, c)
         u[c], _, led[0, c], led[1, c] = fly(held, stage, led[0, c], led[1, c], x[0, c], x[1, c])
@@ -211,7 +216,7 @@ def _flown(loop: Loop, past: Past, number: int, stage: int, led: F2, x: F2, u: F
 
 @making_part
 def _lead(loop: Loop, past: Past, number: int, first: int, last: int, led: F2) -> None:
-    """Roll x̄ of a horizon on from one stage to another."""
+    """Advance x̄ of a horizon from one stage to another."""
     for c in range(led.shape[1]):
         held = _held(loop, past, number, c)
         led[0, c], led[1, c] = lead_to(held, first, last, led[0, c], led[1, c])
@@ -219,7 +224,7 @@ def _lead(loop: Loop, past: Past, number: int, first: int, last: int, led: F2) -
 
 @making_part
 def _go_on(loop: Loop, last: F1, stage: int, holds: bool, u: F1) -> None:
-    """Fill in what is flown without a horizon: an input of before is held, or braked at once."""
+    """Compute the input without a horizon: the last one is held, or the vehicle brakes at once."""
     brake = 0.0 if holds else np.inf
     for c in range(len(u)):
         held = Held(loop.model, (last[c],), 1, True, 1.0, brake, np.inf, False, 0.0, 0.0, 0.0)
@@ -228,7 +233,7 @@ def _go_on(loop: Loop, last: F1, stage: int, holds: bool, u: F1) -> None:
 
 @making_part
 def _follow(loop: Loop, past: Past, x: F2, u: F1) -> None:
-    """Fill in what is flown along a trajectory that rests at the origin."""
+    """Compute the input along a trajectory that rests at the origin."""
     rests = (0.0, 0.0)
     gain_p, gain_v = loop.back[0], loop.back[1]
     guide = Guide(loop.model, rests, 1, 1.0, 1, 0.0, 0.0, 0.0, np.inf, gain_p, gain_v)
@@ -238,7 +243,7 @@ def _follow(loop: Loop, past: Past, x: F2, u: F1) -> None:
 
 @making_part
 def _fly_leg(loop: Loop, past: Past, number: int, begin: int, first: int, last: int) -> None:
-    """Fly what is in force from one step to another, in the roll that began at `begin`."""
+    """Simulate the plan in force from one step to another, in the stretch that began at `begin`."""
     room, w, made, led = len(past.made), past.disturbance, begin, past.scratch[:2]
     if number >= 0:
         made = past.made[number % room]
@@ -252,13 +257,13 @@ def _fly_leg(loop: Loop, past: Past, number: int, begin: int, first: int, last: 
         else:
             _go_on(loop, past.commands[0], k - begin, loop.holds or number == UNKNOWN, u)
         if k == begin:
-            u[:] = past.flown[k % len(past.flown)]  # as it says itself
+            u[:] = past.flown[k % len(past.flown)]  # by the number in the horizon itself
         _move(loop.model, x, u, w, past.track[k - begin + 1])
 
 
 @making_part
 def _roll(loop: Loop, past: Past, begin: int, flying: int, under_way: range, end: int) -> None:
-    """Fly from an observation on with what is in force, then what is under way, to step `end`."""
+    """Simulate from an observation with the horizons in force and under way, to step `end`."""
     past.track[0] = past.reported[begin % len(past.reported)]
     first, number = begin, flying
     for following in under_way:
@@ -273,7 +278,7 @@ def _roll(loop: Loop, past: Past, begin: int, flying: int, under_way: range, end
 
 @making_part
 def _learn(loop: Loop, past: Past, end: int, m: int, trip_ns: int) -> None:
-    """Correct ŵ by where the velocity is that a roll of `m` steps says, see `control.observer`."""
+    """Correct ŵ by the error of the velocity predicted over `m` steps, see `control.observer`."""
     velocity, w = past.reported[end % len(past.reported), 1], past.disturbance
     for c in range(len(w)):
         off = velocity[c] - past.track[m, 1, c]
@@ -293,7 +298,7 @@ def _observe(loop: Loop, timing: Timing, past: Past, t: int) -> None:
     flying, newest = _number(past, before), _number(past, after)
     if min(flying, newest) == UNKNOWN:
         return
-    # Up to `since` by what was expected, and from there on by what is known.
+    # Up to `since` by the expected inputs, and from there on by the known ones.
     if since <= begin:
         _roll(loop, past, begin, newest, range(0), end)
     else:
@@ -327,7 +332,7 @@ def _observe_between(loop: Loop, timing: Timing, past: Past, t: int) -> None:
 
 @making_part
 def _estimate(loop: Loop, timing: Timing, past: Past, t: int) -> None:
-    """Eq. (13): the newest observation, moved on to the present by û."""
+    """Eq. (13): predict the newest observation to the present by û."""
     k, o, reach = timing.step[t], timing.observed[t], len(past.first)
     past.track[0] = past.reported[o % len(past.reported)]
     if loop.scheme == NONE:
@@ -344,7 +349,7 @@ def _estimate(loop: Loop, timing: Timing, past: Past, t: int) -> None:
 
 @making_part
 def _plan(loop: Loop, past: Past, start: int, x: F2) -> None:
-    """Plan from a state at step `start`, without bounds; into `past.plan`."""
+    """Plan from a state at step `start`, without bounds; the result is in `past.plan`."""
     H, w, plan = len(loop.plan), past.disturbance, past.plan
     gap = start - past.marks[START]
     past.marks[START] = start
@@ -363,7 +368,7 @@ def _plan(loop: Loop, past: Past, start: int, x: F2) -> None:
 
 @making_part
 def _tick(loop: Loop, timing: Timing, past: Past, t: int) -> None:
-    """Do what the server does at a tick."""
+    """Simulate a tick of the server."""
     k, d, o, H = timing.step[t], timing.ahead[t], timing.observed[t], len(loop.plan)
     if loop.scheme == COMMITTED:
         if loop.decay < 1.0:
@@ -404,7 +409,7 @@ def _tick(loop: Loop, timing: Timing, past: Past, t: int) -> None:
 
 @making_part
 def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
-    """Do what the compensator aboard does at step `s`."""
+    """Simulate the compensator aboard at step `s`."""
     reach = len(past.flown)
     u, x = past.flown[s % reach], past.reported[s % reach]
     if loop.scheme == TRAJECTORY:
@@ -426,10 +431,10 @@ def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
 
 @making_part
 def _know(loop: Loop, past: Past, s: int, push: int) -> None:
-    """Fill in what the vehicle reports at step `s`, from what it measures and filters.
+    """Compute the report of the vehicle at step `s`, from its measurement and filter.
 
     Args:
-        push: column of its noise, or -1.
+        push: column of the measurement's noise, or -1.
     """
     reach, delay = len(past.reported), loop.sensor_delay
     filtered, reported = past.filtered, past.reported[s % reach]
@@ -459,7 +464,7 @@ def _know(loop: Loop, past: Past, s: int, push: int) -> None:
 
 @making_part
 def _act(loop: Loop, past: Past, step: int, x: F2) -> None:
-    """Advance what is known, `x`, over a step by the inputs that act in it."""
+    """Advance the known state `x` by a step with the inputs that act in it."""
     reach = len(past.flown)
     due = past.flown[(step - loop.known_dead_steps) % reach]
     before = past.flown[(step - loop.known_dead_steps - 1) % reach]
@@ -471,7 +476,7 @@ def _act(loop: Loop, past: Past, step: int, x: F2) -> None:
 
 @making_part
 def _predict(loop: Loop, past: Past, s: int, x: F2) -> None:
-    """Advance the state known at step `s` by the inputs on their way: what the next will meet."""
+    """Predict the state known at step `s` to the time at which the next input acts."""
     reach, n, w = len(past.flown), loop.known_dead_steps, past.filtered[2]
     if n == 0 and loop.rest.a01 == 0.0:
         return
@@ -482,7 +487,7 @@ def _predict(loop: Loop, past: Past, s: int, x: F2) -> None:
 
 @making_part
 def _forget(past: Past, column: int) -> None:
-    """Forget a push, so that its column can take another."""
+    """Reset the column of a push for reuse."""
     for rows in (past.filtered, past.flown, past.first, past.plan, past.led):
         rows[:, column] = 0.0
     for blocks in (past.true, past.reported, past.inputs, past.origins):
@@ -494,20 +499,20 @@ def _forget(past: Past, column: int) -> None:
 def _respond(
     loop: Loop, timing: Timing, past: Past, begin: int, every: int, squares: F3, counts: I1
 ) -> None:
-    """Follow pushes from step `begin` on along a flight's timing.
+    """Simulate the effect of pushes from step `begin` on, along a flight's timing.
 
     Args:
-        every: steps from one push to the next; there are as many at a time as there are columns.
-        squares: what is added to: p² and u² of each source so many steps after a push; shape
-            (2, sources, window).
-        counts: how many pushes were added to each; shape (window,).
+        every: steps from one push to the next; as many are simulated at once as there are columns.
+        squares: output, added to: p² and u² by source and number of steps after a push; shape (2,
+            sources, window).
+        counts: output: number of pushes added to each; shape (window,).
     """
     sources, window = squares.shape[1], squares.shape[2]
     reach, tick, steps = len(past.reported), 0, len(timing.in_force)
     width = past.reported.shape[2] // sources
     none = np.zeros(sources * width)
     for s in range(steps):
-        # What was in force had been made, and what was made had been observed, before.
+        # The horizon in force was made, and its observation taken, before this step.
         made = max(timing.in_force[s], s - 1)
         while tick < len(timing.step) and timing.step[tick] <= made and timing.observed[tick] < s:
             _tick(loop, timing, past, tick)
@@ -543,7 +548,7 @@ def _respond(
 
 
 def make_loops(scenario: Scenario, steps: int) -> list[Loop]:
-    """The loop on each axis of a scenario, for flights of so many steps."""
+    """Loops on each axis of a scenario, for flights of so many steps."""
     terms, control = scenario.terms(), scenario.control
     dt, tau, gain = control.dt, scenario.true_tau_s, scenario.true_gain
     true_axes = zip(tau, scenario.true_dead_time_s, gain, strict=True)
@@ -586,7 +591,7 @@ def make_loops(scenario: Scenario, steps: int) -> list[Loop]:
 
 
 def _plans(model: Model, mpc: MPC) -> tuple[Array, Array]:
-    """Unconstrained plans of (9), U = -𝓗⁻¹ g, by what g is linear in.
+    """Unconstrained plans of (9), U = -𝓗⁻¹ g, as gains from the quantities in g.
 
     Returns:
         for position and velocity where planning starts and ŵ, shape (axes, H, 3), and for the
@@ -595,9 +600,9 @@ def _plans(model: Model, mpc: MPC) -> tuple[Array, Array]:
     H, axes = len(mpc.weights.states), len(model.b0)
     hessian = pose(model, mpc, LATER).hessian
     free = np.zeros((axes, 3, H, 2))
-    """States 1 … H without any input, from a unit of each."""
+    """States 1 … H without any input, for unit initial values."""
     forced = np.zeros((axes, H, H, 2))
-    """Those that come of a unit of the input at each stage."""
+    """States 1 … H for a unit input at each stage."""
     for j, start in enumerate(([1.0, 0.0], [0.0, 1.0], [0.0, 0.0])):
         x = np.tile(start, (axes, 1))
         for i in range(H):
@@ -621,7 +626,7 @@ def _corrections(scenario: Scenario, steps: int) -> tuple[int, Array]:
     kalman = Kalman(scenario, sensor.delay) if filters(scenario) else None
     for step in range(steps):
         measured = sensor.measure(nothing)
-        if kalman is None:  # each number as it is
+        if kalman is None:  # each measurement is reported unfiltered
             for which, values in enumerate(measured[1:]):
                 found[:, step, which, which] = values is not None
             continue
@@ -637,7 +642,7 @@ def _corrections(scenario: Scenario, steps: int) -> tuple[int, Array]:
 
 
 def timing_of(flight: Record) -> Timing:
-    """The timing of a flight of one vehicle, from its record."""
+    """Timing of a flight of one vehicle, from its record."""
     client, server = flight.client, flight.server
     assert (np.diff(client["step"]) == 1).all()
     return Timing(
@@ -650,13 +655,13 @@ def timing_of(flight: Record) -> Timing:
 
 
 def no_packets(steps: int) -> Timing:
-    """The timing of a flight without any packet."""
+    """Timing of a flight without packets."""
     none = np.zeros(0, dtype=np.int64)
     return Timing(np.full(steps, HOVERS), none, none, none, none.astype(np.bool_))
 
 
 def _periods(scenario: Scenario) -> list[int]:
-    """What is periodic in a loop [steps]; pushes must come at any place in it."""
+    """Periods in a loop [steps]; pushes must cover all phases of them."""
     control, sensor = scenario.control, scenario.sensor
     periods = [
         int(each.values[0]) if each.values else control.period
@@ -671,12 +676,12 @@ def _periods(scenario: Scenario) -> list[int]:
 def respond(
     scenario: Scenario, loop: Loop, timing: Timing, begin: int, window: int, width: int
 ) -> tuple[Array, Indices]:
-    """What pushes leave of them along a flight's timing.
+    """Mean squares after pushes, along a flight's timing.
 
     Args:
         begin: step of the first push.
-        window: number of steps for which each push is followed.
-        width: number of pushes of each source that are followed at a time.
+        window: number of steps simulated after each push.
+        width: number of pushes of each source simulated at once.
 
     Returns:
         p² and u² of each source 0 … window - 1 steps after a push of strength 1, summed over the

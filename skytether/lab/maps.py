@@ -2,9 +2,9 @@
 
 Each point of the box is flown without wind, twice: at rest, from START_M beside the point where it
 is to hover; and along the scenario's reference. At rest nothing disturbs it, so a vehicle whose
-loop is stable comes to rest. One that still moves in the last quarter, by more than REST_M about
-the point and hardly less than in the quarter before, is in a limit cycle: it swings between the
-bounds of its input for ever. Beside that stands what is computed (`lab.margins`).
+loop is stable comes to rest. A vehicle that still moves in the last quarter, by more than REST_M
+about the point and hardly less than in the quarter before, is in a limit cycle: it oscillates
+between the bounds of its input. The table also has the computed growth (`lab.margins`).
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,61 +29,61 @@ from skytether.shared.telemetry.summary import Summary, position_error, summaris
 from skytether.sim.flight import fly_batch
 
 START_M = 1.0
-"""Distance along the first axis at which a vehicle begins to come to rest [m]."""
+"""Distance along the first axis from which a vehicle starts to come to rest [m]."""
 REST_S = 60.0
-"""Length of the flights at rest [s]."""
+"""Length of the flights to rest [s]."""
 REST_M = 0.05
-"""Root mean square of the distance from the point, beyond which a vehicle has not come to rest
-[m]."""
+"""Root mean square distance from the point above which a vehicle has not come to rest [m]."""
 SUSTAINED = 0.7
-"""Share of that in the quarter before, beyond which it does not die away."""
+"""Ratio of the last quarter's distance to that of the quarter before, above which it does not
+decay."""
 RUNS = 2
 """Number of flights of each kind at a point, with seeds that count up from the scenario's."""
 TIMINGS, PUSHES = 12, 16
-"""Number of timings that the growth is computed along, and of pushes followed at a time."""
+"""Number of timings for the computed growth, and of pushes simulated at once."""
 
 
 class Place(NamedTuple):
-    """Where a point lies in the box."""
+    """Coordinates of a point in the box."""
 
     burst_s: float
-    """Mean length of the bursts of loss, both ways [s]; 0: each packet is lost by itself."""
+    """Mean burst length of loss, both ways [s]; 0 for independent losses."""
     dead_time_s: float
-    """Dead time of the vehicle, less that of the model [s]."""
+    """Dead time of the vehicle minus that of the model [s]."""
     gain: float
-    """Gain of its velocity loop over that of the model."""
+    """Gain of the vehicle over that of the model."""
     tau: float
-    """Its time constants over those of the model."""
+    """Time constants of the vehicle over those of the model."""
 
 
 class MapPoint(msgspec.Struct, frozen=True):
-    """What came of a point; an entry of a map's journal."""
+    """Results of a point; an entry of a map's journal."""
 
     number: int
     """Number of the point, from 0 on."""
     cycles: bool
-    """Whether a flight at rest ended in a limit cycle."""
+    """Whether a flight to rest ended in a limit cycle."""
     rest_m: float
-    """Largest root mean square of the distance in the last quarter of the flights at rest [m]."""
+    """Largest root mean square distance in the last quarter of the flights to rest [m]."""
     rmse_m: float | None
     """RMSE along the reference, over all axes of the plane [m]."""
     saturated: float | None
-    """Share of the steps along it with an input at its bound."""
+    """Share of the steps along the reference with an input at its bound."""
     event_ratio: float | None
-    """Share of the server's steps along it that sent a horizon."""
+    """Share of the server's steps along the reference that sent a horizon."""
     growth: float
-    """Growth of the second moment at each step, computed without bounds."""
+    """Growth of the second moment per step, computed without bounds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A scenario, and what differs from it."""
+    """Scenario, and the box of differences from it."""
 
     name: str
     """Name of the scenario."""
     scenario: Scenario
     trigger: str
-    """Trigger of which the growth is computed: the scenario's, or one that sends as often."""
+    """Trigger for the computed growth: the scenario's, or a periodic one with the same rate."""
     tau: tuple[float, ...]
     gain: tuple[float, ...]
     dead_time_s: tuple[float, ...]
@@ -95,7 +95,7 @@ class Box:
         return [Place(*at) for at in product(self.burst_s, self.dead_time_s, self.gain, self.tau)]
 
     def settings(self) -> dict[str, Any]:
-        """All that the points follow from, as plain values."""
+        """Settings that determine all points, as plain values."""
         files, table = digests([self.scenario]), reading.to_table(self.scenario)
         box = {
             "tau": self.tau,
@@ -144,7 +144,7 @@ class Box:
         )
 
     def csv(self, points: Iterable[MapPoint]) -> str:
-        """CSV table with a row for each point: where it lies, and what came of it."""
+        """CSV table with a row for each point: coordinates and results."""
         places = self.places
         rows = [
             [point.number, *places[point.number], *msgspec.structs.astuple(point)[1:]]
@@ -154,14 +154,14 @@ class Box:
 
 
 def at_rest(scenario: Scenario) -> Scenario:
-    """The scenario as a flight at rest."""
+    """Scenario as a flight to rest."""
     beside = (START_M,) + (0.0,) * (scenario.model.axes - 1)
     still = replace(hovering(scenario), duration=REST_S, settle=0.0)
     return replace(still, vehicle=replace(still.vehicle, start_m=beside))
 
 
 def resting(scenario: Scenario, client: Rows) -> tuple[float, float]:
-    """Root mean square of the distance from the point, in the last two quarters [m]."""
+    """Root mean square distance from the point, in the last two quarters [m]."""
     squares: Array = (position_error(scenario, client) ** 2).sum(axis=1)
     if not len(squares):
         return 0.0, 0.0
@@ -180,7 +180,7 @@ def draw(path: Path, title: str, box: Box, points: Sequence[MapPoint]) -> None:
 
     Args:
         path: file to write.
-        points: all of the box, by their number.
+        points: all points of the box, by number.
     """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure

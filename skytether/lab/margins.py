@@ -1,8 +1,8 @@
-"""Margins: whether a loop over a bad network is stable, and how far the vehicle may differ.
+"""Margins: stability of a loop over a bad network, and how far the vehicle may differ.
 
-Where no bound is active the loop is linear, given its timing (`lab.linear`), and the timing of
-triggers that look at the clock alone depends on the network alone: flights in virtual time give it.
-With h(n) the mean of p² n steps after a push of strength 1, over pushes and timings,
+While no bound is active the loop is linear for a given timing (`lab.linear`), and with triggers
+that use only the clock the timing depends on the network alone: so it is taken from flights in
+virtual time. With h(n) the mean of p² n steps after a push of strength 1, over pushes and timings,
 
     variance of p  =  strength² · Σ h(n)              under white wind or noise, once it is settled
     growth         =  lim h(n+1) / h(n)               of the second moment, at each step
@@ -31,39 +31,39 @@ from skytether.sim.flight import fly_batch
 FLIGHT_S = 80.0
 """Length of the flights that timings are taken from [s]."""
 SETTLE_S = 5.0
-"""Time until a flight's session and its delay bound are as they stay [s]."""
+"""Time after which a flight's session and delay bound are stationary [s]."""
 FOLLOWED_S = 24.0
-"""Time for which a push is followed [s]: six time constants of a usual disturbance observer."""
+"""Time for which a push is followed [s]: six time constants of a typical disturbance observer."""
 PUSHES = 64
-"""Number of pushes of each source that are followed at a time."""
+"""Number of pushes of each source simulated at once."""
 WIND_ALONE = 0.1
-"""Wind of which the error is told where a scenario has neither wind nor noise."""
+"""Wind for which the error is computed if a scenario has neither wind nor noise."""
 CLOCK_ONLY = ("always", "periodic", "silence", "budget")
 """Policies that do not look at the state."""
 RATE_RUNS = 4
-"""Number of flights from which it is learned how often a trigger sends."""
+"""Number of flights from which the rate of a trigger is measured."""
 
 
 class Margin(msgspec.Struct, frozen=True, kw_only=True):
-    """What is computed of a loop whose vehicle is, or differs from, the model."""
+    """Results for a loop whose vehicle equals, or differs from, the model."""
 
     vehicle: str
     """Name of the vehicle in a table."""
     growth: float
-    """Growth of the second moment at each step."""
+    """Growth of the second moment per step."""
     growth_ci95: float | None
-    """Half the width of its 95 % interval over timings; None for one timing."""
+    """Half-width of the growth's 95 % interval over timings; None for a single timing."""
     stable: bool
-    """Whether the upper end of that is below 1."""
+    """Whether the upper end of the growth's interval is below 1."""
     rms_m: tuple[float, ...] | None
-    """Root mean square of the position's deviation, of each axis [m]; None if it is not stable."""
+    """Root mean square of the position's deviation, of each axis [m]; None if unstable."""
     rms_ci95_m: tuple[float, ...] | None
-    """Half the width of the 95 % interval of each; None if it is not stable, or for one timing."""
+    """Half-width of the 95 % interval of `rms_m`; None if unstable, or for a single timing."""
     rms_input_mps: tuple[float, ...] | None
-    """Root mean square of the input's deviation, of each axis [m/s]; None if it is not stable."""
+    """Root mean square of the input's deviation, of each axis [m/s]; None if unstable."""
 
     def saturated(self, u_max: Sequence[float]) -> float | None:
-        """Share of the steps at which the input, were it normal, would lie beyond its bound."""
+        """Share of the steps at which a normally distributed input would exceed its bound."""
         if self.rms_input_mps is None:
             return None
         beyond = [
@@ -74,21 +74,21 @@ class Margin(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Differing(NamedTuple):
-    """How a vehicle differs from the model."""
+    """Differences of a vehicle from the model."""
 
     tau: float = 1.0
-    """Its time constants over those of the model."""
+    """Time constants over those of the model."""
     gain: float = 1.0
-    """Gains of its velocity loop over those of the model."""
+    """Gains of the velocity loop over those of the model."""
     dead_time_s: float = 0.0
-    """Its dead time less that of the model [s]."""
+    """Dead time minus that of the model [s]."""
 
     def is_of(self, scenario: Scenario) -> bool:
-        """Whether there is such a vehicle: none has less dead time than nothing."""
+        """Whether such a vehicle exists: its dead time must not be negative."""
         return min(scenario.terms().dead_time_s) + self.dead_time_s >= 0.0
 
     def of(self, scenario: Scenario) -> Scenario:
-        """The scenario with such a vehicle."""
+        """Scenario with such a vehicle."""
         terms = scenario.terms()
         vehicle = replace(
             scenario.vehicle,
@@ -112,7 +112,7 @@ VEHICLES: dict[str, Differing] = {
     "dead time 0.2 s more": Differing(dead_time_s=0.2),
     "dead time 0.3 s more": Differing(dead_time_s=0.3),
 }
-"""Vehicles that a margin is computed for, besides the scenario's own, as far as there are such."""
+"""Vehicles for which margins are computed besides the scenario's own, if they exist."""
 
 
 def looks_at_state(scenario: Scenario) -> bool:
@@ -124,7 +124,7 @@ def looks_at_state(scenario: Scenario) -> bool:
 def equivalent_period(
     scenario: Scenario, *, stopped: Callable[[], bool] = lambda: False
 ) -> Scenario:
-    """The scenario with the policy `periodic` that sends as often as its own trigger does."""
+    """Scenario with the policy `periodic`, at the measured rate of its own trigger."""
     seeds = range(scenario.seed, scenario.seed + RATE_RUNS)
     flights = fly_batch(scenario, seeds, stopped=stopped)
     events = np.concatenate([flight.server["event"] for flight in flights])
@@ -133,16 +133,16 @@ def equivalent_period(
 
 
 def hovering(scenario: Scenario) -> Scenario:
-    """The scenario with a point to hover at in place of its reference."""
+    """Scenario with a hover point in place of its reference."""
     point = (0.0,) * scenario.model.axes
     return replace(scenario, reference=ReferenceConfig(shape="hover", points_m=(point,)))
 
 
 def calm(scenario: Scenario) -> Scenario:
-    """The scenario with the model for a vehicle, at rest: what timings are taken from.
+    """Scenario for measuring timings: the vehicle equals the model, and is at rest.
 
-    None of what it leaves out makes a difference to when packets arrive, but for a report that
-    looks at the state, in place of which one at every step is computed.
+    The omitted parts do not affect packet timing, with one exception: reports that depend on the
+    state are replaced by reports at every step.
     """
     vehicle = replace(
         scenario.vehicle,
@@ -163,9 +163,9 @@ def calm(scenario: Scenario) -> Scenario:
 def timings(
     scenario: Scenario, runs: int, *, stopped: Callable[[], bool] = lambda: False
 ) -> list[Timing]:
-    """Timings of so many flights, with seeds that count up from the scenario's."""
+    """Timings of a number of flights, with seeds that count up from the scenario's."""
     flown = calm(scenario)
-    if flown.terms().splines:  # it flies by itself, whatever arrives
+    if flown.terms().splines:  # the vehicle flies the reference aboard, whatever arrives
         return [no_packets(flown.steps)] * runs
     seeds = range(flown.seed, flown.seed + runs)
     return [timing_of(flight) for flight in fly_batch(flown, seeds, stopped=stopped)]
@@ -173,12 +173,12 @@ def timings(
 
 @lru_cache(maxsize=4)
 def _known_timings(still: Scenario, runs: int) -> list[Timing]:
-    """See `timings`, of a scenario that is calm already."""
+    """Timings, see `timings`, of a scenario that is calm already."""
     return timings(still, runs)
 
 
 def growth_of(scenario: Scenario, runs: int, pushes: int) -> tuple[float, float | None]:
-    """Growth of a scenario along so many timings, and half the width of its 95 % interval.
+    """Growth of a scenario along some timings, and half-width of its 95 % interval.
 
     Args:
         pushes: see PUSHES.
@@ -189,7 +189,7 @@ def growth_of(scenario: Scenario, runs: int, pushes: int) -> tuple[float, float 
 
 
 def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
-    """What is computed of a scenario along some timings.
+    """Margin of a scenario along some timings.
 
     Args:
         vehicle: name of the scenario's vehicle.
@@ -212,7 +212,7 @@ def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
 def _kinds(scenario: Scenario) -> list[tuple[float, ...]]:
     """Time constant, gain and dead time of the model and of the vehicle, of each axis.
 
-    Axes may be alike.
+    Equal axes share one entry.
     """
     terms, true = scenario.terms(), (scenario.true_tau_s, scenario.true_gain)
     numbers = (terms.tau_s, terms.gain, terms.dead_time_s, *true, scenario.true_dead_time_s)
@@ -222,20 +222,20 @@ def _kinds(scenario: Scenario) -> list[tuple[float, ...]]:
 def _responses_of_axes(
     scenario: Scenario, given: Sequence[Timing], pushes: int
 ) -> "dict[tuple[float, ...], Responses]":
-    """Responses of each kind of axis."""
+    """Responses of each distinct kind of axis."""
     steps = max(len(timing.in_force) for timing in given)
     loops = dict(zip(_kinds(scenario), make_loops(scenario, steps), strict=True))
     return {kind: responses(scenario, loop, given, pushes) for kind, loop in loops.items()}
 
 
 class Responses(NamedTuple):
-    """Mean squares of position and input so many steps after a push of strength 1."""
+    """Mean squares of position and input by number of steps after a push of strength 1."""
 
     squares: Array
     """Shape (timings, 2, sources, window)."""
 
     def growth(self) -> tuple[float, float | None]:
-        """Growth of the second moment, and half the width of its 95 % interval (jackknife)."""
+        """Growth of the second moment, and half-width of its 95 % interval (jackknife)."""
         h = self.squares[:, 0, :WIND].sum(axis=1)
         n, mean = len(h), _growth(h.mean(axis=0))
         if n < 2:
@@ -249,7 +249,7 @@ class Responses(NamedTuple):
         wind, noises = strengths(scenario)
         sources = np.array([wind, wind, *noises])[: self.squares.shape[2]]
         each = np.einsum("tqsn,s->tq", self.squares, sources**2)
-        # What is left when a push is not followed any longer goes on to die away as it did.
+        # Beyond the simulated window, the response is extrapolated with its decay.
         growth, _ = self.growth()
         each += np.einsum("tqs,s->tq", self.squares[..., -1], sources**2) * growth / (1.0 - growth)
         variance, half = interval(each[:, 0].tolist())
@@ -259,9 +259,9 @@ class Responses(NamedTuple):
 
 
 def _growth(h: Array) -> float:
-    """Growth at each step in the later part of a response, by least squares of its logarithm.
+    """Growth per step in the later part of a response, by least squares of its logarithm.
 
-    Means over a quarter of the response take away most of the swinging of what swings slowly.
+    Averaging over quarters of the response removes most of slow oscillations.
     """
     width = max(1, len(h) // 4)
     means = np.convolve(h, np.full(width, 1.0 / width), "valid")
@@ -273,7 +273,7 @@ def _growth(h: Array) -> float:
 
 
 def strengths(scenario: Scenario) -> tuple[float, tuple[float, float]]:
-    """White wind, and standard deviations of the noise, that the error is told of."""
+    """White wind, and standard deviations of the noise, for which the error is computed."""
     sensor = scenario.sensor
     noises = (sensor.position_noise_m, sensor.velocity_noise_mps)
     alone = not any(noises) and scenario.vehicle.wind == 0.0
@@ -281,7 +281,7 @@ def strengths(scenario: Scenario) -> tuple[float, tuple[float, float]]:
 
 
 def responses(scenario: Scenario, loop: Loop, given: Sequence[Timing], pushes: int) -> Responses:
-    """What pushes leave in a loop along each timing, with so many of a source at a time."""
+    """Responses to pushes along each timing, simulated a number per source at once."""
     dt = scenario.control.dt
     begin, window = round(SETTLE_S / dt), max(round(FOLLOWED_S / dt), 2)
     each = []

@@ -1,7 +1,7 @@
-"""The figures of a report, drawn for print, each with its numbers and a sentence on what they say.
+"""Figures of a report, drawn for print, each with its numbers and a caption.
 
-Sizes are those of a journal's columns, letters 8 points. Red and dashed is the reference, black the
-vehicle, as in the paper.
+Sizes are those of a journal's columns, letters 8 points. The reference is red and dashed, the
+vehicle black, as in the paper.
 """
 
 import io
@@ -38,22 +38,22 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
     EVENT: {"color": "#c1272d", "linestyle": "-", "marker": "^"},
     PERIODIC: {"color": "#0072b2", "linestyle": "--", "marker": "v"},
 }
-"""Line style of each method; they can be told apart without colour as well."""
+"""Line style of each method; methods can be told apart without colour."""
 RATIO_LOG = 20.0
 """Ratio of largest to smallest value above which a scale is logarithmic."""
 
 Samples = Mapping[str, tuple[Scenario, Sequence[Record]]]
-"""Scenario and a few flights with their records, by method."""
+"""Scenario and some complete records of flights, by method."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plate(Picture):
-    """A figure of a report, for print as well, with its numbers."""
+    """Figure of a report, for screen and print, with its numbers."""
 
     pdf: bytes
     """Drawing for print."""
     csv: str
-    """Numbers that are drawn."""
+    """Numbers in the drawing, as CSV."""
 
     def files(self) -> dict[str, bytes]:
         """Content of each of the figure's files, by suffix."""
@@ -62,7 +62,7 @@ class Plate(Picture):
 
 @contextmanager
 def _figure(width: float, height: float) -> "Iterator[Figure]":
-    """An empty figure of some size [inch]."""
+    """Empty figure of a size [inch]."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -71,27 +71,26 @@ def _figure(width: float, height: float) -> "Iterator[Figure]":
 
 
 def _picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Plate:
-    """A figure, as it is written."""
+    """Figure in all written formats."""
     png, pdf = io.BytesIO(), io.BytesIO()
     figure.savefig(png, format="png", dpi=220)
-    figure.set_layout_engine("none")  # it lies as it should
+    figure.set_layout_engine("none")  # keep the figure's exact size
     figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
     return Plate(name, title, says, png.getvalue(), pdf.getvalue(), csv)
 
 
 def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
-    """Fig. 2: the delay (17), and the delay that netem really added.
+    """Fig. 2: the delay (17), and the delay that netem added.
 
     Args:
-        delay_ms: time that each packet took over UDP, and time it was drawn to take [ms]; shape
-            (packets, 2).
+        delay_ms: measured delay of each packet over UDP, and drawn delay [ms]; shape (packets, 2).
     """
     took_ms, late_ms = delay_ms[:, 0], delay_ms[:, 0] - delay_ms[:, 1]
     first_ms, slot_ms = direction.minimum_s * 1e3, direction.slot_s * 1e3
     count = int(stats.poisson.ppf(0.9999, direction.slots_mean)) + 2
     slots = np.arange(count)
     lattice_ms, pdf = first_ms + slot_ms * slots, stats.poisson.pmf(slots, direction.slots_mean)
-    # A packet can be late, not early: what took up to a slot more than the lattice says is its.
+    # A packet can be late, never early: any excess of up to a slot is assigned to the drawn slot.
     nearest = np.floor((took_ms - first_ms) / slot_ms + 0.1)
     share = np.array([np.mean(nearest == slot) for slot in slots])
     fine_ms = np.arange(first_ms - slot_ms, lattice_ms[-1] + 1.0)
@@ -125,7 +124,7 @@ def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
 
 
 def paths(samples: Samples) -> Plate:
-    """Fig. 3: the path without and with compensation, a packet at every step."""
+    """Fig. 3: path without and with compensation, with a packet at every step."""
     rmse, positions = [], []
     with _figure(PAGE, 3.9) as figure:
         planes = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -148,7 +147,7 @@ def paths(samples: Samples) -> Plate:
 
 
 def events(samples: Samples) -> Plate:
-    """Fig. 4: the path with the event trigger, and its events below."""
+    """Fig. 4: path with the event trigger, and its events below."""
     scenario, flights = samples[EVENT]
     flight, dt = flights[0], scenario.control.dt
     step, wanted, position = _path(scenario, flight)
@@ -228,7 +227,7 @@ def maps(flown: Flown, here: ControlConfig) -> Plate:
 
 
 DRAWN = ("rmse_xy", "event_ratio")
-"""Figures of the maps, and of the curves beside them."""
+"""Figures in the maps, and in the curves beside them."""
 
 
 def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
@@ -243,7 +242,7 @@ def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
 
 
 def pareto(flown: Flown, periodic: Flown) -> Plate:
-    """Fig. 5 as curves: RMSE against event ratio, and periodic sending beside it."""
+    """Fig. 5 as curves: RMSE against event ratio, with periodic sending for comparison."""
     decay, _, rmse, ratio = _grid(flown)
     rates, errors = (
         np.array([estimate(runs, name)[0] for runs in periodic.values()], dtype=np.float64)
@@ -286,7 +285,7 @@ def pareto(flown: Flown, periodic: Flown) -> Plate:
 
 
 def curve(study: Study, cells: Cells) -> Plate:
-    """RMSE of all methods against the one thing that changes in a study, with 95 % bands."""
+    """RMSE of all methods against the parameter of a study, with 95 % bands."""
     methods = list(STYLES)
     table = {
         method: np.array(
@@ -302,7 +301,7 @@ def curve(study: Study, cells: Cells) -> Plate:
             halves = np.nan_to_num(halves)
             plane.plot(places, means, **STYLES[method], linewidth=1.0, markersize=3.5, label=method)
             colour = STYLES[method]["color"]
-            low = np.maximum(means - halves, 0.5 * means)  # a logarithmic scale has no 0
+            low = np.maximum(means - halves, 0.5 * means)  # a logarithmic axis has no 0
             plane.fill_between(places, low, means + halves, color=colour, alpha=0.2, linewidth=0)
         plane.axvline(study.here, color="0.6", linewidth=0.8)
         means = np.concatenate([table[method][:, 0] for method in methods])
@@ -337,7 +336,7 @@ def curve(study: Study, cells: Cells) -> Plate:
 
 
 def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
-    """Numbers of values at which periodic sending is better than the trigger, and worse."""
+    """Number of values at which periodic sending is better than the trigger, and worse."""
     signs = [
         periodic_wins(cells[value, EVENT], cells[value, PERIODIC]) for value in study.axis.values
     ]
@@ -373,7 +372,9 @@ def estimates(samples: Samples) -> Plate:
 
 
 def _estimate_error(flight: Record) -> Array:
-    """‖x̂ − x‖ of position [m] and velocity [m/s], where both are known; shape (steps, 2)."""
+    """‖x̂ − x‖ of position [m] and velocity [m/s], at steps where both are known; shape (steps,
+    2).
+    """
     _, ours, theirs = np.intersect1d(
         flight.server["step"], flight.client["step"], return_indices=True
     )
@@ -384,32 +385,32 @@ def _estimate_error(flight: Record) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Bought:
-    """A point of `trade`: what is spent, and the error that it leaves."""
+    """Point of `trade`: resources used, and the remaining error."""
 
     packets_per_s: float
-    """Packets per second, both ways; of none a line is drawn."""
+    """Packets per second, both ways; 0 is drawn as a horizontal line."""
     bytes_per_s: float
     """Bytes per second, both ways and with headers."""
     effort_mps: float
     """RMS change of the command from step to step [m/s]."""
     rmse_m: float | None
-    """Mean RMSE xy [m]; None where none flew."""
+    """Mean RMSE xy [m]; None if no flight succeeded."""
     rmse_half_m: float | None
-    """Half the width of the 95 % interval of `rmse_m` [m]."""
+    """Half-width of the 95 % interval of `rmse_m` [m]."""
     median_m: float | None
-    """Median RMSE xy [m]; None where none flew."""
+    """Median RMSE xy [m]; None if no flight succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A curve of `trade`."""
+    """Curve of `trade`."""
 
     label: str
     """Name in the legend."""
     colour: str
     marker: str
     points: Sequence[Bought]
-    """Points in the order in which they are joined."""
+    """Points in the order of the line."""
 
 
 def trade(
@@ -420,11 +421,11 @@ def trade(
     floor: Sequence[tuple[float, float]],
     csv: str,
 ) -> Plate:
-    """RMSE over what is spent, in packets, in bytes and in effort, with 95 % bands.
+    """RMSE over the resources used: packets, bytes and effort, with 95 % bands.
 
     Args:
         floor: points of a floor: packets up per second, and RMSE xy [m].
-        csv: the numbers, as `Picture` has them.
+        csv: the numbers, as CSV text.
     """
     with _figure(PAGE, 5.0) as figure:
         panes = figure.subplots(1, 3, sharey=True)
@@ -433,7 +434,7 @@ def trade(
             rmse = np.array([point.rmse_m for point in flown], np.float64)
             half = np.array([point.rmse_half_m or 0.0 for point in flown], np.float64)
             median = np.array([point.median_m for point in flown], np.float64)
-            low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic scale has no 0
+            low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic axis has no 0
             if flown and not flown[0].packets_per_s:
                 for plane in panes:
                     plane.axhline(rmse[0], color=curve.colour, linestyle="--", label=curve.label)
@@ -445,7 +446,7 @@ def trade(
                 plane.plot(cost, rmse, **style, marker=shape, markersize=4, label=label)
                 plane.plot(cost, median, **style, marker="_", markersize=7)
                 if spent == "effort_mps":
-                    continue  # with the threshold it may rise or fall
+                    continue  # effort may rise or fall with the threshold
                 plane.plot(cost, rmse, color=style["color"], linewidth=0.8)
                 plane.fill_between(
                     cost, low, rmse + half, color=style["color"], alpha=0.2, linewidth=0
@@ -456,7 +457,7 @@ def trade(
             plane.set_yscale("log")
             if spent != "effort_mps":
                 plane.set_xscale("log")
-                plane.xaxis.set_minor_formatter("")  # they would lie over each other
+                plane.xaxis.set_minor_formatter("")  # such bands would overlap
             plane.set_xlabel(label)
         panes[0].set_ylabel("RMSE xy [m]")
         handles, labels = panes[0].get_legend_handles_labels()
@@ -469,7 +470,7 @@ SPENT = {
     "bytes_per_s": "bytes /s, both ways",
     "effort_mps": "effort [m/s]",
 }
-"""What is spent, and how an axis calls it."""
+"""Resources, and their axis labels."""
 
 
 def intervals(samples: Samples) -> Plate:
@@ -502,7 +503,7 @@ def intervals(samples: Samples) -> Plate:
 
 
 def solve_times(servers: Mapping[str, Rows], dt: float) -> Plate:
-    """Distribution of the time that both MPCs of a step took in the flights over UDP.
+    """Distribution of the computing time of both MPCs per step in the flights over UDP.
 
     Args:
         servers: rows of the server's records, by method.

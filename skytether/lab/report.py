@@ -1,4 +1,4 @@
-"""A report, a page of tables and figures that opens offline; and the report of `reproduce`."""
+"""Report: a page of tables and figures that opens offline; and the report of `reproduce`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,19 +39,19 @@ ABOUT = (
 
 @dataclass(frozen=True, slots=True)
 class Real:
-    """A flight over UDP."""
+    """Flight over UDP."""
 
     scenario: Scenario
-    """What was flown."""
+    """Scenario that was flown."""
     flight: Record
     """Records of the flight."""
     netem: Mapping[str, Any]
-    """Figures of netem: what it counted, and how late it was."""
+    """Figures of netem: its counters, and its lateness."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """All that a reproduction has flown."""
+    """Results of all flights of a reproduction."""
 
     table: tuple[Study, Cells]
     """Study of Table 1, and its cells."""
@@ -62,31 +62,31 @@ class Reproduction:
     periods: Flown
     """Summaries of periodic sending beside Fig. 5, by period."""
     delay_ms: Array
-    """Time of each packet over UDP, and time that was drawn for it [ms]; shape (packets, 2)."""
+    """Measured delay of each packet over UDP, and drawn delay [ms]; shape (packets, 2)."""
     real: Mapping[str, Real]
     """Flights over UDP, by method."""
     samples: Samples
-    """Flights in virtual time with their whole records, by method."""
+    """Complete records of some flights in virtual time, by method."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A report, drawn."""
+    """Report with its figures drawn."""
 
     title: str
     """Heading of the page."""
     about: str
-    """One or two sentences on what was flown."""
+    """Introduction: one or two sentences on the scenario."""
     tables: Sequence[Table]
     """Tables, the most important first."""
     pictures: Sequence[Plate]
     """Figures."""
     verdict: str
-    """One or two sentences on what came out."""
+    """Result: one or two sentences on the outcome."""
 
 
 def draw(measured: Reproduction) -> Drawn:
-    """The report of a reproduction."""
+    """Report of a reproduction."""
     study, cells = measured.table
     columns = {method: cell for (value, method), cell in cells.items() if value == study.here}
     entries = table_1(columns)
@@ -109,7 +109,7 @@ def draw(measured: Reproduction) -> Drawn:
 
 
 def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> Table:
-    """Table 1, the paper's figures beside ours."""
+    """Table 1, the paper's figures beside the reproduced ones."""
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     rows = [
         (
@@ -173,7 +173,7 @@ REAL = {
     "deadline_misses": ("misses", "d"),
     "netem_late_ms_p99": ("netem late p99 [ms]", ".2f"),
 }
-"""Columns of `real_table`: heading and format of each."""
+"""Columns of `real_table`: heading and format."""
 
 
 def real_table(measured: Reproduction) -> Table:
@@ -223,7 +223,7 @@ def real_table(measured: Reproduction) -> Table:
 
 
 def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> str:
-    """What a reproduction came to, in two sentences."""
+    """Result of a reproduction, in two sentences."""
     off = {(e.column, e.entry): e.deviation for e in entries if e.deviation is not None}
     near = sum(within(entry, deviation) for (_, entry), deviation in off.items())
     (column, entry), worst = max(off.items(), key=lambda item: abs(item[1]))
@@ -238,21 +238,21 @@ def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights])
 
 
 def _rmse(cell: MethodFlights) -> float:
-    """Mean RMSE xy [m]; NaN where nothing was flown."""
+    """Mean RMSE xy [m]; NaN if nothing was flown."""
     mean = cell.estimate("rmse_xy")[0]
     return float("nan") if mean is None else mean
 
 
 def as_interval(estimate: Estimate, spec: str) -> str:
-    """A mean with its interval, as a table shows it."""
+    """Mean with its interval, as shown in a table."""
     return " ± ".join(as_text(part, spec) for part in estimate)
 
 
 def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -> str:
-    """The page of a report.
+    """Page of a report.
 
     Args:
-        scenario: what the report is about.
-        calls: facts of each call of the command that made it, the last one last.
+        scenario: scenario of the report.
+        calls: facts about each call of the command that made it, in order.
     """
     return rendered("figures/report.html.jinja", drawn=drawn, scenario=scenario, calls=calls)

@@ -1,7 +1,8 @@
-"""Who sits on the way between vehicles and netem while they are tortured, and reads nothing.
+"""Man in the middle between vehicles and netem that replays and alters packets, but cannot read
+them.
 
-Packets pass, unless a fault is on (`lab.faults`): then they are lost, doubled, held back, changed
-or sent again, or a stranger sends others beside them.
+Packets pass unless a fault is active (`lab.faults`): then they are lost, duplicated, delayed,
+altered or replayed, or a stranger sends further packets.
 """
 
 from collections import Counter, deque
@@ -18,31 +19,31 @@ SERVER: Address = ("server", 0)
 NETEM: Address = ("netem", 0)
 
 RECORDED = 2048
-"""Number of newest packets of a direction that an attacker has recorded."""
+"""Number of newest packets of a direction that an attacker keeps for replay."""
 HELD_MAX = 65536
 """Largest number of packets that an attacker holds back."""
 FLOOD_NS = 10 * MILLISECOND_NS
-"""Time between two volleys of forged packets [ns]."""
+"""Time between two bursts of forged packets [ns]."""
 OTHER_SOCKET, STRANGERS_SOCKET, STRANGERS = 100, 200, 8
-"""First number of the sockets from which packets of vehicles are replayed, of those from which
-forged ones are sent, and number of the latter."""
+"""First number of the sockets that replay vehicles' packets, first number of those that send forged
+ones, and the latter's count."""
 COPIER_SOCKET, COPIERS = 300, 16
-"""First number and number of the sockets from which copies are sent, and which are answered."""
+"""First number and count of the sockets that send copies and receive the answers."""
 COPY_S = 0.3
-"""Longest time for which a copy or an answer to it is held back [s]."""
+"""Longest delay of a copy, or of an answer to one [s]."""
 SWIFT = 0.5
-"""Share of attackers who are faster than the network."""
+"""Share of attackers whose copies are faster than the network."""
 ASTRAY = 0.2
-"""Share of copies and answers that are sent to another than they were meant for."""
+"""Share of copies and answers that are sent to a wrong destination."""
 
 
 class Saboteur(Endpoint):
-    """Who sits on the way between vehicles and netem, and reads nothing.
+    """Man in the middle that replays and alters packets, but cannot read them.
 
-    Vehicle number n is a client of netem's by its socket n. Packets pass unless a fault is on.
+    Vehicle n is represented to netem by socket n. Packets pass unless a fault is active.
 
     Args:
-        rng: source of chance.
+        rng: random generator.
         clients: addresses of vehicles 1, 2, ….
     """
 
@@ -52,28 +53,28 @@ class Saboteur(Endpoint):
         self._clients = dict(enumerate(clients, start=1))
         self._numbers = {client: number for number, client in self._clients.items()}
         self._on: list[ScheduledFault] = []
-        """Faults that last."""
+        """Active faults."""
         self._left: dict[ScheduledFault, int] = {}
-        """Number of packets that are still lost of a burst."""
+        """Number of packets that a burst still drops."""
         self._recorded: dict[str, deque[tuple[int, Datagram]]] = {
             direction: deque(maxlen=RECORDED) for direction in ("uplink", "downlink")
         }
         """Newest packets of each direction, and the times at which they passed."""
         self._held: list[tuple[int, int, Datagram]] = []
-        """Heap of time at which a packet goes on, order, and packet."""
+        """Heap of delayed packets: time at which a packet goes on, order, and packet."""
         self._order = 0
         self._swift: set[ScheduledFault] = set()
-        """Attackers who copy all packets; those of vehicles come to the server before the originals
-        do."""
+        """Attackers that copy all packets; copies of vehicles' packets reach the server before the
+        originals."""
         self._copied: dict[int, Address] = {}
-        """Vehicle whose packet was copied last from each socket, by the socket's number."""
+        """Vehicle whose packet each socket copied last, by the socket's number."""
         self._volley_ns: int | None = None
-        """Time of the next volley of forged packets."""
+        """Time of the next burst of forged packets."""
         self.counts: Counter[str] = Counter()
-        """Number of packets that each kind of fault has befallen."""
+        """Number of packets affected by each kind of fault."""
 
     def begin(self, fault: ScheduledFault, now_ns: int) -> None:
-        """Let a fault befall what passes from now on."""
+        """Apply a fault to packets from now on."""
         self._on.append(fault)
         if fault.kind is Kind.FLOOD:
             self._volley_ns = now_ns
@@ -85,13 +86,13 @@ class Saboteur(Endpoint):
                     self._replay(fault, datagram, passed_ns, now_ns)
 
     def end(self, fault: ScheduledFault) -> None:
-        """Let it befall nothing more."""
+        """End a fault."""
         self._on.remove(fault)
         self._left.pop(fault, None)
         self._swift.discard(fault)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Let a packet pass, or not."""
+        """Pass a packet on, or apply the active faults."""
         payload, peer, socket = datagram
         if socket == 0:
             number = self._numbers.get(peer)
@@ -104,7 +105,7 @@ class Saboteur(Endpoint):
         self._release(now_ns)
 
     def wake(self, *, now_ns: int) -> None:
-        """Let go on what was held back, and flood."""
+        """Pass delayed packets on, and send forged ones."""
         if self._volley_ns is not None and now_ns >= self._volley_ns:
             floods = [fault for fault in self._on if fault.kind is Kind.FLOOD]
             for fault in floods:
@@ -114,7 +115,7 @@ class Saboteur(Endpoint):
         self._release(now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Time at which the next packet goes on."""
+        """Time at which the next delayed packet goes on."""
         due_ns = self._held[0][0] if self._held else None
         if due_ns is None or (self._volley_ns is not None and self._volley_ns < due_ns):
             return self._volley_ns
@@ -167,7 +168,7 @@ class Saboteur(Endpoint):
     def _replay(
         self, fault: ScheduledFault, datagram: Datagram, passed_ns: int, now_ns: int
     ) -> None:
-        """Send a packet again where its time lies in the fault, maybe from another address."""
+        """Replay a packet if the time falls within the fault, sometimes from another address."""
         again_ns = passed_ns + seconds_to_ns(fault.amount)
         if not now_ns <= again_ns < fault.end_ns:
             return
@@ -178,7 +179,7 @@ class Saboteur(Endpoint):
         self._hold(again_ns, datagram)
 
     def _copy(self, fault: ScheduledFault, direction: str, datagram: Datagram, now_ns: int) -> None:
-        """Send a copy of a packet from an address of his own."""
+        """Send a copy of a packet from the attacker's address."""
         swift = fault in self._swift
         if not swift and self._rng.random() >= fault.amount:
             return
@@ -194,12 +195,14 @@ class Saboteur(Endpoint):
         self._hold(now_ns + later_ns, Datagram(datagram.payload, to, socket))
 
     def _hand_on(self, payload: bytes, socket: int, now_ns: int) -> None:
-        """Send a vehicle what came in answer to a copy of its packet, maybe twice."""
+        """Forward the answer to a copied packet to its vehicle, sometimes twice."""
         for _ in range(1 + self._rng.integers(2)):
             self._send_copy(payload, self._copied[socket], socket, now_ns)
 
     def _send_copy(self, payload: bytes, client: Address, socket: int, now_ns: int) -> None:
-        """Send something to a vehicle, maybe to another, and under the server's address or not."""
+        """Send a packet to a vehicle, sometimes the wrong one, from the server's address or
+        another.
+        """
         rng = self._rng
         if rng.random() < ASTRAY:
             client = list(self._clients.values())[rng.integers(len(self._clients))]
@@ -207,18 +210,18 @@ class Saboteur(Endpoint):
         self._hold(now_ns + self._later_ns(), Datagram(payload, client, socket))
 
     def _later_ns(self) -> int:
-        """Time for which a copy is held back [ns]; half of them are not."""
+        """Delay of a copy [ns]; half of the copies have none."""
         return seconds_to_ns(COPY_S * max(0.0, self._rng.uniform(-1.0, 1.0)))
 
     def _flipped(self, payload: bytes) -> bytes:
-        """Payload with one bit flipped."""
+        """Payload with one flipped bit."""
         bit = int(self._rng.integers(8 * len(payload)))
         flipped = bytearray(payload)
         flipped[bit // 8] ^= 1 << bit % 8
         return bytes(flipped)
 
     def _forge(self, where: str) -> None:
-        """Send what a stranger can make: noise, or what was recorded with something changed."""
+        """Send packets that a stranger can make: random bytes, or altered recorded packets."""
         rng = self._rng
         recorded = self._recorded["downlink" if where == "server" else "uplink"]
         payload = rng.bytes(int(rng.integers(1, 600)))
@@ -232,7 +235,7 @@ class Saboteur(Endpoint):
                     payload = payload[:at]
                 case 2:
                     payload = payload[:at] + rng.bytes(size - at)
-                case _:  # another counter, as if it were newer
+                case _:  # a higher counter, so that the packet looks newer
                     payload = payload[:8] + rng.bytes(8) + payload[16:]
         socket = STRANGERS_SOCKET + int(rng.integers(STRANGERS))
         clients = list(self._clients.values())

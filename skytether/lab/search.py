@@ -1,9 +1,8 @@
-"""A search for the values of some keys of a scenario: CMA-ES, resumable from its journal.
+"""Search for values of some keys of a scenario by CMA-ES, resumable from its journal.
 
-The free keys live on logarithmic scales between bounds. A generation of points is proposed, flown
-by whoever is passed in, and scored by an objective. All that a search proposes follows from its
-settings and from the scores it was told: told them again, from its journal, it goes on where it was
-broken off.
+Free keys are searched on logarithmic scales between bounds. Each generation of points is proposed,
+flown by a function passed in, and scored by an objective. The proposals depend only on the settings
+and the earlier scores: given these again, from the journal, an interrupted search continues.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,24 +19,24 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 
 SIGMA = 0.1
-"""First step of a search unless another is asked for, as a share of the range of each key."""
+"""Default initial step size, as a share of each key's range."""
 
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """A key of a scenario, as in `control.state_weight.0`, and the bounds of its value."""
+    """Key of a scenario, as in `control.state_weight.0`, and the bounds of its value."""
 
     key: str
     low: float
     high: float
 
     def __str__(self) -> str:
-        """KEY=LOW:HIGH, as `parse` reads it."""
+        """KEY=LOW:HIGH, as accepted by `parse`."""
         return f"{self.key}={self.low:g}:{self.high:g}"
 
     @classmethod
     def parse(cls, text: str) -> "Free":
-        """The free key that a user writes as KEY=LOW:HIGH.
+        """Free key from the text KEY=LOW:HIGH.
 
         Raises:
             ConfigError: the text has another form, or the bounds are impossible.
@@ -52,13 +51,13 @@ class Free:
         return cls(key, low, high)
 
     def of(self, table: Any) -> float:
-        """Value of the key in the table of a scenario."""
+        """Value of the key in a scenario's table."""
         for name in self._path():
             table = table[name]
         return float(table)
 
     def put(self, table: Any, value: float) -> None:
-        """Change the value of the key in the table of a scenario."""
+        """Set the key in a scenario's table."""
         *path, last = self._path()
         for name in path:
             table = table[name]
@@ -89,7 +88,7 @@ def check_free(free: Sequence[Free], start: Scenario) -> None:
 
 
 def put(scenario: Scenario, values: Mapping[Free, float]) -> Scenario:
-    """A scenario with other values of some keys."""
+    """Scenario with other values of some keys."""
     table = plain(scenario)
     for key, value in values.items():
         key.put(table, value)
@@ -97,7 +96,7 @@ def put(scenario: Scenario, values: Mapping[Free, float]) -> Scenario:
 
 
 def plain(table: Any) -> Any:
-    """A scenario, or a table of one, as dictionaries and lists that may be changed."""
+    """Scenario, or a table of one, as mutable dictionaries and lists."""
     if isinstance(table, Scenario):
         table = reading.to_table(table)
     if isinstance(table, Mapping):
@@ -109,7 +108,7 @@ class Optimiser:
     """CMA-ES over free keys, from the values of a scenario.
 
     Args:
-        sigma: first step, as a share of the (logarithmic) range of each key.
+        sigma: initial step size, as a share of the (logarithmic) range of each key.
     """
 
     def __init__(
@@ -122,7 +121,7 @@ class Optimiser:
         low, high = np.log([key.low for key in free]), np.log([key.high for key in free])
         self._low, self._range = low, high - low
         here = (np.log([key.of(plain(start)) for key in free]) - low) / self._range
-        rng = np.random.default_rng(seed)  # its own dice: numpy's global ones are anybody's
+        rng = np.random.default_rng(seed)  # a generator of its own: numpy's global one is shared
         options = {
             "bounds": [0, 1],
             "popsize": population,
@@ -134,7 +133,7 @@ class Optimiser:
         self._points: list[Any] = []
 
     def ask(self) -> list[Scenario]:
-        """The next generation; the first one begins with the start itself."""
+        """Next generation; the first one begins with the starting point."""
         first = self._search.countiter == 0
         self._points = self._search.ask()
         if first:
@@ -142,12 +141,12 @@ class Optimiser:
         return [self._scenario(point) for point in self._points]
 
     def tell(self, scores: Sequence[float]) -> None:
-        """Take the score of each point of the generation that was asked for."""
+        """Take the scores of the generation that was proposed."""
         self._search.tell(self._points, scores)
 
     def _scenario(self, point: Any) -> Scenario:
         values = np.exp(self._low + self._range * point)
-        # Rounded, so that people can read the file, before it is flown.
+        # Rounded before the flight, so that the file is readable and exact.
         return put(
             self._start,
             {key: float(f"{value:.4g}") for key, value in zip(self._free, values, strict=True)},
@@ -160,45 +159,45 @@ class Optimiser:
 
 
 Values = Mapping[str, Mapping[str, float | None]]
-"""Figures of a point, by column and name; None where a flight failed."""
+"""Figures of a point, by column and name; None if a flight failed."""
 
 
 class Objective(Protocol):
-    """What a search is after."""
+    """Objective of a search."""
 
     def settings(self) -> Mapping[str, Any]:
         """Name and settings of the objective, as plain values."""
 
     def free(self) -> Sequence[Free]:
-        """Keys to change unless others are asked for."""
+        """Default free keys."""
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
         """Figures of a point; called in a worker."""
 
     def score(self, values: Values) -> float:
-        """Score of a point with these figures; the smaller, the better."""
+        """Score of a point with these figures; smaller is better."""
 
 
 class SearchPoint(msgspec.Struct, frozen=True):
-    """A point that was flown."""
+    """Point that was flown."""
 
     keys: dict[str, float]
     """Values of the free keys."""
     values: dict[str, dict[str, float | None]]
-    """Figures, by column and name; None where a flight failed."""
+    """Figures, by column and name; None if a flight failed."""
     score: float
-    """Score, which is the smaller the better the point is."""
+    """Score; smaller is better."""
 
 
 Generation = list[SearchPoint]
 """Entry of a search's journal."""
 FlyAll = Callable[[Callable[[Scenario], Values], Sequence[Scenario]], Sequence[Values]]
-"""Calls a function with each of some scenarios, and returns the results in their order."""
+"""Function that calls a function with each of some scenarios, and returns the results in order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Where a search starts, what it is after, and its effort."""
+    """Starting point, objective and effort of a search."""
 
     start: Scenario
     objective: Objective
@@ -209,10 +208,10 @@ class Search:
     population: int
     """Number of points in a generation."""
     sigma: float = SIGMA
-    """First step, as a share of the (logarithmic) range of each key."""
+    """Initial step size, as a share of each key's (logarithmic) range."""
 
     def settings(self) -> dict[str, Any]:
-        """All that the points of the search follow from, as plain values."""
+        """Settings that determine all points of the search, as plain values."""
         return {
             **self.objective.settings(),
             "free": list(map(str, self.free)),
@@ -226,10 +225,10 @@ class Search:
     def points(
         self, journal: Journal[Generation], generations: int, fly_all: FlyAll
     ) -> Iterator[list[SearchPoint]]:
-        """After each generation, all points so far, those that the journal has with them.
+        """All points so far after each generation, including those of the journal.
 
         Raises:
-            ConfigError: the journal has points that this search does not propose.
+            ConfigError: the journal has points that this search would not propose.
         """
         seed = self.start.seed
         optimiser = Optimiser(
@@ -258,10 +257,10 @@ class Search:
         return SearchPoint(keys, figures, self.objective.score(values))
 
     def scenario(self, point: SearchPoint) -> Scenario:
-        """The scenario of a point."""
+        """Scenario of a point."""
         return put(self.start, {key: point.keys[key.key] for key in self.free})
 
 
 def best(points: Sequence[SearchPoint]) -> SearchPoint:
-    """The point with the smallest score."""
+    """Point with the smallest score."""
     return min(points, key=lambda point: point.score)

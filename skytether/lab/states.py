@@ -1,6 +1,6 @@
-"""The failsafe's states as a picture, drawn from its table (docs/failsafe.svg).
+"""Diagram of the failsafe's states, drawn from its table (docs/failsafe.svg).
 
-`print(svg(), end='')`, redirected to that file, draws it anew.
+`print(svg(), end='')`, redirected to that file, updates it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,7 +26,7 @@ AT: Mapping[Mode, tuple[int, int]] = {
     Mode.FAULT: (80, 380),
     Mode.MANUAL: (770, 540),
 }
-"""Middle of each state."""
+"""Centre of each state."""
 BEND: Mapping[tuple[Mode, Mode], int] = {
     (Mode.READY, Mode.SYNC): 60,
     (Mode.SYNC, Mode.READY): 0,
@@ -36,17 +36,17 @@ BEND: Mapping[tuple[Mode, Mode], int] = {
     (Mode.BRAKE, Mode.TRACK): 80,
     (Mode.COAST, Mode.BRAKE): -30,
 }
-"""How far the middle of an arrow lies to the left of its way; 0 of those that are not here."""
+"""Distance by which an arrow's middle is bent to the left; 0 for those not listed."""
 BELOW = {Mode.BRAKE, Mode.HOVER, Mode.LAND, Mode.FAULT, Mode.MANUAL}
-"""States whose arrow to themselves is drawn below them."""
+"""States whose self-loop is drawn below them."""
 ANYWHERE: Mapping[Mode, tuple[str, tuple[int, int], tuple[int, int]]] = {
     Mode.FAULT: ("from every state:", (0, -90), (0, -96)),
     Mode.MANUAL: ("from every state but INIT, LAND, FAULT:", (-110, 0), (-240, -4)),
 }
-"""States to which the same causes lead from everywhere: what is said of it, where their one arrow
-begins, and where its label is, from the middle of the state."""
+"""States that the same causes reach from everywhere: label, start of the single arrow, and position
+of its label, relative to the state's centre."""
 LOST = "lost link ¹"
-"""What all causes in `BROKEN` are called together."""
+"""Common label of all causes in `BROKEN`."""
 TIP = (
     '<defs><marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" '
     'markerHeight="7" orient="auto"><path d="M0 0L10 5L0 10z" '
@@ -61,7 +61,7 @@ STYLE = (
 
 
 def svg(table: Table = TABLE) -> str:
-    """Draw a table as an SVG file; causes between the same two states share an arrow."""
+    """Diagram of a table as SVG; causes between the same two states share an arrow."""
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}">',
         f"<style>{STYLE}</style>",
@@ -100,7 +100,9 @@ def svg(table: Table = TABLE) -> str:
 
 
 def _arrows(table: Table) -> Iterator[tuple[tuple[Mode, Mode], set[Reason]]]:
-    """Causes of each pair of states that an arrow joins; being there already is no arrow."""
+    """Causes of each pair of states that an arrow joins; transitions to the same state have
+    none.
+    """
     rows = sorted((before, after, cause) for (before, cause), after in table.items())
     for pair, group in groupby(rows, key=lambda row: row[:2]):
         causes = {cause for *_, cause in group}
@@ -113,7 +115,7 @@ def _sign(number: int) -> int:
 
 
 def _texts(causes: set[Reason]) -> list[str]:
-    """Names of causes, a line each; those in `BROKEN` are one where most of them are there."""
+    """Names of causes, one per line; most causes in `BROKEN` together get a common name."""
     lost = [LOST] if len(causes & BROKEN) > 1 else []
     rest = causes - BROKEN if lost else causes
     return [_name(cause) for cause in sorted(rest)] + lost
@@ -138,7 +140,7 @@ def _way(before: Mode, after: Mode) -> tuple[str, tuple[float, float]]:
     mx, my = (x0 + x1) / 2 + bend * dy / length, (y0 + y1) / 2 - bend * dx / length
 
     def border(x: float, y: float) -> tuple[float, float]:
-        """Where the line from a state's middle towards the bend leaves its box."""
+        """Point where the line from a state's centre towards the bend crosses its border."""
         tx, ty = mx - x, my - y
         scale = min(half / abs(tx) if tx else 9e9, side / abs(ty) if ty else 9e9)
         return x + tx * scale, y + ty * scale

@@ -1,8 +1,8 @@
-"""What `skytether reproduce` flies: the paper's Table 1 and Fig. 5, and the literature's usual set.
+"""Studies of `skytether reproduce`: the paper's Table 1 and Fig. 5, and usual further studies.
 
-A study flies all methods over the values of one thing that changes. Its second sweep is the honest
-baseline: at each value, periodic sending with the period nearest to the event trigger's own rate
-at that value, which follows from the first sweep.
+A study flies all methods over the values of one parameter. Its second sweep is a fair baseline: at
+each value, periodic sending with the period nearest to the event trigger's rate at that value,
+known from the first sweep.
 """
 
 import math
@@ -27,12 +27,12 @@ METHODS = GridAxis(
     tuple(COLUMNS),
     tuple({f"control.{key}": value for key, value in keys.items()} for keys in COLUMNS.values()),
 )
-"""Methods of Table 1, each a column of it; PERIODIC is flown beside them."""
+"""Methods of Table 1, each a column of it; PERIODIC is flown for comparison."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReproductionSize:
-    """How much a reproduction flies."""
+    """Size of a reproduction."""
 
     runs: int
     """Number of flights of each column of Table 1."""
@@ -51,15 +51,15 @@ class ReproductionSize:
     real_s: float
     """Length of a flight over UDP [s]."""
     real_settle_s: float
-    """Start of a flight over UDP that RMSE leaves out [s]."""
+    """Beginning of a flight over UDP that RMSE leaves out [s]."""
     sample_runs: int
-    """Number of flights of each method whose whole records are drawn."""
+    """Number of flights of each method whose complete records are drawn."""
     delay_packets: int
     """Number of packets sent through netem, each way, to measure their delay."""
 
 
 def full(runs: int) -> ReproductionSize:
-    """Scale of a reproduction that is reported."""
+    """Size of a complete reproduction."""
     return ReproductionSize(
         runs=runs,
         curve_runs=-(-runs // 2),
@@ -88,32 +88,32 @@ QUICK = ReproductionSize(
     sample_runs=2,
     delay_packets=500,
 )
-"""Scale of a first look."""
+"""Size of a first look."""
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """All methods over the values of one thing that changes."""
+    """Study of all methods over the values of one parameter."""
 
     name: str
-    """Short name, in files."""
+    """Short name, for files."""
     label: str
     """Label of the axis, with its unit."""
     scenario: Scenario
-    """What is flown, but for what changes."""
+    """Scenario that is flown, except for the parameter."""
     axis: GridAxis
-    """Values, and the keys that each changes."""
+    """Values of the parameter, and the keys that each changes."""
     runs: int
     """Number of flights of each method at each value."""
     here: float
-    """Value that the scenario itself has."""
+    """Value of the parameter in the scenario itself."""
 
     def first(self) -> Sweep:
-        """The sweep of the methods of Table 1."""
+        """Sweep of the methods of Table 1."""
         return Sweep(SCENARIO, self.scenario, [self.axis, METHODS], self.runs)
 
     def second(self, flown: "Flown") -> Sweep:
-        """The sweep of periodic sending, as often as the event trigger sent in the first."""
+        """Sweep of periodic sending, at the rate of the event trigger in the first sweep."""
         changes = tuple(
             {**keys, **periodic(period(flown[value, EVENT]))} for value, keys in self.axis.points()
         )
@@ -123,21 +123,21 @@ class Study:
 
 
 def periodic(steps: int) -> Mapping[str, Any]:
-    """Keys of a scenario that sends every so many steps, and their values."""
+    """Keys and values of periodic sending with so many steps between packets."""
     return {"control.trigger": "periodic", "control.period": steps}
 
 
 def period(runs: Sequence[Summary]) -> int:
     """Period whose rate is nearest to the mean event ratio of some runs [steps]."""
     ratio = estimate(runs, "event_ratio")[0]
-    if not ratio:  # none of them flew
+    if not ratio:  # no flight succeeded
         return 1
     below = max(1, math.floor(1.0 / ratio))
     return min(below, below + 1, key=lambda steps: abs(1.0 / steps - ratio))
 
 
 def table_study(scenario: Scenario, scale: ReproductionSize) -> Study:
-    """Study of Table 1, and of flights as short as those over UDP, to stand beside them."""
+    """Study of Table 1, and of flights as short as those over UDP, for comparison."""
     short = {"duration": scale.real_s, "settle": scale.real_settle_s}
     values = (scenario.duration, scale.real_s)
     axis = GridAxis("duration", values, ({}, short))
@@ -145,7 +145,9 @@ def table_study(scenario: Scenario, scale: ReproductionSize) -> Study:
 
 
 def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
-    """Studies of the literature's usual set: loss, delay, jitter, a wrong model, other clocks."""
+    """Studies that are usual in the literature: loss, delay, jitter, a wrong model, other
+    clocks.
+    """
     up, n = scenario.network.uplink, scale.points
     slots_s = up.slot_s * up.slots_mean
 
@@ -165,7 +167,7 @@ def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
         return {f"network.{way}.{key}": keys[key] for way in directions for key in keys}
 
     def jitter(std_ms: float) -> Mapping[str, Any]:
-        # A Poisson number of slots has its mean as variance; the mean delay stays what it is.
+        # A Poisson number of slots has variance = mean; the mean delay is kept.
         slots = (std_ms / 1e3 / up.slot_s) ** 2
         return both_ways(slots_mean=slots, minimum_s=round(up.mean_s - up.slot_s * slots, 9))
 
@@ -220,7 +222,7 @@ def map_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
 
 
 def period_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
-    """Sweep of periodic sending beside Fig. 5, from every step to hardly ever."""
+    """Sweep of periodic sending for Fig. 5, from every step to very rarely."""
     axis = GridAxis("control.period", scale.periods, tuple(map(periodic, scale.periods)))
     return Sweep(SCENARIO, scenario, [axis], scale.map_runs)
 
@@ -241,10 +243,10 @@ class MethodFlights:
     runs: Sequence[Summary]
     """Summary of each flight."""
     period: int | None = None
-    """Steps between packets, for periodic sending; None for other methods."""
+    """Steps between packets with periodic sending; None for other methods."""
 
     def estimate(self, figure: str) -> Estimate:
-        """Estimate of a figure; `total_packets` and `total_bytes` count both directions."""
+        """Estimate of a figure; `total_packets` and `total_bytes` sum both directions."""
         if not figure.startswith("total_"):
             return estimate(self.runs, figure)
         what = figure.removeprefix("total_")
@@ -254,9 +256,9 @@ class MethodFlights:
 
 
 def periodic_wins(event: MethodFlights, periodic: MethodFlights) -> int:
-    """1 where periodic sending has the smaller RMSE xy, -1 where it has the larger one.
+    """Comparison of RMSE xy: 1 if periodic sending is better, -1 if it is worse.
 
-    The result is 0 where the 95 % intervals meet, or nothing was flown.
+    The result is 0 if the 95 % intervals overlap, or nothing was flown.
     """
     (ours, ours_half), (theirs, theirs_half) = (
         cell.estimate("rmse_xy") for cell in (event, periodic)
@@ -268,15 +270,15 @@ def periodic_wins(event: MethodFlights, periodic: MethodFlights) -> int:
 
 
 Cells = Mapping[tuple[float, str], MethodFlights]
-"""Cells of a study, by value and method; PERIODIC is one of the methods."""
+"""Cells of a study, by value and method, including PERIODIC."""
 
 
 def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly: Results) -> Cells:
     """Cells of a study, from both of its sweeps.
 
     Args:
-        firstly: what is done of the first sweep.
-        secondly: what is done of the second sweep.
+        firstly: finished tasks of the first sweep.
+        secondly: finished tasks of the second sweep.
     """
     found = {key: MethodFlights(runs) for key, runs in flown(first, firstly).items()}
     periods = [keys["control.period"] for _, keys in second.axes[0].points()]
@@ -290,20 +292,20 @@ def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly:
 
 
 class TableEntry(msgspec.Struct, frozen=True):
-    """An entry of Table 1, the paper's figure beside ours."""
+    """Entry of Table 1, the paper's figure beside the reproduced one."""
 
     column: str
     """Method."""
     entry: str
     """Name of the figure."""
     paper: float | None
-    """The paper's figure; None where it has none."""
+    """Paper's figure; None if it has none."""
     here: float | None
-    """Mean of our flights; None where none flew."""
+    """Mean of the flights; None if none succeeded."""
     ci95: float | None
-    """Half the width of the 95 % interval of `here`."""
+    """Half-width of the 95 % interval of `here`."""
     deviation: float | None
-    """Relative deviation of `here` from `paper`; None without the latter."""
+    """Relative deviation of `here` from `paper`; None without a paper's figure."""
 
 
 ENTRIES = ("rmse_x", "rmse_y", "rmse_xy", "event_ratio")
@@ -312,7 +314,7 @@ TRAFFIC = tuple(f"{way}_{what}" for way in WAYS for what in ("packets", "bytes")
 
 
 def table_1(columns: Mapping[str, MethodFlights]) -> list[TableEntry]:
-    """Entries of Table 1 for all columns; PERIODIC, which the paper does not have, with them."""
+    """Entries of Table 1 for all columns, including PERIODIC, which the paper does not have."""
     found = {
         (column, name): cell.estimate(name) for column, cell in columns.items() for name in ENTRIES
     }

@@ -1,8 +1,8 @@
 """Sweeps: many flights over a grid of scenarios, their summaries, and the tables of their means.
 
-A sweep is cells × runs. A cell is the scenario with one value from each grid; its runs differ in
-the seed alone, counting up from the scenario's. They are flown in chunks of a fixed size, so that
-no result depends on how many workers there were, or on what was interrupted.
+A sweep is cells × runs. A cell is the scenario with one value from each grid; its runs differ only
+in the seed, which counts up from the scenario's. Runs are flown in chunks of a fixed size, so that
+no result depends on the number of workers, or on interruptions.
 """
 
 import itertools
@@ -37,17 +37,19 @@ SEED_MAX = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class GridAxis:
-    """One key of the scenario, and the values it takes; or a label, and what its values change."""
+    """Key of the scenario with its values; or a label, with the keys that each value changes."""
 
     key: str
-    """Key with dots, or a label where there are `changes`."""
+    """Key with dots, or a label if there are `changes`."""
     values: tuple[Any, ...]
     """Values of the key, or names of the changes."""
     changes: tuple[Mapping[str, Any], ...] = ()
-    """Keys that each value changes, and their values; empty where it changes `key` alone."""
+    """Keys that each value changes, and their values; empty if it changes only `key`."""
 
     def __str__(self) -> str:
-        """KEY=VALUE,VALUE,... as `parse_axis` reads it, or with the changes in place of values."""
+        """KEY=VALUE,VALUE,... as accepted by `parse_axis`, or with the changes in place of
+        values.
+        """
         values = self.changes or self.values
         return f"{self.key}={','.join(msgspec.json.encode(value).decode() for value in values)}"
 
@@ -58,7 +60,7 @@ class GridAxis:
 
 
 def parse_axis(text: str) -> GridAxis:
-    """The grid that a user writes: `control.epsilon=0.5:8:10` or `control.scheme=committed,none`.
+    """Grid from a user's text: `control.epsilon=0.5:8:10` or `control.scheme=committed,none`.
 
     Raises:
         ConfigError: the text has another form, or a value twice.
@@ -83,7 +85,7 @@ def parse_axis(text: str) -> GridAxis:
 
 
 def _linear(start: str, stop: str, count: str) -> list[float]:
-    """Evenly spaced values, ends included; whole numbers where both ends and all between are."""
+    """Evenly spaced values, ends included; integers if all of them are whole."""
     first, last, n = float(start), float(stop), int(count)
     if n < 2 or not math.isfinite(first - last):
         raise ValueError
@@ -93,7 +95,7 @@ def _linear(start: str, stop: str, count: str) -> list[float]:
 
 
 def _listed(given: str) -> list[Any]:
-    """Values between commas, as in TOML; a bare word is a text."""
+    """Values between commas, as in TOML; a bare word is a string."""
     try:
         return tomllib.loads(f"values = [{given}]")["values"]
     except ValueError:
@@ -104,14 +106,14 @@ def _value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except ValueError:
-        # A text that needs no quotes: a name, or a path.
+        # A string without quotes: a name, or a path.
         if not text or {*text} & {*"\"'[]{}=:"}:
             raise
         return text
 
 
 class FlightTask(msgspec.Struct, frozen=True):
-    """Some runs of a cell, flown together."""
+    """Some runs of a cell, which are flown together."""
 
     cell: int
     """Number of the cell in its sweep, from 0 on."""
@@ -120,28 +122,28 @@ class FlightTask(msgspec.Struct, frozen=True):
     name: str
     """Name of the scenario, for the summaries."""
     scenario: Scenario
-    """What is flown, but for the seed."""
+    """Scenario that is flown, except for the seed."""
     seeds: tuple[int, ...]
     """Seed of each run."""
 
 
 class Done(msgspec.Struct, frozen=True):
-    """What came of a task; an entry of a sweep's journal."""
+    """Results of a task; an entry of a sweep's journal."""
 
     cell: int
     """Number of the task's cell."""
     chunk: int
     """Number of the task in its cell."""
     runs: tuple[Summary, ...]
-    """Summary of each run, in the order of the seeds."""
+    """Summary of each run, in order of the seeds."""
 
 
 Results = Mapping[tuple[int, int], Done]
-"""What is done of a sweep, by cell and chunk."""
+"""Results of a sweep so far, by cell and chunk."""
 
 
 def results(entries: Iterable[Done]) -> Results:
-    """What is done of a sweep, from the entries of its journal."""
+    """Results of a sweep so far, from the entries of its journal."""
     return {(done.cell, done.chunk): done for done in entries}
 
 
@@ -151,7 +153,7 @@ def fly(task: FlightTask) -> Done:
 
 
 def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> tuple[Summary, ...]:
-    """Summaries of flights of a scenario in virtual time, one a seed."""
+    """Summaries of flights of a scenario in virtual time, one per seed."""
     flown = zip(seeds, fly_batch(scenario, seeds), strict=True)
     return tuple(
         summarise(replace(scenario, seed=seed), name, each.client, each.server, each.netem)
@@ -160,16 +162,16 @@ def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> tuple[Summ
 
 
 class Sweep:
-    """A grid of scenarios, and the number of flights of each.
+    """Grid of scenarios, and the number of flights of each.
 
     Args:
         name: name of the scenario, for messages and summaries.
-        scenario: what is the same in all cells.
-        axes: what differs between cells; the last axis changes fastest.
+        scenario: common part of all cells.
+        axes: grids; the last one changes fastest.
         runs: number of flights of each cell.
 
     Raises:
-        ConfigError: a cell that cannot be flown, or a key given twice.
+        ConfigError: a cell cannot be flown, or a key is given twice.
     """
 
     def __init__(self, name: str, scenario: Scenario, axes: Sequence[GridAxis], runs: int) -> None:
@@ -193,7 +195,7 @@ class Sweep:
 
     @property
     def flights(self) -> int:
-        """Number of all its flights."""
+        """Number of all flights."""
         return len(self.cells) * self.runs
 
     def _scenario(self, changes: Mapping[str, Any]) -> Scenario:
@@ -212,11 +214,11 @@ class Sweep:
                 yield FlightTask(cell, chunk, self.name, scenario, seeds)
 
     def todo(self, done: Results) -> list[FlightTask]:
-        """Tasks that are not done yet."""
+        """Tasks that are not finished yet."""
         return [task for task in self.tasks() if (task.cell, task.chunk) not in done]
 
     def settings(self) -> dict[str, Any]:
-        """All that the results follow from, as plain values."""
+        """Settings that determine the results, as plain values."""
         return {
             "name": self.name,
             "runs": self.runs,
@@ -236,7 +238,7 @@ class Sweep:
         return to_csv([*keys, *Summary.__struct_fields__], rows)
 
     def cells_csv(self, done: Results) -> str:
-        """CSV table with a row for each cell: means, and half the widths of 95 % intervals."""
+        """CSV table with a row for each cell: means, and half-widths of 95 % intervals."""
         keys = [axis.key for axis in self.axes]
         rows = []
         for cell, values in enumerate(self.cells):
@@ -281,21 +283,21 @@ FIGURES = (
     "saturated",
     "deadline_misses",
 )
-"""Figures of a summary that make sense as a mean."""
+"""Figures of a summary that can be averaged."""
 
 Estimate = tuple[float | None, float | None]
-"""Mean, and half the width of its 95 % interval; None where there are too few values."""
+"""Mean, and half-width of its 95 % interval; None with too few values."""
 
 
 def estimate(runs: Iterable[Summary], figure: str) -> Estimate:
-    """Mean of a figure over the runs that have it, and half the width of its 95 % interval."""
+    """Mean of a figure over the runs that have it, and half-width of its 95 % interval."""
     return interval([value for run in runs if (value := getattr(run, figure)) is not None])
 
 
 def interval(values: Sequence[float]) -> Estimate:
-    """Mean of some values, and half the width of its 95 % interval (Student's t).
+    """Mean of some values, and half-width of its 95 % interval (Student's t).
 
-    The mean is None where there are no values, the interval where there are fewer than two.
+    The mean is None without values, the interval with fewer than two.
     """
     if not values:
         return None, None
@@ -306,7 +308,7 @@ def interval(values: Sequence[float]) -> Estimate:
 
 
 def by_name(figures: Iterable[str], estimate_of: Callable[[str], Estimate]) -> dict[str, Any]:
-    """Mean of each figure by its name, and half the width of its interval by NAME_ci95."""
+    """Mean of each figure by its name, and half-width of its interval as NAME_ci95."""
     found: dict[str, Any] = {}
     for figure in figures:
         found[figure], found[f"{figure}_ci95"] = estimate_of(figure)

@@ -1,10 +1,10 @@
-"""Torture: the real endpoints, sealed, through a schedule of faults, with somebody who looks.
+"""Torture: the real endpoints, encrypted, under a schedule of faults, with invariants checked.
 
     clients ── saboteur ── netem ── server          on hosts that stop, freeze, and set their clocks
 
-What is flown follows from the seed of a trial, the faults are given with it, and so it goes the
-same each time. All that fails is a `Violation` of an invariant (`lab.invariants`), or an exception
-of an endpoint. A vehicle that has landed is begun anew after a while, as an operator would.
+The scenario is drawn from a trial's seed, and the faults are part of the trial, so every trial is
+reproducible. A failure is a `Violation` of an invariant (`lab.invariants`), or an exception of an
+endpoint. A vehicle that has landed is restarted after a while, as by an operator.
 """
 
 import traceback
@@ -58,27 +58,27 @@ from skytether.sim.world import Clock, World
 SABOTEUR: Address = ("saboteur", 0)
 
 CLOCK_NS = 10**7 * SECOND_NS
-"""Time that all clocks show at first [ns]: no step back leads below zero."""
+"""Initial time on all clocks [ns], so large that no backward step makes it negative."""
 LANDED_NS = 5 * SECOND_NS
-"""Time after which a vehicle that has landed is begun anew [ns]."""
+"""Time after which a landed vehicle is restarted [ns]."""
 QUIET_NS = SECOND_NS
-"""Time for which a flight goes on after it must have recovered [ns]."""
+"""Time for which a flight goes on after the recovery deadline [ns]."""
 SHORT_S = (8.0, 25.0)
-"""Time within which the faults of a short trial begin and end [s], drawn between these."""
+"""Range of the time within which the faults of a short trial begin and end [s]."""
 RESTARTED = (Kind.RESTART, "client")
 TRAJECTORIES = 0.5
 """Share of the trials that fly the scheme "trajectory"."""
 REKEYING = 0.3
-"""Share of the trials in which vehicles want new keys every REKEY_NS."""
+"""Share of the trials in which vehicles renew their keys every REKEY_NS."""
 REKEY_NS = 4 * SECOND_NS
 STEP_FOUND_NS = (BUCKETS + RECENT) * BUCKET_NS
-"""Time after which the server has forgotten what it saw before a clock was set [ns]."""
+"""Time after which the server has forgotten clock measurements from before a step [ns]."""
 COMPUTE_NS = MILLISECOND_NS
-"""Time that the server takes for a step [ns]."""
+"""Computing time of the server per step [ns]."""
 
 
 def make_scenario(seed: int) -> tuple[Scenario, int]:
-    """Scenario of a trial, and how many vehicles fly it; both are drawn from the seed."""
+    """Scenario of a trial, and its number of vehicles, both drawn from the seed."""
     rng = stream(seed, "torture", "scenario")
     kind = rng.choice(3, p=(0.6, 0.2, 0.2))
     scheme = ("committed", "committed", "predictive")[kind]
@@ -95,7 +95,7 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
             "horizon": round(2.0 / dt_s),
             "scheme": scheme,
             "feedback": bool(kind == 1),
-            "input_weight": 0.01,  # tight: inputs change as fast as they may
+            "input_weight": 0.01,  # tight rate limit: inputs change as fast as allowed
             "input_reference": False,
             "trigger": f"{'state_gap' if scheme == 'predictive' else 'cost_gap'} | silence(1)",
         },
@@ -122,7 +122,7 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
 
 
 def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> None:
-    """Let a scenario fly the scheme "trajectory", with all that belongs to it drawn."""
+    """Change a scenario to the scheme "trajectory", with its options drawn at random."""
     axes = table["model"]["axes"]
     error_m, silence_s = round(rng.uniform(0.003, 0.1), 3), round(rng.uniform(0.3, 2.0), 2)
     gap = f"{round(float(np.exp(rng.uniform(np.log(0.01), np.log(3.0)))), 3)}"
@@ -165,37 +165,37 @@ def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> Non
 
 
 def short_trial(seed: int) -> Trial:
-    """Trial of some 25 s."""
+    """Trial of about 25 s."""
     rng = stream(seed, "torture", "faults")
     return Trial(seed, schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S))))
 
 
 def long_trial(seed: int, hours: float = 1.0) -> Trial:
-    """Trial of so many hours, with faults all along."""
+    """Trial of a number of hours, with faults throughout."""
     return Trial(seed, schedule(stream(seed, "torture", "faults"), seconds_to_ns(3600.0 * hours)))
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of a trial."""
+    """Result of a trial."""
 
     trial: Trial
     failure: str = ""
-    """Violation or exception that ended it; empty where there was none."""
+    """Violation or exception that ended it; empty for none."""
     invariant: str = ""
-    """Name of the invariant, or `raises`."""
+    """Name of the violated invariant, or `raises` for an exception."""
     flown_s: float
     """Time of the world [s]."""
     counts: dict[str, int]
-    """Number of steps, lives, packets and the like, by name."""
+    """Counters of steps, lives, packets and so on, by name."""
 
 
 class Failing:
-    """Solver that says of a share of its problems that it has found nothing.
+    """Solver that fails for a share of its problems.
 
     Args:
-        inner: what solves the others.
-        share: that share.
-        rng: source of chance.
+        inner: solver for the other problems.
+        share: share of failures.
+        rng: random generator.
     """
 
     def __init__(self, inner: Solver, share: float, rng: np.random.Generator) -> None:
@@ -213,25 +213,25 @@ class Failing:
 
 @dataclass(slots=True)
 class TorturedVehicle:
-    """A vehicle through its lives."""
+    """Vehicle through its lives: runs of its endpoint between restarts."""
 
     name: str
     """Name of its host."""
     plant: FirstOrderPlant
-    """What flies, in all of them."""
+    """Simulated vehicle, which persists through all lives."""
     life: WatchedLife
-    """The present one."""
+    """Present life."""
     lives: int = 1
     """Number of lives so far."""
     down: int = 0
-    """Number of faults for which its host is down."""
+    """Number of active faults that keep its host down."""
 
 
 class Torture:
-    """A trial under way.
+    """Trial that is running.
 
     Args:
-        trial: what is to happen.
+        trial: trial to run.
     """
 
     def __init__(self, trial: Trial) -> None:
@@ -241,20 +241,21 @@ class Torture:
         rekeys = stream(trial.seed, "torture", "keys").random() < REKEYING
         self._rekey_ns = REKEY_NS if rekeys else LIFE_NS
         self._wrong_keys = 0
-        """Number of faults for which the server has other keys."""
+        """Number of active faults for which the server has wrong keys."""
         self._chance = stream(trial.seed, "torture", "flight")
         self.world = World(self._hear)
         self._up, self._down = Ledger(), Ledger()
         self._calm_ns = 0
-        """Time of the world since which nothing happens, as far as nothing does."""
+        """Time of the world since which no fault is active, while this is so."""
         self._under_way = 0
-        """Number of faults that last, or leave something under way."""
+        """Number of faults that are active, or have effects under way."""
         restarts = any((each.kind, each.where) == RESTARTED for each in trial.faults)
         steps = any(each.kind is Kind.STEP and is_small(each.amount) for each in trial.faults)
         self._step_ns = STEP_FOUND_NS if steps else 0
-        """Time that clocks take to be known again after a step that none can tell from a stall."""
+        """Time after a clock's step until clocks are known again; such a step looks like a
+        freeze."""
         self._recovery_ns = recovery_ns(self.scenario, restarts=restarts) + self._step_ns
-        """Time within which a vehicle flies again once nothing happens [ns]."""
+        """Time within which a vehicle must fly again after the last fault [ns]."""
         self.counts: Counter[str] = Counter()
         self._servers = self._netems = 0
         names = [f"client {number}" for number in range(1, count + 1)]
@@ -273,13 +274,13 @@ class Torture:
             self.world.add(name, client, clock=Clock(CLOCK_NS), start_ns=start_ns)
         self.world.add(SERVER[0], self._new_server(), clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS)
         self._down_hosts: Counter[str] = Counter()
-        """Number of faults for which each host is down."""
+        """Number of active faults that keep each host down."""
         for fault in trial.faults:
             self._plan(fault)
         self.end_ns = trial.end_ns + self._recovery_ns + QUIET_NS
 
     def run(self, stopped: Callable[[], bool] = lambda: False) -> Outcome:
-        """Fly it to its end, or to the first violation."""
+        """Run the trial to its end, or to the first violation."""
         failure = invariant = ""
         try:
             self.world.run(stopped, limit_ns=self.end_ns)
@@ -359,7 +360,7 @@ class Torture:
         return life, Steady(client)
 
     def _renew(self, name: str) -> None:
-        """Begin another life of whatever runs on a host."""
+        """Start a new life on a host."""
         self.counts[f"lives of {name.partition(' ')[0]}"] += 1
         if name == SERVER[0]:
             self.world.restart(name, self._new_server())
@@ -384,11 +385,11 @@ class Torture:
     # -- faults ------------------------------------------------------------------------------
 
     def _overdue(self) -> bool:
-        """Whether nothing has happened for so long that every vehicle must fly."""
+        """Whether faults have been over for so long that every vehicle must fly."""
         return not self._under_way and self.world.now_ns - self._calm_ns > self._recovery_ns
 
     def _plan(self, fault: ScheduledFault) -> None:
-        """Put a fault on the agenda."""
+        """Schedule a fault."""
         world = self.world
 
         harm = int(fault.kind not in HARMLESS)
@@ -411,11 +412,11 @@ class Torture:
         world.at(fault.start_ns, begin)
 
     def hosts(self, where: str) -> list[str]:
-        """Names of the hosts that a fault befalls."""
+        """Names of the hosts affected by a fault."""
         return [each.name for each in self.vehicles] if where == "client" else [where]
 
     def set_down(self, name: str, *, down: bool) -> None:
-        """Take a host down, or begin another life there once no fault keeps it down any more."""
+        """Take a host down, or start a new life once no fault keeps it down."""
         self._down_hosts[name] += 1 if down else -1
         if down:
             self.world.stop(name)
@@ -423,13 +424,13 @@ class Torture:
             self._renew(name)
 
     def set_keys(self, *, right: bool) -> None:
-        """Let the next lives of the server have the vehicles' keys, or others."""
+        """Let the server's next lives have the vehicles' keys, or others."""
         self._wrong_keys += -1 if right else 1
 
     def set_solver(self, share: float, *, failing: bool) -> None:
-        """Let a share of solves of the present life of the server fail, or none any more."""
+        """Let a share of the solves of the server's present life fail, or none."""
         planner = self._server.controller.planner
-        if not isinstance(planner, Planner):  # trajectories take no solver
+        if not isinstance(planner, Planner):  # trajectories need no solver
             return
         solvers = [getattr(solver, "inner", solver) for solver in planner.solvers]
         if failing:
@@ -437,10 +438,10 @@ class Torture:
             solvers = [Failing(solver, share, rng) for solver in solvers]
         planner.solvers = solvers
 
-    # -- who looks ---------------------------------------------------------------------------
+    # -- checks ------------------------------------------------------------------------------
 
     def _hear(self, time_ns: int, _: str, event: Event) -> None:
-        """Check a change of mode; begin a vehicle anew that has landed."""
+        """Check a change of mode; restart a vehicle that has landed."""
         if not isinstance(event, ModeChanged):
             return
         vehicle = self.vehicles[event.vehicle - 1]
@@ -459,7 +460,7 @@ class Torture:
             self.world.at(due_ns, renew)
 
     def _check_end(self) -> None:
-        """Every vehicle flies, and nothing has grown beyond its bounds."""
+        """Check that every vehicle flies, and no container exceeds its bound."""
         for vehicle in self.vehicles:
             life = vehicle.life
             silent_ns = self.end_ns - life.row_ns
@@ -473,19 +474,20 @@ class Torture:
 
 
 def is_small(step_s: float) -> bool:
-    """Whether a clock that is set ahead by so much may as well have been asleep for so long [s]."""
+    """Whether a forward step of a clock is so small that it may be taken for a freeze [s]."""
     return 0 < seconds_to_ns(step_s) <= JUMP_NS
 
 
 def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
-    """Time within which a vehicle flies again once nothing happens [ns].
+    """Time within which a vehicle must fly again after the last fault [ns].
 
-    The end of the session is noticed; HELLO is said, a cookie and a session come; the link is good
-    for a while; a horizon comes that was planned after that.
+    It is the sum of the stages: the end of the session is noticed; HELLO, cookie and session are
+    exchanged; the link is good for the required time; a horizon planned after that arrives.
 
     Args:
-        scenario: what is flown.
-        restarts: whether vehicles are begun anew: the server may wait for the life before.
+        scenario: scenario that is flown.
+        restarts: whether vehicles are restarted: then the server may wait for the end of the
+            earlier life.
     """
     direction = scenario.network.uplink
     trip_ns = 2 * seconds_to_ns(direction.minimum_s + 8 * direction.slot_s)
@@ -496,7 +498,7 @@ def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
 def act(  # noqa: PLR0912 - a branch for each kind of fault
     torture: Torture, fault: ScheduledFault, *, begins: bool
 ) -> None:
-    """Do what a fault does when it begins, or when it ends."""
+    """Apply the beginning, or the end, of a fault."""
     world, dt_ns = torture.world, torture.scenario.dt_ns
     names = torture.hosts(fault.where)
     match fault.kind:
@@ -535,7 +537,7 @@ def fly(trial: Trial, stopped: Callable[[], bool] = lambda: False) -> Outcome:
 
 
 def shrunk(outcome: Outcome) -> Outcome:
-    """The outcome of the shortest schedule of a failed trial that violates the same invariant."""
+    """Result of the shortest schedule of a failed trial that violates the same invariant."""
 
     def fails(faults: tuple[ScheduledFault, ...]) -> bool:
         return fly(replace(outcome.trial, faults=faults)).invariant == outcome.invariant

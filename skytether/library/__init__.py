@@ -1,1 +1,1 @@
-"""The library: what `import skytether` offers beside the commands; `docs/python.md` shows it."""
+"""Library behind `import skytether`; see docs/python.md."""

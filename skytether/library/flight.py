@@ -1,4 +1,4 @@
-"""A flight from Python: its arrays, summary and events, its picture and its file."""
+"""Flight from Python: its arrays, summary and events, its picture and its file."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -38,31 +38,31 @@ if TYPE_CHECKING:
 PARTS = ("client", "server", "netem", "plan")
 """Parts of a record: rows of the vehicle's steps, the server's, of packets, and of plans."""
 UNITS = MappingProxyType({"m": "m", "mps": "m/s", "s": "s", "ns": "ns", "bytes": "B"})
-"""Unit of an array whose name ends in this word; others are counts, flags or have none."""
+"""Unit of an array whose name ends in one of these words; other arrays have none."""
 
 
 class Column(NamedTuple):
-    """An array of a flight, as `Flight.columns` tells it."""
+    """Description of an array of a flight, as `Flight.columns` lists it."""
 
     name: str
     shape: tuple[int, ...]
     unit: str
-    """Unit; empty for a count, a flag and what has none."""
+    """Unit; empty for counts, flags and numbers without a unit."""
 
 
 class Flight:
-    """A flight that was flown, or loaded from a recording.
+    """Flight that was flown, or loaded from a recording.
 
     `flight["position_m"]` is an array, one row for each step of the vehicle, of shape (steps, axes)
-    where it is a vector. Names of arrays that the server, netem and the plans have rows of begin
-    with the name of the part, as in `flight["server.event"]`. `print(flight)` lists all arrays with
-    shape and unit. Arrays cannot be written to.
+    where it is a vector. Names of arrays of the server, netem and the plans begin with the name of
+    that part, as in `flight["server.event"]`. `print(flight)` lists all arrays with shape and unit.
+    Arrays cannot be written to.
 
     Args:
-        scenario: what was flown.
+        scenario: scenario that was flown.
         record: the record of the flight.
         name: name of the scenario.
-        secure: whether the link was sealed.
+        secure: whether the link was encrypted.
     """
 
     def __init__(
@@ -73,19 +73,19 @@ class Flight:
         self.name = name
         """Name of the scenario."""
         self.secure = secure
-        """Whether the link was sealed."""
-        # A part without rows has the columns of this scenario, wherever the record comes from.
+        """Whether the link was encrypted."""
+        # An empty part gets this scenario's columns, so that its arrays exist.
         parts: dict[str, Any] = {**_no_rows(scenario)}
         parts |= {part: rows for part in PARTS if len(rows := getattr(record, part))}
         events = tuple(each._replace(host=each.process) for each in record.events)
         self.record = replace(record, **parts, events=events)
-        """Record as it was written: rows of each part as numpy structured arrays."""
+        """Record as written: rows of each part as numpy structured arrays."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Array of this name.
 
         Raises:
-            KeyError: there is none of this name.
+            KeyError: there is no array of this name.
         """
         try:
             return self._arrays[name]
@@ -114,7 +114,7 @@ class Flight:
 
     @cached_property
     def summary(self) -> Summary:
-        """Figures of the flight; of several vehicles those of the first."""
+        """Figures of the flight; with several vehicles, those of the first."""
         client = self.record.client
         client = client[client["vehicle"] == client["vehicle"][:1]]
         others = self.record.server, self.record.netem
@@ -122,7 +122,7 @@ class Flight:
 
     @property
     def events(self) -> tuple[FlightEvent, ...]:
-        """Events of the flight in their order: time in the flight, process, and the event."""
+        """Events of the flight in order: time of flight [s], process, and the event."""
         return self.record.events
 
     @property
@@ -132,10 +132,10 @@ class Flight:
 
     @extras.named()
     def plot(self) -> "Figure":
-        """Picture of the flight: the path over the reference, and when packets went up.
+        """Picture of the flight: the path over the reference, and the times of uplink packets.
 
         Raises:
-            FlightError: not a step was flown.
+            FlightError: no step was flown.
         """
         if not len(self.record.client):
             raise FlightError(f"{self.name}: no step was flown: {self.failure or 'no vehicle'}")
@@ -144,7 +144,7 @@ class Flight:
 
     @extras.named()
     def to_pandas(self, part: str = "client") -> "pandas.DataFrame":
-        """Table of a part, a column for each number, with axis and unit in its name.
+        """Table of a part, one column per number, with axis and unit in its name.
 
         Args:
             part: "client" for the vehicle's steps, "server", "netem" for packets, or "plan".
@@ -163,13 +163,13 @@ class Flight:
 
     @extras.named()
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the flight to a recording, from which `Flight.load` makes it again.
+        """Write the flight to a recording, from which `Flight.load` restores it.
 
         Args:
             path: file that ends in .mcap.
 
         Raises:
-            ConfigError: the file is called otherwise.
+            ConfigError: the file has another suffix.
             RecordingError: the file cannot be written.
         """
         from skytether.cli import recorder
@@ -183,11 +183,11 @@ class Flight:
     @classmethod
     @extras.named()
     def load(cls, path: str | PathLike[str]) -> "Flight":
-        """Flight of a recording, that of `save` or of `skytether fly --record`.
+        """Flight from a recording, written by `save` or by `skytether fly --record`.
 
         Raises:
             OSError: the file cannot be read.
-            RecordingError: it is no recording, or damaged.
+            RecordingError: the file is no recording, or damaged.
         """
         from skytether.view.recording import Recorded
 
@@ -236,7 +236,7 @@ class Flight:
 
 
 def _no_rows(scenario: Scenario) -> dict[str, Table]:
-    """Each part of a record without a row, by its name."""
+    """Empty rows for each part of a record, by its name."""
     axes = scenario.model.axes
     return {
         "client": np.empty(0, client_columns(axes)),
@@ -247,7 +247,7 @@ def _no_rows(scenario: Scenario) -> dict[str, Table]:
 
 
 def _failure(events: list[FlightEvent]) -> Failure | None:
-    """Failure of the first vehicle that has one: the last event of such a vehicle."""
+    """Failure of the first vehicle that failed: its last event."""
     last: dict[int, Event] = {
         each.event.vehicle: each.event
         for each in events

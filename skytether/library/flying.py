@@ -24,32 +24,32 @@ Given = str | PathLike[str] | Scenario
 
 
 def load(scenario: Given, /, **keys: Any) -> Scenario:
-    """A scenario, with keys laid over it as flags are on the command line.
+    """Scenario, with keys replaced as by flags on the command line.
 
         skytether.load("demo", duration=20, **{"control.trigger": "always"})
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
         keys: keys of the scenario and their values. A dot leads into a table, as in TOML; a table
-            may be given as a mapping, too, and is laid over the scenario's own.
+            may also be given as a mapping, which replaces only the keys that it has.
 
     Raises:
         ConfigError: there is no such scenario or key, or a value that cannot be flown.
-        TypeError: `scenario` is none of these.
+        TypeError: `scenario` is of another type.
     """
     return named(scenario, keys)[1]
 
 
 def check(scenario: Scenario | Mapping[str, Any], /, **keys: Any) -> Scenario:
-    """A scenario made by hand, every value of it checked.
+    """Scenario made by hand, with every value checked.
 
     Args:
-        scenario: a `Scenario`, or its tables as mappings, as a TOML file has them.
+        scenario: a `Scenario`, or its tables as mappings, as in a TOML file.
         keys: see `load`.
 
     Raises:
-        ConfigError: the first thing that is wrong.
-        TypeError: `scenario` is neither.
+        ConfigError: the scenario is invalid; the message names the first wrong value.
+        TypeError: `scenario` is of another type.
     """
     if isinstance(scenario, Mapping):
         return reading.check(_laid({**scenario, **keys}, {}))
@@ -68,21 +68,21 @@ def fly(
     server: Endpoint | None = None,
     **keys: Any,
 ) -> Flight:
-    """Fly a scenario: in virtual time, the same to the last bit each time, or over real UDP.
+    """Fly a scenario: in virtual time, reproducible to the last bit, or over real UDP.
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
         udp: whether server, netem and client fly as three processes on loopback, in real time.
-        secure: whether the link is sealed, with keys that are made for this flight.
-        server: endpoint that plans in place of Skytether's server, in virtual time; it has a flight
-            to itself.
+        secure: whether the link is encrypted, with keys made for this flight.
+        server: endpoint that plans in place of Skytether's server, in virtual time; make a new one
+            for each flight.
         keys: see `load`.
 
     Returns:
         The flight; where the vehicle could not fly, `Flight.failure` says why.
 
     Raises:
-        ConfigError: the scenario cannot be flown, or not in this way.
+        ConfigError: the scenario cannot be flown, or not with these arguments.
         FlightError: one of the three processes failed.
         TypeError: an argument is of another type.
     """
@@ -93,7 +93,7 @@ def fly(
         prepare()
     if udp:
         return Flight(flown, _over_udp(flown, secure=secure), name=name, secure=secure)
-    from skytether.sim import flight  # brings the planner, and its compiler
+    from skytether.sim import flight  # imports the planner and numba, which takes a while
 
     record = flight.fly(flown, secure=secure, server=server)
     return Flight(flown, record, name=name, secure=secure)
@@ -103,7 +103,7 @@ def fly(
 def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Flight]:
     """Fly a scenario once for each seed in virtual time, several times faster than one by one.
 
-    Each flight is the one that `fly` makes with that seed, to the last bit, but for the plans,
+    Each flight equals that of `fly` with the same seed, to the last bit, except for the plans,
     which are not recorded.
 
     Args:
@@ -124,15 +124,15 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
         if numbers.count(number) > 1:
             raise ConfigError(f"seeds: got {number} twice, expected seeds that differ")
     prepare()
-    from skytether.sim import flight  # brings the planner, and its compiler
+    from skytether.sim import flight  # imports the planner and numba, which takes a while
 
     records = flight.fly_batch(flown, numbers)
     return [Flight(run, record, name=name) for run, record in zip(each, records, strict=True)]
 
 
 def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
-    """Name of a scenario, of one that was made by hand its title, and the scenario; see `load`."""
-    plugins.load()  # of installed packages, once in a process
+    """Name of a scenario (of one made by hand, its title), and the scenario; see `load`."""
+    plugins.load()  # plug-ins of installed packages, once per process
     if isinstance(scenario, Scenario):
         name, given = scenario.title, scenario
     elif isinstance(scenario, str | PathLike):
@@ -145,7 +145,7 @@ def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
 
 
 def prepare() -> None:
-    """Compile what plans where this machine has not yet, which is said on stderr."""
+    """Compile the server's kernels if this machine has not yet, with a note on stderr."""
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.shared.base import kernel
     from skytether.shell import command
@@ -154,29 +154,29 @@ def prepare() -> None:
 
 
 def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:
-    """A scenario with keys laid over it, every value checked."""
+    """Scenario with keys replaced, every value checked."""
     table = _laid(keys, msgspec.to_builtins(scenario, enc_hook=_plain))
     return reading.check(table, f"{name or 'the scenario'}{' with these keys' if keys else ''}")
 
 
 def _laid(keys: Mapping[str, Any], table: dict[str, Any]) -> dict[str, Any]:
-    """Plain values of keys, laid over a table."""
+    """Table with plain values of keys laid over it."""
     plain: dict[str, Any] = msgspec.to_builtins(dict(keys), enc_hook=_plain)
     lay(dict(flat(plain)), table)
     return table
 
 
 def _plain(value: Any) -> Any:
-    """Plain value of a number or array of numpy, or of a path; of anything else its text."""
+    """Plain value of a numpy number or array, or of a path; of anything else its text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
-    """Refuse a server of one's own that cannot be flown.
+    """Refuse a server of the user's that cannot be flown.
 
     Raises:
-        ConfigError: with what could be.
-        TypeError: it is no endpoint.
+        ConfigError: with the kinds of flight that it could fly.
+        TypeError: the server is no endpoint.
     """
     if not isinstance(server, Endpoint):
         raise TypeError(f"server: got {server!r}, expected an Endpoint")
@@ -188,7 +188,9 @@ def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
 
 
 def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
-    """Fly over UDP, in a thread: the caller's may have an event loop already, as in a notebook."""
+    """Fly over UDP, in a thread: the caller's thread may run an event loop already, as in a
+    notebook.
+    """
     from skytether.cli import processes
     from skytether.shell.command import CommandError
     from skytether.shell.log import LogLine
@@ -200,7 +202,8 @@ def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
         ThreadPoolExecutor(1) as pool,
         ExitStack() as stack,
     ):
-        stack.callback(stopped.set)  # Ctrl-C: the processes are ended in order before it goes on
+        # Ctrl-C: the processes are ended in order before the exception goes on
+        stack.callback(stopped.set)
         flying = pool.submit(
             processes.run,
             scenario,

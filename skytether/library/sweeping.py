@@ -28,12 +28,12 @@ class Swept:
     """Summary of each flight, by seed."""
 
     def mean(self, figure: str) -> lab.Estimate:
-        """Mean of a figure of the summaries, and half the width of its 95 % interval.
+        """Mean of a figure over the flights, and half the width of its 95 % confidence interval.
 
         The mean is None where no flight has the figure, the interval where fewer than two have it.
 
         Raises:
-            KeyError: it is no figure of a summary that has a mean.
+            KeyError: the name is no numeric figure of a summary.
         """
         if figure not in lab.FIGURES:
             raise KeyError(f"no figure {figure!r}; {hint(str(figure), lab.FIGURES)}")
@@ -57,12 +57,12 @@ def sweep(
         scenario: name of a scenario, path of a .toml file, or a scenario.
         grid: values of each key that is swept; the last key changes fastest.
         runs: number of flights of each combination, with seeds that count up from the scenario's.
-        workers: number of processes that fly; 1 for this one alone. A script that has more needs
-            `if __name__ == "__main__":`, as with `multiprocessing`. The results are the same.
+        workers: number of processes that fly; 1 for the calling one. A script with more needs `if
+            __name__ == "__main__":`, as with `multiprocessing`. The results are the same.
         keys: see `skytether.load`.
 
     Raises:
-        ConfigError: a combination that cannot be flown.
+        ConfigError: a combination cannot be flown.
         TypeError: an argument is of another type.
     """
     for argument, value in (("runs", runs), ("workers", workers)):
@@ -76,7 +76,8 @@ def sweep(
     if workers == 1:
         done = lab.results(map(lab.fly, tasks))
     else:
-        spawned = multiprocessing.get_context("spawn")  # a fork may hold a lock that nobody opens
+        # not fork: the child could inherit a lock that nobody releases
+        spawned = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers, spawned) as pool:
             done = lab.results(pool.map(lab.fly, tasks))
     names = [axis.key for axis in axes]
@@ -100,8 +101,8 @@ def _axis(key: str, values: Iterable[Any]) -> lab.GridAxis:
     """One key of the grid.
 
     Raises:
-        ConfigError: the key is not swept, or has no values, or one twice.
-        TypeError: its values are no list.
+        ConfigError: the key cannot be swept, or has no values, or a value twice.
+        TypeError: the values are no list.
     """
     if key == "seed":
         raise ConfigError("grid: got 'seed', expected another key: it counts the runs")

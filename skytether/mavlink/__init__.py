@@ -1,4 +1,4 @@
-"""MAVLink, as an autopilot and who flies it both speak it: bytes, axes, parameters.
+"""MAVLink for both ends, autopilot and companion: bytes, axes, parameters.
 
-No module in here has a socket: pymavlink is used to read and write messages, and for nothing else.
+No module of this room has a socket: pymavlink only encodes and decodes messages.
 """

@@ -1,8 +1,7 @@
-"""Messages of MAVLink from bytes, whatever these are, and to bytes.
+"""Encoder and decoder of MAVLink messages; the decoder accepts any bytes.
 
-A frame begins with 0xFD (MAVLink 2) or 0xFE (MAVLink 1), and has its length and a checksum. What
-does not fit is passed over a byte at a time: a frame that was cut off takes none with it that
-follows.
+A frame begins with 0xFD (MAVLink 2) or 0xFE (MAVLink 1), and has its length and a checksum. Bytes
+that fit no frame are skipped one at a time, so a truncated frame does not lose the frames after it.
 """
 
 from typing import Any
@@ -10,22 +9,22 @@ from typing import Any
 from skytether.mavlink.dialect import dialect
 
 Message = Any
-"""Message of pymavlink, which knows no types: its fields are its attributes."""
+"""Message of pymavlink, which is untyped: its fields are its attributes."""
 
 FRAME_BYTES_MAX = 280
-"""Longest frame: 10 of head, 255, 2 of checksum and 13 of signature [B]."""
+"""Longest frame [B]: 10 of header, 255 of payload, 2 of checksum and 13 of signature."""
 SIGNED = 0x01
 """Flag of a frame that has a signature."""
 
 
 class Codec:
-    """Reads and writes frames, for one end of a link.
+    """Encoder and decoder of frames, for one end of a link.
 
     Args:
         system: number of this system.
         component: number of this component.
-        stream: whether frames come in pieces, as over a serial line or TCP; a datagram has whole
-            ones.
+        stream: whether frames may come in pieces, as over a serial line or TCP; a datagram has
+            whole frames.
     """
 
     def __init__(self, system: int, component: int, *, stream: bool = False) -> None:
@@ -33,17 +32,17 @@ class Codec:
         self._stream = stream
         self._rest = bytearray()
         self.garbage_bytes = 0
-        """Bytes so far that belong to no frame."""
+        """Number of bytes so far that belong to no frame."""
 
     def encode(self, message: Message) -> bytes:
-        """Frame of a message, with the next number."""
+        """Frame of a message, with the next sequence number."""
         mavlink = self._mavlink
         frame: bytes = message.pack(mavlink)
         mavlink.seq = (mavlink.seq + 1) % 256
         return bytes(frame)
 
     def decode(self, data: bytes) -> list[Message]:
-        """Messages in some bytes, the oldest first; never fails."""
+        """Messages in some bytes, in order; never raises."""
         waiting = self._rest + data
         messages, at, end = [], 0, len(waiting)
         while at < end:
@@ -61,11 +60,12 @@ class Codec:
         return messages
 
     def _one(self, frame: bytearray) -> Message | None:
-        """Message of a frame, None where it is none."""
+        """Message of a frame; None where the frame is invalid."""
         if not frame:
             return None
         number = int.from_bytes(frame[7:10], "little") if frame[0] == 0xFD else frame[5]
-        if number not in dialect.mavlink_map:  # without its type there is no checking it
+        # without the message's type its checksum cannot be verified
+        if number not in dialect.mavlink_map:
             return None
         try:
             return self._mavlink.decode(frame)
@@ -74,9 +74,9 @@ class Codec:
 
 
 def _length(data: bytearray, at: int) -> int:
-    """Length of the frame that begins here; 0 where none does.
+    """Length of the frame that begins here; 0 where none begins.
 
-    Where its head is cut off, it is taken for one of the longest.
+    A truncated header counts as the longest frame.
     """
     left = len(data) - at
     if data[at] == 0xFD:

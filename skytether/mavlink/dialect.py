@@ -1,6 +1,6 @@
-"""The one dialect of MAVLink 2 that is spoken here: ArduPilot's, which has PX4's in it.
+"""MAVLink 2 dialect used here: ArduPilot's, which includes PX4's messages.
 
-Everything else imports it from here. It is 14 MB in memory.
+All other modules import the dialect from here. It takes 14 MB of memory.
 """
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect

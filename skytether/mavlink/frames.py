@@ -1,12 +1,14 @@
-"""Axes: MAVLink's north, east, down against ours, x north, y east, altitude up.
+"""Axes: MAVLink's are north, east, down; those of Skytether are x north, y east, altitude up.
 
-The way back is the same as the way there: this is the one place that knows of it.
+The conversion is its own inverse. It is used only here.
 """
 
 from collections.abc import Sequence
 
 
 def turned(vector: Sequence[float]) -> tuple[float, float, float]:
-    """Vector in north, east, down of one in ours, and the other way round; shape (3,)."""
+    """Vector converted between (north, east, down) and (x north, y east, up), either way; shape
+    (3,).
+    """
     x, y, z = vector
     return x, y, -z

@@ -1,4 +1,4 @@
-"""Values of parameters on the wire: a float, whatever type the parameter has.
+"""Parameter values on the wire: a float, whatever the parameter's type.
 
 ArduPilot converts an integer into a float, PX4 puts its bits into one (`MAV_PROTOCOL_CAPABILITY_
 PARAM_ENCODE_C_CAST`, `…_BYTEWISE`).
@@ -21,11 +21,11 @@ INTEGERS = frozenset(
         INTEGER,
     }
 )
-"""Types of parameters that are whole numbers of at most four bytes."""
+"""Types of parameters that are integers of at most four bytes."""
 
 
 def type_of(value: float) -> int:
-    """Type that a parameter with this value has: of 32 bits."""
+    """Parameter type for this value, of 32 bits."""
     return INTEGER if isinstance(value, int) else FLOAT
 
 
@@ -43,7 +43,7 @@ def to_wire(value: float, *, bytewise: bool) -> float:
 
 
 def from_wire(value: float, kind: int, *, bytewise: bool) -> float | None:
-    """Value of a parameter of a type, int where that is whole; None where it is no number."""
+    """Value of a parameter from the wire, an int for integer types; None where it is no number."""
     if kind not in INTEGERS:
         return value if kind == FLOAT and math.isfinite(value) else None
     if bytewise:

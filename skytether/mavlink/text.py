@@ -1,4 +1,4 @@
-"""Sentences in STATUSTEXT: 50 bytes a message, and longer ones in chunks that are put together."""
+"""STATUSTEXT messages: texts of 50 bytes, longer ones in chunks that are reassembled."""
 
 from collections import OrderedDict
 
@@ -8,23 +8,23 @@ from skytether.mavlink.dialect import dialect
 CHUNK_BYTES = 50
 """Longest text of a message [B]."""
 UNFINISHED_MAX = 8
-"""Most texts that wait for their last chunk; the oldest gives way."""
+"""Most unfinished texts that are kept; a new one replaces the oldest."""
 CHUNKS_MAX = 8
-"""Most chunks that are put together."""
+"""Most chunks of a text."""
 
 
 def chunks(severity: int, text: str, number: int) -> list[Message]:
-    """Messages that say a text.
+    """Messages that carry a text.
 
     Args:
         severity: MAV_SEVERITY.
-        text: what is said.
-        number: number of the text from 1 to 65535, which tells its chunks from another's.
+        text: the text.
+        number: id of the text from 1 to 65535, which its chunks share.
     """
     said = text.encode()
     parts = [said[at : at + CHUNK_BYTES] for at in range(0, len(said), CHUNK_BYTES)]
     if len(said) % CHUNK_BYTES == 0:
-        parts.append(b"")  # a chunk that is not full is the last one
+        parts.append(b"")  # a chunk that is not full marks the end
     own = number if len(parts) > 1 else 0
     return [
         dialect.MAVLink_statustext_message(severity, part, own, k) for k, part in enumerate(parts)
@@ -32,14 +32,14 @@ def chunks(severity: int, text: str, number: int) -> list[Message]:
 
 
 class Texts:
-    """Puts the chunks of texts together."""
+    """Reassembly of texts from chunks."""
 
     def __init__(self) -> None:
         self._begun: OrderedDict[tuple[int, int, int], list[str]] = OrderedDict()
-        """Chunks so far of each text, by its system, component and number."""
+        """Chunks so far of each text, by system, component and text id."""
 
     def take(self, message: Message) -> str | None:
-        """Text that a message has ended; None where there is more to come, or its begin is lost."""
+        """Text completed by a message; None where more chunks follow, or its beginning is lost."""
         if message.id == 0:
             return str(message.text)
         key = message.get_srcSystem(), message.get_srcComponent(), message.id

@@ -1,20 +1,22 @@
-"""What follows from packets that went both ways, as functions of arrays.
+"""Analysis of packets that went both ways, as functions of arrays.
 
-Clocks: an apparent delay is the true one and the offset of the clocks, t_receiver - t_sender =
-d + o(t), one way, and d - o(t) the other. With o(t) = o + s t, the line of least delays below all
-points of a direction has the slope s, or -s. As Moon, Skelly and Towsley (1999) do, the line is
-taken that is highest in the mean; both directions together give one slope. What lies above a line
-is the delay beyond the least one. Of the two least delays only the sum is known, in which the
-offset cancels: half of it is taken for each direction.
+Clocks: an apparent delay is the true one and the offset of the clocks, t_receiver - t_sender = d +
+o(t), one way, and d - o(t) the other. With o(t) = o + s t, a line below all points of a direction,
+along the least delays, has the slope s, or -s. Following Moon, Skelly and Towsley (1999), of all
+lines below the points the one with the highest mean is taken; both directions share one slope. A
+point's height above the line is its delay beyond the least one. Of the two least delays only the
+sum is known, in which the offset cancels: half of it is assumed for each direction.
 
-Loss: the interval is Wilson's, of as many packets as were lost independently of each other.
+Loss: the confidence interval is Wilson's, for the number of packets that are effectively
+independent.
 
 Rate: packets of a train that are sent at once leave a bottleneck one behind the other, each after
 size / rate (packet dispersion). So the i-th of a train has the delay of a packet that was sent
-alone, and i size / rate more. That time is found in two ways, and the surer one is taken: as the
-slope of a straight line through delays over places, with one slope for all trains, which does not
-mind delays that last; and as the most likely time, with the measured distribution of the delays of
-packets sent alone, which makes the most of delays that do not last.
+alone, and i size / rate more. The time size / rate is estimated in two ways, and the estimate with
+the smaller error is taken. One is the slope of a line through delay over place in the train, common
+to all trains: it is insensitive to slowly varying delays. The other is the maximum-likelihood time,
+given the measured distribution of the delays of packets sent alone: it is the better one for delays
+that vary fast.
 """
 
 from collections.abc import Callable
@@ -32,46 +34,47 @@ from skytether.shared.law.model import Array
 Bools = NDArray[np.bool_]
 
 DRIFT_MAX = 500e-6
-"""Largest drift between two clocks that is believed: as fast as clocks are slewed."""
+"""Largest believable drift between two clocks: the fastest rate at which clocks are slewed."""
 WINDOWS = 12
-"""Number of parts of a measurement whose least delays tell how sure the drift is."""
+"""Number of parts of a measurement whose least delays give the drift's uncertainty."""
 CERTAIN = 5.0
-"""Standard errors from which on a drift is no chance, told by so few parts."""
+"""Number of standard errors above which a drift is taken as real, estimated from so few parts."""
 Z95 = 1.959963984540054
-"""Quantile of the standard normal distribution, of an interval of 95 %."""
+"""Two-sided 95 % quantile of the standard normal distribution."""
 ALIKE_S = 50e-6
-"""Standard deviation of values that are taken to be all alike [s]."""
+"""Standard deviation up to which values count as all equal [s]."""
 LAGS = 20
 """Number of lags of the autocorrelation."""
 TOGETHER_NS = 2 * MILLISECOND_NS
-"""Longest time in which the packets of a train are sent [ns]."""
+"""Longest time within which the packets of a train are sent [ns]."""
 SPREAD_MIN_S = 1e-3
-"""Spread of a train that tells a finite rate from a machine that is busy [s]."""
+"""Spread of a train above which it shows a finite rate, and not a busy machine [s]."""
 ARRIVED_MIN = 4
-"""Smallest number of packets of a train that came, for it to count."""
+"""Smallest number of received packets for a train to count."""
 GROUPS_MIN, GROUPS_MAX = 4, 10
-"""Number of groups of trains, each left out in turn, that tell how sure a time is."""
+"""Number of groups of trains for the jackknife error of the time per packet."""
 ALONE_MIN, KERNELS = 100, 500
-"""Smallest number of packets that tell a distribution, and largest number of its kernels."""
+"""Smallest number of packets for a distribution, and largest number of its kernels."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
-"""Shares of which quantiles are told."""
+"""Probabilities of the reported quantiles."""
 
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """The listener's clock against the prober's."""
+    """Listener's clock relative to the prober's."""
 
     offset_s: float
-    """Offset at the first probe, half of the least round trip being taken for each way [s]."""
+    """Offset at the first probe, assuming that half of the least round trip is the delay of each
+    way [s]."""
     drift: float
-    """Rate by which the listener's clock runs faster; 0 where none is sure."""
+    """Rate by which the listener's clock runs faster; 0 where no drift is certain."""
     drift_doubt: float
     """Standard error of the drift."""
     least_sum_s: float
     """Sum of the two least delays [s]."""
     doubt_s: float
-    """Largest error of the offset, and so of all one-way delays: half of the least delays, without
-    times that are known [s]."""
+    """Largest error of the offset, and so of all one-way delays: half of the least delays, less
+    known fixed times [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,25 +85,25 @@ class Rate:
     """Rate, headers of IP and UDP included [B/s]."""
     low: float
     high: float
-    """Bounds of the interval of 95 % [B/s]."""
+    """Bounds of the 95 % interval [B/s]."""
     trains: int
-    """Number of trains that it was found from."""
+    """Number of trains used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Delays:
-    """Packets of one direction that were sent alone, in the order of sending."""
+    """Packets of one direction that were sent alone, in order of sending."""
 
     time_s: Array
-    """Time of sending, by the prober's clock from the first probe on [s]; shape (n,)."""
+    """Time of sending on the prober's clock, from the first probe [s]; shape (n,)."""
     delay_s: Array
     """One-way delay [s]; NaN of a lost packet; shape (n,)."""
     rate: Rate | None
-    """Rate of the direction; None where trains show none."""
+    """Rate of the direction; None where trains show no finite one."""
 
     @property
     def came(self) -> Bools:
-        """Whether each arrived; shape (n,)."""
+        """Whether each packet arrived; shape (n,)."""
         return np.isfinite(self.delay_s)
 
 
@@ -111,7 +114,7 @@ def delays(measured: Measured) -> tuple[Clocks, Delays, Delays]:
     """Clocks, and delays of the downlink and of the uplink.
 
     Raises:
-        ValueError: too few packets went a way.
+        ValueError: too few packets arrived in a direction.
     """
     down, up = measured.downlink, measured.uplink
     alone = down.came & (down.train < 0), up.came & (up.train < 0)
@@ -131,7 +134,7 @@ def delays(measured: Measured) -> tuple[Clocks, Delays, Delays]:
     half = max(least_sum_s - service_down - service_up, 0.0) / 2.0
     offset_s = floor_down - half - service_down
     clocks = Clocks((far_ns - near_ns) / SECOND_NS + offset_s, drift, doubt, least_sum_s, half)
-    # A lost answer has no arrival: it was sent when its probe arrived there.
+    # A lost answer has no arrival time; it was sent when its probe arrived at the listener.
     x_up = (up.sent_ns - far_ns) / SECOND_NS - offset_s
     return (
         clocks,
@@ -157,7 +160,7 @@ def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[floa
     mean = float(np.mean(x_down)), float(np.mean(x_up))
 
     def height(slope: float) -> float:
-        """Mean height of both lines; concave in the slope."""
+        """Mean height of both lines, a concave function of the slope."""
         below = float(np.min(down[1] - slope * (down[0] - mean[0])))
         return below + float(np.min(up[1] + slope * (up[0] - mean[1])))
 
@@ -169,8 +172,8 @@ def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[floa
 def _drift_doubt(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> float:
     """Standard error of the slope, from least delays in parts of the measurement.
 
-    Half the difference of the two least delays is the offset there; its scatter over time tells
-    how well a line through it is known.
+    Half the difference of both directions' least delays in a part is the offset there; the scatter
+    of these offsets over time gives the uncertainty of a line through them.
     """
     edges = np.linspace(0.0, max(x_down[-1], x_up.max()), WINDOWS + 1)
     offsets, times = [], []
@@ -204,7 +207,7 @@ def lower_hull(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def highest(function: Callable[[float], float], low: float, high: float, steps: int = 100) -> float:
-    """Place between two at which a concave function is highest (golden section)."""
+    """Argument between two bounds at which a concave function is largest (golden section)."""
     ratio = (sqrt(5.0) - 1.0) / 2.0
     left, right = high - ratio * (high - low), low + ratio * (high - low)
     at_left, at_right = function(left), function(right)
@@ -224,13 +227,13 @@ def highest(function: Callable[[float], float], low: float, high: float, steps: 
 
 
 def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Array, Array]:
-    """Mean time between packets so many places apart, and the correlation of their values.
+    """Mean time between packets by lag, and the correlation of their values.
 
-    Pairs with a gap between them are left out, as those around a train.
+    Pairs with a gap between them, such as those around a train, are left out.
 
     Args:
         time_s: times of sending, in the order of sending [s]; shape (n,).
-        values: NaN for what is not known; shape (n,).
+        values: NaN for unknown values; shape (n,).
 
     Returns:
         Two arrays of shape (lags,), with fewer entries where there are few packets.
@@ -251,9 +254,10 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
 
 
 def effective(count: int, correlations: Array) -> float:
-    """Number of independent values that tell as much of a mean as so many correlated ones.
+    """Effective sample size: number of independent values that determine a mean as well as these
+    correlated ones.
 
-    Correlations count as long as they differ from chance.
+    The sum over lags ends where the correlation no longer differs significantly from 0.
     """
     certain = 2.0 / sqrt(max(count, 1))
     lasting = 0.0
@@ -265,7 +269,7 @@ def effective(count: int, correlations: Array) -> float:
 
 
 def correlation_time_s(apart_s: Array, correlations: Array, count: int) -> float:
-    """Time in which the autocorrelation falls to 1/e [s]; 0 where there is none to speak of."""
+    """Time in which the autocorrelation falls to 1/e [s]; 0 without significant correlation."""
     if not len(correlations) or correlations[0] < max(4.0 / sqrt(count), 0.02):
         return 0.0
     low = np.flatnonzero(correlations < max(0.1, 2.0 / sqrt(count)))
@@ -275,7 +279,7 @@ def correlation_time_s(apart_s: Array, correlations: Array, count: int) -> float
 
 
 def wilson(share: float, count: float) -> tuple[float, float]:
-    """Interval of 95 % of a share of so many independent packets (Wilson's)."""
+    """Wilson's 95 % confidence interval of a share of so many independent packets."""
     if count <= 0.0:
         return 0.0, 1.0
     z2 = Z95 * Z95
@@ -293,7 +297,7 @@ def bursts(lost: Bools) -> tuple[int, float]:
 
 
 def reordered(way: Way) -> float:
-    """Share of the packets that arrived after one that was sent later (RFC 4737)."""
+    """Share of packets that arrived after one sent later (RFC 4737)."""
     alone = way.came & (way.train < 0)
     came_ns = way.came_ns[alone]
     order = np.argsort(came_ns, kind="stable")
@@ -305,11 +309,11 @@ def reordered(way: Way) -> float:
 
 
 def rate(way: Way, delay_s: Array, size: int) -> Rate | None:
-    """Rate of the narrowest part of a path; None where trains show none.
+    """Rate of the narrowest part of a path; None where trains show no finite one.
 
     Args:
-        delay_s: delays of all packets, those of lost ones ignored, from any zero on [s];
-            shape (n,).
+        delay_s: delays of all packets, with any constant offset; those of lost ones are ignored
+            [s]; shape (n,).
         size: UDP payload of each packet [B].
     """
     trains = []
@@ -335,11 +339,13 @@ def rate(way: Way, delay_s: Array, size: int) -> Rate | None:
 
 
 Trains = list[tuple[Array, Array]]
-"""Places in a train, from 0, and delays [s] of its packets that came; a pair for each train."""
+"""Places in the train, from 0, and delays [s] of the received packets, for each train."""
 
 
 def _slope(trains: Trains) -> tuple[float, float]:
-    """Slope of straight lines through trains, each at a height of its own, and standard error."""
+    """Common slope of lines through all trains, each with its own intercept, and its standard
+    error.
+    """
     centred = [(x - x.mean(), y - y.mean()) for x, y in trains]
     sxx = sum(float(x @ x) for x, _ in centred)
     slope = sum(float(x @ y) for x, y in centred) / sxx
@@ -349,11 +355,12 @@ def _slope(trains: Trains) -> tuple[float, float]:
 
 
 def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tuple[float, float]:
-    """Most likely time to pass, and its standard error by the jackknife over groups of trains.
+    """Most likely transmission time of a packet [s], and its jackknife standard error over groups
+    of trains.
 
     Args:
-        alone: delays of packets that were sent alone, ascending [s].
-        first, doubt: a time that it is near, and the standard error of that [s].
+        alone: sorted delays of packets that were sent alone [s].
+        first, doubt: initial estimate of the time, and its standard error [s].
     """
     count = min(len(alone), KERNELS)
     kernels = np.quantile(alone, (np.arange(count) + 0.5) / count)
@@ -389,8 +396,9 @@ def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tupl
     ]
     spread = np.array(without) - np.mean(without)
     error = sqrt((groups - 1) / groups * float(spread @ spread))
-    # A time that is hardly likelier than none is not sure, however alike the groups are.
+    # A time that is hardly likelier than zero is not certain, however small the scatter is.
     gain = likelihood(time_s, trains) - likelihood(0.0, trains)
     error = max(error, time_s / sqrt(2.0 * max(gain, 1e-9)))
-    few = 1.0 + (Z95**2 + 1.0) / (4.0 * (groups - 1))  # as Student's t is wider than the normal law
+    # factor by which Student's t is wider than the normal distribution
+    few = 1.0 + (Z95**2 + 1.0) / (4.0 * (groups - 1))
     return time_s, max(few * error, 1e-9)

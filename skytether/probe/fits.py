@@ -1,10 +1,9 @@
-"""Models of delay and loss fitted to what was measured: those of `skytether impairments`.
+"""Models of delay and loss, those of `skytether impairments`, fitted to a measurement.
 
 Each is fitted by maximum likelihood. They are compared by BIC, k ln n - 2 ln L with k parameters,
-where n packets that are correlated count as fewer, see `analysis.effective`. Likelihoods are of
-densities, with times no finer than RESOLUTION_S: the paper's lattice of slots is taken with a
-normal error of at least that, and a delay stays that far from the bound of its law. Delays that
-hardly vary are called constant.
+where n is the effective sample size, see `analysis.effective`. Likelihoods are densities, with a
+time resolution of RESOLUTION_S: the paper's lattice of slots has a normal error of at least that,
+and delays keep that distance from a law's lower bound. Delays that hardly vary are called constant.
 """
 
 from collections.abc import Callable
@@ -18,27 +17,28 @@ from skytether.probe.analysis import Bools, highest
 from skytether.shared.law.model import Array
 
 RESOLUTION_S = 50e-6
-"""Finest time that is told apart [s]."""
+"""Time resolution of the likelihoods [s]."""
 CONSTANT_S = 0.5e-3
-"""Largest standard deviation of a delay that is called constant [s]."""
+"""Largest standard deviation of delays that are called constant [s]."""
 LEASTS = 60
-"""Number of least delays that are tried for a law that has one."""
+"""Number of lower bounds that are tried for a law that has one."""
 SLOTS = 4000
-"""Number of slots that are tried for the paper's law."""
+"""Number of slot lengths that are tried for the paper's law."""
 PAIRS_MIN = 20
-"""Smallest number of packets that anything is fitted to."""
+"""Smallest number of packets for a fit."""
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
-"""Shortest time in which a channel is redrawn, in mean times between packets, and longest [s]."""
+"""Shortest time after which a channel is redrawn, in mean times between packets, and longest
+[s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A model that was fitted."""
+    """Fitted model."""
 
     name: str
     """Name of the impairment."""
     numbers: tuple[float, ...]
-    """Its arguments."""
+    """Arguments of the impairment."""
     bic: float
     """Bayesian information criterion: the smaller, the better."""
 
@@ -57,8 +57,8 @@ def fit_delays(delay_s: Array, independent: float) -> list[Fit]:
     """Models of delays, the best first.
 
     Args:
-        delay_s: delays of the packets that came [s]; shape (n,).
-        independent: number of independent packets that they count as.
+        delay_s: delays of the received packets [s]; shape (n,).
+        independent: effective sample size.
     """
     if len(delay_s) < PAIRS_MIN:
         return []
@@ -94,7 +94,7 @@ def _normal(delay_s: Array) -> Found:
 
 
 def _with_least(delay_s: Array, name: str) -> Found:
-    """Gamma or lognormal law beyond a least delay: the best least delay, by trial."""
+    """Gamma or lognormal law beyond a least delay, with the best least delay found by trial."""
     first, span = float(delay_s.min()), float(np.mean(delay_s) - delay_s.min())
     law = _gamma if name == "gamma" else _lognormal
     below = np.minimum(np.geomspace(RESOLUTION_S, 30.0 * span, LEASTS), first)
@@ -107,7 +107,9 @@ def _with_least(delay_s: Array, name: str) -> Found:
 
 
 def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Likelihood, mean and standard deviation of the best lognormal law beyond a least delay."""
+    """Log-likelihood, mean and standard deviation of the best lognormal law beyond a least
+    delay.
+    """
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
     logs = np.log(over)
     mu, sigma = float(np.mean(logs)), max(float(np.std(logs)), 1e-6)
@@ -117,7 +119,7 @@ def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Likelihood, mean and standard deviation of the best gamma law beyond a least delay."""
+    """Log-likelihood, mean and standard deviation of the best gamma law beyond a least delay."""
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
     count, mean, mean_log = len(over), float(np.mean(over)), float(np.mean(np.log(over)))
 
@@ -131,7 +133,9 @@ def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _paper(delay_s: Array) -> Found | None:
-    """Least delay and a Poisson number of slots, with a normal error; None without slots."""
+    """Least delay plus a Poisson number of slots, with a normal error; None without visible
+    slots.
+    """
     first, span = float(delay_s.min()), float(delay_s.max() - delay_s.min())
     if span < 20.0 * RESOLUTION_S:
         return None
@@ -147,7 +151,7 @@ def _paper(delay_s: Array) -> Found | None:
     good = np.flatnonzero(scores > max(0.9 * float(scores.max()), 0.8))
     if not len(good):
         return None
-    # Every fraction of a slot has as good a score: the longest is the slot.
+    # Every fraction of a slot scores as well: take the longest one.
     run = good[: int(np.argmax(np.diff(good, append=10**9) > 1)) + 1]
     peak = inverse[run[np.argmax(scores[run])]]
     step = inverse[1] - inverse[0]
@@ -161,7 +165,9 @@ def _paper(delay_s: Array) -> Found | None:
     begin = float(np.mean(delay_s - slot * places))
 
     def likelihood(before: int) -> float:
-        """Likelihood of the Poisson numbers, if so many slots below the least delay never came."""
+        """Log-likelihood of the Poisson law if so many slots below the smallest delay never
+        occurred.
+        """
         counts, times = np.unique(places + before, return_counts=True)
         mean = float(np.mean(places)) + before
         logs = [count * log(mean) - mean - lgamma(count + 1.0) for count in counts.tolist()]
@@ -181,9 +187,9 @@ def _paper(delay_s: Array) -> Found | None:
 def fit_losses(time_s: Array, lost: Bools) -> list[Fit]:
     """Models of losses, the best first; none where nothing was lost, or everything.
 
-    The channel of `gilbert_elliott` is drawn anew at random moments, bad with the share, and loses
-    everything while it is bad: it is as at the packet before with the chance exp(-Δt / cell), and
-    lasts for cell / (1 - share).
+    The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and
+    loses every packet while it is bad. Its state is not redrawn between two packets with
+    probability exp(-Δt / cell), and a bad period lasts cell / (1 - share) on average.
 
     Args:
         time_s: times of sending, in the order of sending [s]; shape (n,).
@@ -203,7 +209,7 @@ def fit_losses(time_s: Array, lost: Bools) -> list[Fit]:
     low, high = log(BURST_MIN * spacing), log(BURST_MAX_S)
     best_share = share
     cell = spacing
-    for _ in range(20):  # one after the other: they hardly depend on each other
+    for _ in range(20):  # alternate between both parameters, which hardly depend on each other
         cell = exp(highest(partial(_at_share, likelihood, best_share), low, high, 40))
         best_share = highest(partial(_at_cell, likelihood, cell), 1e-6, 1.0 - 1e-6, 50)
     first = log(best_share if lost[0] else 1.0 - best_share)
@@ -215,12 +221,12 @@ def fit_losses(time_s: Array, lost: Bools) -> list[Fit]:
 
 
 def _at_share(likelihood: Callable[[float, float], float], share: float, cell: float) -> float:
-    """Likelihood of a share and the logarithm of a cell's length."""
+    """Log-likelihood as a function of the share, with the best cell length."""
     return likelihood(share, exp(cell))
 
 
 def _at_cell(likelihood: Callable[[float, float], float], cell_s: float, share: float) -> float:
-    """Likelihood of a cell's length and a share."""
+    """Log-likelihood as a function of the cell length at a share."""
     return likelihood(share, cell_s)
 
 
@@ -229,10 +235,10 @@ _TURNS = ((True, True), (True, False), (False, True), (False, False))
 
 
 def _gilbert(groups: list[Array], share: float, cell_s: float) -> float:
-    """Logarithm of the likelihood of what became of each packet after the one before.
+    """Log-likelihood of each packet's fate, given that of the previous one.
 
     Args:
-        groups: times between two packets, of each of the four turns [s].
+        groups: times between two packets, by the four pairs of fates in `_TURNS` [s].
     """
     total = 0.0
     for (before, after), between in zip(_TURNS, groups, strict=True):

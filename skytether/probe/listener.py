@@ -1,11 +1,11 @@
-"""The far end of a measurement: it answers each probe with one packet that is no longer.
+"""Far end of a measurement: it answers each probe with one packet that is no longer.
 
-An answer has the listener's time, and tells of probes that have arrived, from the first on that the
-prober has not been told of: so an answer that is lost loses no arrival. The probes of a train are
-answered together once all have come, so that the answers are a train as well.
+An answer has the listener's time, and lists the arrivals that the prober has not acknowledged, the
+oldest first: so a lost answer loses no arrival. The probes of a train are answered together once
+all have come, so that the answers are a train as well.
 
-Nothing is kept of a HELLO: its session is made of a secret and the sender's address. State is kept
-from the first PROBE on, which only who can be answered at that address can send.
+A HELLO leaves no state: its session id is derived from a secret and the sender's address. State is
+kept from the first PROBE on, which only a sender that receives packets at that address can send.
 """
 
 import hashlib
@@ -33,23 +33,23 @@ from skytether.shared.wire.channel import OVERHEAD_BYTES
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
 
 SESSIONS_MAX = 16
-"""Number of measurements at once; one that is silent for IDLE_NS gives way."""
+"""Most measurements at once; one without a probe for IDLE_NS may be replaced."""
 IDLE_NS = 60 * SECOND_NS
-"""Time without a probe after which a measurement gives way to another [ns]."""
+"""Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
-"""Number of arrivals kept until the prober has been told of them; older ones are forgotten."""
+"""Most arrivals kept until the prober has acknowledged them; older ones are dropped."""
 HOLD_NS = 200 * MILLISECOND_NS
-"""Time for which the rest of a train is waited for after each of its packets [ns]."""
+"""Time to wait for the rest of a train after each of its packets [ns]."""
 _TOLD_MAX = PAYLOAD_BYTES_MAX // 12
-"""Number of arrivals that have room in an answer."""
+"""Most arrivals that fit an answer."""
 
 
 @dataclass(slots=True)
 class Held:
-    """Packet of a train whose answer waits for the others."""
+    """Packet of a train whose answer waits for the rest of the train."""
 
     number: int
-    """Number of its arrival."""
+    """Number of the packet's arrival."""
     call: Call
     peer: Address
     size: int
@@ -58,33 +58,33 @@ class Held:
 
 @dataclass(slots=True)
 class Session:
-    """One measurement."""
+    """Measurement by one prober."""
 
     heard_ns: int
     """Time of the newest probe [ns]."""
     logged: int = 0
     """Number of arrivals so far."""
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
-    """Newest arrivals that the prober may not have been told of: number and time [ns]."""
+    """Newest arrivals not yet acknowledged by the prober: number and time [ns]."""
     train: list[Held] = field(default_factory=list)
-    """Packets of a train that wait for the others."""
+    """Packets of a train that wait for the rest."""
     train_ns: int = 0
-    """Time of the newest of these [ns]."""
+    """Time of the newest packet in `train` [ns]."""
 
 
 class Listener(Endpoint):
-    """Answers probes.
+    """Listener that answers probes.
 
     Args:
-        gate: opens what comes, and answers it.
-        secret: bytes that nobody else can know, which sessions are made of.
+        gate: opens incoming packets, and seals answers.
+        secret: random bytes, from which session ids are derived.
     """
 
     def __init__(self, gate: Gate, secret: bytes) -> None:
         super().__init__()
         self._gate, self._secret = gate, secret
         self._sessions: OrderedDict[bytes, Session] = OrderedDict()
-        """Measurements by session, the one first whose newest probe is oldest."""
+        """Measurements by session id, in order of their newest probe, oldest first."""
         self._dropped: Counter[Drop] = Counter()
         self._answered = 0
 
@@ -115,10 +115,10 @@ class Listener(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
     def _session(self, name: bytes, peer: Address, now_ns: int) -> Session:
-        """Measurement of a session, begun where there is none.
+        """Measurement of a session, begun if it is new.
 
         Raises:
-            ProtocolError: it is no session of this listener's, or there is no room.
+            ProtocolError: the session id is not this listener's, or there is no room.
         """
         session = self._sessions.get(name)
         if session is None:
@@ -136,7 +136,7 @@ class Listener(Endpoint):
         return session
 
     def _oldest_idle(self, now_ns: int) -> bytes | None:
-        """Session that gives way to another, if one does."""
+        """Session that may be replaced, or None."""
         name, session = next(iter(self._sessions.items()), (None, None))
         return name if session and now_ns - session.heard_ns > IDLE_NS else None
 
@@ -162,7 +162,7 @@ class Listener(Endpoint):
             self._answer(session, probe.session, waits, now_ns)
 
     def _release(self, session: Session, name: bytes, now_ns: int) -> None:
-        """Answer the packets of a train."""
+        """Answer all packets of a train."""
         for each in session.train:
             self._answer(session, name, each, now_ns)
         session.train.clear()
@@ -174,18 +174,18 @@ class Listener(Endpoint):
         answer = Answer(name, held.number, now_ns, first, session.logged, arrivals)
         size = held.size - (OVERHEAD_BYTES if self._gate.secure else 0)
         packet = line.seal(encode(answer, size))
-        if len(packet) <= held.size:  # a shorter probe than any prober's has no answer
+        if len(packet) <= held.size:  # a probe shorter than any prober's cannot be answered
             self.send(packet, held.peer)
             self._answered += 1
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`; the rest of a train is not waited for for ever."""
+        """See `Endpoint`; an incomplete train is answered after a time limit."""
         for name, session in self._sessions.items():
             if session.train and now_ns >= session.train_ns + HOLD_NS:
                 self._release(session, name, now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Time at which a train is answered as far as it has come."""
+        """Time at which an incomplete train is answered."""
         return min(
             (each.train_ns + HOLD_NS for each in self._sessions.values() if each.train),
             default=None,

@@ -1,4 +1,4 @@
-"""What is told of a measured path: figures of each direction, and the text that flies it."""
+"""Results of a measurement: figures of each direction, and the text that flies them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,14 +15,15 @@ from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5
-"""Shortest correlation time that is told of a model, in times between two packets."""
+"""Shortest reported correlation time, in times between two packets; shorter ones are left out of
+the text."""
 ORDERED_SHARE = 0.01
-"""Share of packets that independent delays would reorder, from which on a path that reorders none
+"""Share of reordered packets predicted for independent delays; above it, a path without reordering
 is called ordered."""
 
 
 class Model(msgspec.Struct, frozen=True):
-    """A model that was fitted."""
+    """Fitted model, for the output."""
 
     text: str
     """The impairment as a scenario writes it."""
@@ -36,47 +37,47 @@ class WayTold(msgspec.Struct, frozen=True, kw_only=True):
     sent: int
     came: int
     copies: int
-    """Packets that arrived again, those of trains included."""
+    """Duplicate arrivals, those of trains included."""
     loss: float
     """Share of the packets that were lost."""
     loss_low: float
     loss_high: float
-    """Bounds of the interval of 95 % of that share."""
+    """Bounds of the 95 % interval of the loss."""
     bursts: int
-    """Runs of lost packets."""
+    """Number of runs of lost packets."""
     burst_packets: float
     """Mean length of a run [packets]."""
     reordered: float
-    """Share of the packets that arrived after one that was sent later."""
+    """Share of packets that arrived after one sent later."""
     mean_s: float
     """Mean one-way delay [s]."""
     sd_s: float
     """Standard deviation of the delay [s]."""
     quantiles_s: dict[str, float]
-    """Delay that a share of the packets does not exceed [s], by that share."""
+    """Quantiles of the delay [s], by probability."""
     correlation: list[tuple[float, float]]
     """Time between two packets [s], and correlation of their delays."""
     correlation_s: float
-    """Time in which the correlation falls to 1/e [s]; 0 where there is none to speak of."""
+    """Time in which the correlation falls to 1/e [s]; 0 without significant correlation."""
     rate_bytes_per_s: float | None
     """Rate of the narrowest part, with headers [B/s]; None where trains show none."""
     rate_low: float | None
     rate_high: float | None
-    """Bounds of the interval of 95 % of that rate [B/s]."""
+    """Bounds of the 95 % interval of the rate [B/s]."""
     trains: int
-    """Trains of which enough came."""
+    """Number of trains of which enough packets arrived."""
     train_wait_s: float
-    """Time for which the last packet of a train waits in the queue [s]."""
+    """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
     delay_models: list[Model]
-    """Models of the delay, without the time to pass that rate, the best first."""
+    """Models of the delay, without the transmission time at the rate, the best first."""
     loss_models: list[Model]
     """Models of the losses, the best first."""
     text: str
-    """The best models as one text, for `network.uplink` or `network.downlink`."""
+    """Text of the best models, for `network.uplink` or `network.downlink`."""
 
 
 class PathTold(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of a path, for a program."""
+    """Figures of a path, as written with --json."""
 
     listener: str
     secure: bool
@@ -91,15 +92,15 @@ class PathTold(msgspec.Struct, frozen=True, kw_only=True):
     offset_doubt_s: float
     """Largest error of that offset, and of all one-way delays, with opposite signs [s]."""
     drift_ppm: float
-    """Drift of the listener's clock [10⁻⁶]; 0 where none is sure."""
+    """Drift of the listener's clock [10⁻⁶]; 0 where none is certain."""
     drift_doubt_ppm: float
     """Standard error of the drift [10⁻⁶]."""
     round_trip_mean_s: float
-    """Mean delay of both ways together [s], which depends on no clock."""
+    """Mean round trip [s], which depends on no clock."""
     round_trip_least_s: float
-    """Sum of the two least delays [s]."""
+    """Sum of both least delays [s]."""
     unreported: int
-    """Arrivals that the listener had to forget before it could tell of them."""
+    """Number of arrivals that the listener dropped before it could report them."""
     uplink: WayTold
     """Direction from the listener to the prober."""
     downlink: WayTold
@@ -108,7 +109,7 @@ class PathTold(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a measurement."""
+    """Result of a measurement."""
 
     clocks: Clocks
     delays: Mapping[str, Delays]
@@ -117,14 +118,14 @@ class Outcome:
 
 
 def outcome(measured: Measured, listener: str, *, secure: bool) -> Outcome:
-    """What came of a measurement.
+    """Result of a measurement.
 
     Args:
         listener: HOST:PORT of the other end.
-        secure: whether packets were sealed.
+        secure: whether packets were encrypted.
 
     Raises:
-        ValueError: too few packets went each way.
+        ValueError: too few packets arrived.
     """
     ways = {"uplink": measured.uplink, "downlink": measured.downlink}
     clocks, down, up = analysis.delays(measured)
@@ -200,7 +201,7 @@ def _way_told(way: Way, delays: Delays, size: int) -> WayTold:
 
 
 def _would_reorder(delays: Delays) -> float:
-    """Share of the packets that would be overtaken, were their delays independent."""
+    """Share of packets that would be overtaken if their delays were independent."""
     came = delays.came
     time_s, delay_s = delays.time_s[came], delays.delay_s[came]
     mixed = np.random.default_rng(0).permutation(delay_s)
@@ -209,12 +210,12 @@ def _would_reorder(delays: Delays) -> float:
 
 
 def trace(delays: Delays) -> str:
-    """Packets of a direction as a file of `trace`: CSV text, a row a packet."""
+    """Packets of a direction as CSV text for `trace`, one row per packet."""
     lines, last = ["time_s,delay_s,lost"], -np.inf
     begin = float(delays.time_s[0])
     for time_s, delay_s in zip(delays.time_s.tolist(), delays.delay_s.tolist(), strict=True):
         at = round(time_s - begin, 6)
-        if at > last:  # of two at one instant, which a trace has no place for, the first
+        if at > last:  # of two at one instant, which a trace cannot hold, the first
             last = at
             lines.append(
                 f"{at:.6f},,1" if isnan(delay_s) else f"{at:.6f},{max(delay_s, 0.0):.6f},0"
@@ -223,9 +224,9 @@ def trace(delays: Delays) -> str:
 
 
 def rows(measured: Measured, clocks: Clocks) -> Rows:
-    """Packets as netem records them, a row each, those of trains included.
+    """Packets in netem's format, one row each, those of trains included.
 
-    Times are those of the prober's clock; `delay_ns` of a lost packet is 0.
+    Times are on the prober's clock; `delay_ns` of a lost packet is 0.
     """
     parts = []
     for direction, way in ((DOWNLINK, measured.downlink), (UPLINK, measured.uplink)):
@@ -246,7 +247,7 @@ def rows(measured: Measured, clocks: Clocks) -> Rows:
 
 
 def _ahead_ns(way: Way, measured: Measured, clocks: Clocks) -> Longs:
-    """Time by which the listener's clock is ahead when each packet is sent [ns]; shape (n,)."""
+    """Offset of the listener's clock when each packet is sent [ns]; shape (n,)."""
     near_ns = measured.downlink.sent_ns[0]
     base_ns = round(clocks.offset_s * SECOND_NS)
     since: Array = (way.sent_ns - near_ns).astype(np.float64)

@@ -1,11 +1,11 @@
-"""The near end of a measurement: it sends probes on a grid, and keeps what came of them.
+"""Near end of a measurement: it sends probes on a time grid, and keeps the fate of each.
 
     HELLO until WELCOME → probes for so many seconds → polls until all arrivals are known, and until
     the last answers have had time to come
 
-Once in a while a train of packets is sent at once, for the rate of the path. It takes the place of
-twice as many probes as it has packets, so that a path that carries the probes has emptied its queue
-both ways before the next one: delays are measured on an idle path.
+Sometimes a train of packets is sent at once, to measure the rate of the path. The train takes the
+place of twice as many probes as it has packets: a path that can carry the probes has then emptied
+its queues both ways before the next probe, so delays are measured on an idle path.
 """
 
 from array import array
@@ -34,24 +34,24 @@ from skytether.shared.wire.channel import OVERHEAD_BYTES
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
 
 BYTES_MIN = MESSAGE_BYTES_MIN + OVERHEAD_BYTES
-"""Smallest size of a probe, sealed or not [B]."""
+"""Smallest size of a probe, encrypted or not [B]."""
 PROBES_MAX = 1_000_000
-"""Largest number of probes: as many as a trace has rows."""
+"""Most probes: as many as a trace has rows."""
 TRAIN = 16
 """Number of packets of a train."""
 TRAIN_SLOTS = 2 * TRAIN
-"""Number of probes whose place a train takes."""
+"""Number of probes that a train replaces."""
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 """Shortest time [ns], and smallest number of probes, from one train to the next."""
 HELLO_BYTES = 64
 """Size of a HELLO without keys: its WELCOME is shorter [B]."""
 PATIENCE_NS = 10 * SECOND_NS
-"""Time for which a first answer is waited for [ns]."""
+"""Longest wait for a first answer [ns]."""
 POLL_NS = 100 * MILLISECOND_NS
 """Time between two polls [ns]."""
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
-"""Shortest and longest time for which the last answers are waited for [ns]; between them, twice the
-longest round trip."""
+"""Shortest and longest wait for the last answers [ns]; between them, twice the longest round
+trip."""
 
 Longs = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -59,25 +59,26 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """Packets of one direction, in the order in which they were sent. Times are of monotonic
-    clocks, the sender's and the receiver's, which have nothing in common.
+    """Packets of one direction, in order of sending.
+
+    Times are those of the sender's and the receiver's monotonic clocks, which have no common zero.
     """
 
     sent_ns: Longs
-    """Time of sending, by the sender's clock [ns]; shape (n,)."""
+    """Time of sending, on the sender's clock [ns]; shape (n,)."""
     came_ns: Longs
-    """Time of arrival, by the receiver's clock [ns]; 0 of a lost packet; shape (n,)."""
+    """Time of arrival, on the receiver's clock [ns]; 0 for a lost packet; shape (n,)."""
     came: Bools
-    """Whether each arrived; shape (n,)."""
+    """Whether each packet arrived; shape (n,)."""
     train: Longs
-    """Number of the train that each belongs to, -1 of a packet sent alone; shape (n,)."""
+    """Number of each packet's train, -1 for a packet sent alone; shape (n,)."""
     copies: int
-    """Number of packets that arrived again."""
+    """Number of duplicate arrivals."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Packets that went both ways."""
+    """Packets of both directions."""
 
     downlink: Way
     """Packets from the prober to the listener, as from a vehicle to the server."""
@@ -88,18 +89,18 @@ class Measured:
     period_ns: int
     """Time between two probes [ns]."""
     unreported: int
-    """Number of arrivals that the listener had to forget before it could tell of them."""
+    """Number of arrivals that the listener dropped before it could report them."""
 
 
 class Prober(Endpoint):
-    """Sends probes, and keeps when each was sent, when it arrived, and when its answer did.
+    """Prober that sends probes, and keeps their times of sending, arrival and answer.
 
     Args:
-        link: seals what is sent, and opens what comes.
+        link: seals outgoing packets, and opens incoming ones.
         listener: address of the other end.
-        nonce: NONCE_BYTES that no other measurement has.
+        nonce: NONCE_BYTES, different for each measurement.
         probes: number of places on the grid, at most PROBES_MAX.
-        period_ns: time between two of them [ns].
+        period_ns: time between two places [ns].
         size: UDP payload of a probe, BYTES_MIN to PAYLOAD_BYTES_MAX [B].
     """
 
@@ -133,13 +134,13 @@ class Prober(Endpoint):
         self._slot = 0
         """Place on the grid of the next probe."""
         self._over_ns: int | None = None
-        """Time of the last probe, once it was sent."""
+        """Time at which the last probe was sent; None before."""
         self._longest_ns = 0
         """Longest round trip so far."""
         self.refused = False
-        """Whether the listener has no room."""
+        """Whether the listener has refused for lack of room."""
         self.failed = False
-        """Whether no listener has answered."""
+        """Whether the listener has not answered in time."""
         self._done = False
         self._sent_ns, self._train = array("q"), array("q")
         self._logged_number, self._logged_ns = array("q"), array("q")
@@ -149,9 +150,9 @@ class Prober(Endpoint):
             array("q"),
         )
         self._logged = 0
-        """Number of arrivals that the listener has told of, known or forgotten."""
+        """Number of arrivals that the listener has reported, or dropped."""
         self._total = 0
-        """Number of arrivals that the listener has counted, as far as is known."""
+        """Largest known number of arrivals at the listener."""
         self._settled = False
         self._trains = 0
         self._dropped: Counter[Drop] = Counter()
@@ -189,15 +190,16 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
     def _learn(self, answer: Answer, now_ns: int) -> None:
-        """Keep what an answer tells."""
-        # An attacker without keys may claim anything; more than twice the probes is none of ours.
+        """Keep the arrivals in an answer."""
+        # Without keys, an attacker may claim anything: more than twice the probes is impossible.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
             raise ProtocolError(Drop.FIELD)
         if any(number >= len(self._sent_ns) for number, _ in answer.arrivals):
             raise ProtocolError(Drop.FIELD)
         self._total = max(self._total, answer.logged)
         known = self._logged
-        if answer.first > known:  # the listener has no room for more: what was between is gone
+        # the listener's memory was full: the arrivals between were dropped
+        if answer.first > known:
             for _ in range(answer.first - known):
                 self._logged_number.append(-1)
                 self._logged_ns.append(0)
@@ -241,8 +243,9 @@ class Prober(Endpoint):
         self.send(self._link.hello(self._hello, now_ns=now_ns), self._listener)
 
     def _probe(self, now_ns: int) -> None:
-        """Send the probe, or the train, of this place on the grid; places slept through are left
-        out.
+        """Send the probe, or the train, at this place on the grid.
+
+        Places missed by waking too late are left out.
         """
         slot = max(self._slot, (now_ns - self._zero_ns) // self._period_ns)
         if now_ns < self._zero_ns + slot * self._period_ns:
@@ -268,7 +271,7 @@ class Prober(Endpoint):
         self._train.append(number)
 
     def _poll(self, now_ns: int, over_ns: int) -> None:
-        """Ask for arrivals until all are known, or for as long as is reasonable."""
+        """Ask for arrivals until all are known, or until a time limit."""
         waited_ns = now_ns - over_ns
         least_ns = min(max(LAST_MIN_NS, 2 * self._longest_ns), LAST_MAX_NS)
         if waited_ns >= LAST_MAX_NS or (waited_ns >= least_ns and self._logged >= self._total):
@@ -309,8 +312,10 @@ class Prober(Endpoint):
         }
 
     def measured(self) -> Measured:
-        """Packets so far. Where the measurement was ended early, those that may still be under way
-        are left out: the ones after the newest of which anything is known.
+        """Packets so far.
+
+        If the measurement was ended early, packets that may still be under way are left out: those
+        after the newest one with a known fate.
         """
         number = np.array(self._logged_number, np.int64)
         logged_ns = np.array(self._logged_ns, np.int64)
@@ -334,7 +339,7 @@ class Prober(Endpoint):
         return Way(sent_ns[:end], came_ns[:end], came[:end], train[:end], copies)
 
     def _uplink(self, number: Longs, logged_ns: Longs) -> Way:
-        """Answers; the time of sending of a lost one is that of the arrival that drew it."""
+        """Answers; a lost one was sent when its probe arrived."""
         answered = np.array(self._answer_number, np.int64)
         first, at = np.unique(answered[answered < len(number)], return_index=True)
         end = len(number) if self._settled else int(first.max(initial=-1)) + 1

@@ -22,63 +22,63 @@ import msgpack
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
 
 VERSION = 64
-"""Version of these messages; no endpoint of a flight takes one of them for its own."""
+"""Protocol version; endpoints of a flight reject it, so that none takes a probe for its own."""
 NONCE_BYTES = COOKIE_BYTES = 8
 SESSION_BYTES = NONCE_BYTES + COOKIE_BYTES
 MESSAGE_BYTES_MIN = 96
-"""Smallest size of a PROBE: its ANSWER has room for two arrivals [B]."""
+"""Smallest size of a PROBE [B]: its ANSWER then has room for two arrivals."""
 TRAIN_MAX = 64
-"""Largest number of packets of a train."""
+"""Most packets of a train."""
 NO_NUMBER = 2**32 - 1
-"""Number of a PROBE that only asks for arrivals, and of its ANSWER."""
+"""Number in a PROBE that only asks for arrivals, and in its ANSWER."""
 
 _ARRIVAL = Struct("<IQ")
-"""An arrival: number of the PROBE, and the listener's time [ns]."""
+"""Arrival: number of the PROBE, and the listener's time [ns]."""
 _PADDING = bytes(PAYLOAD_BYTES_MAX)
 
 
 class Hello(NamedTuple):
-    """Prober asks for a session."""
+    """HELLO: the prober asks for a session."""
 
     nonce: bytes
 
 
 class Welcome(NamedTuple):
-    """Listener gives a session."""
+    """WELCOME: the listener grants or refuses a session."""
 
     nonce: bytes
-    """Nonce of the HELLO that it answers."""
+    """Nonce of the HELLO that is answered."""
     cookie: bytes
     room: bool
     """Whether the listener has room for another session."""
 
 
 class Probe(NamedTuple):
-    """Packet from the prober to the listener."""
+    """PROBE: packet from the prober to the listener."""
 
     session: bytes
     number: int
     """Number of the packet, from 0; or NO_NUMBER."""
     train: int
-    """Number of packets of the train that it belongs to; 0 of a packet sent alone."""
+    """Number of packets of its train; 0 for a packet sent alone."""
     held: int
-    """Number of arrivals that the prober has been told of."""
+    """Number of arrivals that the prober has received reports of."""
 
 
 class Answer(NamedTuple):
-    """Packet from the listener to the prober."""
+    """ANSWER: packet from the listener to the prober."""
 
     session: bytes
     number: int
-    """Number of the arrival that it answers, from 0; or NO_NUMBER."""
+    """Number of the arrival that is answered, from 0; or NO_NUMBER."""
     sent_ns: int
-    """Time of sending, by the listener's clock [ns]."""
+    """Time of sending, on the listener's clock [ns]."""
     first: int
-    """Number of the first arrival that it tells of."""
+    """Number of the first reported arrival."""
     logged: int
     """Number of arrivals so far."""
     arrivals: tuple[tuple[int, int], ...]
-    """Number of the PROBE and the listener's time [ns], of each arrival from the first on."""
+    """Reported arrivals: number of the PROBE and the listener's time [ns]."""
 
 
 Message = Hello | Welcome | Probe | Answer
@@ -86,11 +86,11 @@ _TYPES: tuple[type[Message], ...] = (Hello, Welcome, Probe, Answer)
 
 
 def encode(message: Message, size: int = 0) -> bytes:
-    """Bytes of a message.
+    """Encoded message.
 
     Args:
-        size: size that it is padded to, which it falls short of by one byte at most [B]. An ANSWER
-            leaves out the arrivals that have no room.
+        size: size to pad to [B]; the result may be one byte shorter. An ANSWER omits arrivals that
+            do not fit.
     """
     fields: tuple[Any, ...] = message
     if isinstance(message, Answer):
@@ -101,7 +101,7 @@ def encode(message: Message, size: int = 0) -> bytes:
         return msgpack.packb((VERSION, 2, *message))
     bare = _packed(type(message), fields, b"")
     room = size - len(bare)
-    # The header of more than 255 bytes is longer by one.
+    # The msgpack header of more than 255 padding bytes is one byte longer.
     return _packed(type(message), fields, _PADDING[: max(0, room - (room > 255))])
 
 
@@ -114,7 +114,7 @@ def decode(payload: bytes) -> Message:
     """Message in a datagram, every field checked.
 
     Raises:
-        ProtocolError: it is none of these.
+        ProtocolError: the datagram is no such message.
     """
     if len(payload) > PAYLOAD_BYTES_MAX:
         raise ProtocolError(Drop.TOO_LONG)
@@ -159,7 +159,7 @@ def decode(payload: bytes) -> Message:
 
 
 def _check(session: bytes, numbers: tuple[int, ...]) -> None:
-    """Refuse a session of another length, and numbers that no field has.
+    """Refuse a session id of wrong length, and numbers out of range.
 
     Raises:
         ProtocolError: with the field.

@@ -1,8 +1,8 @@
-"""The quadrotor: a rigid body with four rotors, and the loops that make it fly a velocity.
+"""Quadrotor: a rigid body with four rotors, and control loops that track a velocity.
 
     velocity → acceleration → attitude → rates → rotors → forces
 
-No module in here reads a clock or throws unseeded dice: a quadrotor is advanced by its caller.
+No module of this room reads a clock or draws unseeded random numbers; the caller advances time.
 """
 
 from skytether.shared.base import extras

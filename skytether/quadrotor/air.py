@@ -24,15 +24,15 @@ ROOT_3 = 1.7320508075688772
 
 
 class Air(NamedTuple):
-    """Wind, and the state of its gusts."""
+    """Wind, and the state of its gust filters."""
 
     steady: F1
-    """Velocity of steady wind [m/s; north, east, down]; shape (3,)."""
+    """Velocity of the steady wind [m/s; north, east, down]; shape (3,)."""
     turbulence: F1
-    """Speed of the wind 6 m above ground that the gusts belong to [m/s]; 0: no gusts. Shape
+    """Wind speed 6 m above ground that the gusts correspond to [m/s]; 0 for no gusts; shape
     (1,)."""
     gust: F1
-    """States of the filters: u, two of v, two of w [m/s]; shape (5,)."""
+    """States of the gust filters: one for u, two for v, two for w [m/s]; shape (5,)."""
 
 
 @part
@@ -71,7 +71,7 @@ def blow(air: Air, drawn: F1, height: float, out: F1) -> None:
 
 @part
 def _second_order(state: F1, keep: float, strength: float, drawn: float) -> None:
-    """Two lags in a row, the first driven so that what passes has the standard deviation σ."""
+    """Two first-order lags in series, driven so that the output has the standard deviation σ."""
     spread = strength / np.sqrt(2.0) * np.sqrt(1.0 - keep * keep)
     state[1] = keep * state[1] + (1.0 - keep) * state[0]
     state[0] = keep * state[0] + spread * drawn
@@ -79,5 +79,5 @@ def _second_order(state: F1, keep: float, strength: float, drawn: float) -> None
 
 @part
 def _passed(state: F1) -> float:
-    """Output of the filter (1 + √3 T s) / (1 + T s)², by its two lags."""
+    """Output of the filter (1 + √3 T s) / (1 + T s)², from its two lags."""
     return ROOT_3 * state[0] + (1.0 - ROOT_3) * state[1]

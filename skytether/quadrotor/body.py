@@ -1,9 +1,9 @@
-"""The rigid body and its rotors, compiled: what forces and torques do to them within a step.
+"""Equations of motion of the rigid body and its rotors, compiled.
 
     ṗ = v      v̇ = g + R F / m      q̇ = q ⊗ (0, Ω) / 2      J Ω̇ = M - Ω × J Ω      ω̇ = (ω* - ω) / τ
 
-Inside this room vectors are north, east, down, and forward, right, down in the body: R, of the
-quaternion q, turns the second into the first.
+In this room, world vectors are north, east, down, and body vectors forward, right, down. R, the
+rotation matrix of the quaternion q, turns body vectors into world vectors.
 """
 
 from typing import NamedTuple
@@ -23,14 +23,14 @@ STEP_S = 0.002
 
 
 class Signs(NamedTuple):
-    """Sides of the rotors: 1 front right, 2 back left, 3 front left, 4 back right."""
+    """Signs of the rotors' positions: 1 front right, 2 back left, 3 front left, 4 back right."""
 
     front: tuple[float, ...] = (1.0, -1.0, 1.0, -1.0)
-    """Whether a rotor is in front: 1, or behind: -1."""
+    """Position of each rotor along the forward axis: 1 in front, -1 behind."""
     right: tuple[float, ...] = (1.0, -1.0, -1.0, 1.0)
-    """Whether a rotor is to the right: 1, or to the left: -1."""
+    """Position of each rotor along the right axis: 1 right, -1 left."""
     turn: tuple[float, ...] = (1.0, 1.0, -1.0, -1.0)
-    """Way that a rotor turns the body: 1 clockwise, seen from above."""
+    """Sign of each rotor's torque on the body: 1 clockwise, seen from above."""
 
 
 FRONT, RIGHT, TURN = Signs()
@@ -38,7 +38,7 @@ FRONT, RIGHT, TURN = Signs()
 
 @making_part
 def rotated(q: F1, body: F1, out: F1) -> None:
-    """Turn a vector of the body into north, east, down; all of shape (3,), q of shape (4,)."""
+    """Rotate a body vector to north, east, down; vectors of shape (3,), q of shape (4,)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     a, b, c = body[0], body[1], body[2]
     out[0] = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c
@@ -48,7 +48,7 @@ def rotated(q: F1, body: F1, out: F1) -> None:
 
 @making_part
 def turned_back(q: F1, world: F1, out: F1) -> None:
-    """Turn a vector from north, east, down into the body's axes."""
+    """Rotate a vector from north, east, down to the body's axes."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     a, b, c = world[0], world[1], world[2]
     out[0] = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c
@@ -58,11 +58,11 @@ def turned_back(q: F1, world: F1, out: F1) -> None:
 
 @making_part
 def derivative(frame: Frame, x: F1, command: F1, wind: F1, out: F1) -> None:
-    """Time derivative of the states, the equations above; shape (STATES,).
+    """Time derivative of the states, by the module's equations; shape (STATES,).
 
     Args:
         x: states.
-        command: speeds ω* that the rotors go for [rad/s]; shape (4,).
+        command: commanded rotor speeds ω* [rad/s]; shape (4,).
         wind: velocity of the air [m/s; north, east, down]; shape (3,).
         out: derivative.
     """
@@ -78,7 +78,7 @@ def derivative(frame: Frame, x: F1, command: F1, wind: F1, out: F1) -> None:
     for k in range(4):
         rotor = x[13 + k]
         ahead, aside = FRONT[k] * frame.arm_x_m, RIGHT[k] * frame.arm_y_m
-        # Forces at the rotor's place: thrust, and drag by its own airspeed v + Ω × r.
+        # Force at each rotor's position: thrust, and drag from its own airspeed v + Ω × r.
         along = -frame.rotor_drag * rotor * (air[0] - rates[2] * aside)
         across = -frame.rotor_drag * rotor * (air[1] + rates[2] * ahead)
         inflow = air[2] + rates[0] * aside - rates[1] * ahead
@@ -107,7 +107,7 @@ def derivative(frame: Frame, x: F1, command: F1, wind: F1, out: F1) -> None:
 
 @making_part
 def advance(frame: Frame, x: F1, command: F1, wind: F1) -> None:
-    """Advance the states by a step, by the method of Runge and Kutta of the fourth order."""
+    """Advance the states by one step with a fourth-order Runge-Kutta method."""
     slopes, between = np.empty((4, STATES)), np.empty(STATES)
     derivative(frame, x, command, wind, slopes[0])
     for stage in range(1, 4):
@@ -125,6 +125,6 @@ def advance(frame: Frame, x: F1, command: F1, wind: F1) -> None:
 
 @making_kernel
 def drive(frame: Frame, x: F1, command: F1, wind: F1, steps: int) -> None:
-    """Advance the states by some steps with the same speeds for the rotors, and no loop closed."""
+    """Advance the states by some steps with constant rotor commands, without control loops."""
     for _ in range(steps):
         advance(frame, x, command, wind)

@@ -1,4 +1,4 @@
-"""Frames: what a quadrotor is made of, with the source of each number.
+"""Frames: physical parameters of quadrotors, with the source of each number.
 
 Rotor k turns with the speed ω_k [rad/s], pushes with k_T ω_k² along the body's axis and turns the
 body with k_M ω_k² about it. In the air each rotor drags with ω_k diag(k_d, k_d, k_z) times its own
@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """A quadrotor in X with rotors 1 front right, 2 back left, 3 front left, 4 back right."""
+    """Quadrotor in X configuration; rotors 1 front right, 2 back left, 3 front left, 4 back
+    right.
+    """
 
     mass_kg: float
     """Mass [kg]."""
@@ -41,18 +43,18 @@ class Frame(NamedTuple):
     cells: int
     """Number of cells of the battery, in series."""
     capacity_ah: float
-    """Charge of the full battery [A h]."""
+    """Capacity of the battery [A h]."""
     resistance_ohm: float
-    """Inner resistance of the battery [Ω]."""
+    """Internal resistance of the battery [Ω]."""
     hover_a: float
-    """Current of the battery in hover [A]."""
+    """Battery current in hover [A]."""
     attitude_gain: float
-    """Rate of turning over the error of the attitude [1/s]."""
+    """Gain from attitude error to angular rate [1/s]."""
     rate_gain: float
-    """Angular acceleration over the error of the rate [1/s]."""
+    """Gain from rate error to angular acceleration [1/s]."""
     rate_damping: float
-    """Angular acceleration taken back for each unit there is: it makes the lag of rotors
-    shorter."""
+    """Gain on measured angular acceleration, subtracted from the command: it shortens the rotors'
+    lag."""
 
     @property
     def hover(self) -> float:

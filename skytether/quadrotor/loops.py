@@ -1,4 +1,4 @@
-"""The loops that fly a velocity, compiled: from the velocity that is wanted to the rotors' speeds.
+"""Control loops of a quadrotor, compiled: from a velocity command to rotor speeds.
 
     velocity      v* follows the target within limits of jerk and acceleration, where there are any;
                   e = v* - v + K ∫(v* - v) dt      a = a* + P e + I ∫e dt + D (a* - v̇)
@@ -7,8 +7,8 @@
     rotors        forces of the rotors that make thrust and torques, none below 0 or above what the
                   battery gives
 
-The limits are those of ArduPilot's input shaping: the acceleration goes for p (v - v*), or its
-square root far away, with p = jerk / acceleration.
+The limits follow ArduPilot's input shaping: the acceleration tracks p (v - v*), or its square root
+for large errors, with p = jerk / acceleration.
 """
 
 from typing import NamedTuple
@@ -22,30 +22,30 @@ from skytether.shared.base.kernel import F1, F2, inline, making_kernel, making_p
 
 
 class Gains(NamedTuple):
-    """Gains of the loop of velocity, of an autopilot."""
+    """Gains of an autopilot's velocity loop."""
 
     jerk: float
-    """Largest jerk of the wanted velocity in the plane [m/s³]; 0: it is the target at once."""
+    """Largest horizontal jerk of the shaped velocity [m/s³]; 0 for no shaping."""
     acceleration: float
-    """Largest acceleration of the wanted velocity in the plane [m/s²]."""
+    """Largest horizontal acceleration of the shaped velocity [m/s²]."""
     jerk_up: float
-    """Largest jerk of the wanted velocity upwards and downwards [m/s³]."""
+    """Largest vertical jerk of the shaped velocity [m/s³]."""
     acceleration_up: float
-    """Largest acceleration of the wanted velocity upwards and downwards [m/s²]."""
+    """Largest vertical acceleration of the shaped velocity [m/s²]."""
     catch_up: float
-    """Velocity over the way that the wanted one is ahead, K [1/s]."""
+    """Gain K from the distance by which the shaped motion is ahead to velocity [1/s]."""
     p: float
-    """Acceleration over the error of the velocity in the plane [1/s]."""
+    """Gain from horizontal velocity error to acceleration [1/s]."""
     i: float
-    """Acceleration over the integral of that error [1/s²]."""
+    """Gain from the integral of the horizontal velocity error to acceleration [1/s²]."""
     d: float
-    """Acceleration taken back over the acceleration there is."""
+    """Gain on the measured acceleration, subtracted from the command."""
     p_up: float
-    """Acceleration over the error of the vertical velocity [1/s]."""
+    """Gain from vertical velocity error to acceleration [1/s]."""
     i_up: float
-    """Acceleration over the integral of that error [1/s²]."""
+    """Gain from the integral of the vertical velocity error to acceleration [1/s²]."""
     integral_max: float
-    """Largest acceleration that an integral asks for [m/s²]."""
+    """Largest acceleration from an integral [m/s²]."""
     tilt_max: float
     """Largest tilt [rad]."""
 
@@ -104,42 +104,42 @@ CRAZYFLIE = Gains(
 Crazyflie. Its integrals end at no value that is reached; 5 m/s² is assumed."""
 
 AHEAD_MAX_M = 2.0
-"""Longest way that is caught up with [m]."""
+"""Largest distance that K acts on [m]."""
 CELL_V = (0.0, 3.3, 3.6, 3.68, 3.75, 3.82, 3.95, 4.2)
 CELL_CHARGE = (-0.05, 0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Voltage of a cell of lithium polymer at rest [V], over its charge; typical, of no cell in
-particular. Below nothing it ends within a twentieth."""
+particular. The first entry extends the curve below charge 0."""
 CELL_FULL_V = 4.2
 """Voltage of a full cell [V]."""
 
 
 class Quad(NamedTuple):
-    """All that changes in flight."""
+    """State of a quadrotor in flight."""
 
     x: F1
     """States of the body, see `body.STATES`; shape (17,)."""
     wanted: F1
-    """Wanted velocity v* (0 to 2), its acceleration a* (3 to 5), and the way that it is ahead of
-    the quadrotor (6 to 8) [north, east, down]; shape (9,)."""
+    """Shaped velocity v* (0 to 2), its acceleration a* (3 to 5), and the distance by which it is
+    ahead of the quadrotor (6 to 8) [north, east, down]; shape (9,)."""
     integral: F1
-    """Accelerations that the integrals ask for [m/s²]; shape (3,)."""
+    """Integral terms of the acceleration command [m/s²]; shape (3,)."""
     acceleration: F1
     """Acceleration over the last step [m/s²]; shape (3,)."""
     turning: F1
     """Angular acceleration over the last step [rad/s²]; shape (3,)."""
     battery: F1
-    """Charge left, from 1 to 0, voltage [V] and current [A]; shape (3,)."""
+    """Remaining charge from 1 to 0, voltage [V] and current [A]; shape (3,)."""
 
 
 @inline
 def clipped(value: float, most: float) -> float:
-    """Value between -most and most."""
+    """Value clipped to -most … most."""
     return min(max(value, -most), most)
 
 
 @inline
 def pull(error: float, jerk: float, acceleration: float) -> float:
-    """Acceleration that takes an error of velocity away, as fast as the jerk allows."""
+    """Acceleration that removes a velocity error as fast as the jerk limit allows."""
     p = jerk / acceleration
     near = jerk / (p * p)
     if error <= near:
@@ -149,7 +149,7 @@ def pull(error: float, jerk: float, acceleration: float) -> float:
 
 @making_part
 def shape(gains: Gains, wanted: F1, target: F1) -> None:
-    """Lead the wanted velocity a step towards the target, within the limits."""
+    """Move the shaped velocity one step towards the target, within the limits."""
     if gains.jerk == 0.0:
         for i in range(3):
             wanted[i] = target[i]
@@ -175,7 +175,7 @@ def shape(gains: Gains, wanted: F1, target: F1) -> None:
 
 @making_part
 def accelerate(gains: Gains, quad: Quad, out: F1) -> None:
-    """Specific force a - g that the loop of velocity asks for [m/s²]; shape (3,)."""
+    """Specific force a - g commanded by the velocity loop [m/s²]; shape (3,)."""
     x, wanted, integral = quad.x, quad.wanted, quad.integral
     for i in range(3):
         p, i_, d = (gains.p, gains.i, gains.d) if i < 2 else (gains.p_up, gains.i_up, 0.0)
@@ -185,7 +185,7 @@ def accelerate(gains: Gains, quad: Quad, out: F1) -> None:
         integral[i] = clipped(integral[i] + i_ * error * STEP_S, gains.integral_max)
         lead = wanted[3 + i]
         out[i] = lead + p * error + integral[i] - d * (quad.acceleration[i] - lead)
-    # Height goes before distance: what is asked for in the plane gives way to the largest tilt.
+    # Height has priority over horizontal motion, which is limited by the largest tilt.
     out[2] = clipped(out[2], 0.9 * GRAVITY) - GRAVITY
     aside = np.sqrt(out[0] * out[0] + out[1] * out[1])
     most = np.tan(gains.tilt_max) * -out[2]
@@ -196,11 +196,11 @@ def accelerate(gains: Gains, quad: Quad, out: F1) -> None:
 
 @making_part
 def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
-    """Thrust [N] and torques [N m] that turn the body to the force that is asked for, nose north.
+    """Thrust [N] and torques [N m] that align the body with the commanded force, nose north.
 
     Args:
         force: specific force [m/s²; north, east, down].
-        torque: takes the torques about the body's axes; shape (3,).
+        torque: output: torques about the body's axes; shape (3,).
     """
     q, rates = quad.x[6:10], quad.x[10:13]
     unit, column = np.zeros((3, 3)), np.empty((3, 3))
@@ -211,7 +211,7 @@ def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
     down = np.empty(3)
     for i in range(3):
         down[i] = -force[i] / size
-    # Right is across both down and north, and forward across right and down.
+    # Right is the cross product of down and north; forward, that of right and down.
     right = np.array([0.0, down[2], -down[1]])
     length = np.sqrt(right[1] * right[1] + right[2] * right[2])
     for i in range(1, 3):
@@ -240,10 +240,10 @@ def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
 
 @making_part
 def mix(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1) -> None:
-    """Rotors' speeds that make a thrust and torques, as far as the rotors can.
+    """Rotor speeds that produce a thrust and torques, within the rotors' limits.
 
-    Where one is asked for more than it has, all push less: torques go before thrust. Yaw gives way
-    to both.
+    If a rotor would saturate, all rotors push less: torques have priority over thrust, and roll and
+    pitch over yaw.
     """
     most = frame.thrust * rotor_max * rotor_max
     yaw = clipped(0.25 * torque[2] * frame.thrust / frame.torque, 0.15 * most)
@@ -263,7 +263,7 @@ def mix(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1) 
 
 @making_part
 def drain(frame: Frame, x: F1, battery: F1) -> None:
-    """Take a step's charge from the battery; its voltage sags with the current."""
+    """Discharge the battery by one step; its voltage sags with the current."""
     hover = np.sqrt(frame.mass_kg * GRAVITY / (4.0 * frame.thrust))
     drawn = 0.0
     for k in range(4):
@@ -280,7 +280,7 @@ def drain(frame: Frame, x: F1, battery: F1) -> None:
 
 @making_part
 def stand(quad: Quad, ground: float) -> None:
-    """Keep the body out of the ground: what has come down stands level."""
+    """Keep the body above the ground: a landed body stands level."""
     x = quad.x
     if x[2] < ground:
         return
@@ -298,13 +298,13 @@ def stand(quad: Quad, ground: float) -> None:
 def fly(
     frame: Frame, gains: Gains, quad: Quad, air: Air, drawn: F2, target: F1, ground: float, on: bool
 ) -> None:
-    """Fly some steps towards a velocity.
+    """Fly some steps with a velocity command.
 
     Args:
-        air: wind, and what is left of gusts.
-        drawn: random numbers of the gusts, a row a step; shape (steps, 3).
-        target: velocity that is wanted [m/s; north, east, down]; shape (3,).
-        ground: where the ground is, counted downwards [m].
+        air: wind, and state of the gusts.
+        drawn: random numbers of the gusts, one row per step; shape (steps, 3).
+        target: commanded velocity [m/s; north, east, down]; shape (3,).
+        ground: height of the ground, positive downwards [m].
         on: whether the rotors turn.
     """
     x = quad.x

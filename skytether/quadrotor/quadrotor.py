@@ -1,4 +1,4 @@
-"""A quadrotor that flies the velocity it is told, in steps of 2 ms.
+"""Quadrotor that flies a commanded velocity, in steps of 2 ms.
 
 Outside this room: x north, y east, altitude up.
 """
@@ -16,7 +16,7 @@ from skytether.shared.base.kernel import plain
 from skytether.shared.law.model import Array
 
 UP = np.array([1.0, 1.0, -1.0])
-"""Signs between down and altitude."""
+"""Signs that convert between down and altitude."""
 
 
 class Attitude(NamedTuple):
@@ -36,7 +36,7 @@ class Battery(NamedTuple):
     """State of the battery."""
 
     charge: float
-    """Charge left, from 1 to 0."""
+    """Remaining charge, from 1 to 0."""
     voltage: float
     """Voltage [V]."""
     current: float
@@ -44,16 +44,16 @@ class Battery(NamedTuple):
 
 
 class Quadrotor:
-    """A quadrotor in its air.
+    """Quadrotor and the air around it.
 
     Args:
-        frame: what it is made of.
-        gains: gains of its autopilot's loop of velocity.
-        rng: chance of its gusts, for this vehicle alone.
-        position: where it is, at rest [m]; shape (3,).
-        ground_m: altitude of the ground [m]; None: there is none.
-        charge: charge of its battery, from 0 to 1; endless: it stays full.
-        hovers: whether it begins in hover, with its rotors turning.
+        frame: physical parameters.
+        gains: gains of its autopilot's velocity loop.
+        rng: random generator of its gusts, for this vehicle alone.
+        position: initial position, at rest [m]; shape (3,).
+        ground_m: altitude of the ground [m]; None for no ground.
+        charge: charge of its battery, from 0 to 1; endless if it never discharges.
+        hovers: whether it begins in hover, with rotors turning.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Quadrotor:
             frame, charge = frame._replace(capacity_ah=np.inf), 1.0
         self.frame, self._rng = frame, rng
         self.gains = gains
-        """Gains of its autopilot's loop of velocity."""
+        """Gains of its autopilot's velocity loop."""
         self._ground = np.inf if ground_m is None else -ground_m
         self.on = hovers
         """Whether the rotors turn."""
@@ -87,11 +87,11 @@ class Quadrotor:
         self._rest_ns = 0
 
     def blow(self, steady_mps: Sequence[float], turbulence_mps: float) -> None:
-        """Let other winds blow from now on.
+        """Set the wind.
 
         Args:
             steady_mps: velocity of steady wind along the first axes [m/s; x, y, z].
-            turbulence_mps: wind speed 6 m above ground that the gusts belong to [m/s].
+            turbulence_mps: wind speed 6 m above ground that the gusts correspond to [m/s].
         """
         steady = np.zeros(3)
         steady[: len(steady_mps)] = steady_mps
@@ -99,10 +99,10 @@ class Quadrotor:
         self._air.turbulence[0] = turbulence_mps
 
     def advance(self, velocity: Array, duration_ns: int) -> None:
-        """Fly for some time; what is no whole number of steps is flown with the next.
+        """Fly for some time; a remainder of less than a step is carried over to the next call.
 
         Args:
-            velocity: velocity that is wanted [m/s]; shape (3,).
+            velocity: commanded velocity [m/s]; shape (3,).
             duration_ns: time [ns].
         """
         steps, self._rest_ns = divmod(self._rest_ns + duration_ns, STEP_NS)
@@ -122,9 +122,9 @@ class Quadrotor:
         return UP * self._quad.x[3:6]
 
     def wanted_position(self) -> Array:
-        """Position where its loops want it to be now [m]; shape (3,).
+        """Position that its loops track [m]; shape (3,).
 
-        Without gains that catch up it is where it is.
+        Without a position loop (`Gains.catch_up` 0) it is the true position.
         """
         ahead = self._quad.wanted[6:] if self.gains.catch_up else 0.0
         wanted: Array = UP * (self._quad.x[:3] + ahead)
@@ -145,9 +145,9 @@ class Quadrotor:
         return Battery(max(charge, 0.0), voltage, current)
 
     def discharge(self, charge: float) -> None:
-        """Have less left in the battery."""
+        """Set the battery's charge to a lower value."""
         self._quad.battery[0] = min(self._quad.battery[0], charge)
 
     def stands(self) -> bool:
-        """Whether it stands on the ground."""
+        """Whether the quadrotor stands on the ground."""
         return bool(self._quad.x[2] >= self._ground)

@@ -1,1 +1,1 @@
-"""What drives an endpoint: sockets, the clock, signals, processes and the command line."""
+"""Drivers of endpoints: sockets, the clock, signals, processes and the command line."""

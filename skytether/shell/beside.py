@@ -1,4 +1,4 @@
-"""A recording beside a process: another process reads its feed and writes an MCAP file of it.
+"""Recording of a single process: another process reads its feed and writes an MCAP file.
 
 The process that flies waits for no disk and imports nothing for it. When it ends, or is killed, the
 recorder's standard input ends, and the recorder ends its file.
@@ -17,11 +17,11 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins, temporary
 
 PATIENCE_S = 30.0
-"""Longest time for which a recorder may end its file [s]."""
+"""Longest time that a recorder may take to end its file [s]."""
 
 
 class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):
-    """What a recorder has to know before the first frame."""
+    """Order to a recorder: all that it needs before the first frame."""
 
     path: str
     """File of the recording."""
@@ -40,12 +40,14 @@ class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecorderError(Exception):
-    """Error: something is missing in the recording; the message is a line about it."""
+    """Error: the recording is incomplete; the message is one line about what is missing."""
 
 
 @contextmanager
 def socket_of(feed: Path | None) -> Iterator[Path]:
-    """Socket of a feed: the one that was asked for, or one in a folder that nobody else can see."""
+    """Socket of a feed: the path that was asked for, or one in a folder that nobody else can
+    see.
+    """
     if feed:
         yield feed
         return
@@ -57,10 +59,11 @@ def socket_of(feed: Path | None) -> Iterator[Path]:
 def recorder(
     path: Path, feed: Path, process: str, name: str, scenario: Scenario, *, secure: bool
 ) -> Iterator[None]:
-    """Have a feed recorded for as long as the block takes; the feed ends with the block.
+    """Record a feed in another process for as long as the block takes; the feed ends with the
+    block.
 
     Raises:
-        RecorderError: not all of it is recorded.
+        RecorderError: the recording is incomplete.
     """
     told = RecorderOrder(
         path=str(path),
@@ -76,14 +79,15 @@ def recorder(
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C is for the process that flies
+        # Ctrl-C is for the process that flies; it ends the recorder in order.
+        start_new_session=True,
     )
     assert child.stdin is not None
     assert child.stdout is not None
     try:
         child.stdin.write(msgspec.json.encode(told) + b"\n")
         child.stdin.flush()
-        child.stdout.readline()  # it reads the feed from here on, or has ended
+        child.stdout.readline()  # the recorder reads the feed from here on, or has ended
         yield
     except BrokenPipeError:
         pass

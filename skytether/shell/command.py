@@ -1,4 +1,4 @@
-"""Commands: what all of them have in common, from arguments to the one line for a mistake.
+"""Common parts of all commands, from arguments to the one line that reports an error.
 
 A command's options are a dataclass with a field `scenario` for the name and a field `config` for
 the scenario itself, whose every key is a flag: the file comes first, flags lie over it.
@@ -61,14 +61,14 @@ from skytether.shell.udp import (
     sockets_max,
 )
 
-if TYPE_CHECKING:  # they take a while to import, and a process that flies does without
+# for type checking alone: they are slow to import, and a process that flies does without
+if TYPE_CHECKING:
     from rich.table import Table
 
     from skytether.shell.exporter import Metrics
 
 CONFIGURATION, RUN, INTERRUPTED = 2, 1, 128 + signal.SIGINT
-"""Exit codes: what the command asked for is impossible, something went wrong on the way, or it was
-ended by Ctrl-C."""
+"""Exit codes: 2 the request is impossible, 1 something failed on the way, 130 ended by Ctrl-C."""
 OUTPUTS = ("json", "figure", "record")
 """Options of all commands that name a file to write."""
 
@@ -86,7 +86,7 @@ Plugins = Annotated[
 
 
 class CommandError(Exception):
-    """What ends a command: one line for the user, and the exit code."""
+    """Error that ends a command: one line for the user, and the exit code."""
 
     def __init__(self, message: str, code: int = RUN) -> None:
         super().__init__(message)
@@ -94,7 +94,7 @@ class CommandError(Exception):
 
 
 class Options(Protocol):
-    """The options of a command that is about a scenario."""
+    """Options of a command that is about a scenario."""
 
     @property
     def scenario(self) -> str:
@@ -122,8 +122,8 @@ def parse(
         leads: whether an argument without a flag, at the front, is the scenario's name.
 
     Raises:
-        CommandError: a file that it is to write cannot be written.
-        ConfigError: the scenario cannot be flown, or a plug-in not be imported.
+        CommandError: an output file cannot be written.
+        ConfigError: the scenario cannot be flown, or a plug-in cannot be imported.
         SystemExit: tyro has shown the help, or what is wrong with a flag.
     """
     plugins.load(plugins.named(argv))
@@ -144,7 +144,7 @@ def parse(
 
 
 def _directions(argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """A command line without directions of the network that it gives as texts, and these."""
+    """Command line without network directions given as texts, and these directions."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for way in reading.DIRECTIONS:
         parser.add_argument(f"--network.{way}", dest=way)
@@ -156,10 +156,10 @@ def _directions(argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
 
 
 def address(flag: str, text: str) -> Address:
-    """Address that a flag was given as HOST:PORT, with an IPv6 host in brackets.
+    """Address given to a flag as HOST:PORT, with an IPv6 host in brackets.
 
     Raises:
-        CommandError: it is none.
+        CommandError: the text is no address.
     """
     found = parse_address(text)
     if found is None:
@@ -168,32 +168,32 @@ def address(flag: str, text: str) -> Address:
 
 
 def flight_warnings(scenario: Scenario) -> list[Event]:
-    """What whoever flies a scenario is to know before."""
+    """Warnings for the operator before a scenario is flown."""
     return [NoFailsafe()] if scenario.vehicle.exhausted == "hold" else []
 
 
 def optional_address(flag: str, text: str | None) -> Address | None:
-    """Address that a flag was given, see `address`; None where it was given none."""
+    """Address given to a flag, see `address`; None where the flag was given none."""
     return None if text is None else address(flag, text)
 
 
 def check_count(flag: str, given: int, most: int) -> None:
-    """Refuse a number of things that is less than 1 or more than `most`.
+    """Refuse a count that is less than 1 or more than `most`.
 
     Raises:
-        CommandError: with the flag, what it was given and what was expected.
+        CommandError: with the flag, its value and what was expected.
     """
     if not 1 <= given <= most:
         raise CommandError(f"{flag}: got {given}, expected 1 to {most}", CONFIGURATION)
 
 
 def check_sealed(bind: Address, *, secure: bool) -> None:
-    """Refuse to do without keys at an address that other machines can reach.
+    """Refuse to run without keys at an address that other machines can reach.
 
     Raises:
-        CommandError: with what would do.
+        CommandError: with the options that would be accepted.
     """
-    with suppress(OSError):  # what is wrong with an address is said once it is bound
+    with suppress(OSError):  # an unusable address is reported when the socket is bound
         if not (secure or is_loopback(look_up(bind))):
             raise _unsealed(bind)
 
@@ -206,10 +206,10 @@ def _unsealed(*addresses: Address) -> CommandError:
 
 
 def check_sockets(flag: str, given: int) -> None:
-    """Let this process open a socket for each of so many things.
+    """Let this process open so many sockets.
 
     Raises:
-        CommandError: the system does not allow as many.
+        CommandError: the system does not allow as many open files.
     """
     most = sockets_max()
     if given > most:
@@ -242,7 +242,7 @@ def check_output(flag: str, path: Path | None) -> None:
 
 @contextmanager
 def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a file; a disk that fails in flight ends the command, but not the flight.
+    """Record into a file; a disk that fails in flight makes the command fail, but not the flight.
 
     Raises:
         CommandError: the file cannot be opened; at the end, it does not hold all rows.
@@ -256,7 +256,7 @@ def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
 
 @contextmanager
 def recorded_meanwhile(columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a temporary file; where there can be none, nothing is recorded.
+    """Record into a temporary file; where none can be made, nothing is recorded.
 
     Raises:
         CommandError: at the end, the file does not hold all rows.
@@ -305,22 +305,22 @@ def drive(
     Args:
         process: name of the process in its log.
         endpoint: what to run.
-        options: its options: what it flies, and the name of that.
+        options: its options, with the scenario and its name.
         bind, peers, forms, stopwatch, line: see `Shell`.
-        waiting_for: whose datagrams it waits for, for the operator.
-        secure: whether it has keys; None of one that only passes on what others say.
-        insecure: whether it may do without keys even where other machines are reached.
+        waiting_for: the peer whose datagrams it waits for, named to the operator.
+        secure: whether it has keys; None for one that only forwards datagrams.
+        insecure: whether it may run without keys even where other machines can reach it.
         log: form of its log on stdout.
         json: file for its last figures.
-        recording: where it records; waited for at the end.
-        control: where the socket for changes in flight is made.
-        feed: where it tells what is recorded and said.
-        metrics: where its figures are served over HTTP.
-        warnings: what its operator is to know of what it flies.
-        ready: called once nothing speaks against the start, before anything is heard.
+        recording: its recorder, which is waited for at the end.
+        control: path of the socket for changes in flight.
+        feed: feed of its rows and events.
+        metrics: HTTP address for its figures.
+        warnings: warnings for the operator about the scenario.
+        ready: called once all checks have passed, before the first datagram is received.
 
     Raises:
-        CommandError: it cannot start, must not without keys, or the file cannot be written.
+        CommandError: it cannot start, lacks the keys it needs, or a file cannot be written.
     """
     running = Running(endpoint, options.config)
     if feed:
@@ -392,10 +392,10 @@ def drive(
 
 @contextmanager
 def _served(address: Address | None, process: str, options: Options) -> Iterator["Metrics | None"]:
-    """Serve metrics for as long as the block takes; none without an address.
+    """Serve metrics over HTTP for as long as the block takes; none without an address.
 
     Raises:
-        CommandError: nothing can listen there.
+        CommandError: the address cannot be listened at.
     """
     if address is None:
         yield None
@@ -413,7 +413,7 @@ def _served(address: Address | None, process: str, options: Options) -> Iterator
 
 
 def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
-    """What makes the first frame of a feed."""
+    """Function that makes the first frame of a feed."""
     wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
 
     def make() -> Opened:
@@ -430,7 +430,7 @@ def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[]
 
 
 def part_of(record: Path | None) -> Path | None:
-    """File for a part of the record: `record`, unless that is for a recording (see `fed`)."""
+    """File for a part of the record: `record`, unless it names a recording (see `fed`)."""
     return None if record and record.suffix == RECORDING else record
 
 
@@ -438,17 +438,17 @@ def part_of(record: Path | None) -> Path | None:
 def fed(
     path: Path | None, record: Path | None, process: str, options: Options, *, secure: bool
 ) -> Iterator[Feed | None]:
-    """Have a feed for as long as the block takes; none where nobody is to read it.
+    """Open a feed for as long as the block takes; None where nobody is to read it.
 
     Args:
-        path: where its socket is made; None for no readers, or none but a recorder.
-        record: file of a recording that is made of it by a process of its own; others are left out.
+        path: path of its socket; None for no readers other than a recorder.
+        record: output file; if it is a recording (.mcap), another process writes it from the feed.
         process: name of this process.
-        options: its options: what it flies, and the name of that.
+        options: its options, with the scenario and its name.
         secure: whether it has keys.
 
     Raises:
-        CommandError: its socket cannot be made; at the end, not all is recorded.
+        CommandError: the socket cannot be made, or the recording is incomplete at the end.
     """
     recorded = record if record and not part_of(record) else None
     if path is None and recorded is None:
@@ -478,7 +478,7 @@ def fed(
 def recorder(
     part: str, columns: np.dtype[np.void], recording: RecordFile | None, feed: Feed | None
 ) -> Recorder | None:
-    """Recorder of a part of the record, for a file, a feed or both; None where there is neither."""
+    """Recorder of a part of the record, for a file, a feed or both; None for neither."""
     if feed is None:
         return recording.recorder if recording else None
     both = recording.recorder if recording else Recorder(columns)
@@ -488,7 +488,9 @@ def recorder(
 
 @contextmanager
 def _told_once() -> Iterator[Callable[[], None]]:
-    """Heed SIGINT and SIGTERM once: from the call of what is yielded on, an end takes its time."""
+    """Handle SIGINT and SIGTERM once: after the yielded function was called, later ones are
+    ignored.
+    """
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def ignore() -> None:
@@ -506,15 +508,15 @@ class Bar(Protocol):
     """A progress bar."""
 
     def __call__(self, done: float, text: str = "") -> None:
-        """Show how much is done, in the bar's unit, and what to say of it."""
+        """Set how much is done, in the bar's unit, and a remark."""
 
 
 @contextmanager
 def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
-    """A bar on stderr: title, how much of the total is done, and the time remaining.
+    """Progress bar on stderr: title, how much of the total is done, and the time remaining.
 
-    It vanishes at the end, and is not shown where stderr is no terminal, or one that cannot move
-    its cursor. What is printed on stderr meanwhile is shown above the bar.
+    The bar vanishes at the end. It is not shown where stderr is no terminal, or a terminal that
+    cannot move its cursor. Lines printed on stderr meanwhile appear above the bar.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -528,7 +530,7 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
         TextColumn("{task.fields[text]}", markup=False),
         console=console,
         transient=True,
-        speed_estimate_period=600.0,  # a step may take minutes
+        speed_estimate_period=600.0,  # one step may take minutes: the clock must go on meanwhile
         disable=not console.is_interactive,
     ) as shown:
         row = shown.add_task(title, total=total, text="")
@@ -540,10 +542,10 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
 
 
 def prepare(kernels: Sequence[Callable[[], None]]) -> None:
-    """Compile the kernels that this machine has not compiled yet, and say so on stderr.
+    """Compile the kernels that this machine has not compiled yet, with a note on stderr.
 
     Args:
-        kernels: what compiles each of them, as the server's `missing` returns it.
+        kernels: functions that compile one kernel each, from the server's `missing`.
     """
     if not kernels:
         return
@@ -557,7 +559,9 @@ def prepare(kernels: Sequence[Callable[[], None]]) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C, or SIGTERM, end work in order; yields what tells whether one has come."""
+    """Let Ctrl-C or SIGTERM end work in order; yields a function that tells whether one has
+    come.
+    """
     interrupted = threading.Event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]
@@ -569,7 +573,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 
 def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, prog: str) -> int:
-    """Run a command, with one line on stderr for what went wrong; returns its exit code."""
+    """Run a command, with one line on stderr if it fails; returns its exit code."""
     try:
         try:
             with extras.named():
@@ -580,10 +584,12 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
         return _refuse(prog, str(error), error.code)
     except (ConfigError, ExtraMissing) as error:
         return _refuse(prog, str(error), CONFIGURATION)
-    except KeyboardInterrupt:  # before there was anything to end in order
+    except KeyboardInterrupt:  # Ctrl-C before `interruptible` was entered
         return INTERRUPTED
-    except OSError as error:  # the machine's: a full disk, too few open files, a broken pipe
-        gone = isinstance(error, BrokenPipeError)  # whoever read our output has seen enough
+    # a fault of the machine: a full disk, too few open files, a broken pipe
+    except OSError as error:
+        # the reader of our output has closed it, as `head` does
+        gone = isinstance(error, BrokenPipeError)
         with suppress(OSError):
             sys.stdout.flush()
             return RUN if gone else _refuse(prog, _reason(error), RUN)
@@ -593,7 +599,7 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
 
 
 def _refuse(prog: str, message: str, code: int) -> int:
-    """Say what went wrong in one line, whatever stands in it; returns the exit code."""
+    """Print an error as a single line, whatever characters are in it; returns the exit code."""
     shown = (
         letter if letter.isprintable() else letter.encode("unicode_escape").decode()
         for letter in f"{prog}: {message}"
@@ -603,7 +609,7 @@ def _refuse(prog: str, message: str, code: int) -> int:
 
 
 def _reason(error: OSError) -> str:
-    """What the system has against it, and where."""
+    """Text of a system's error, and the file it is about."""
     where = f"{error.filename}: " if error.filename else ""
     allowed = f"; {files_max()} may be open here (ulimit -n)" if error.errno == EMFILE else ""
     return f"{where}{error.strerror or error}{allowed}"
@@ -622,7 +628,8 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
     Raises:
         CommandError: the file cannot be written.
     """
-    if json is not None:  # first: whoever was to read the table may be gone
+    # The file comes first: the table's reader may be gone, and printing then fails.
+    if json is not None:
         write(json, msgspec.json.encode(summary))
     from rich.console import Console
     from rich.table import Table
@@ -630,7 +637,7 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
 
     table = Table(title=title, title_justify="left", show_header=False)
     for row in summary_rows(summary):
-        table.add_row(*map(Text, row))  # as text: "[m]" would be markup
+        table.add_row(*map(Text, row))  # Rendered as text: rich would take "[m]" for markup.
     Console().print(table)
 
 
@@ -638,7 +645,7 @@ def write(path: Path, json: bytes) -> None:
     """Write a file of indented JSON.
 
     Raises:
-        CommandError: it cannot be written.
+        CommandError: the file cannot be written.
     """
     try:
         files.write(path, msgspec.json.format(json, indent=2) + b"\n")
@@ -647,7 +654,7 @@ def write(path: Path, json: bytes) -> None:
 
 
 def summary_rows(summary: Summary) -> list[tuple[str, str]]:
-    """Names and values of what a summary knows, as a table shows them."""
+    """Names and values of a summary's known figures, for a table."""
     s = summary
     ages = _values(".3f", s.aoi_s_mean, s.aoi_s_peak, s.plan_age_s_mean)
     rows = [
@@ -683,7 +690,7 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
 
 
 def _uplink(s: Summary) -> tuple[int, ...]:
-    """Numbers of horizons and of other packets, where both are known."""
+    """Numbers of horizons and of other packets sent up, where both are known."""
     if s.uplink_horizons is None or s.uplink_packets is None:
         return ()
     return s.uplink_horizons, max(0, s.uplink_packets - s.uplink_horizons)

@@ -1,8 +1,8 @@
-"""The socket through which keys are changed in flight: a Unix one, that its owner alone can use.
+"""The socket through which keys are changed in flight: a Unix one, which only its owner can use.
 
-A datagram is a request of `shared.core.change`, and its answer goes back to whoever has sent it.
-After each request the socket rests: whoever floods it waits, and the endpoint does not. An answer
-that nobody takes is not kept.
+A datagram is a request of `shared.core.change`, and its answer goes back to the sender. After each
+request the socket pauses, so a flood of requests delays the sender and not the endpoint. An answer
+that cannot be delivered is dropped.
 """
 
 import asyncio
@@ -20,10 +20,10 @@ from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shell.local import Local
 
 REST_S = 0.01
-"""Least time from a request to the next that is read [s]."""
+"""Shortest pause from a request until the next is read [s]."""
 RESTS = 20
-"""Ratio of that time to the time that the request took, at least: requests cost the endpoint no
-more than a 21st of its time."""
+"""Smallest ratio of the pause to the time that the request took: requests take at most 1/21 of the
+endpoint's time."""
 PATIENCE_S = 5.0
 """Longest time to wait for an answer [s]."""
 ANSWER_BYTES_MAX = 65_536
@@ -31,18 +31,18 @@ ANSWER_BYTES_MAX = 65_536
 
 
 class ControlError(OSError):
-    """Error: nobody answers at the socket; the message says why."""
+    """Error: no process answers at the socket; the message says why."""
 
 
 class Control:
-    """Heeds requests to an endpoint.
+    """Server of requests to change an endpoint's keys.
 
     Args:
-        path: where the socket is made, with mode 0600; in place of one that nobody listens at.
-        running: what may be changed.
+        path: path of the socket, mode 0600; a socket that no process listens at is replaced.
+        running: the endpoint's keys that may change.
 
     Raises:
-        LocalError: it cannot be made there.
+        LocalError: the socket cannot be made there.
     """
 
     def __init__(self, path: Path, running: Running) -> None:
@@ -53,10 +53,10 @@ class Control:
         self._after: Callable[[], None] = lambda: None
 
     def begin(self, loop: asyncio.AbstractEventLoop, after: Callable[[], None]) -> None:
-        """Heed requests from now on.
+        """Answer requests from now on.
 
         Args:
-            loop: where it is woken.
+            loop: event loop that watches the socket.
             after: called after each request.
         """
         self._loop, self._after = loop, after
@@ -75,7 +75,7 @@ class Control:
             answer = self._running.answer(request, now_ns=time.monotonic_ns())
             if sender:
                 self._socket.sendto(answer, sender)
-        except OSError:  # nothing there after all, or nobody takes the answer
+        except OSError:  # no datagram after all, or the sender's socket is full or gone
             pass
         finally:
             rest_s = max(REST_S, RESTS * (time.monotonic() - began_s))
@@ -83,24 +83,24 @@ class Control:
             self._after()
 
     def end(self) -> None:
-        """Heed no more requests."""
+        """Answer no more requests."""
         if self._loop is not None:
             self._loop.remove_reader(self._socket)
             self._loop = None
 
     def close(self) -> None:
-        """Remove the socket, if it is still ours."""
+        """Remove the socket, if the path still leads to it."""
         self._local.close()
 
 
 class Caller:
-    """Asks for changes at a socket.
+    """Client of a control socket, which asks for changes.
 
     Args:
-        path: the socket of a server, netem or client.
+        path: socket of a server, netem or client.
 
     Raises:
-        ControlError: nobody listens there.
+        ControlError: no process listens there.
     """
 
     def __init__(self, path: Path) -> None:
@@ -119,7 +119,7 @@ class Caller:
             raise self._failed(error) from None
 
     def ask(self, values: Mapping[str, Any]) -> Answer:
-        """Ask for other values, or without any for those that may change.
+        """Ask for other values, or without arguments for the keys that may change.
 
         Raises:
             ControlError: no answer has come.
@@ -135,7 +135,7 @@ class Caller:
             raise ControlError(f"{self._path}: {error}") from None
 
     def close(self) -> None:
-        """Ask no more."""
+        """Close the socket."""
         self._socket.close()
         self._folder.cleanup()
 
@@ -145,13 +145,13 @@ class Caller:
 
 
 def _answers(sock: socket.socket, path: Path) -> "tempfile.TemporaryDirectory[str]":
-    """Bind a socket to an address for answers that is nobody else's; returns its folder.
+    """Bind a socket to an address for answers that no other process uses; returns its folder.
 
-    It lies beside the socket that is asked: in another container whoever answers may see no other
-    folder of ours. Where nothing can be made there, it is a temporary one.
+    The address lies beside the socket that is asked: a process in another container may see no
+    other folder of ours. If nothing can be created there, a temporary folder is used.
 
     Raises:
-        OSError: there is no place for it.
+        OSError: the address cannot be created anywhere.
     """
     for beside in (path.parent.absolute(), None):
         with suppress(OSError):
@@ -169,10 +169,10 @@ _DECODER = msgspec.json.Decoder(Answer)
 
 
 def answer_of(text: bytes) -> Answer:
-    """The answer in a datagram.
+    """Answer in a datagram.
 
     Raises:
-        ControlError: it is none.
+        ControlError: the datagram is no answer.
     """
     try:
         return _DECODER.decode(text)
@@ -182,10 +182,10 @@ def answer_of(text: bytes) -> Answer:
 
 @contextmanager
 def controlled(path: Path | None, running: Running) -> Iterator[Control | None]:
-    """A socket at a path for as long as the block takes; none without a path.
+    """Control socket at a path for as long as the block takes; None without a path.
 
     Raises:
-        LocalError: it cannot be made.
+        LocalError: the socket cannot be made.
     """
     if path is None:
         yield None

@@ -1,11 +1,11 @@
-"""Metrics over HTTP, for Prometheus and for whoever asks whether the process is well.
+"""Metrics over HTTP for Prometheus, and a health check.
 
-    GET /metrics   what was counted, as text for Prometheus
-    GET /healthz   200 while all is well, else 503; JSON either way
+    GET /metrics   counted figures, as text for Prometheus
+    GET /healthz   200 while the process is healthy, else 503; JSON either way
 
-The loop hands over its figures once a second; a thread renders them and answers. It never touches
-the endpoint. Whoever connects has a bounded time, and takes the place of the oldest where there are
-too many: nobody keeps others out, and no more than 50 are heard in a second.
+The loop hands over its figures once a second; a thread renders them and answers. The thread never
+touches the endpoint. A connection has a bounded time, and the oldest is closed where there are too
+many, so that no client keeps others out; at most 50 are accepted per second.
 """
 
 import os
@@ -30,19 +30,19 @@ from skytether.shell.metrics import OWN, PREFIX, TABLES, families, trouble
 from skytether.shell.udp import from_kernel, look_up
 
 CONNECTIONS_MAX = 8
-"""Most connections at once; the oldest gives way to a new one."""
+"""Most connections at once; a new one closes the oldest."""
 PATIENCE_S = 5.0
 """Longest time for a request and its answer [s]."""
 REQUEST_BYTES_MAX = 8192
 """Largest size of a request [B]."""
 REST_S = 0.02
-"""Time from one connection to the next that is accepted [s]."""
+"""Pause between two accepted connections [s]."""
 FRESH_S = 3.0
-"""Age of the figures from which the process is taken to be stuck [s]."""
+"""Age from which figures count as stale, and the process as stuck [s]."""
 
 
 class MetricsError(OSError):
-    """Error: the address cannot be listened at; the message says which and why."""
+    """Error: the metrics' address cannot be listened at; the message says which and why."""
 
 
 class Collected(Collector):
@@ -58,15 +58,15 @@ class Collected(Collector):
         self._process = process
         self._kind = process.partition(".")[0]
         self._scenario, self._step_s = scenario, step_s
-        # Replaced as a whole: the thread sees the one or the other.
+        # Replaced as a whole, so the thread sees either the old or the new figures.
         self._snapshot: tuple[Mapping[str, Any], float] | None = None
 
     def take(self, figures: Mapping[str, Any]) -> None:
-        """Take figures that nobody changes any more."""
+        """Take new figures, which the caller must not change any more."""
         self._snapshot = figures, time.monotonic()
 
     def collect(self) -> Iterable[Exposed]:
-        """See prometheus_client."""
+        """Metrics for prometheus_client, which calls this method."""
         labels = {"process": self._process, "scenario": self._scenario}
         info, step_s, age_s, unmapped = (
             Exposed(PREFIX + metric.name, metric.help, metric.kind) for metric in OWN
@@ -83,7 +83,7 @@ class Collected(Collector):
         yield from (age_s, unmapped)
         for metric, samples in told:
             kind = "gauge" if metric.kind == "modes" else metric.kind
-            # prometheus_client has the name of a counter without what it ends in.
+            # prometheus_client adds the suffix of a counter's name itself.
             name = PREFIX + metric.name
             exposed = Exposed(name.removesuffix("_total"), metric.help, kind)
             exposed.samples += [
@@ -92,7 +92,7 @@ class Collected(Collector):
             yield exposed
 
     def trouble(self) -> str:
-        """What is wrong with the process; empty where nothing is."""
+        """Reason why the process is unhealthy; empty for a healthy one."""
         if self._snapshot is None:
             return "it has not begun"
         figures, taken_s = self._snapshot
@@ -102,7 +102,7 @@ class Collected(Collector):
         return trouble(self._kind, figures)
 
     def health(self) -> tuple[int, bytes]:
-        """Status and body of an answer to who asks whether all is well."""
+        """Status and body of the answer to a health check."""
         why = self.trouble()
         told = {"process": self._process, "healthy": not why, "trouble": why}
         return 503 if why else 200, msgspec.json.encode(told) + b"\n"
@@ -110,25 +110,25 @@ class Collected(Collector):
 
 @dataclass(slots=True)
 class _Scrape:
-    """Somebody who asks."""
+    """Connection of one client."""
 
     socket: socket.socket
     until_s: float
-    """Time at which it is closed, whatever it has come to [s]."""
+    """Time at which the connection is closed, complete or not [s]."""
     request: bytearray = field(default_factory=bytearray)
     answer: memoryview | None = None
-    """What is left to be sent, once the request is whole."""
+    """Remaining bytes of the answer; None until the request is complete."""
 
 
 class Metrics:
-    """Serves the metrics of a process, in a thread.
+    """HTTP server of a process's metrics, in a thread.
 
     Args:
-        address: where to listen; port 0 takes a free one.
-        collected: what it serves.
+        address: address to listen at; port 0 takes a free one.
+        collected: metrics that it serves.
 
     Raises:
-        MetricsError: it cannot listen there.
+        MetricsError: the address cannot be listened at.
     """
 
     def __init__(self, address: Address, collected: Collected) -> None:
@@ -137,13 +137,13 @@ class Metrics:
         self._registry.register(collected)
         self._socket = _listening(address)
         self.address = from_kernel(self._socket.getsockname())
-        """Address that it listens at."""
+        """Address that the server listens at."""
         self._selector = selectors.DefaultSelector()
         self._ours, self._waker = socket.socketpair()
         self._selector.register(self._socket, selectors.EVENT_READ)
         self._selector.register(self._ours, selectors.EVENT_READ)
         self._connections: dict[int, _Scrape] = {}
-        """Connections by the number of their file, the oldest first."""
+        """Connections by file descriptor, the oldest first."""
         self._closed = False
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -153,9 +153,9 @@ class Metrics:
         self._collected.take(figures)
 
     def close(self) -> None:
-        """Answer nobody any more."""
+        """Stop serving."""
         self._closed = True
-        with suppress(BrokenPipeError):  # it has ended already
+        with suppress(BrokenPipeError):  # the thread has ended already
             self._waker.send(b"\0")
         self._thread.join()
         self._waker.close()
@@ -188,7 +188,7 @@ class Metrics:
         time.sleep(REST_S)
         try:
             sock, _ = self._socket.accept()
-        except OSError:  # gone already, or too many files are open
+        except OSError:  # the client is gone already, or too many files are open
             return
         if len(self._connections) == CONNECTIONS_MAX:
             self._end(next(iter(self._connections.values())))
@@ -221,7 +221,8 @@ class Metrics:
     def _end(self, connection: _Scrape) -> None:
         del self._connections[connection.socket.fileno()]
         self._selector.unregister(connection.socket)
-        with suppress(OSError):  # what was not read would take back what was sent
+        # data left unread would reset the connection and discard the answer
+        with suppress(OSError):
             connection.socket.shutdown(socket.SHUT_WR)
         connection.socket.close()
 
@@ -263,22 +264,22 @@ def _response(
 
 
 def _is_whole(request: bytearray) -> bool:
-    """Whether all of a request has come, or too much of it."""
+    """Whether the request is complete, or too long."""
     return b"\r\n\r\n" in request or len(request) > REQUEST_BYTES_MAX
 
 
 def _listening(address: Address) -> socket.socket:
-    """A TCP socket that listens.
+    """Listening TCP socket.
 
     Raises:
-        MetricsError: it cannot.
+        MetricsError: the address cannot be listened at.
     """
     try:
         host, port = look_up(address)
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         sock = socket.create_server((host, port), family=family, backlog=CONNECTIONS_MAX)
     except OSError as error:
-        # The text of a system's error has the address in it, that of a name has none.
+        # The text of an OSError contains the address, that of a gaierror does not.
         number = error.errno or 0
         raise MetricsError(os.strerror(number) if number > 0 else str(error.strerror)) from None
     sock.setblocking(False)
@@ -286,7 +287,7 @@ def _listening(address: Address) -> socket.socket:
 
 
 def names() -> frozenset[str]:
-    """Names of all numbers that any process may serve."""
+    """Names of all metrics that any process may serve."""
     told = {metric for table in TABLES.values() for metric in table} | set(OWN)
     return frozenset(
         PREFIX + metric.name + suffix

@@ -1,4 +1,4 @@
-"""The feed's socket: a process tells whoever looks on, and waits for nobody.
+"""The feed's socket: a process sends its readers rows and events, and never waits for them.
 
 All of it happens in the process's own loop, between two steps, and nothing in it blocks: what a
 reader does not take at once waits for it, up to a bound, and a reader whose bound is full is
@@ -34,30 +34,30 @@ from skytether.shared.telemetry.feed import (
 from skytether.shell.local import Local
 
 READERS_MAX = 8
-"""Most readers at once; others are turned away, and counted."""
+"""Most readers at once; further ones are refused and counted."""
 WAITING_BYTES_MAX = 4 * 1024 * 1024
-"""Bytes that wait for a reader; one for which there are more is dropped, and counted."""
+"""Most bytes queued for a reader; a reader with more is dropped and counted."""
 BACKLOG_BYTES_MAX = 1024 * 1024
-"""Bytes of the newest frames that are kept for readers to come."""
+"""Bytes of the newest frames that are kept for future readers."""
 ROWS_BYTES_MAX = 256 * 1024
-"""Bytes of rows from which a frame takes no more of them."""
+"""Size of rows after which a frame is full [B]."""
 SEND_BYTES_MAX = 64 * 1024
 """Most bytes that a reader is sent in one turn of the loop."""
 GATHER_S = 0.01
 """Time for which frames gather before they are sent [s]."""
 REST_S = 0.02
-"""Time from one reader to the next that is let in [s]: who comes again and again costs little."""
+"""Pause between two accepted readers [s], so that one that reconnects in a loop costs little."""
 PATIENCE_S = 0.5
-"""Longest time to wait at the end until readers have all [s]."""
+"""Longest time to wait at the end until readers have received everything [s]."""
 
 READ_BYTES = 256 * 1024
-"""Most bytes that are read of a feed at a time."""
+"""Most bytes that are read from a feed at a time."""
 AGAIN_S = 1.0
-"""Time from one attempt to reach a process to the next [s]."""
+"""Time between two attempts to connect to a process [s]."""
 
 
 class _Part:
-    """Rows of one part of the record that no frame has taken yet."""
+    """Rows of one part of the record that are in no frame yet."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -68,7 +68,7 @@ class _Part:
         self.rows.append(rows)
 
     def frames(self, now_ns: int) -> Iterator[bytes]:
-        """Frames of all rows, none of which remain."""
+        """Frames of all pending rows; none are pending afterwards."""
         rows, self.rows = self.rows, []
         first = size = 0
         for last, piece in enumerate(rows, start=1):
@@ -80,7 +80,7 @@ class _Part:
 
 
 class _Reader:
-    """Somebody who reads, and what he has not taken yet."""
+    """Reader of the feed, and the bytes queued for it."""
 
     def __init__(self, connection: socket.socket, pieces: Iterator[bytes]) -> None:
         connection.setblocking(False)
@@ -88,25 +88,25 @@ class _Reader:
         self._waiting = deque(pieces)
         self._bytes = sum(map(len, self._waiting))
         self._begin = 0
-        """Number of bytes of the first piece that are sent."""
+        """Number of bytes of the first piece that were sent already."""
 
     @property
     def is_behind(self) -> bool:
-        """Whether something waits."""
+        """Whether bytes are queued."""
         return bool(self._waiting)
 
     @property
     def is_full(self) -> bool:
-        """Whether more waits than may."""
+        """Whether more bytes are queued than allowed."""
         return self._bytes > WAITING_BYTES_MAX
 
     def add(self, piece: bytes) -> None:
-        """Let a piece wait."""
+        """Queue a piece."""
         self._waiting.append(piece)
         self._bytes += len(piece)
 
     def send(self) -> None:
-        """Send what there is room for, and no more than a turn's.
+        """Send what the socket takes, but no more than one turn's share.
 
         Raises:
             OSError: the reader is gone.
@@ -126,10 +126,10 @@ class _Reader:
                 self._begin = 0
 
     def finish(self, patience_s: float) -> None:
-        """Send all there is, but do not wait for longer.
+        """Send everything that is queued, waiting only for a bounded time.
 
         Raises:
-            OSError: the reader is gone, or takes too long.
+            OSError: the reader is gone, or too slow.
         """
         until_s = time.monotonic() + patience_s
         while self._waiting:
@@ -140,13 +140,13 @@ class _Reader:
 class Feed:
     """The feed of a process.
 
-    It is used by the thread that drives the endpoint, and by no other.
+    Only the thread that drives the endpoint may use the feed.
 
     Args:
-        path: where the socket is made, see `Local`.
+        path: path of the socket, see `Local`.
 
     Raises:
-        LocalError: it cannot be made there.
+        LocalError: the socket cannot be made there.
     """
 
     def __init__(self, path: Path) -> None:
@@ -155,60 +155,60 @@ class Feed:
         self._columns: dict[str, np.dtype[np.void]] = {}
         self._parts: list[_Part] = []
         self._fresh: list[bytes] = []
-        """Frames that nobody was sent yet."""
+        """Frames that were not sent to anybody yet."""
         self._backlog: deque[bytes] = deque()
-        """The newest of all others; each item is one frame, or several."""
+        """Newest frames that were sent already; each item is one frame, or several."""
         self._backlog_bytes = 0
         self._readers: list[_Reader] = []
         self._behind: set[_Reader] = set()
-        """Readers that the loop tells of once they have room."""
+        """Readers whose sockets are full; the loop calls back when they have room."""
         self._loop: AbstractEventLoop | None = None
         self._armed: TimerHandle | None = None
         self._opened: Callable[[], Opened] | None = None
         self._dropped = self._refused = 0
 
     def part(self, name: str, columns: np.dtype[np.void]) -> _Part:
-        """Sink of the rows of a part of the record, which the feed has from now on."""
+        """Sink for rows of a part of the record, which the feed contains from now on."""
         self._columns[name] = columns
         self._parts.append(_Part(name))
         return self._parts[-1]
 
     @property
     def parts(self) -> dict[str, str]:
-        """Parts of the record, as `Opened` names them."""
+        """Parts of the record, in the form that `Opened` has."""
         return described(self._columns)
 
     def open(self, opened: Callable[[], Opened]) -> None:
-        """Let readers in once the loop begins.
+        """Accept readers once the loop runs.
 
         Args:
-            opened: makes the frame that a reader gets first.
+            opened: makes the first frame that a reader gets.
         """
         self._opened = opened
 
     def begin(self, loop: AbstractEventLoop) -> None:
-        """Tell readers from now on, in a loop."""
+        """Serve readers from now on, in an event loop."""
         self._loop = loop
         self._listen()
 
     def take(self) -> None:
-        """Make frames of the rows that were made just now."""
+        """Put the newly written rows into frames."""
         for part in self._parts:
             if part.rows:
                 for frame in part.frames(time.monotonic_ns()):
                     self._add(frame)
 
     def say(self, event: Event) -> None:
-        """Tell of an event."""
+        """Add an event."""
         self.take()
         self._add(encode(Said(time_ns=time.monotonic_ns(), event=event)))
 
     def count(self, figures: Mapping[str, Any]) -> None:
-        """Tell the figures of the process."""
+        """Add the figures of the process."""
         self._add(encode(Figures(time_ns=time.monotonic_ns(), figures=dict(figures))))
 
     def figures(self) -> dict[str, Any]:
-        """Numbers of the feed itself, as in `Endpoint.figures`."""
+        """Counters of the feed itself, in the form of `Endpoint.figures`."""
         return {
             "readers": len(self._readers),
             "dropped": self._dropped,
@@ -216,7 +216,7 @@ class Feed:
         }
 
     def end(self) -> None:
-        """Tell nobody anything in the loop any more."""
+        """Stop serving readers in the loop."""
         if self._loop is None:
             return
         self._loop.remove_reader(self._local.socket)
@@ -229,7 +229,7 @@ class Feed:
         self._loop = None
 
     def close(self) -> None:
-        """Send readers the rest, with some patience, and remove the socket."""
+        """Send readers the rest, within a bounded time, and remove the socket."""
         self.end()
         self.take()
         self._send()
@@ -249,7 +249,7 @@ class Feed:
             self._armed = self._loop.call_later(GATHER_S, self._send)
 
     def _send(self) -> None:
-        """Hand on the frames that have gathered."""
+        """Send the frames that have gathered."""
         self._armed = None
         if not self._fresh:
             return
@@ -270,7 +270,7 @@ class Feed:
             self._backlog_bytes -= len(self._backlog.popleft())
 
     def _go_on(self, reader: _Reader) -> None:
-        """Send a reader more; the loop goes on with it where it is behind then."""
+        """Send a reader more; if its socket is full, the loop goes on later."""
         try:
             reader.send()
         except OSError:
@@ -301,14 +301,14 @@ class Feed:
             self._loop.add_reader(self._local.socket, self._let_in)
 
     def _let_in(self) -> None:
-        """Let the next reader in, and rest."""
+        """Accept the next reader, then pause."""
         assert self._loop is not None
         assert self._opened is not None
         self._loop.remove_reader(self._local.socket)
         self._loop.call_later(REST_S, self._listen)
         try:
             connection, _ = self._local.socket.accept()
-        except OSError:  # it is gone already, or too many files are open
+        except OSError:  # the reader is gone already, or too many files are open
             return
         if len(self._readers) == READERS_MAX:
             self._refused += 1
@@ -321,12 +321,12 @@ class Feed:
 
 
 class Subscriber:
-    """Reads the feeds of processes in a thread of its own, and begins anew where one has ended.
+    """Reader of processes' feeds in a thread of its own, which reconnects after a feed's end.
 
     Args:
-        paths: sockets of the feeds by a name of the process; there need be nobody yet.
+        paths: sockets of the feeds by a name of the process; the processes need not run yet.
         take: called in the thread with a name and each frame; a feed begins with `Opened`.
-        lost: called in the thread with a name, where a feed that had begun has ended.
+        lost: called in the thread with a name when a feed that had begun has ended.
     """
 
     def __init__(
@@ -346,9 +346,9 @@ class Subscriber:
         self._thread.start()
 
     def close(self) -> None:
-        """Read no more; returns when nothing is called any more."""
+        """Stop reading; no callback runs any more when this returns."""
         self._closed = True
-        with suppress(OSError):  # the thread has ended by itself
+        with suppress(OSError):  # called by the thread itself
             self._waker.send(b"\0")
         if threading.current_thread() is not self._thread:
             self._thread.join()
@@ -376,7 +376,7 @@ class Subscriber:
         connection.setblocking(False)
         try:
             connection.connect(str(self._paths[name]))
-        except OSError:  # nobody is there, or he has no time
+        except OSError:  # no process listens, or its queue of connections is full
             connection.close()
             return
         self._open[name] = connection, Reader()

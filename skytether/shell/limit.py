@@ -1,4 +1,4 @@
-"""How much is said of a kind: whatever peers cause, a log stays short enough to be read."""
+"""Rate limit of log lines: the log stays readable whatever peers cause."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Event, Omitted
 
 KIND_MAX = 5
-"""Events of a kind that are told in a second; the others are counted."""
+"""Most events of a kind that are logged in a second; the others are counted."""
 
 
 @dataclass(slots=True)
@@ -16,25 +16,25 @@ class _Second:
 
     end_ns: int
     told: int = 0
-    """Number of events told."""
+    """Number of logged events."""
     omitted: int = 0
     """Number of events left out."""
 
 
 class Limit:
-    """Chooses the events that are told: of each class the first few in a second.
+    """Limiter of log events: the first few of each kind in a second are logged.
 
-    A class is a kind, and not a vehicle's events of a class: a stranger may call himself by any
-    number.
+    The limit is per kind, not per kind and vehicle: a stranger may claim any vehicle's number.
     """
 
     def __init__(self) -> None:
         self._seconds: dict[str, _Second] = {}
 
     def admit(self, event: Event, *, now_ns: int) -> Sequence[Event]:
-        """Events to tell now: what was left out of a second that is over, and this one if it may.
+        """Events to log now: counts of those omitted in past seconds, and this one if within the
+        limit.
 
-        An `Omitted` is added to what is left out of its kind.
+        An `Omitted` event itself adds to the count of its kind.
         """
         kind = event.kind if isinstance(event, Omitted) else type(event).__name__
         over = self.omitted(kind, now_ns=now_ns)
@@ -49,10 +49,10 @@ class Limit:
         return over
 
     def omitted(self, *kinds: str, now_ns: int | None) -> list[Omitted]:
-        """What was left out of the seconds that are over, each told once.
+        """Counts of events omitted in the seconds that are over, each returned once.
 
         Args:
-            kinds: kinds to look at; all, if there are none.
+            kinds: kinds to look at; if empty, all.
             now_ns: time at which a second is over or not; None ends every second.
         """
         told = []

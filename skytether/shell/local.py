@@ -1,4 +1,4 @@
-"""Unix sockets that their owner alone can use, and that are gone when whoever made them ends."""
+"""Unix sockets that only their owner can use, and that are removed with their maker."""
 
 import os
 import socket
@@ -9,24 +9,24 @@ from pathlib import Path
 
 
 class LocalError(OSError):
-    """Error: a socket cannot be made; the message says where and why."""
+    """Error: a Unix socket cannot be made; the message says where and why."""
 
 
 class Local:
-    """A Unix socket that does not block, bound to a path with mode 0600.
+    """Non-blocking Unix socket, bound to a path with mode 0600.
 
     Args:
-        path: where it is made, in place of one that nobody listens at.
+        path: path of the socket; a socket that no process listens at is replaced.
         kind: SOCK_DGRAM or SOCK_STREAM.
 
     Raises:
-        LocalError: it cannot be made there.
+        LocalError: the socket cannot be made there.
     """
 
     def __init__(self, path: Path, kind: socket.SocketKind) -> None:
         self._path = path
         self.socket = socket.socket(socket.AF_UNIX, kind)
-        """The socket."""
+        """Bound socket."""
         try:
             self.socket.setblocking(False)
             _clear(path, kind)
@@ -43,7 +43,7 @@ class Local:
         self._made = made.st_dev, made.st_ino
 
     def close(self) -> None:
-        """Remove the socket, if it is still ours."""
+        """Remove the socket, if the path still leads to it."""
         self.socket.close()
         with suppress(OSError):
             found = self._path.lstat()
@@ -52,10 +52,10 @@ class Local:
 
 
 def _clear(path: Path, kind: socket.SocketKind) -> None:
-    """Remove a socket of ours that nobody listens at; where anything else is, nothing happens.
+    """Remove a socket of this user that no process listens at; leave anything else alone.
 
     Raises:
-        OSError: it cannot be removed, or another reason not to listen there.
+        OSError: the socket cannot be removed, or another reason not to listen there.
     """
     try:
         found = path.lstat()
@@ -64,6 +64,6 @@ def _clear(path: Path, kind: socket.SocketKind) -> None:
     if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
         raise OSError("expected a path where nothing is, or a socket that was left behind")
     with socket.socket(socket.AF_UNIX, kind) as caller:
-        caller.setblocking(False)  # somebody who listens may have no time
+        caller.setblocking(False)  # a listener whose queue is full counts as alive
         if caller.connect_ex(str(path)) == ECONNREFUSED:
             path.unlink()

@@ -2,8 +2,8 @@
 
 A line of text begins with the local time and the name of the process.
 
-Nobody need read it. What is printed waits for its reader in a thread of its own, up to a bound; a
-standard output that is closed or full is silence, and no fault.
+Logging never blocks the process. Lines wait for their reader in a thread of their own, up to a
+bound; if standard output is closed or full, lines are lost, and this is no error.
 """
 
 import errno
@@ -20,32 +20,33 @@ from skytether.shell.limit import Limit
 from skytether.shell.writer import Writer
 
 ROOM_BYTES = 256 * 1024
-"""Lines that wait for their reader [B]."""
+"""Most bytes of lines that wait to be written."""
 TOGETHER_BYTES = 4096
-"""Most bytes of lines in one write: what a pipe takes whole, whoever else writes to it."""
+"""Most bytes of lines in one write: PIPE_BUF, which a pipe takes whole even with several
+writers."""
 PATIENCE_S = 0.5
-"""Longest time to wait at the end for a reader [s]."""
+"""Longest time to wait at the end until all lines are written [s]."""
 
 LogFormat = Literal["text", "json"]
 
 
 class LogLine(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of JSON: an event, who says it, and when."""
+    """Line of a JSON log: an event, its process and its time."""
 
     process: str
     """Name of the process: server, netem or client; `server.N` is worker N of a server."""
     time_ns: int
-    """Time at which it is said [ns; CLOCK_MONOTONIC]."""
+    """Time of the event [ns; CLOCK_MONOTONIC]."""
     event: Event
 
 
 _DECODER = msgspec.json.Decoder(LogLine)
 _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
-"""Errors that the decoder has for what is no line of a log."""
+"""Errors of the decoder for text that is no log line."""
 
 
 def line_of(text: bytes) -> LogLine | None:
-    """An event, of what a process has printed; None where it is none: a traceback, or a mistake."""
+    """Event in a printed line; None where the line is none of the log's: a traceback, say."""
     try:
         return _DECODER.decode(text)
     except _UNDECODABLE:
@@ -53,12 +54,12 @@ def line_of(text: bytes) -> LogLine | None:
 
 
 class Log:
-    """The log of a process, which never waits and never fails.
+    """Log of a process; writing to it never blocks and never raises.
 
     Args:
         process: name of the process.
         form: form of its lines.
-        beside: called with each event that is said.
+        beside: called with each event that is logged.
     """
 
     def __init__(
@@ -71,10 +72,10 @@ class Log:
         self._writer = Writer(sys.stdout or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
         self._limit = Limit()
         self._unread = 0
-        """Number of lines for which there was no room, and which are not told of yet."""
+        """Number of lines that were dropped for lack of room and not reported yet."""
 
     def hear(self, event: Event) -> None:
-        """Take an event of an endpoint: of each kind only a few are said in a second."""
+        """Log an event of an endpoint, within the limit of each kind."""
         for told in self._limit.admit(event, now_ns=time.monotonic_ns()):
             self.say(told)
 
@@ -86,18 +87,18 @@ class Log:
                 self._unread += 1
 
     def each_second(self, *, last: bool = False) -> None:
-        """Say what was left out; to be called once a second, and at the end."""
+        """Report omitted events; called once a second, and at the end."""
         now_ns = None if last else time.monotonic_ns()
         for omitted in self._limit.omitted(now_ns=now_ns):
             self.say(omitted)
         if self._unread:
             before, self._unread = self._unread, 0
             self.say(Omitted(kind="lines", count=before))
-            if self._unread:  # still nobody reads
+            if self._unread:  # the output is still full
                 self._unread = before
 
     def close(self) -> None:
-        """Wait for the reader, but not for long."""
+        """Wait until all lines are written, for a bounded time."""
         self._writer.close(PATIENCE_S)
 
     def _lines(self, event: Event) -> list[bytes]:
@@ -108,14 +109,14 @@ class Log:
         if isinstance(event, Counted):
             lines += rendered(_for_people(event.figures), indent=2)
         now = f"{datetime.now():%Y-%m-%d %H:%M:%S.%f}"[:-3]  # noqa: DTZ005 - the operator's own
-        # Not `encode()` alone: the name of a file need not be Unicode.
+        # Not `encode()` alone: a file's name need not be valid Unicode.
         return [f"{now} {self._process}: {line}\n".encode(errors="replace") for line in lines]
 
 
 def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
-    """Figures as lines: names and numbers in two columns, the groups among them indented.
+    """Figures as lines: names and numbers in two columns, nested groups indented.
 
-    Two groups of the same kind, as of two directions, share the lines, a column each.
+    Groups with the same names, such as the two directions, share their lines, a column each.
     """
     groups = {name: value for name, value in figures.items() if isinstance(value, Mapping)}
     if len(groups) == 2 and len({frozenset(group) for group in groups.values()} - {()}) == 1:
@@ -133,7 +134,7 @@ def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
 
 
 def _for_people(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures without cumulative histograms, which are for programs that gather them."""
+    """Figures without cumulative histograms, which only monitoring programs need."""
     return {
         name: _for_people(value) if isinstance(value, Mapping) else value
         for name, value in figures.items()
@@ -142,7 +143,7 @@ def _for_people(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:
-    """Groups of the same kind, a column each, and below their names what each has."""
+    """Groups of the same kind, a column each, with their names at the left."""
     flat = [_flat(group) for group in groups.values()]
     names = dict.fromkeys(name for each in flat for name in each)
     table = [
@@ -158,7 +159,7 @@ def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:
 
 
 def _flat(group: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Numbers of a group and of those within it, by names joined by spaces."""
+    """Numbers of a group and of its nested groups, by names joined by spaces."""
     flat: dict[str, Any] = {}
     for name, value in group.items():
         inner = isinstance(value, Mapping)

@@ -1,8 +1,8 @@
-"""What the figures of a process are called where machines gather them: names, units, and health.
+"""Tables of metrics: names, units and labels of a process's figures for Prometheus, and its health.
 
-Each figure of an endpoint (`Endpoint.figures`) is either told by a metric or left out on purpose;
-one that is neither is counted, and a test finds it. Names follow Prometheus: base units, `_total`
-for what only grows. `shell.exporter` serves them.
+Each figure of an endpoint (`Endpoint.figures`) is either exported by a metric or left out on
+purpose; one that is neither is counted, and a test finds it. Names follow Prometheus: base units,
+`_total` for counters. `shell.exporter` serves the metrics.
 """
 
 from collections.abc import Iterator, Mapping
@@ -11,39 +11,39 @@ from typing import Any, Literal, NamedTuple
 from skytether.shared.wire.protocol import Mode
 
 PREFIX = "skytether_"
-"""What all names begin with."""
+"""Prefix of all metrics' names."""
 Kind = Literal["counter", "gauge", "histogram", "summary", "modes"]
-"""What a metric is; "modes" is a gauge for each mode of a vehicle, 1 for the one it is in."""
+"""Kind of a metric; "modes" is one gauge per mode of a vehicle, 1 for its present mode."""
 MILLI, NANO = 1e-3, 1e-9
 
 
 class Label(NamedTuple):
-    """Name of a label, in place of any name among figures, which is then its value."""
+    """Label that takes the place of any name in a figure's path, and has this name as its value."""
 
     name: str
 
 
 Path = tuple[str | Label, ...]
-"""Names of the groups that a figure is in, the outermost first, and of itself."""
+"""Path of a figure: names of its groups, the outermost first, and its own name."""
 
 
 class Metric(NamedTuple):
-    """A metric, and the figure that it tells."""
+    """Metric, and the path of the figure that it exports."""
 
     figure: Path
     name: str
     """Name of the metric, without the prefix."""
     kind: Kind
     help: str
-    """What it is, in a sentence."""
+    """Help text of the metric: one sentence."""
     scale: float = 1.0
-    """Factor that makes the metric's unit of the figure's."""
+    """Factor from the figure's unit to the metric's."""
     labels: tuple[tuple[str, str], ...] = ()
-    """Labels that tell it from other figures of the same metric, and their values."""
+    """Names and values of fixed labels that separate figures of the same metric."""
 
 
 class MetricValue(NamedTuple):
-    """A number of a metric."""
+    """Number of a metric, with its labels."""
 
     suffix: str
     labels: dict[str, str]
@@ -51,7 +51,7 @@ class MetricValue(NamedTuple):
 
 
 class Family(NamedTuple):
-    """A metric and its numbers."""
+    """Metric and its numbers."""
 
     metric: Metric
     samples: list[MetricValue]
@@ -60,7 +60,7 @@ class Family(NamedTuple):
 def _each_way(
     figure: Path, name: str, kind: Kind, help_: str, scale: float = 1.0, **labels: str
 ) -> list[Metric]:
-    """A metric of both directions; arguments as of `Metric`."""
+    """Metric of both directions; arguments as for `Metric`."""
     return [
         Metric((way, *figure), name, kind, help_, scale, (("direction", way), *labels.items()))
         for way in ("uplink", "downlink")
@@ -68,7 +68,7 @@ def _each_way(
 
 
 _VEHICLE = ("by_vehicle", Label("vehicle"))
-"""Group of the figures of one vehicle."""
+"""Path of the figures of one vehicle."""
 _PROCESS = (
     Metric(("cpu_s",), "cpu_seconds_total", "counter", "CPU time used."),
     Metric(
@@ -275,7 +275,7 @@ _CLIENT = (
     ),
 )
 _AUTOPILOT = (*_VEHICLE, "autopilot")
-"""Group of the figures of a vehicle's own autopilot."""
+"""Path of the figures of a vehicle's own autopilot."""
 _ABOARD = (
     Metric((*_AUTOPILOT, "armed"), "autopilot_armed", "gauge", "Whether it is armed."),
     Metric(
@@ -344,39 +344,39 @@ TABLES = {
 """Metrics of each kind of process."""
 LEFT_OUT: dict[str, tuple[Path, ...]] = {
     "server": (
-        ("tick_ms_p50",),  # of all ticks since the start; the histogram tells of any time
+        ("tick_ms_p50",),  # since the start; the histogram gives quantiles over any period
         ("tick_ms_p99",),
     ),
     "netem": (
         *((way, f"delay_ms_{each}") for way in ("uplink", "downlink") for each in ("p50", "p99")),
         ("uplink", "delays_ms", Label("ms")),  # up to 500 numbers
         ("downlink", "delays_ms", Label("ms")),
-        ("uplink", "queue_max"),  # of all time; a gatherer has the largest of any time
+        ("uplink", "queue_max"),  # since the start; Prometheus has the largest over any period
         ("downlink", "queue_max"),
     ),
     "client": (
-        ("vehicles",),  # it never changes
-        (*_VEHICLE, "missed"),  # told of all of them
-        (*_VEHICLE, "began_s"),  # of no clock that a gatherer knows
-        (*_AUTOPILOT, "mode"),  # its number is told
+        ("vehicles",),  # constant
+        (*_VEHICLE, "missed"),  # covered by the other metrics
+        (*_VEHICLE, "began_s"),  # from a clock that Prometheus does not know
+        (*_AUTOPILOT, "mode"),  # its number is exported
     ),
 }
-"""Figures that no metric tells."""
+"""Figures that are deliberately not exported."""
 OWN = (
     Metric((), "info", "gauge", "What the process is, and what it flies; always 1."),
     Metric((), "step_seconds", "gauge", "Length of a step, the deadline of a tick."),
     Metric((), "snapshot_age_seconds", "gauge", "Age of all other numbers."),
     Metric((), "unmapped_figures", "gauge", "Figures of the process that no metric tells."),
 )
-"""Metrics that tell no figure: what the process is, and of the others."""
+"""Metrics of the process itself and of the exporter, which export no figure."""
 
 
 def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Family], list[str]]:
-    """Metrics that figures have a number for, and the figures that are not known.
+    """Metrics made of figures, and the paths of figures that no table has.
 
     Args:
         process: server, netem or client.
-        figures: as `Endpoint.figures` has them, and what the process adds.
+        figures: from `Endpoint.figures`, and those that the process adds.
     """
     found: dict[str, Family] = {}
     unknown = []
@@ -394,10 +394,10 @@ def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Family], li
 
 
 def trouble(process: str, figures: Mapping[str, Any]) -> str:
-    """What is wrong with a process, as far as its figures tell; empty where nothing is.
+    """Reason why a process is unhealthy, as its figures show; empty for a healthy one.
 
-    A server that misses its ticks is in trouble, and a client one of whose vehicles is not flown,
-    or about to be.
+    A server is unhealthy if it misses ticks, and a client if one of its vehicles neither flies nor
+    is ready to.
 
     Args:
         process, figures: see `families`.
@@ -412,13 +412,13 @@ def trouble(process: str, figures: Mapping[str, Any]) -> str:
 
 
 HEALTHY = {str(mode) for mode in (Mode.READY, Mode.TRACK, Mode.COAST)}
-"""Names of the modes of a vehicle that has a session and is flown, or could be."""
+"""Names of the modes of a vehicle that has a session and flies, or is ready to."""
 
 
 def flat(
     figures: Mapping[str, Any], groups: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Figures with the names of the groups that they are in, and their own."""
+    """Figures by their paths: the names of their groups, and their own."""
     for name, value in figures.items():
         if isinstance(value, Mapping):
             yield from flat(value, (*groups, name))
@@ -427,7 +427,7 @@ def flat(
 
 
 def matched(figure: Path, path: tuple[str, ...]) -> dict[str, str] | None:
-    """Labels of a figure with these names; None where it is not the one that is meant."""
+    """Labels of a figure with this path; None where the metric's path does not match."""
     if len(figure) != len(path):
         return None
     labels = {}

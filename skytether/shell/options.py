@@ -1,9 +1,9 @@
 """Options of a command on its command line: a dataclass, whose nested fields are flags with dots.
 
-tyro reads any command line, shows the help and says what is wrong with a flag; but it describes all
-keys of a scenario first, which takes longer than all else until a vehicle's first packet, and keeps
-its memory. So plain flags, which processes are started with, are read here, and tyro is imported
-for any other line.
+tyro reads any command line, shows the help and reports wrong flags. But it first builds a
+description of all keys of a scenario, which takes longer than everything else until a vehicle's
+first packet, and keeps the memory. So plain flags, with which processes are started, are read here,
+and tyro is imported only for other lines.
 """
 
 import dataclasses
@@ -25,23 +25,23 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """How a field stands on the command line, in its annotation."""
+    """Annotation of a field: its form on the command line."""
 
     name: str | None = None
-    """Name of the flag, where it is another than the field's; empty: each of its own fields is
-    a flag."""
+    """Name of the flag, if different from the field's; empty: each of the field's own fields is a
+    flag."""
     metavar: str | None = None
-    """What stands for the value in the help."""
+    """Placeholder for the value in the help."""
     help: str | None = None
-    """Text of the help, where it is another than the field's docstring."""
+    """Text of the help, if different from the field's docstring."""
     positional: bool = False
-    """Whether it has no flag."""
+    """Whether the argument is positional, without a flag."""
     append: bool = False
     """Whether the flag may come several times, with a value each."""
 
 
 def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
-    """Options of a command line, laid over others; `help_` says what the command does.
+    """Options of a command line, laid over defaults; `help_` says what the command does.
 
     Raises:
         ConfigError: a plug-in cannot be imported.
@@ -60,15 +60,16 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
 
 
 def plain(default: T, argv: Sequence[str]) -> T | None:
-    """Options of a line of plain flags, as tyro reads it; None where only tyro can tell.
+    """Options of a line of plain flags, as tyro would read them; None where only tyro can tell.
 
-    Plain is `--flag VALUE`, `--flag=VALUE` and the `--flag` of a truth, and before them all one
-    value without a flag. A value is a text, a path, a number or a word, and begins with no hyphen.
+    Plain flags are `--flag VALUE`, `--flag=VALUE` and the bare `--flag` of a boolean, after at most
+    one positional value. A value is a text, a path, a number or a literal, and begins with no
+    hyphen.
     """
     fields = dataclasses.fields(default)  # type: ignore[arg-type]
     empty = dataclasses.MISSING
     if any(field.default is empty and field.default_factory is empty for field in fields):
-        return None  # what has no default may be missing
+        return None  # a required option may be missing: tyro reports it
     names, positional = _flags(type(default))
     options, words = default, deque(argv)
     try:
@@ -91,7 +92,7 @@ def plain(default: T, argv: Sequence[str]) -> T | None:
 
 
 def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
-    """Fields of options by flag, and those without a flag."""
+    """Fields of options by flag, and the positional ones."""
     flags, positional = {}, []
     for name, hint in get_type_hints(options, include_extras=True).items():
         argument = _argument(hint) or Argument()
@@ -103,15 +104,15 @@ def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
 
 
 def _argument(hint: Any) -> Argument | None:
-    """How the field of an annotation stands on the command line, where it says so."""
+    """Form of a field on the command line, where its annotation has one."""
     return next((a for a in getattr(hint, "__metadata__", ()) if isinstance(a, Argument)), None)
 
 
 def _laid(holder: Any, path: Sequence[str], words: deque[str], *, given: bool = True) -> Any:
-    """A record with the next word as the value of a field of its own, or further down.
+    """Record with the next word as the value of one of its fields, or of a nested one.
 
     Raises:
-        LookupError, ValueError: it is not for here to tell what the value is.
+        LookupError, ValueError: only tyro can read the value.
     """
     name, *below = path
     hint = get_type_hints(type(holder))[name]
@@ -126,13 +127,13 @@ def _laid(holder: Any, path: Sequence[str], words: deque[str], *, given: bool = 
 
 
 def _value(hint: Any, text: str, *, given: bool) -> Any:
-    """Value of a text, for a field with this annotation; `given` with the flag, after a `=`.
+    """Value of a text for a field with this annotation; `given` for `--flag=VALUE`.
 
     Raises:
-        ValueError: it is not for here to tell what the value is.
+        ValueError: only tyro can read the value.
     """
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    # Where one number stands for those of all axes, the text is that one.
+    # Where one number may stand for all axes, the text is that number.
     (kind,) = (kind for kind in kinds if kind is not NoneType and get_origin(kind) is not tuple)
     if kind in (str, Path) and text and text != "None" and (given or text[0] != "-"):
         return kind(text)
@@ -145,7 +146,7 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
 
 @cache
 def _tell_tyro(options: type) -> None:
-    """Add in tyro's words what the annotations of options say in ours."""
+    """Add tyro's annotations that correspond to the options' own."""
     from tyro import conf
 
     def told(hint: Any) -> Any:

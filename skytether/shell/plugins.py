@@ -1,8 +1,8 @@
-"""Plug-ins: Python of one's own that adds to what a scenario can name (`shared.scenario.registry`).
+"""Plug-ins: users' Python code that adds names for scenarios (`shared.scenario.registry`).
 
-A plug-in is a file (`--plugin FILE`), or an installed package that says so by its entry points.
-All are imported before a scenario is read; processes that a command starts are given the same
-files. What is imported runs with all rights of the user.
+A plug-in is a file (`--plugin FILE`), or an installed package that declares entry points. All are
+imported before a scenario is read; processes that a command starts get the same files. A plug-in
+runs with all rights of the user.
 """
 
 import hashlib
@@ -36,14 +36,14 @@ GROUPS = {
     "skytether.vehicles": VEHICLES,
     "skytether.impairments": IMPAIRMENTS,
 }
-"""Groups of entry points, and the tables that they add to."""
+"""Groups of entry points, and the tables that they extend."""
 
 
 class Plugin(NamedTuple):
-    """A plug-in that is a file."""
+    """Plug-in that is a file."""
 
     path: str
-    """Absolute path, which is the name of its module, too."""
+    """Absolute path, which is also the name of its module."""
     code: bytes
     """Content of the file."""
 
@@ -52,19 +52,20 @@ _loaded: dict[str, Plugin] = {}
 
 
 def named(argv: Sequence[str]) -> list[str]:
-    """Files that a command line names as plug-ins, before anything else of it is read."""
+    """Files that a command line names as plug-ins, found before anything else of it is parsed."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument(FLAG, action="append", default=[])
-    with suppress(ArgumentError):  # a flag without its file: whoever reads the rest will say so
+    # a flag without its file: the parser of the whole line reports it
+    with suppress(ArgumentError):
         return parser.parse_known_args(list(argv))[0].plugin
     return []
 
 
 def load(paths: Iterable[str] = ()) -> None:
-    """Import plug-ins: installed packages', once in a process, and files.
+    """Import plug-ins: those of installed packages, once per process, and files.
 
     Raises:
-        ConfigError: one cannot be read or imported, adds nothing, or a name that there is.
+        ConfigError: a plug-in cannot be read or imported, adds nothing, or adds an existing name.
     """
     _load_installed()
     for path in paths:
@@ -78,7 +79,7 @@ def load(paths: Iterable[str] = ()) -> None:
 
 
 def loaded() -> tuple[Plugin, ...]:
-    """Files that this process has imported, for others to `use`."""
+    """Files that this process has imported, to be passed to `use` elsewhere."""
     return tuple(_loaded.values())
 
 
@@ -88,7 +89,7 @@ def flags() -> list[str]:
 
 
 def use(plugins: Iterable[Plugin]) -> None:
-    """Import plug-ins that were read, maybe by another process; installed ones, too.
+    """Import plug-ins that were read already, maybe by another process, and installed ones.
 
     Raises:
         ConfigError: see `load`.
@@ -110,7 +111,7 @@ def _import(plugin: Plugin) -> None:
         exec(compile(code, path, "exec"), module.__dict__)
 
     with _tables(f"{FLAG}: {path}"):
-        for table in TABLES:  # of an older content of the file
+        for table in TABLES:  # compiled from an older version of the file
             for name in [name for name, entry in table.items() if entry.source == path]:
                 del table[name]
         _guarded(run, f"{FLAG}: {path}", path)
@@ -126,7 +127,7 @@ def _import(plugin: Plugin) -> None:
 
 @cache
 def _load_installed() -> None:
-    """Import what installed packages add by their entry points.
+    """Import the plug-ins of installed packages, found by their entry points.
 
     Raises:
         ConfigError: see `load`.
@@ -149,7 +150,7 @@ def _load_installed() -> None:
 
 
 def _mention_groups(folder: Path) -> bool:
-    """Whether a package in a folder of packages has entry points of ours."""
+    """Whether any package in a folder of packages has entry points of ours."""
     words = [f"[{group}]".encode() for group in GROUPS]
     for points in folder.glob("*-info/entry_points.txt"):
         with suppress(OSError):
@@ -161,7 +162,7 @@ def _mention_groups(folder: Path) -> bool:
 
 @contextmanager
 def _tables(where: str) -> Iterator[None]:
-    """Leave all tables as they were where something goes wrong, and say where it did."""
+    """Restore all tables where the block fails, and say which plug-in failed."""
     before = [dict(table) for table in TABLES]
     try:
         yield
@@ -175,13 +176,13 @@ def _tables(where: str) -> Iterator[None]:
 
 
 def _guarded(run: Callable[[], Any], where: str, path: str = "") -> Any:
-    """Run a plug-in's code, with one line for whatever it raises.
+    """Run a plug-in's code, with one line for any exception.
 
     Args:
-        path: its file, for the number of the line.
+        path: its file, for the line number.
 
     Raises:
-        ConfigError: it has raised something.
+        ConfigError: the code raised an exception.
     """
     try:
         return run()

@@ -1,4 +1,6 @@
-"""A part of the record on its way to a file, so that no flight waits for a disk or ends with it."""
+"""File of a part of the record, written in a thread: no flight waits for a disk or fails with
+it.
+"""
 
 import os
 from typing import BinaryIO
@@ -10,12 +12,12 @@ from skytether.shared.telemetry.record import Recorder, Rows, parse
 from skytether.shell.writer import Writer
 
 ROOM_BYTES = 32 * 1024 * 1024
-"""Rows that wait for the disk [B]: those of 1000 vehicles at 20 Hz in 8 s; in memory, rows as short
-as netem's take three times as much."""
+"""Most bytes of rows that wait for the disk: those of 1000 vehicles at 20 Hz in 8 s; rows as short
+as netem's take three times as much in memory."""
 TOGETHER_BYTES = 256 * 1024
 """Most bytes of rows in one write."""
 PAUSE_S = 0.02
-"""Time for which rows gather [s]; as much is lost of a process that is killed."""
+"""Time for which rows gather before a write [s]; a killed process loses at most this much."""
 PATIENCE_S = 3.0
 """Longest time to wait at the end until all rows are written [s]."""
 
@@ -23,7 +25,7 @@ SLOW = "the disk is too slow"
 
 
 class RecordFile:
-    """A recorder and its file; what the file does not take is missing in it, and known of.
+    """Recorder and its file; rows that the file does not take are lost and counted.
 
     Args:
         name: what the operator knows the file by.
@@ -36,13 +38,13 @@ class RecordFile:
         self._file = file
         self._writer = Writer(file, room=ROOM_BYTES, together=TOGETHER_BYTES, pause_s=PAUSE_S)
         self.recorder = Recorder(columns, self._writer)
-        """Takes the rows; it never waits and never fails."""
+        """Recorder that takes the rows; it never blocks and never raises."""
         self._header_bytes = self._writer.offered
         self._ended = False
         self._told = False
 
     def news(self) -> RecordIncomplete | None:
-        """What is to be told of the record: once, after the first row was lost."""
+        """Event to report about the record: once, after the first row was lost."""
         reason = self._reason()
         if reason is None or self._told:
             return None
@@ -50,12 +52,12 @@ class RecordFile:
         return RecordIncomplete(file=self._name, reason=reason)
 
     def end(self) -> None:
-        """Wait until the last row is written, for as long as is reasonable."""
+        """Wait until the last row is written, for a bounded time."""
         self._writer.close(PATIENCE_S)
         self._ended = True
 
     def fault(self) -> str | None:
-        """What is missing in the record, as a line, or None; to be asked for after `end`."""
+        """Sentence on what is missing in the record, or None; valid after `end`."""
         reason = self._reason()
         if reason is None:
             return None
@@ -67,14 +69,14 @@ class RecordFile:
         return f"{self._name}: {reason}: {kept} of {rows} rows are recorded"
 
     def rows(self) -> Rows:
-        """The rows in the file, whole ones alone; to be asked for after `end`.
+        """Whole rows in the file; valid after `end`.
 
         Raises:
             OSError: the file cannot be read.
         """
         part = bytearray()
         while not isinstance(self._file, OSError) and len(part) < self._writer.written:
-            # Not `read`, which would move the place where a late write goes.
+            # Not `read`, which would move the position of a late write.
             count = min(self._writer.written - len(part), TOGETHER_BYTES)
             piece = os.pread(self._file.fileno(), count, len(part))
             if not piece:

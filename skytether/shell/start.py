@@ -1,7 +1,7 @@
-"""The first moment of every command, before what takes seconds to import.
+"""Start of every command, before the imports that take seconds.
 
-A process may come to life without standard streams, with a terminal that knows no Greek, and be
-told to end, or to count, before it knows what it is. All of that is settled here, once.
+A process may be started without standard streams, or with a terminal that cannot print Greek
+letters, and may get SIGTERM or SIGUSR1 during its imports. All of these are handled here, once.
 """
 
 import contextlib
@@ -17,8 +17,8 @@ def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
     """Run a command from the first moment of its process; returns its exit code.
 
     Args:
-        command: its function, as "module:name", which is imported here.
-        prog: its name, for the one line of a mistake.
+        command: its function as "module:name", which is imported here.
+        prog: its name, for the one line of an error.
         argv: its arguments; those of the process unless given.
     """
     begin()
@@ -33,22 +33,23 @@ def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
         with _mortal():
             from skytether.shell.command import main
         return main(call, argv, prog)
-    except KeyboardInterrupt:  # between two of these lines
+    except KeyboardInterrupt:  # Ctrl-C between two of these lines
         return 128 + signal.SIGINT
 
 
 def begin() -> None:
-    """Give this process its three streams, and let SIGUSR1 wait until there is what to count.
+    """Open missing standard streams, and ignore SIGUSR1 until there are figures to print.
 
-    A stream that is closed becomes /dev/null, for the children as well: the next socket would take
-    its number, and be printed to. What a stream cannot encode is written as an escape. SIGUSR1 is
-    ignored until there is a handler, by the children as well.
+    A closed stream becomes /dev/null, for the children as well: otherwise the next socket would
+    take its number, and be printed to. Characters that a stream cannot encode are written as
+    escapes. SIGUSR1 is ignored, also by children, until a handler is set.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+            # open() takes the lowest free descriptor, which is this one
+            os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(number, True)
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
@@ -61,7 +62,7 @@ def begin() -> None:
 
 @contextlib.contextmanager
 def _mortal() -> Iterator[None]:
-    """Let Ctrl-C end the process at once: what is being imported may swallow an exception."""
+    """Let Ctrl-C end the process at once: code that is being imported may swallow an exception."""
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,7 +1,7 @@
-"""Lines of bytes, TCP and serial, driven by asyncio beside the sockets of a `Shell`.
+"""Byte streams, TCP and serial, driven by asyncio beside the sockets of a `Shell`.
 
-A line that has ended, or is not there yet, is opened anew each second, for as long as its endpoint
-is driven: a cable that is plugged in again is an autopilot that is heard again.
+A stream that has ended, or cannot be opened yet, is opened again each second while its endpoint
+runs: after a cable is plugged in again, the autopilot is heard again.
 """
 
 import asyncio
@@ -18,15 +18,15 @@ from skytether.shell.udp import AddressError
 AGAIN_S = 1.0
 """Time after which a line that has ended is opened again [s]."""
 PIECE_BYTES = 4096
-"""Most bytes that are heard at once."""
+"""Most bytes that are read at once."""
 
 
 class Stream:
-    """A line of bytes.
+    """Byte stream to an autopilot, over TCP or a serial port.
 
     Args:
-        line: where it leads, TCP or serial.
-        hear: called with each piece that has come.
+        line: address of the stream.
+        hear: called with each piece that was read.
 
     Raises:
         AddressError: no serial port runs at its rate.
@@ -37,10 +37,12 @@ class Stream:
             raise AddressError(f"{line.host}: no serial port runs at {line.number} bit/s")
         self._line, self._hear = line, hear
         self._end: int | None = None
-        """File descriptor of our end; None while the line is not open."""
+        """File descriptor of our end; None while the stream is not open."""
 
     def send(self, payload: bytes) -> bool:
-        """Send; False where it is lost, for the line is not open or cannot take all of it."""
+        """Send bytes; False where they are lost: the stream is not open or cannot take all of
+        them.
+        """
         if self._end is None:
             return False
         try:
@@ -49,14 +51,14 @@ class Stream:
             return False
 
     async def run(self) -> None:
-        """Keep the line open, until this task is cancelled."""
+        """Keep the stream open, until this task is cancelled."""
         while True:
             with contextlib.suppress(OSError, termios.error):
                 await self._carry(await self._open())
             await asyncio.sleep(AGAIN_S)
 
     async def _carry(self, end: int) -> None:
-        """Hear what comes until the line ends."""
+        """Read from the stream until it ends."""
         loop = asyncio.get_running_loop()
         ended = loop.create_future()
 
@@ -65,7 +67,7 @@ class Stream:
                 piece = os.read(end, PIECE_BYTES)
             except BlockingIOError:
                 return
-            except OSError:  # what was plugged in is not any more
+            except OSError:  # the device was unplugged
                 piece = b""
             if piece:
                 self._hear(piece)
@@ -82,11 +84,11 @@ class Stream:
             os.close(end)
 
     async def _open(self) -> int:
-        """Open the line; returns the file descriptor of our end, which does not block.
+        """Open the stream; returns a non-blocking file descriptor.
 
         Raises:
-            OSError: nobody is there.
-            termios.error: what is there is no serial port.
+            OSError: no peer listens, or there is no device.
+            termios.error: the file is no serial port.
         """
         with contextlib.ExitStack() as failed:
             if self._line.kind == "serial":
@@ -107,14 +109,14 @@ class Stream:
 
 
 def prepare(port: int, baud: int) -> None:
-    """Let a serial port carry bytes as they are, at a rate.
+    """Configure a serial port for raw bytes at a rate.
 
     Args:
         port: its file descriptor.
         baud: rate [bit/s], one that the system knows.
 
     Raises:
-        termios.error: it is no serial port.
+        termios.error: the file is no serial port.
     """
     rate = getattr(termios, f"B{baud}")
     tty.setraw(port)

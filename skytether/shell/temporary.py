@@ -1,9 +1,9 @@
-"""Temporary folders, of which none stays for good: what a killed process has left, the next clears.
+"""Temporary folders; those that a killed process has left are removed by the next process.
 
-A folder has a mark in it, a file that its owner holds locked for as long as it lives, however it
-ends. Only a folder of this user with a mark that nobody holds is cleared: neither another's, nor
-one that only has such a name. The mark is the last to go, so that what an interrupted owner could
-not remove is cleared as well.
+A folder contains a mark, a file that its owner keeps locked while it lives, however it ends. Only a
+folder of this user with an unlocked mark is removed: no other user's, and none that merely has such
+a name. The mark is removed last, so that a removal that was interrupted is finished by the next
+process.
 """
 
 import contextlib
@@ -17,12 +17,12 @@ from pathlib import Path
 PREFIX = "skytether-"
 """Beginning of the names of temporary folders."""
 MARK = ".of-a-process"
-"""Name of the file that tells that a folder is one of these, and whether its owner lives."""
+"""Name of the lock file that marks a folder as one of these and shows whether its owner lives."""
 
 
 @contextlib.contextmanager
 def folder() -> Iterator[Path]:
-    """A temporary folder for as long as the block takes; those of dead processes are cleared."""
+    """Temporary folder for as long as the block takes; those of dead processes are removed."""
     _clear(Path(tempfile.gettempdir()))
     made = Path(tempfile.mkdtemp(prefix=PREFIX))
     with _marked(made):
@@ -34,17 +34,20 @@ def folder() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _marked(made: Path) -> Iterator[None]:
-    """Hold the mark of a folder; it has its name only once it is held, or another may clear it."""
+    """Create and lock a folder's mark; it gets its name only once locked, so that nobody clears
+    it.
+    """
     held = made / f"{MARK}.new"
     with held.open("x") as mark:
-        with contextlib.suppress(OSError):  # a file system without locks: nobody can clear it
+        # a file system without locks: nobody can clear the folder
+        with contextlib.suppress(OSError):
             fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
             held.rename(made / MARK)
         yield
 
 
 def _clear(place: Path) -> None:
-    """Remove the folders whose owners are gone."""
+    """Remove the folders whose owners are dead."""
     with contextlib.suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
             with contextlib.suppress(OSError):
@@ -53,10 +56,10 @@ def _clear(place: Path) -> None:
 
 
 def _clear_one(made: Path) -> None:
-    """Remove a folder, if it is ours to remove.
+    """Remove a folder, if it is ours and its owner is dead.
 
     Raises:
-        OSError: it is none of these, or its owner lives.
+        OSError: the folder is none of these, or its owner lives.
     """
     if made.lstat().st_uid != os.getuid():
         return
@@ -67,7 +70,7 @@ def _clear_one(made: Path) -> None:
 
 
 def _remove(made: Path) -> None:
-    """Remove a folder, its mark last; where somebody still writes, it is left for the next."""
+    """Remove a folder, its mark last; if a process still writes there, the next call removes it."""
     with contextlib.suppress(OSError):
         for each in made.iterdir():
             if each.name == MARK:

@@ -1,7 +1,7 @@
 """One absolute timer on an asyncio loop, as exact as the machine allows.
 
 A `timerfd` wakes within 0.1 ms on either loop. The loop's own timer is the fallback: uvloop rounds
-it to 1 ms and may fire early, so the callback must look at its own clock.
+it to 1 ms and may fire early, so the callback must check the clock itself.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ class Timer(Protocol):
     """Timer that calls back once per `set`, at or after the absolute time given."""
 
     def set(self, due_ns: int | None) -> None:
-        """Arm for `due_ns` [ns; CLOCK_MONOTONIC], in place of what was set before; None disarms."""
+        """Arm for `due_ns` [ns; CLOCK_MONOTONIC], replacing an earlier time; None disarms."""
 
     def close(self) -> None:
         """Disarm for good."""
@@ -66,7 +66,8 @@ class KernelTimer:
 
     def set(self, due_ns: int | None) -> None:
         """See `Timer`."""
-        # An absolute time of zero would disarm; one nanosecond is as long past as any other.
+        # An absolute time of zero would disarm the timer; 1 ns is as far in the past as any other
+        # time.
         due_ns = 0 if due_ns is None else max(due_ns, 1)
         self._spec.value_s, self._spec.value_ns = divmod(due_ns, SECOND_NS)
         self._settime(self._fd, _TFD_TIMER_ABSTIME, ctypes.byref(self._spec), None)

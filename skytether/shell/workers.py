@@ -1,8 +1,8 @@
 """One address served by several processes, so that a server may use several cores.
 
-Each has a socket of its own at the address (SO_REUSEPORT): the kernel deals out peers among them by
-a hash of their address, so one peer always meets the same process while all of them live. When one
-ends, all do.
+Each process has its own socket at the address (SO_REUSEPORT): the kernel assigns peers to the
+processes by a hash of their address, so a peer always reaches the same process while all of them
+live. When one ends, all are ended.
 """
 
 import contextlib
@@ -19,13 +19,13 @@ from skytether.shared.core.endpoint import Address
 from skytether.shell.udp import from_kernel, open_socket
 
 FORK = multiprocessing.get_context("fork")
-"""Way to start a worker: what is imported and compiled is there at once, and in memory once."""
+"""Start method of workers: imported and compiled code is there at once, and in memory once."""
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-"""Signals that are passed on to every worker; SIGINT as SIGTERM, and either of them once."""
+"""Signals passed on to every worker, SIGINT as SIGTERM, and each of both only once."""
 
 
 def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
-    """Let `count` processes work until the first of them ends; returns the worst exit code.
+    """Run `count` processes until the first of them ends; returns the worst exit code.
 
     Args:
         count: number of processes.
@@ -42,7 +42,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
         FORK.Process(target=_work, args=(work, number, sockets, os.getpid()))
         for number in range(1, count + 1)
     ]
-    # Until they are told otherwise, children would do with a signal what is meant for their parent.
+    # Until they set handlers of their own, children would treat a signal as their parent does.
     signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)
     for child in children:
         child.start()
@@ -54,7 +54,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     def pass_on(number: int, _: object) -> None:
         nonlocal ending
         if number != signal.SIGUSR1:
-            if ending:  # a worker that is told twice would not end in order
+            if ending:  # a worker that gets SIGTERM twice would not end in order
                 return
             number, ending = signal.SIGTERM, True
         told.add(-number)
@@ -69,7 +69,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     pass_on(signal.SIGTERM, None)
     for child in children:
         child.join()
-    # A worker that was told to end before it could do so in order has not failed.
+    # A worker that got SIGTERM before it could end in order has not failed.
     return max(0 if child.exitcode in told else abs(child.exitcode or 0) for child in children)
 
 
@@ -77,25 +77,25 @@ def _work(
     work: Callable[[int, socket], None], number: int, sockets: list[socket], parent: int
 ) -> None:
     die_with_parent()
-    if os.getppid() != parent:  # it was gone before
+    if os.getppid() != parent:  # it had ended before
         return
     for other, sock in enumerate(sockets, start=1):
         if other != number:
             sock.close()
     for passed_on in (signal.SIGINT, signal.SIGTERM):
         signal.signal(passed_on, signal.SIG_DFL)
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until there is what to count
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # ignored until there are figures to print
     # SIGINT stays blocked: a terminal sends it to all, and the parent passes it on as SIGTERM.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGUSR1))
     with closing(sockets[number - 1]) as sock:
         try:
             work(number, sock)
         finally:
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends already
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is ending already
 
 
 def die_with_parent() -> None:
-    """Ask the kernel to end this process with SIGTERM once its parent is gone; runs in a child."""
+    """Ask the kernel to send this process SIGTERM once its parent is gone; runs in a child."""
     pr_set_pdeathsig = 1
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)

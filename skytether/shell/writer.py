@@ -1,4 +1,4 @@
-"""Writing in the background: nobody waits for a full pipe, a slow disk or a reader that is gone."""
+"""Background writer: nobody waits for a full pipe, a slow disk or a reader that is gone."""
 
 import contextlib
 import os
@@ -9,15 +9,16 @@ from typing import IO, Any
 
 
 class Writer:
-    """Writes to a file in a thread of its own; pieces for which there is no room are left out.
+    """Writer to a file in a thread of its own; pieces for which there is no room are dropped.
 
-    The thread starts at once: a process that forks makes its writers in its children. It keeps no
-    process from ending, whatever it waits for. A killed process loses what gathered in the pause.
+    The thread starts at once, so a process that forks must create writers in its children. A
+    blocked thread never keeps the process from ending. A killed process loses what gathered in the
+    pause.
 
     Args:
-        file: file to write to, past its own buffer; or the error for which there is none.
+        file: unbuffered file to write to; or the error for which there is none.
         room: most bytes that wait to be written.
-        together: most bytes of several pieces in one write; none is spread over two by us.
+        together: most bytes of several pieces in one write; a piece is never split.
         pause_s: time for which pieces gather before they are written [s].
     """
 
@@ -34,9 +35,9 @@ class Writer:
         self.refused = 0
         """Number of bytes among them for which there was no room."""
         self.written = 0
-        """Number of bytes that the file has taken."""
+        """Number of bytes that were written to the file."""
         self._handled = 0
-        """Number of bytes that wait no longer, written or not."""
+        """Number of bytes that are no longer waiting, written or not."""
         self._pieces: SimpleQueue[bytes] = SimpleQueue()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -44,11 +45,11 @@ class Writer:
 
     @property
     def failure(self) -> OSError | None:
-        """Error since which nothing is written."""
+        """Error after which nothing more is written."""
         return self._file if isinstance(self._file, OSError) else None
 
     def write(self, piece: bytes) -> bool:
-        """Have a piece written soon; returns whether there was room. Never waits, never raises."""
+        """Queue a piece for writing; returns whether there was room. Never blocks, never raises."""
         self.offered += len(piece)
         if self.offered - self.refused - self._handled > self._room:
             self.refused += len(piece)
@@ -57,9 +58,9 @@ class Writer:
         return True
 
     def close(self, patience_s: float) -> bool:
-        """Wait until all is written, but not for longer; returns whether the thread has ended.
+        """Wait until all is written, for a bounded time; returns whether the thread has ended.
 
-        Only then may the file be closed.
+        The file may be closed only if this returns True.
         """
         self._closed.set()
         self._pieces.put(b"")
@@ -88,7 +89,7 @@ class Writer:
         while rest and not isinstance(self._file, OSError):
             try:
                 count = os.write(self._file.fileno(), rest)
-            except BlockingIOError:  # a pipe that somebody has made non-blocking
+            except BlockingIOError:  # another process has made the pipe non-blocking
                 room = select.poll()
                 room.register(self._file, select.POLLOUT)
                 room.poll()

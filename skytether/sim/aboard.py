@@ -1,9 +1,9 @@
-"""Kernels of a vehicle's usual step in virtual time.
+"""Kernels of a vehicle's regular step in virtual time.
 
-At every step a vehicle does the same: eq. (1) moves it, it measures that, holds it against what it
-measured before, filters it, chooses the input by the rule of flight and clamps it. The functions
-are those of `client` and `shared`, in the order of `client.pilot`, and the numbers are the same to
-the last bit (`tests/sim/test_compiled_pilot.py`). `sim.pilot` calls the kernels.
+A regular step: eq. (1) moves the vehicle; it measures its state, checks it against the previous
+one, filters it, chooses the input by the rule of flight and clamps it. The functions are those of
+`client` and `shared`, in the order of `client.pilot`, and the numbers are equal to the last bit
+(`tests/sim/test_compiled_pilot.py`). `sim.pilot` calls the kernels.
 """
 
 import math
@@ -31,36 +31,36 @@ by_position, by_velocity = shared(kalman.by_position), shared(kalman.by_velocity
 
 
 class AxisAboard:
-    """Record: what does not change from step to step on one axis of a vehicle."""
+    """Record: constants of one axis of a vehicle."""
 
     true_a01: float
-    """Eq. (4) of the vehicle as it is: how far the velocity carries the position [s]."""
+    """Eq. (4) of the true vehicle: position gained per unit of velocity in a step [s]."""
     true_a11: float
-    """Share of the velocity that is left after a step."""
+    """Share of the true velocity that is left after a step."""
     true_b0: float
-    """How far the input carries the position [s]."""
+    """Position that the true vehicle gains per unit of input in a step [s]."""
     true_b1: float
-    """Share of the input that the velocity has taken on."""
+    """Share of the input that the true velocity takes on in a step."""
     true_gain: float
-    """Gain g of the vehicle as it is."""
+    """Gain g of the true vehicle."""
     push: float
-    """What the air adds to the input, but for white acceleration [m/s]."""
+    """Velocity that wind adds to the input, apart from white acceleration [m/s]."""
     windy: bool
-    """Whether there is white acceleration."""
+    """Whether there is white acceleration (random gusts)."""
     shove_p: float
-    """What a unit of white acceleration's first number adds to the position [m]."""
+    """Position added per unit of white acceleration's first random number [m]."""
     shove_vp: float
-    """What that adds to the velocity [m/s]."""
+    """Velocity added per unit of white acceleration's first random number [m/s]."""
     shove_v: float
-    """What a unit of its second number adds to the velocity [m/s]."""
+    """Velocity added per unit of white acceleration's second random number [m/s]."""
     a01: float
-    """Eq. (4) as the terms have it: how far the velocity carries the position [s]."""
+    """Eq. (4) with the terms' model: position gained per unit of velocity in a step [s]."""
     a11: float
-    """Share of the velocity that is left after a step."""
+    """Share of the velocity that is left after a step, in the model."""
     b0: float
-    """How far the input carries the position [s]."""
+    """Position gained per unit of input in a step, in the model [s]."""
     b1: float
-    """Share of the input that the velocity has taken on."""
+    """Share of the input that the velocity takes on in a step, in the model."""
     bound: float
     """Bound u_max of the input [m/s]."""
     change_max: float
@@ -68,9 +68,9 @@ class AxisAboard:
     dt_s: float
     """Length of a step [s]."""
     noise_m: float
-    """What noise may add to a change of position [m]."""
+    """Largest change of position in a step that noise explains [m]."""
     noise_mps: float
-    """What noise may add to a change of velocity [m/s]."""
+    """Largest change of velocity in a step that noise explains [m/s]."""
     filters: bool
     """Whether there is a Kalman filter."""
     variance_p: float
@@ -78,73 +78,73 @@ class AxisAboard:
     variance_v: float
     """Variance of a measured velocity [m²/s²]."""
     noise_pp: float
-    """Q of the filter: variance of the position [m²]; the other fields likewise."""
+    """Filter's process noise Q: variance of the position [m²]."""
     noise_pv: float
-    """Q: covariance of position and velocity."""
+    """Filter's process noise Q: covariance of position and velocity [m²/s]."""
     noise_vv: float
-    """Q: variance of the velocity."""
+    """Filter's process noise Q: variance of the velocity [m²/s²]."""
     noise_ww: float
-    """Q: variance of the disturbance."""
+    """Filter's process noise Q: variance of the disturbance [m²/s²]."""
 
 
 class AxisState:
-    """Record: what changes from step to step on one axis of a vehicle."""
+    """Record: state of one axis of a vehicle, which changes from step to step."""
 
     p: float
     """True position [m]."""
     v: float
     """True velocity [m/s]."""
     x_p: float
-    """Position that is flown by [m]."""
+    """Position estimate that the vehicle flies by [m]."""
     x_v: float
-    """Velocity that is flown by [m/s]."""
+    """Velocity estimate that the vehicle flies by [m/s]."""
     x_w: float
-    """Disturbance ŵ that the filter has found [m/s]; 0 without a filter."""
+    """Disturbance ŵ that the filter estimates [m/s]; 0 without a filter."""
     u: float
-    """Input that is flown [m/s]."""
+    """Input in force [m/s]."""
     lead_p: float
-    """Position to which the horizon leads [m]."""
+    """Position predicted by the horizon [m]."""
     lead_v: float
-    """Velocity to which the horizon leads [m/s]."""
+    """Velocity predicted by the horizon [m/s]."""
     pp: float
-    """P of the filter: variance of the position [m²]; the other fields likewise."""
+    """Filter's P: variance of the position [m²]."""
     pv: float
-    """P: covariance of position and velocity."""
+    """Filter's P: covariance of position and velocity [m²/s]."""
     pw: float
-    """P: covariance of position and disturbance."""
+    """Filter's P: covariance of position and disturbance [m²/s]."""
     vv: float
-    """P: variance of the velocity."""
+    """Filter's P: variance of the velocity [m²/s²]."""
     vw: float
-    """P: covariance of velocity and disturbance."""
+    """Filter's P: covariance of velocity and disturbance [m²/s²]."""
     ww: float
-    """P: variance of the disturbance."""
+    """Filter's P: variance of the disturbance [m²/s²]."""
 
 
 class AxisPlan:
-    """Record: the horizon or spline that is held, on one axis."""
+    """Record: horizon or spline in force, on one axis."""
 
     is_spline: bool
     """Whether it is a spline."""
     length: int
-    """Number of stages that are flown."""
+    """Number of stages in the plan."""
     spacing: int
     """Steps from one knot of a spline to the next."""
     indexed: bool
-    """Whether each stage of a horizon has an input of its own."""
+    """Whether each stage of a horizon has its own input."""
     last: float
     """Input at the last stage of a spline [m/s]."""
     speed: float
     """Magnitude of the last input over all axes [m/s]."""
     brake: float
-    """Speed that braking takes away in a step [m/s]."""
+    """Speed lost per step while braking [m/s]."""
     feeds_back: bool
     """Whether there is feedback."""
     gain_p: float
-    """K on position [1/s]."""
+    """Feedback gain K on position [1/s]."""
     gain_v: float
-    """K on velocity."""
+    """Feedback gain K on velocity."""
     disturbance: float
-    """Disturbance ŵ that the inputs of a horizon reckon with [m/s]."""
+    """Disturbance ŵ that a horizon's inputs already compensate [m/s]."""
 
 
 AXIS_ABOARD, AXIS_STATE, AXIS_PLAN = record(AxisAboard), record(AxisState), record(AxisPlan)
@@ -158,7 +158,7 @@ Plans = Annotated[NDArray[np.void], records(AXIS_PLAN, 1)]
 
 @part
 def measured_on(constants: Constants, now: StatesNow, after: StatesNow, drawn: F2) -> bool:
-    """Fly the vehicle to the next step, measure it and filter that; see `fly_step`."""
+    """Move the vehicle to the next step, measure and filter; see `fly_step`."""
     usual = True
     for i in range(len(constants)):
         axis, was, now_is = constants[i], now[i], after[i]
@@ -191,7 +191,7 @@ def measured_on(constants: Constants, now: StatesNow, after: StatesNow, drawn: F
 
 @part
 def guide_of(axis: AxisAboard, plan: AxisPlan, knots: R1) -> Guide:
-    """Spline of one axis."""
+    """Spline of one axis, for the rule of flight."""
     return Guide(
         Axis(axis.a01, axis.a11, axis.b0, axis.b1),
         knots,
@@ -209,7 +209,7 @@ def guide_of(axis: AxisAboard, plan: AxisPlan, knots: R1) -> Guide:
 
 @part
 def held_of(axis: AxisAboard, plan: AxisPlan, inputs: R1) -> Held:
-    """Horizon of one axis."""
+    """Horizon of one axis, for the rule of flight."""
     return Held(
         Axis(axis.a01, axis.a11, axis.b0, axis.b1),
         inputs,
@@ -240,20 +240,20 @@ def fly_step(
     """Fly a vehicle to its next step, and choose the input from there on.
 
     Args:
-        constants: those of the vehicle.
-        now: its state at the step before.
-        after: what is filled in: its state at the step.
+        constants: constants of the vehicle.
+        now: its state at the previous step.
+        after: output: its state at the step.
         drawn: normal numbers of white acceleration; shape (axes, 2).
-        plans: the horizon or spline that is held.
-        numbers: its inputs [m/s] or knots [m, m/s]; shape (axes, n).
-        stage: where in the plan the step is.
-        lead_stage: stage at which `now` has the state to which the plan leads.
-        told: what is filled in, for all axes one after the other: true position [m] and velocity
-            [m/s], those measured, those flown by, then input [m/s], and part of the input that is
-            no feedback [m/s]; shape (8 axes,).
+        plans: horizon or spline in force.
+        numbers: the plan's inputs [m/s] or knots [m, m/s]; shape (axes, n).
+        stage: stage of the plan at the step.
+        lead_stage: stage to which the predicted state in `now` belongs.
+        told: output, for all axes one after the other: true position [m] and velocity [m/s], those
+            measured, those flown by, the input [m/s], and its part without feedback [m/s]; shape (8
+            axes,).
 
     Returns:
-        whether all of that is as usual; if not, it counts for nothing.
+        whether the step was regular; if not, the outputs must not be used.
     """
     usual, axes = measured_on(constants, now, after, drawn), len(constants)
     for i in range(axes):
@@ -291,18 +291,18 @@ def believe_step(
     told: F2,
     apart: F2,
 ) -> None:
-    """Foresee the state of the next step, as `Compensator.foresee` does.
+    """Predict the state at the next step, as `Compensator.foresee` does.
 
     Args:
-        constants: those of the vehicle.
+        constants: constants of the vehicle.
         now: its state at the step.
-        plans: the horizon or spline that is held.
-        numbers: its inputs [m/s] or knots [m, m/s]; shape (axes, n).
-        stage: where in the plan the step is.
-        believed: state that the server must take it to be in [m, m/s]; shape (axes, 2).
-        silent: what is filled in: where that leads [m, m/s]; shape (axes, 2).
-        told: what is filled in: where the state leads that is flown by [m, m/s]; shape (axes, 2).
-        apart: what is filled in: how far the vehicle is from `believed` [m, m/s]; shape (axes, 2).
+        plans: horizon or spline in force.
+        numbers: the plan's inputs [m/s] or knots [m, m/s]; shape (axes, n).
+        stage: stage of the plan at the step.
+        believed: state that the server must assume [m, m/s]; shape (axes, 2).
+        silent: output: prediction from `believed` [m, m/s]; shape (axes, 2).
+        told: output: prediction from the state that is flown by [m, m/s]; shape (axes, 2).
+        apart: output: distance of the vehicle from `believed` [m, m/s]; shape (axes, 2).
     """
     for i in range(len(constants)):
         axis, at, plan = constants[i], now[i], plans[i]

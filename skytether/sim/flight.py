@@ -1,13 +1,13 @@
 """Flights in virtual time: scenario + seed → World → record and events.
 
-**A run is the same in any company.** Runs of a batch share one server, which solves for all of them
-at once, and nothing else: each has a network, winds and clocks of its own, from its seed. Three
-things make their records equal, to the last bit, to those of the runs one by one. The server's
-ticks lie on the grid of its clock, whoever flies, and the phase that a seed draws is when its
-vehicles start. What the server computes delays what it sends, not what it hears, and it is woken
-after everybody else (`sim.world`). And what differs from run to run, vehicle and session number,
-takes as many bytes on the wire in any of them. Events are equal as well, once the vehicles of each
-run are numbered from 1.
+**A run in a batch equals the same run alone, bit for bit.** Runs of a batch share one server, which
+solves for all of them at once, and nothing else: each run has its own network, winds and clocks,
+from its seed. Three things make the records equal. First, the server's ticks lie on the grid of its
+own clock, and a seed's random phase shifts the vehicles' start instead. Second, the server's
+computing time delays what it sends, not what it hears, and the server is woken after all other
+hosts (`sim.world`). Third, the numbers that differ between runs, of vehicles and sessions, always
+take the same number of bytes on the wire. Events are equal as well, once the vehicles of each run
+are numbered from 1.
 """
 
 import io
@@ -56,16 +56,16 @@ from skytether.sim.pilot import CompiledPilot
 from skytether.sim.world import Clock, World
 
 MIDNIGHT_NS = 86_400 * SECOND_NS
-"""Time that the server's clock shows at the start [ns]: no stamp may become negative."""
+"""Time on the server's clock at the start [ns]; far from 0, so that no timestamp is negative."""
 BOOT_ID = 2**63 + 2**31
-"""Boot id of every endpoint: as long on the wire as a random one, and so are session numbers."""
+"""Boot id of every endpoint: it takes as many bytes as a random one, and so do session numbers."""
 SERVER: Address = ("server", 0)
 COMPANY_MAX = 100
-"""Most runs that share a server; more would be no faster, and a vehicle's number takes one byte."""
+"""Most runs that share a server; more would be no faster, and vehicle numbers must fit one byte."""
 ASK_NS = 10 * MILLISECOND_NS
-"""Time of the world after which it is asked again whether to break a flight off [ns]."""
+"""Time of the world between two checks whether to stop the flight [ns]."""
 EVENTS_MAX = 65_536
-"""Events kept of a flight; older ones give way."""
+"""Most events kept of a flight; newer ones replace the oldest."""
 
 
 def fly(
@@ -82,21 +82,21 @@ def fly(
 ) -> Record:
     """Fly a scenario in virtual time.
 
-    The vehicles start at a phase of the server's grid given by the seed, so that its ticks fall
-    anywhere within their steps, as they do in life.
+    The vehicles start at a random phase of the server's grid, drawn from the seed: as in a real
+    flight, the server's ticks may fall anywhere within the vehicles' steps.
 
     Args:
         scenario: what to fly.
-        vehicles: number of vehicles, numbered from 1, all with the same plan and winds of their
-            own.
+        vehicles: number of vehicles, numbered from 1, all with the same trajectory, each with its
+            own winds.
         secure: whether the link is sealed, with keys from the seed.
-        server: endpoint in place of ours, which records nothing; left out: `Server`.
-        beside: endpoints of other hosts by name, as an autopilot at `vehicle.address`.
-        changes: when keys get other values in flight [s; as `Record.events` have it], and which, as
-            in `shared.core.change`; what is refused is an event, and the flight goes on.
-        stopwatch: measures the server; what it measures differs from flight to flight.
-        on_second: called with the time flown [s], once a second of it.
-        stopped: asked often; once it says so, the flight is broken off.
+        server: endpoint in place of `Server`; nothing of it is recorded.
+        beside: endpoints of further hosts by name, such as an autopilot at `vehicle.address`.
+        changes: times [s, counted as in `Record.events`] and the keys and values that change then,
+            as in `shared.core.change`; a refused change is an event, and the flight goes on.
+        stopwatch: stopwatch for the server's stages; its times differ from flight to flight.
+        on_second: called with the time flown [s], once per second of flight.
+        stopped: called often; once it returns true, the flight is ended.
     """
     keyring = make_keys(scenario.seed, vehicles) if secure else None
     columns, sink = plan_columns(scenario.model.axes, scenario.control.horizon), io.BytesIO()
@@ -126,9 +126,9 @@ def fly_batch(
 ) -> list[Record]:
     """Fly a scenario once for each of these seeds, many times faster than one by one.
 
-    Each flight is the one that `fly` makes of the scenario with that seed, to the last bit, but for
-    `figures`. Where the server takes longer than a step and so sleeps through some (which ones
-    depends on when it began), runs are flown one by one.
+    Each flight is the one that `fly` makes of the scenario with that seed, to the last bit, except
+    for `figures`. If the server's computing time exceeds a step, so that it misses ticks, runs are
+    flown one by one: which ticks it misses depends on when it began.
 
     Args:
         scenario: what to fly.
@@ -136,10 +136,10 @@ def fly_batch(
         on_second, stopped: see `fly`; the time begins anew every COMPANY_MAX runs.
 
     Raises:
-        ConfigError: a plug-in makes mistakes; a batch is to be measured, and this would be nothing.
+        ConfigError: a plug-in raised an exception.
     """
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
-    # Vehicles of one server share a budget, and keep apart on a mission.
+    # Vehicles of one server share a budget, and on a mission keep clear of each other.
     alone = not in_time or scenario.is_mission or scenario.control.shared_bytes_per_s
     company = 1 if alone else COMPANY_MAX
     groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
@@ -151,12 +151,12 @@ def fly_batch(
 
 
 class Run:
-    """The vehicles of one seed and their network, in a world with others.
+    """Vehicles of one seed and their network, in a world shared with other runs.
 
     Args:
         world: where its hosts are added.
         scenario: what to fly, with the run's seed.
-        server_rows: gives the number of rows that the server has recorded so far.
+        server_rows: returns the number of rows that the server has recorded so far.
         number: number of the run, from 0; its vehicles' numbers follow those of the runs before.
         vehicles: number of its vehicles.
         keyring: their keys, where the link is sealed.
@@ -183,7 +183,7 @@ class Run:
         )
         netem_at = world.add(f"netem {scenario.seed}", self.netem)
         self.hosts: dict[str, Endpoint] = {netem_at[0]: self.netem}
-        """Endpoints by the names of its hosts."""
+        """Endpoints by the names of their hosts."""
         self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
         simulation = scenario.simulation
         clock = Clock(
@@ -216,10 +216,12 @@ class Run:
         self.flying = vehicles
         """Number of vehicles that have not finished."""
         self._ends: tuple[int | None, int | None] = None, None
-        """Rows of the server and bytes of netem by the time the last vehicle had finished."""
+        """Rows of the server and bytes of netem when the last vehicle finished."""
 
     def hear(self, time_ns: int, host: str, event: Event) -> None:
-        """Keep an event of its own, as if it were alone, until its last vehicle has finished."""
+        """Keep an event of this run, numbered as if it flew alone, until its last vehicle has
+        finished.
+        """
         if not self.flying:
             return
         if isinstance(event, VehicleEvent):
@@ -232,10 +234,10 @@ class Run:
             self._ends = self._server_rows(), self._sinks[1].tell()
 
     def flight(self, server_rows: Rows, server_figures: Mapping[str, Any]) -> Record:
-        """Make its flight, as if it had been alone.
+        """Record of the run, numbered as if it had flown alone.
 
         Args:
-            server_rows: the server's part of the record, of all runs.
+            server_rows: the server's rows of all runs.
             server_figures: figures of the server.
         """
         rows_end, bytes_end = self._ends
@@ -259,7 +261,7 @@ class Run:
 
 
 def make_keys(seed: int, vehicles: int) -> Keyring:
-    """A key for each of the vehicles from 1 on, the same for the same seed."""
+    """Keys for the vehicles from 1 on; equal seeds give equal keys."""
     entropy = stream(seed, "keys").bytes
     lines = [
         keys.write(vehicle, 1, entropy(keys.SECRET_BYTES)) for vehicle in range(1, vehicles + 1)
@@ -331,7 +333,7 @@ def _fly(
     run_of = {host: run for run in runs for host in run.hosts} | dict.fromkeys(beside, runs[0])
     for name, endpoint in beside.items():
         world.add(name, endpoint)
-    # Added last, it is woken last: it has heard all there is to hear at that instant.
+    # Added last, the server is woken last at an instant: it has heard everything due by then.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
     plan_changes(world, scenario, {SERVER[0]: server, **runs[0].hosts, **beside}, changes)
@@ -362,7 +364,7 @@ def plan_changes(
     endpoints: Mapping[str, Endpoint],
     changes: Sequence[tuple[float, Mapping[str, Any]]],
 ) -> None:
-    """Have keys changed in flight, each at the hosts where it can be, or refused by the first."""
+    """Schedule changes of keys, each at the hosts that accept it, or to be refused by the first."""
     running = {host: Running(endpoint, scenario) for host, endpoint in endpoints.items()}
     changeable = frozenset[str]().union(*(each.changeable for each in running.values()))
 
@@ -370,7 +372,7 @@ def plan_changes(
         for i, (host, each) in enumerate(running.items()):
             here = each.changeable if i else each.changeable | (values.keys() - changeable)
             if own := {key: value for key, value in values.items() if key in here}:
-                with suppress(ConfigError):  # it is told as an event
+                with suppress(ConfigError):  # the refusal is reported as an event
                     world.act(host, partial(each.change, own))
 
     for time_s, values in changes:

@@ -1,8 +1,8 @@
-"""The pilot of a vehicle in virtual time: its usual steps are compiled, see `sim.aboard`.
+"""Pilot of a vehicle in virtual time, whose regular steps are compiled (`sim.aboard`).
 
-What is not usual is left to `client.pilot`: a first step, a landing, a fault, a pilot of its own, a
-state that has leapt or is not finite, braking that has to be bounded; and all steps of a vehicle
-with a dead time, a fence, a mission, or a sensor that is not exact.
+All other steps run in `client.pilot`: a first step, a landing, a fault, a scripted pilot takeover,
+a state that has jumped or is not finite, braking that has to be bounded; and every step of a
+vehicle with a dead time, a fence, a mission, or a sensor that is not exact.
 """
 
 import math
@@ -31,14 +31,14 @@ from skytether.sim.aboard import AXIS_ABOARD, AXIS_PLAN, AXIS_STATE, believe_ste
 
 
 class SimpleBody(NamedTuple):
-    """A vehicle of which all that happens in a usual step is in `fly_step`."""
+    """Simulated vehicle whose regular step is entirely in `fly_step`."""
 
     vehicle: SimulatedVehicle
     plant: FirstOrderPlant
 
     @classmethod
     def of(cls, vehicle: Vehicle) -> Self | None:
-        """The vehicle with its plant; None of one that is not as simple."""
+        """Simple body of a vehicle, with its plant; None for a vehicle that is not as simple."""
         if type(vehicle) is not SimulatedVehicle or type(vehicle.plant) is not FirstOrderPlant:
             return None
         simple = vehicle.is_simple and vehicle.plant.is_simple
@@ -46,12 +46,12 @@ class SimpleBody(NamedTuple):
 
 
 class _Flying:
-    """Arrays of a vehicle whose usual steps are compiled, and the objects whose place they take.
+    """Arrays of a vehicle whose regular steps are compiled, and the objects that they stand in for.
 
     Args:
-        scenario: what is flown.
+        scenario: scenario that is flown.
         navigation, compensator: those of the pilot.
-        body: what flies.
+        body: simulated vehicle.
         change_max: largest change of the input from step to step [m/s].
     """
 
@@ -75,13 +75,14 @@ class _Flying:
         self._known = slice(4 * axes, 6 * axes)
         self._inputs = slice(6 * axes, 7 * axes)
         self._parts = slice(7 * axes, 8 * axes)
-        """Where in `_told` the true state is, the one flown by, the input, and its part."""
+        """Four slices of `_told`: true state, state flown by, input, input without feedback."""
         self.row: list[float] = []
-        """What `fly_step` has told last."""
+        """Last output of `fly_step`."""
         self.step: int | None = None
-        """Step that the arrays are at; None where they are not to be used."""
+        """Step that the arrays are at; None where they must not be used."""
         self._stage = self._lead_stage = 0
-        """Stage that the plan is at, and that up to which its lead was rolled."""
+        """Stage of the plan that the vehicle is at, and stage up to which its prediction was
+        advanced."""
         self._is_ahead = False
         """Whether the arrays are newer than the objects."""
         self._is_loaded = False
@@ -89,11 +90,11 @@ class _Flying:
         self._held: object = None
         self._guides: object = None
         self._calm: object = None
-        """Horizon, spline and air that the arrays have."""
+        """Horizon, spline and air that the arrays were filled from."""
         self._set_constants(scenario, change_max)
 
     def _set_constants(self, scenario: Scenario, change_max: float) -> None:
-        """Fill in what does not change in flight."""
+        """Fill in the constants of the flight."""
         terms, to, leaps = scenario.terms(), self._constants, self._navigation.leaps
         for name, numbers in zip(Axis._fields, zip(*self._plant.model, strict=True), strict=True):
             to[f"true_{name}"] = numbers
@@ -110,16 +111,15 @@ class _Flying:
                 to[f"noise_{name}"] = [getattr(noise, name) for noise in noises]
 
     def fly(self, step: int, before: Array, speed_max: float) -> list[float] | None:
-        """Fly to the begin of a step, and choose the input from there on.
+        """Fly to the beginning of a step, and choose the input from there on.
 
         Args:
             step: the step after the one that the vehicle is at.
-            before: input that is flown until there [m/s]; shape (axes,).
-            speed_max: bound of the magnitude of what is no feedback [m/s].
+            before: input in force until then [m/s]; shape (axes,).
+            speed_max: bound of the magnitude of the input's part without feedback [m/s].
 
         Returns:
-            the input of each axis [m/s]; None where something is not as usual: then nothing was
-            done.
+            input of each axis [m/s]; None if the step is not regular: then nothing was changed.
         """
         compensator, weather = self._compensator, self._plant.weather
         if not self._is_loaded:
@@ -155,9 +155,9 @@ class _Flying:
         return row[self._inputs]
 
     def foresee(self, believed: Array, silent: Array, told: Array, apart: Array) -> None:
-        """Foresee the state of the next step from the one that the arrays are at.
+        """Predict the state at the next step from the one that the arrays are at.
 
-        See `believe_step`, whose arguments these are.
+        The arguments are those of `believe_step`.
         """
         believe_step(
             self._constants,
@@ -172,7 +172,7 @@ class _Flying:
         )
 
     def _load(self, before: Array) -> None:
-        """Have the arrays know what the objects know."""
+        """Copy the objects' state into the arrays."""
         now, self._is_loaded = self._now, True
         now["p"], now["v"] = zip(*self._plant.x, strict=True)
         now["x_p"], now["x_v"] = zip(*self._navigation.estimate, strict=True)
@@ -185,7 +185,7 @@ class _Flying:
                 now[name] = numbers
 
     def _load_plan(self) -> None:
-        """Take on the horizon or spline that is held."""
+        """Copy the horizon or spline in force into the arrays."""
         compensator, now = self._compensator, self._now
         self._held, self._guides = held, guides = compensator.held, compensator.guides
         now["lead_p"], now["lead_v"] = zip(*compensator.lead, strict=True)
@@ -228,7 +228,7 @@ class _Flying:
             ]
 
     def _load_air(self) -> None:
-        """Take on the air as it is now."""
+        """Copy the present wind into the arrays."""
         weather, to = self._plant.weather, self._constants
         self._calm, to["push"], to["windy"] = weather.calm, weather.calm.push, bool(weather.white)
         if weather.white:
@@ -237,12 +237,12 @@ class _Flying:
             to["shove_v"] = white[:, 1, 1]
 
     def leave(self) -> None:
-        """Have the objects know what the arrays know, which are to be loaded anew."""
+        """Copy the arrays' state to the objects, and mark the arrays to be filled again."""
         self.tell()
         self._is_loaded, self.step = False, None
 
     def tell(self) -> None:
-        """Have the objects know what the arrays know."""
+        """Copy the arrays' state to the objects."""
         if not self._is_ahead:
             return
         assert self.step is not None
@@ -270,12 +270,14 @@ class _Flying:
 
 
 def pairs(numbers: list[float]) -> list[tuple[float, float]]:
-    """Numbers two by two."""
+    """Numbers grouped in pairs."""
     return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 class _Belief(BelievedState):
-    """What the server must believe of a vehicle, foreseen by the arrays where they are in use."""
+    """State that the server must assume of a vehicle, predicted by the arrays while they are in
+    use.
+    """
 
     def __init__(self, terms: Terms, compensator: Compensator, flying: _Flying) -> None:
         super().__init__(terms, compensator)
@@ -284,7 +286,7 @@ class _Belief(BelievedState):
         self._is_array = False
         """Whether the state is in `_believed`."""
         self._foreseen: int | None = None
-        """Step from which the next state has been foreseen by the arrays."""
+        """Step from which the arrays have predicted the next state."""
 
     def off_m(self, states: States) -> float:
         """See `BelievedState`."""
@@ -313,7 +315,7 @@ class _Belief(BelievedState):
             super().silent()
 
     def _is_foreseen(self) -> bool:
-        """Whether the next state is known; if not, the objects know what it follows from."""
+        """Whether the next state is predicted; if not, the objects can compute it."""
         if self._flying.step is not None and self._foreseen == self._flying.step:
             return True
         self._flying.tell()
@@ -321,15 +323,15 @@ class _Belief(BelievedState):
         return False
 
     def _to_list(self) -> None:
-        """Have the state as `BelievedState` has it."""
+        """Convert the state to the form that `BelievedState` uses."""
         if self._is_array:
             self._states, self._is_array = pairs(self._believed.ravel().tolist()), False
 
 
 class CompiledPilot(Pilot):
-    """Pilot of a simulated vehicle whose usual steps are compiled.
+    """Pilot of a simulated vehicle whose regular steps are compiled.
 
-    In usual steps the arrays of `fly_step` are newer than what the objects of a `Pilot` know; the
+    After regular steps the arrays of `fly_step` are newer than the objects of a `Pilot`; the
     objects are brought up to date before any other step.
     """
 
@@ -343,7 +345,7 @@ class CompiledPilot(Pilot):
     ) -> None:
         super().__init__(scenario, number, vehicle, failsafe, recorder)
         self._flying: _Flying | None = None
-        """What flies usual steps; None where these are not compiled."""
+        """Compiled flight of regular steps; None where they are not compiled."""
         if self._fence is None and not self._terms.join and self._navigation.is_simple:
             body = SimpleBody.of(vehicle)
             if body is not None:
@@ -352,7 +354,7 @@ class CompiledPilot(Pilot):
                 )
                 self._reporter.belief = _Belief(self._terms, self.compensator, self._flying)
         self._due: int | None = None
-        """Step up to whose begin the vehicle is still to be flown and measured."""
+        """Step up to whose beginning the vehicle is still to be moved and measured."""
 
     @property
     def disturbance(self) -> Sequence[float]:
@@ -369,7 +371,7 @@ class CompiledPilot(Pilot):
         return flying.row[: 7 * self._terms.axes]
 
     def _navigate(self, step: int) -> None:
-        """Take what was measured up to the begin of a step, at once or with its input."""
+        """Measure up to the beginning of a step: now, or together with the choice of its input."""
         if self._due is not None:
             self._catch_up()
         if step and self._flying is not None:
@@ -378,7 +380,7 @@ class CompiledPilot(Pilot):
             super()._navigate(step)
 
     def _catch_up(self) -> None:
-        """Leave it to the objects to fly on, from where the arrays are."""
+        """Bring the objects up to date, and let them fly on."""
         if self._flying is not None:
             self._flying.leave()
         if self._due is not None:
@@ -399,6 +401,6 @@ class CompiledPilot(Pilot):
         return super()._choose(now_ns)
 
     def _is_usual(self) -> bool:
-        """Whether the vehicle flies what is chosen, and its state is known."""
+        """Whether the vehicle flies the plan's input, and its state is known."""
         mode = self._failsafe.mode
         return mode is not Mode.LAND and mode not in STOPPED and self._navigation.is_known

@@ -30,10 +30,10 @@ from skytether.station.joined import joined, station_columns
 from skytether.station.laws import Law
 
 READY_S = 1.0
-"""Time from the autopilot's start until it may be armed [s]: nobody needs to wait for its filters
-here."""
+"""Time from the autopilot's start until it may be armed [s]; short, because a simulation need not
+wait for filters to settle."""
 AROUND_S = 180.0
-"""Longest time that take-off and landing take [s]."""
+"""Longest time of take-off and landing together [s]."""
 
 
 def fly(
@@ -49,8 +49,8 @@ def fly(
 
     Args:
         scenario: what to fly.
-        law: how set-points are chosen.
-        flavour: which autopilot.
+        law: law that chooses set-points.
+        flavour: flavour of the autopilot.
         changes, on_second, stopped: see `sim.flight.fly`.
     """
     events: list[FlightEvent] = []

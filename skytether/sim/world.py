@@ -1,14 +1,13 @@
 """Virtual time: any number of endpoints on one clock that jumps from instant to instant.
 
-Between endpoints a datagram takes no time (delays are netem's business, and netem is an endpoint
-here as well). Every host has a clock of its own, with offset and drift, and may take time to
-compute when it is woken: what it then sends leaves, and it can be woken again, only once it is
-done. It hears all along, so that its computing for one peer does not delay another that only talks
-to it. A host can be stopped and begin another life, be frozen for a while, and have its clock set:
-what happens to hosts is done by actions that the world is given with their time (`World.at`). Time
-is integer nanoseconds, and whatever happens at one instant happens in a fixed order:
-the same inputs give the same outcome everywhere, and hosts that never meet do not change each
-other's.
+Between endpoints a datagram takes no time: delays come from netem, which is an endpoint here as
+well. Every host has its own clock, with offset and drift. A host may take time to compute when it
+is woken: only at the end of that time do its datagrams leave, and only then can it be woken again.
+It receives datagrams meanwhile, so computing for one peer does not delay what another sends. A host
+can be stopped and restarted, frozen for a while, and have its clock set, by actions scheduled with
+their time (`World.at`). Time is integer nanoseconds, and events of one instant happen in a fixed
+order: equal inputs give equal outcomes on every machine, and hosts that exchange no datagrams do
+not affect each other.
 """
 
 from collections import deque
@@ -22,37 +21,37 @@ from skytether.shared.core.events import Event
 
 BILLION = 1_000_000_000
 FROZEN_MAX = 6_500
-"""Most datagrams that wait for a frozen host: as many of 600 B as the buffer of a socket holds."""
+"""Most datagrams queued for a frozen host: the number of 600 B that fit a socket's buffer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A host's monotonic clock, as a function of the world's time."""
+    """Host's monotonic clock, as a function of the world's time."""
 
     offset_ns: int = 0
-    """Time that it shows at time 0 of the world [ns]."""
+    """Time on the clock at time 0 of the world [ns]."""
     drift_ppb: int = 0
-    """Rate by which it runs faster than the world's [10⁻⁹]."""
+    """Rate by which the clock runs faster than the world's [10⁻⁹]."""
 
     def local(self, time_ns: int) -> int:
-        """Time that it shows at a time of the world."""
+        """Time on the clock at a time of the world."""
         shown_ns = self.offset_ns + time_ns
         return shown_ns + time_ns * self.drift_ppb // BILLION if self.drift_ppb else shown_ns
 
     def world(self, local_ns: int) -> int:
-        """First time of the world at which it shows at least this time."""
+        """First time of the world at which the clock shows at least this time."""
         passed_ns = local_ns - self.offset_ns
         if not self.drift_ppb:
             return passed_ns
         return passed_ns - passed_ns * self.drift_ppb // (BILLION + self.drift_ppb)
 
     def changed(self, time_ns: int, *, step_ns: int = 0, drift_ppb: int | None = None) -> "Clock":
-        """Clock that goes on from this one.
+        """Clock that continues this one, with a step or another rate.
 
         Args:
-            time_ns: time of the world from which it is read [ns].
-            step_ns: how much later it shows then than this one [ns].
-            drift_ppb: its own rate; None keeps this one's.
+            time_ns: time of the world at which the change happens [ns].
+            step_ns: jump of the clock then [ns].
+            drift_ppb: new rate; None keeps the present one.
         """
         drift_ppb = self.drift_ppb if drift_ppb is None else drift_ppb
         offset_ns = self.local(time_ns) + step_ns - Clock(0, drift_ppb).local(time_ns)
@@ -60,11 +59,11 @@ class Clock:
 
 
 class _Still(Endpoint):
-    """What stands in for the endpoint of a host that is down or frozen: it does nothing.
+    """Stand-in for the endpoint of a host that is down or frozen: it does nothing.
 
     Args:
-        inner: the endpoint.
-        room: most datagrams that wait for it; none do for a host that is down.
+        inner: the real endpoint.
+        room: most datagrams queued for it; 0 for a host that is down.
         armed_ns: time of the world at which its timer ends, or None.
     """
 
@@ -74,55 +73,55 @@ class _Still(Endpoint):
         self.inner = inner
         self.room = room
         self.waiting: deque[Datagram] = deque()
-        """Datagrams that wait, in the order in which they came; there is no room for later ones."""
+        """Queued datagrams, in order of arrival; later ones are dropped when the queue is full."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
-        """Keep the datagram where there is room."""
+        """Queue the datagram if there is room."""
         if len(self.waiting) < self.room:
             self.waiting.append(datagram)
 
     def wake(self, *, now_ns: int) -> None:
-        """Nothing happens: it has never asked for it."""
+        """Do nothing: the stand-in never asks to be woken."""
 
     def next_wake_ns(self) -> None:
-        """None: it is never woken."""
+        """None: the stand-in is never woken."""
 
 
 @dataclass(slots=True)
 class Host:
-    """One endpoint in the world; its socket s has the address (name, s)."""
+    """Endpoint in the world; its socket s has the address (name, s)."""
 
     name: str
     endpoint: Endpoint
     clock: Clock
     turn: int
-    """Place in the order in which hosts are woken at one instant, from 1: that of being added."""
+    """Rank among hosts that are woken at one instant, from 1: the order of being added."""
     compute_ns: int
-    """Time that it works whenever it is woken [ns]."""
+    """Computing time of each wake [ns]."""
     busy_until_ns: int
-    """Time of the world until which it works, and cannot be woken."""
+    """Time of the world until which the host computes, and cannot be woken."""
     on_finished: Callable[[], None] | None
     """Callback for the end of the endpoint, until it has been called."""
     armed_ns: int | None = None
-    """Time of the world at which it is to be woken, or None."""
+    """Time of the world at which the host is to be woken, or None."""
     due_ns: int | None = None
-    """Time of its clock that `armed_ns` was found from; None where it is to be found anew."""
+    """Time on the host's clock that `armed_ns` was computed from; None to compute it again."""
 
 
 ACTION, ARRIVAL = -1, 0
-"""Turns of an action and of a datagram: what happens to hosts comes first, and what has arrived is
-heard before anybody acts on the time."""
+"""Ranks of an action and of a datagram within an instant: actions come first, and arrivals are
+received before any host is woken."""
 
 
 class Act(Protocol):
-    """Something that is done to an endpoint, by its own clock."""
+    """Action on an endpoint, at a time of its own clock."""
 
     def __call__(self, *, now_ns: int) -> object:
-        """Do it."""
+        """Perform the action."""
 
 
 class World:
-    """Hosts, and what happens to them.
+    """Hosts, and the agenda of events that happen to them.
 
     Args:
         on_event: called with the time of the world, the host's name and the event, for each event
@@ -138,10 +137,10 @@ class World:
             tuple[int, int, int, Host, Datagram | None]
             | tuple[int, int, int, None, Callable[[], None]]
         ] = []
-        """Heap of what will happen: time, turn, order of entry, host, and the datagram that arrives
-        there, or None for a wake; of an action no host and the action."""
+        """Heap of future events: time, rank, order of entry, host, and the arriving datagram, or
+        None for a wake; an action has no host but a function."""
         self._scheduled = 0
-        """Number of entries so far."""
+        """Number of entries made so far."""
         self._arriving: deque[tuple[Host, Datagram]] = deque()
         """Datagrams that arrive at the present time, in the order in which they were sent."""
 
@@ -159,10 +158,10 @@ class World:
 
         Args:
             name: name of the host, unlike any other's.
-            endpoint: what runs on it.
+            endpoint: endpoint that runs on it.
             clock: its clock.
             start_ns: time of the world before which it is not woken.
-            compute_ns: time that it works whenever it is woken [ns].
+            compute_ns: computing time of each wake [ns].
             on_finished: called once, when the endpoint has just finished.
 
         Returns:
@@ -176,13 +175,13 @@ class World:
         return (name, 0)
 
     def at(self, time_ns: int, action: Callable[[], None]) -> None:
-        """Have an action done at a time of the world that has not passed."""
+        """Schedule an action for a time of the world that has not passed."""
         assert time_ns >= self.now_ns
         self._scheduled += 1
         heappush(self._agenda, (time_ns, ACTION, self._scheduled, None, action))
 
     def stop(self, name: str) -> None:
-        """Take a host down: it hears nothing and sends nothing, nor what it has just computed."""
+        """Take a host down: it receives nothing, and datagrams it was about to send are lost."""
         host = self._hosts[name]
         host.endpoint, host.armed_ns = _Still(host.endpoint, 0), None
         self._agenda[:] = [
@@ -194,11 +193,12 @@ class World:
         heapify(self._agenda)
 
     def restart(self, name: str, endpoint: Endpoint) -> None:
-        """Let a host begin another life, at its address and with its clock, from now on.
+        """Start a new endpoint on a host, at its address and with its clock, from now on.
 
         Args:
-            name: name of the host, which may be down, frozen, or at work until now.
-            endpoint: what runs on it from now on; its end is told unless one was told before.
+            name: name of the host, which may be up, down or frozen.
+            endpoint: endpoint that runs on it from now on; its end is reported unless one was
+                before.
         """
         self.stop(name)
         host = self._hosts[name]
@@ -206,9 +206,9 @@ class World:
         self._arm(host)
 
     def freeze(self, name: str) -> None:
-        """Stop a host's time: datagrams wait for it, as many as there is room for.
+        """Freeze a host: datagrams are queued for it, up to a bound.
 
-        One that is down or frozen already stays as it is.
+        A host that is down or frozen already stays as it is.
         """
         host = self._hosts[name]
         if not isinstance(host.endpoint, _Still):
@@ -216,9 +216,10 @@ class World:
             host.armed_ns = None
 
     def thaw(self, name: str) -> None:
-        """Let a frozen host go on: it hears what has waited, and then is woken, if it wants to.
+        """Let a frozen host go on: it receives the queued datagrams, and is then woken if it wants
+        to be.
 
-        One that is not frozen stays as it is.
+        A host that is not frozen stays as it is.
         """
         host = self._hosts[name]
         still = host.endpoint
@@ -233,32 +234,32 @@ class World:
     def set_clock(self, name: str, *, step_ns: int = 0, drift_ppb: int | None = None) -> None:
         """Step a host's clock now, or change its rate from now on.
 
-        The host is not told. What it waits for is on a timer, which counts on: it comes when it
-        would have come.
+        The host is not informed. Its pending wake is on a timer, which is independent of the clock,
+        and comes when it would have come.
 
         Args:
             name: name of the host.
-            step_ns: time by which the clock goes ahead, or back [ns].
-            drift_ppb: rate by which it runs faster than the world's [10⁻⁹]; None leaves it.
+            step_ns: jump of the clock, forward or back [ns].
+            drift_ppb: rate by which the clock runs faster than the world's [10⁻⁹]; None leaves it.
         """
         host = self._hosts[name]
         host.clock = host.clock.changed(self.now_ns, step_ns=step_ns, drift_ppb=drift_ppb)
         host.due_ns = None
 
     def set_compute(self, name: str, compute_ns: int) -> None:
-        """Change the time that a host works whenever it is woken [ns]."""
+        """Change the computing time of each wake of a host [ns]."""
         self._hosts[name].compute_ns = compute_ns
 
     def rearm(self, name: str) -> None:
-        """Ask a host when it wants to be woken, after an action has given it something to do."""
+        """Ask a host for its next wake, after an action has given it something to do."""
         self._arm(self._hosts[name])
 
     def act(self, name: str, act: Act) -> None:
-        """Do something to a host's endpoint now, and let it say what it has to say of that.
+        """Act on a host's endpoint now, and let its datagrams and events out.
 
         Args:
             name: name of the host.
-            act: called with the time that the host's clock shows.
+            act: called with the time on the host's clock.
         """
         host = self._hosts[name]
         try:
@@ -267,10 +268,10 @@ class World:
             self._after(host, self.now_ns)
 
     def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
-        """Let time pass until a condition holds, or until a time of the world."""
+        """Run the world until a condition holds, or until a time."""
         agenda, arriving, receive = self._agenda, self._arriving, self._receive
         while (agenda or arriving) and not until():
-            # What was sent at an earlier time waits on the agenda, and arrives first.
+            # Datagrams sent at an earlier time are on the agenda, and arrive first.
             if arriving and not (agenda and agenda[0][:2] <= (self.now_ns, ARRIVAL)):
                 receive(*arriving.popleft())
                 continue
@@ -295,7 +296,7 @@ class World:
             host.armed_ns = None
             return
         if due_ns == host.due_ns and host.armed_ns is not None:
-            return  # it is armed for that already
+            return  # armed for this time already
         host.due_ns = due_ns
         time_ns = host.clock.world(due_ns)
         time_ns = max(time_ns, host.busy_until_ns)
@@ -307,7 +308,7 @@ class World:
     def _wake(self, host: Host) -> None:
         now_ns = self.now_ns
         if host.armed_ns != now_ns:
-            return  # it has changed its mind since
+            return  # the endpoint has changed its next wake since
         host.armed_ns = None
         host.endpoint.wake(now_ns=host.clock.local(now_ns))
         host.busy_until_ns = now_ns + host.compute_ns
@@ -318,7 +319,7 @@ class World:
         self._after(host, self.now_ns)
 
     def _after(self, host: Host, leaves_ns: int) -> None:
-        """Let its datagrams leave, hand on its events, and arm its next wake."""
+        """Let a host's datagrams leave, report its events, and arm its next wake."""
         endpoint = host.endpoint
         for payload, (name, socket), source in endpoint.outbox():
             receiver = self._hosts.get(name)

@@ -1,5 +1,5 @@
-"""A ground station that flies a vehicle as people do without Skytether: set-points, straight.
+"""Ground station that flies a vehicle as is usual without Skytether: by set-points alone.
 
-It sends an autopilot MAVLink set-points at every step, through whatever network lies between. It
-is here to be compared with: nothing else of Skytether flies by it.
+The station sends an autopilot MAVLink set-points at every step, through whatever network lies
+between. It is here only as a baseline for comparison.
 """

@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # before the imports below, which take a while
+if __name__ == "__main__":  # first, before the imports below, which take a while
     sys.exit(run("skytether.station.__main__:fly", "station"))
 
 from collections.abc import Sequence
@@ -30,15 +30,15 @@ class StationOptions(LawOptions):
     scenario: ScenarioName = "autopilot"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     bind: str = "127.0.0.1:14550"
-    """HOST:PORT to hear MAVLink at; the first autopilot that is heard there is flown."""
+    """HOST:PORT to receive MAVLink at; the first autopilot that is heard there is flown."""
     insecure: bool = False
     """Listen even where other machines can reach it: MAVLink has no keys."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Form of printed events: sentences, or lines of JSON for a program."""
     record: Path | None = None
-    """File for the station's part of the record: what was heard and sent at each step."""
+    """File for the station's part of the record: what it heard and sent at each step."""
     json: Path | None = None
-    """File for what was counted, and the CPU time it took."""
+    """File for counters and the CPU time used."""
     plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
@@ -46,8 +46,8 @@ class StationOptions(LawOptions):
 def fly(argv: Sequence[str]) -> None:
     """Fly an autopilot by set-points sent straight to it, from take-off to landing.
 
-    This is what people do without Skytether, and is here to be compared with. The exit code is 1
-    where the vehicle cannot be flown.
+    This is how autopilots are usually flown, and serves for comparison. The exit code is 1 if the
+    vehicle cannot be flown.
     """
     options = command.parse(StationOptions(), argv, "skytether station", fly.__doc__)
     scenario = options.config

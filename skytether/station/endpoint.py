@@ -1,10 +1,11 @@
-"""The ground station as an endpoint: from the first heartbeat of an autopilot to its landing.
+"""Ground station as an endpoint: from the first heartbeat of an autopilot to its landing.
 
     heard → streams asked for, clock known → armed, climbed (`client.mavlink.launch`)
           → a set-point at every step of the flight → landed
 
-All of it goes through a bad network: what is asked for is asked again until it is done. While a
-pilot, or the autopilot by itself, flies the vehicle, nothing is sent: who took it keeps it.
+All messages cross a bad network, so every request is repeated until it is confirmed. While a pilot,
+or the autopilot itself, flies the vehicle, nothing is sent, and the station does not take the
+vehicle back.
 """
 
 from collections import Counter
@@ -33,44 +34,44 @@ from skytether.shared.telemetry.record import Recorder
 from skytether.station.laws import Heard, Law, Setpoint, setpoint
 
 SYSTEM, COMPONENT = 255, int(dialect.MAV_COMP_ID_MISSIONPLANNER)
-"""Numbers of a ground station's system and component: ArduPilot listens to this system."""
+"""System and component id of the ground station; ArduPilot obeys this system id."""
 VEHICLE = 1
-"""Number of the vehicle in what is told."""
+"""Number of the vehicle in records and events."""
 TICK_NS = 100 * MILLISECOND_NS
-"""Time between two looks at what is due beside set-points [ns]."""
+"""Time between two checks for requests that are due besides set-points [ns]."""
 HEARTBEAT_NS = SECOND_NS
-"""Time between two heartbeats of ours [ns]."""
+"""Time between two heartbeats of the station [ns]."""
 CLOCK_BEGIN_NS, CLOCK_NS = 200 * MILLISECOND_NS, 5 * SECOND_NS
-"""Time between two questions for the autopilot's clock [ns]: before the flight, and in it."""
+"""Time between two requests for the autopilot's clock [ns]: before the flight, and during it."""
 STREAM_NS = 500 * MILLISECOND_NS
-"""Time between two streams that are asked for [ns], one after the other, until the flight begins:
-the network loses some of these. A stream begins anew where it is asked for again, so that each must
-have its turn less often than its messages."""
+"""Time between two stream requests [ns], one stream after the other, until the flight begins,
+because the network loses some requests. A stream starts again when it is requested again, so each
+must be requested less often than its messages come."""
 AGE_MAX_NS = 10 * SECOND_NS
-"""Largest age of a position, and longest round trip, that is of use [ns]."""
+"""Largest usable age of a position, and longest usable round trip [ns]."""
 CLOSES = 3
-"""Times that a vehicle in the air is told to land when the station ends."""
+"""Number of land commands sent to a flying vehicle when the station ends."""
 FRAME = int(dialect.MAV_FRAME_LOCAL_NED)
 VELOCITY_ALONE, POSITION_AND_VELOCITY = 0b110111000111, 0b110111000000
-"""Type masks of set-points: neither acceleration nor yaw."""
+"""Type masks of set-points, with neither acceleration nor yaw."""
 SET_INTERVAL = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
 LOCAL_POSITION = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
 SLOW = (
     int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE),
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION),
 )
-"""Messages that the take-off needs, once a second."""
+"""Messages that the take-off needs, requested once a second."""
 UNASKED = (int(dialect.MAVLINK_MSG_ID_ATTITUDE), int(dialect.MAVLINK_MSG_ID_SYS_STATUS))
-"""Messages that PX4 sends unasked, and that nobody here needs."""
+"""Messages that PX4 sends unrequested, and that the station does not use."""
 
 
 class Station(Endpoint):
-    """A ground station that flies one vehicle.
+    """Ground station that flies one vehicle.
 
     Args:
         scenario: what is flown.
-        law: how set-points are chosen.
-        recorder: takes one row a step, see `station.joined`.
+        law: law that chooses set-points.
+        recorder: takes one row per step, see `station.joined`.
 
     Raises:
         ConfigError: the flight begins on the ground.
@@ -92,30 +93,30 @@ class Station(Endpoint):
         self._texts = Texts()
         self._peer: Address | None = None
         self._target = (0, 0)
-        """Numbers of the autopilot's system and component."""
+        """System and component id of the autopilot."""
         self._flavour: Flavour | None = None
         self._launch: Launch | None = None
         self._failure: NotTakenOff | None = None
         self._counts: Counter[str] = Counter()
         self._since_ns: int | None = None
-        """Time since which the autopilot is waited for: to be heard, then to tell its time."""
+        """Start of the wait for the autopilot: first for a heartbeat, then for its time."""
         self._tick_ns = self._beat_ns = self._clock_ns = self._stream_ns = 0
-        """Times of the next tick, heartbeat, question for the clock and for a stream."""
+        """Times of the next tick, heartbeat, clock request and stream request."""
         self._asked = 0
-        """Number of streams asked for so far."""
+        """Number of streams requested so far."""
         self._epoch_ns: int | None = None
         """Time of step 0."""
         self._step_ns = 0
         """Time of the next set-point."""
         self._step = 0
-        """Step that comes next."""
+        """Next step."""
         self._missed = 0
-        """Steps slept through."""
+        """Number of steps missed by waking too late."""
         self._newest: Measurement | None = None
 
     @property
     def failure(self) -> NotTakenOff | None:
-        """Event after which there is no flight."""
+        """Event after which the vehicle could not be flown."""
         return self._failure or (self._launch.failure if self._launch else None)
 
     @property
@@ -145,7 +146,7 @@ class Station(Endpoint):
                 self._hear(message, self._launch, now_ns)
 
     def _meet(self, message: Message, sender: tuple[int, int], peer: Address) -> None:
-        """Take who sends a heartbeat for our autopilot, if it is one."""
+        """Accept the sender of an autopilot's heartbeat as the vehicle."""
         if sender[1] != dialect.MAV_COMP_ID_AUTOPILOT1:
             return
         self._target, self._peer = sender, peer
@@ -197,8 +198,9 @@ class Station(Endpoint):
 
     @property
     def _streams(self) -> bool:
-        """Whether set-points are due: those of the flight, or zeros before a mode that needs a
-        stream of them.
+        """Whether set-points are due.
+
+        They are due in flight, and as zeros before a mode that requires a stream of them.
         """
         flies = self._epoch_ns is not None and not self._is_over
         return flies or (self._launch is not None and self._launch.streams_zeros)
@@ -217,7 +219,7 @@ class Station(Endpoint):
                 self._fly(self._epoch_ns, now_ns)
 
     def _tick(self, now_ns: int) -> None:
-        """Ask for what is due beside set-points."""
+        """Send the requests that are due besides set-points."""
         launch = self._launch
         self._wait(now_ns)
         if launch is None or self._failure:
@@ -237,7 +239,7 @@ class Station(Endpoint):
             self._say(message)
 
     def _wait(self, now_ns: int) -> None:
-        """Wait for the autopilot, but no longer than it may take."""
+        """Wait for the autopilot, up to a time limit."""
         self._since_ns = now_ns if self._since_ns is None else self._since_ns
         if self._clock.is_known or self._failure or now_ns - self._since_ns <= self._patience_ns:
             return
@@ -248,7 +250,7 @@ class Station(Endpoint):
             self._fail(f"no time told {waited}", "TIMESYNC is not answered")
 
     def _begin(self, launch: Launch, now_ns: int) -> None:
-        """Ask for the next stream, go on with the take-off, and begin to fly after that."""
+        """Request the next stream, go on with the take-off, and begin to fly after that."""
         if now_ns >= self._stream_ns:
             self._stream_ns = now_ns + STREAM_NS
             self._ask_stream()
@@ -294,7 +296,7 @@ class Station(Endpoint):
 
     @property
     def _obeys(self) -> bool:
-        """Whether the vehicle is armed and in the mode that follows set-points, as last heard."""
+        """Whether the vehicle was armed and in the mode that follows set-points when last heard."""
         assert self._flavour is not None
         return self._condition.armed and self._condition.mode == self._flavour.guided
 
@@ -329,7 +331,7 @@ class Station(Endpoint):
         self.send(self._codec.encode(message), self._peer)
 
     def close(self, *, now_ns: int) -> None:
-        """See `Endpoint`; a vehicle in the air that is ours lands by itself."""
+        """See `Endpoint`; a vehicle that the station flies is told to land."""
         if self._launch is not None:
             for message in self._launch.close(now_ns=now_ns) * CLOSES:
                 self._say(message)

@@ -1,11 +1,11 @@
-"""The record of a flight by a ground station, joined from the parts of its three processes.
+"""Record of a ground station's flight, joined from the parts of its three processes.
 
     station    what was heard and sent at each step
     autopilot  where the vehicle truly was, at each of its ticks (`record.TRUTH_COLUMNS`)
     netem      the fate of every packet
 
-The result is a record as of any flight: its rows of the client have the vehicle's true state, and
-those of the server say at which steps the station has sent.
+The result has the form of any flight's record: its client rows have the vehicle's true state, and
+its server rows the steps at which the station has sent.
 """
 
 from collections.abc import Sequence
@@ -27,17 +27,18 @@ from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 
 def station_columns(axes: int) -> np.dtype[np.void]:
-    """Columns of the ground station's part: one row for each step."""
+    """Columns of the ground station's part: one row per step."""
     return np.dtype(
         [
             ("time_ns", "<i8"),  # [the station's clock]
             ("step", "<i8"),
             ("input", "<f8", (axes,)),  # velocity of the set-point [m/s]
-            ("measured", "<f8", (axes,)),  # newest position heard [m], NaN for none
-            ("age_ns", "<i8"),  # since that was measured, -1 for none
-            ("obeyed", "?"),  # whether the autopilot was in our hands, so that it was sent
-            ("late", "<i8"),  # positions that came after newer ones, so far
-            ("missed", "<i8"),  # steps slept through, so far
+            ("measured", "<f8", (axes,)),  # newest position received [m]; NaN for none
+            ("age_ns", "<i8"),  # its age; -1 for none
+            # whether the station was in control of the autopilot, and so sent a set-point
+            ("obeyed", "?"),
+            ("late", "<i8"),  # number of positions so far that came after newer ones
+            ("missed", "<i8"),  # number of steps so far that were missed by waking too late
         ]
     )
 
@@ -54,12 +55,12 @@ def joined(
     """Record of a flight; packets are counted from its first step to its last.
 
     Args:
-        scenario: what was flown.
+        scenario: scenario that was flown.
         station: rows of `station_columns`.
         truth: rows of `record.TRUTH_COLUMNS`, on the same clock.
         netem: rows of netem's part, on the same clock.
-        failure: event after which there was no flight.
-        events: what was told.
+        failure: event after which the vehicle could not be flown.
+        events: events of the flight.
     """
     axes = scenario.model.axes
     client = np.zeros(len(station), client_columns(axes))
@@ -86,7 +87,7 @@ def joined(
 
 
 def state_at(truth: Rows, times_ns: np.ndarray) -> np.ndarray:
-    """True position [m] and velocity [m/s] at some times, NaN where there is none; (n, 3, 2)."""
+    """True position [m] and velocity [m/s] at given times, NaN where unknown; shape (n, 3, 2)."""
     if not len(truth):
         return np.full((len(times_ns), 3, 2), np.nan)
     flat = truth["state"].reshape(len(truth), -1)
@@ -98,7 +99,7 @@ def state_at(truth: Rows, times_ns: np.ndarray) -> np.ndarray:
 
 
 def within(netem: Rows, times_ns: np.ndarray, dt_ns: int) -> Rows:
-    """Rows of the packets that entered the network in steps that began at these times."""
+    """Rows of packets that entered the network in steps that began at these times."""
     if not len(times_ns):
         return netem[:0]
     entered = netem["arrived_ns"]
@@ -106,5 +107,5 @@ def within(netem: Rows, times_ns: np.ndarray, dt_ns: int) -> Rows:
 
 
 def summary_of(scenario: Scenario, name: str, flown: Record) -> Summary:
-    """Summary of a flight by a ground station, which plans nothing."""
+    """Summary of a ground station's flight, which has no plans."""
     return summarise(scenario, name, flown.client, None, flown.netem)

@@ -1,13 +1,12 @@
-"""Laws by which people fly an autopilot from afar: the set-point of each step.
+"""Laws to fly an autopilot over a network by set-points alone: the set-point of each step.
 
-With the desired trajectory r, the newest position y that was heard, and the time t_m at which it
-was measured:
+With the desired trajectory r, the newest received position y, and its time of measurement t_m:
 
     velocity   u(t) = r'(t) + k (r(t) - y)
     targets    p(t) = r(t + T), u(t) = r'(t + T): the autopilot regulates
     led        u(t) = r'(t + T) + k (r(t_m) - y(t_m))
 
-T is the time by which set-points lead, as the sum of delay, dead time and lag is estimated by hand.
+T is the time by which set-points lead: delay, dead time and lag together, estimated by hand.
 """
 
 from dataclasses import dataclass
@@ -26,27 +25,27 @@ LEAD_MAX_S, GAIN_MAX = 10.0, 10.0
 
 @dataclass(frozen=True)
 class LawOptions:
-    """Options of a command by which a law is chosen."""
+    """Options that choose a law."""
 
     law: LawName = "led"
-    """How set-points are chosen. velocity: the desired velocity and a share of the distance from
-    the newest position; targets: desired position and velocity, and the autopilot regulates; led:
-    the desired velocity some time ahead, and a share of the distance when it was measured."""
+    """Law that chooses set-points. velocity: desired velocity plus a share of the distance from the
+    newest position; targets: desired position and velocity, which the autopilot regulates; led:
+    desired velocity some time ahead, plus a share of the distance at the time of measurement."""
     lead: float | None = None
-    """Time by which set-points lead [s], of targets and led: 0 and 1.1 unless given."""
+    """Time by which set-points lead [s], for targets and led; 0 and 1.1 unless given."""
     gain: float | None = None
-    """Velocity over distance [1/s], of velocity and led: 0.3 and 0.5 unless given."""
+    """Gain from distance to velocity [1/s], for velocity and led; 0.3 and 0.5 unless given."""
 
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """Law with its numbers; one that it has no use for is None."""
+    """Law with its numbers; None for a number that it does not use."""
 
     name: LawName
     lead_s: float | None
     """Time by which set-points lead, T [s]."""
     gain: float | None
-    """Velocity over the distance from the desired trajectory, k [1/s]."""
+    """Gain from the distance to the desired trajectory to velocity, k [1/s]."""
 
 
 LAWS: dict[LawName, Law] = {
@@ -59,10 +58,10 @@ LAWS: dict[LawName, Law] = {
 
 
 def make(name: LawName, lead_s: float | None = None, gain: float | None = None) -> Law:
-    """Law with numbers of its own.
+    """Law with the given numbers, or its defaults.
 
     Raises:
-        ConfigError: a number is out of bounds, or of no use to it.
+        ConfigError: a number is out of bounds, or the law does not use it.
     """
     law = LAWS[name]
     return Law(
@@ -85,14 +84,14 @@ def _number(
 
 
 def flags(law: Law) -> list[str]:
-    """Arguments that choose a law on the command line of `skytether station`."""
+    """Arguments of `skytether station` that choose a law."""
     numbers = {"--lead": law.lead_s, "--gain": law.gain}
     given = [f"{flag}={number}" for flag, number in numbers.items() if number is not None]
     return [f"--law={law.name}", *given]
 
 
 class Heard(NamedTuple):
-    """Position that was heard."""
+    """Position received from the vehicle."""
 
     time_s: float
     """Time of flight at which it was measured [s]."""
@@ -101,19 +100,19 @@ class Heard(NamedTuple):
 
 
 class Setpoint(NamedTuple):
-    """What the autopilot is told."""
+    """Set-point sent to the autopilot."""
 
     velocity: Array
     """Velocity [m/s]; shape (axes,)."""
     position: Array | None
-    """Position [m], shape (axes,); None: the velocity alone."""
+    """Position [m], shape (axes,); None: only the velocity is set."""
 
 
 def setpoint(law: Law, reference: Reference, time_s: float, heard: Heard | None) -> Setpoint:
     """Set-point of a step.
 
     Args:
-        law: how it is chosen.
+        law: law that chooses it.
         reference: desired trajectory r.
         time_s: time of flight t [s].
         heard: newest position; None before the first.

@@ -1,5 +1,5 @@
-"""What people look at: the live page, recordings, and what both are made of.
+"""Live page, recordings, and the data and pictures that both are made of.
 
-Everything here is made of frames (`shared.telemetry.feed`), whether they come from a feed, a
-recording or a flight in virtual time.
+Everything here is made of frames (`shared.telemetry.feed`), from a feed, a recording or a flight in
+virtual time.
 """

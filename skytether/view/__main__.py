@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # before the imports below, which take a while
+if __name__ == "__main__":  # first, before the imports below, which take a while
     sys.exit(run("skytether.view.__main__:show", "page"))
 
 import os
@@ -24,7 +24,7 @@ from skytether.view.browser.access import HOST_PORT
 from skytether.view.browser.serve import followed, until_told
 
 NICE = 5
-"""How far the page stands back behind the processes that fly."""
+"""Niceness of the page's process, so that it yields to the processes that fly."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +34,19 @@ class PageOptions:
     folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
     """Folders of flights, each with the feeds and control sockets of its processes."""
     page: str = HOST_PORT
-    """HOST:PORT to serve the page on; where that is taken, the next free port. Where other machines
-    can reach it, they may only look, unless they know the token that is printed."""
+    """HOST:PORT to serve the page on; if the port is taken, the next free one. Visitors from other
+    machines may only look, unless they know the printed token."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Form of printed events: sentences, or lines of JSON for a program."""
     plugin: command.Plugins = ()
 
 
 def show(argv: Sequence[str]) -> None:
     """Show flights in a browser while they fly, until SIGINT or SIGTERM.
 
-    A flight's folder is one that `fly --control` was given, or in which server, netem and client
-    have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on. Flights may
-    begin later, or anew.
+    A flight's folder is one that `fly --control` was given, or one in which server, netem and
+    client have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on.
+    Flights may begin, or begin again, later.
     """
     options = read(PageOptions(tyro.MISSING), argv, "skytether page", show.__doc__)
     if not options.folders:

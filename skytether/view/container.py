@@ -1,9 +1,9 @@
-"""MCAP files as they are read: what a file says of a size is checked before memory is taken for it.
+"""Safe reading of MCAP files: sizes that a file claims are checked before memory is allocated.
 
-A file of a few kilobytes may say that it holds gigabytes. The library `mcap` believes that, so it
-is handed what cannot mislead it: a stream that ends where the file does (`Bounded`), chunks whose
-size is known before they are decompressed, and never more records than the file has room to
-index (`Allowance`).
+A file of a few kilobytes may claim to hold gigabytes, and the library `mcap` believes that. So the
+library is only given safe input: a stream that ends where the file does (`Bounded`), chunks whose
+size is known before they are decompressed, and never more records than the file has room to index
+(`Allowance`).
 """
 
 import io
@@ -41,25 +41,25 @@ from skytether.shared.telemetry.record import RECORDING
 MAGIC = b"\x89MCAP0\r\n"
 """Bytes that an MCAP file begins and ends with."""
 HEAD = struct.Struct("<BQ")
-"""Head of a record: what it is, and its size without the head [B]."""
+"""Header of a record: its type, and its size without the header [B]."""
 FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
-"""Size of the end of a file [B]: a record that says where the index begins."""
+"""Size of the end of a file [B]: the record with the position of the index."""
 
 CHUNK_BYTES_MAX = 8 * 1024 * 1024
-"""Largest size of a chunk, decompressed [B]; ours end at 256 KiB and a message."""
+"""Largest size of a decompressed chunk [B]; this program ends chunks at 256 KiB and a message."""
 MESSAGE_BYTES_MAX = 4 * 1024 * 1024
-"""Largest size of a message [B]: the scenario of a process that begins is the largest of ours."""
+"""Largest size of a message [B]; the largest written by this program has a process's scenario."""
 ROOM_BYTES = 16 * 1024 * 1024
-"""Size that the chunks of any file may have together, decompressed [B]."""
+"""Total decompressed size of chunks that any file may have, however small it is [B]."""
 RATIO_MAX = 50
-"""Largest ratio by which the chunks may be larger, together, than their file; flights have 3 to 5,
-as the index of their messages is not compressed."""
+"""Largest total decompressed size of the chunks over the file's size; flights have 3 to 5, as the
+index of their messages is not compressed."""
 ROOM_MESSAGES = 10_000
 """Number of messages that any file may have: those of a chunk whose index was not written yet."""
 INDEXED_BYTES = 16
-"""Size of a message in the index [B]: a file has no more messages than it has room to index."""
+"""Size of a message's entry in the index [B]; it bounds the number of messages in a file."""
 ATTACHED_MAX = 100
-"""Most attachments and pieces of metadata; ours have three."""
+"""Most attachments and metadata records; this program writes three."""
 
 BROKEN = (
     McapError,
@@ -73,12 +73,12 @@ BROKEN = (
     TypeError,
     ValueError,
 )
-"""What the library, or what reads the messages, may meet in a file that is damaged."""
+"""Exceptions that reading a damaged file may raise in the library or in the decoders."""
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Make one error of whatever is met in a damaged file."""
+    """Turn any exception from a damaged file into one error."""
     try:
         yield
     except RecordingError:
@@ -89,11 +89,11 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def opened(path: Path) -> tuple[BinaryIO, int]:
-    """A file that begins as an MCAP file does, and its size [B].
+    """File that begins with MCAP's magic bytes, and its size [B].
 
     Raises:
-        OSError: it cannot be read.
-        RecordingError: it is no MCAP file.
+        OSError: the file cannot be read.
+        RecordingError: the file is no MCAP file.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     status = os.fstat(descriptor)
@@ -109,9 +109,9 @@ def opened(path: Path) -> tuple[BinaryIO, int]:
 
 
 class Bounded:
-    """A file from which nobody reads, or reserves memory for, more than there is of it.
+    """File of which no more is read, and for which no more memory is reserved, than its size.
 
-    All that is read of it together is bounded, too: a file may name the same place many times.
+    The total number of bytes read is bounded, too: a file's index may name one position many times.
 
     Args:
         file: the file.
@@ -124,13 +124,13 @@ class Bounded:
         self.size = size
         """Size of the file [B]."""
         self.at = 0
-        """Place of the next byte that is read [B]."""
+        """Position of the next byte to read [B]."""
 
     def read(self, size: int = -1) -> bytes:
-        """The next bytes, as many as there are.
+        """Next bytes, as many as there are.
 
         Raises:
-            ValueError: far more was read than there is, or the place is none.
+            ValueError: far more was read in total than the file has, or the position is invalid.
         """
         if self._left < 0:
             raise ValueError("it names the same places again and again")
@@ -145,14 +145,14 @@ class Bounded:
 
     @property
     def stream(self) -> Any:
-        """The file as the library takes it, which reads nothing but `read`."""
+        """The file as a stream for the library, which calls only `read`."""
         return self
 
     def records(self, at: int) -> Iterator[McapRecord]:
-        """Records from a place on; chunks stay closed.
+        """Records from a position on; chunks stay compressed.
 
         Raises:
-            BROKEN: there is none.
+            BROKEN: no record is there.
         """
         self.at = at
         limit = self.size
@@ -161,13 +161,13 @@ class Bounded:
         ).records
 
     def chunk(self, at: int) -> Chunk:
-        """The chunk at a place, whatever its head says."""
+        """Chunk at a position; its claimed size is checked."""
         self.at = at + HEAD.size
         return Chunk.read(ReadDataStream(self.stream))
 
 
 class Allowance:
-    """What may still be read of a file.
+    """Remaining budget of bytes and messages that may be read of a file.
 
     Args:
         size: size of the file [B].
@@ -181,8 +181,8 @@ class Allowance:
         """Content of a chunk.
 
         Raises:
-            BROKEN: it is damaged.
-            ValueError: it is larger than any of ours, or all of them together are.
+            BROKEN: the chunk is damaged.
+            ValueError: the chunk, or all chunks together, exceed the bounds.
         """
         size = chunk.uncompressed_size
         if size > CHUNK_BYTES_MAX:
@@ -210,8 +210,8 @@ class Allowance:
         """Records of a chunk, one by one.
 
         Raises:
-            BROKEN: it is damaged.
-            ValueError: see `content`; or there are more messages than a file of this size has.
+            BROKEN: the chunk is damaged.
+            ValueError: see `content`; or the file has more messages than its size allows.
         """
         content = self.content(chunk)
         stream = io.BytesIO(content)
@@ -230,7 +230,7 @@ class Allowance:
 
 @dataclass(slots=True)
 class Index:
-    """The end of a file: what is in it, and where [B]."""
+    """Index of a file: positions of its records [B]."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
@@ -242,7 +242,7 @@ def index_of(file: Bounded) -> Index:
     """Index of a file.
 
     Raises:
-        BROKEN: it has none, or that is damaged.
+        BROKEN: the file has no index, or a damaged one.
     """
     footer = next(file.records(file.size - FOOTER_BYTES))
     if not isinstance(footer, Footer) or not footer.summary_start:
@@ -265,7 +265,7 @@ def attached(file: Bounded, index: Index) -> tuple[dict[str, dict[str, str]], di
     """Metadata and attachments of a file, by name.
 
     Raises:
-        BROKEN: some are damaged, or not there.
+        BROKEN: some are damaged or missing.
     """
     metadata: dict[str, dict[str, str]] = {}
     attachments: dict[str, bytes] = {}
@@ -284,10 +284,10 @@ def attached(file: Bounded, index: Index) -> tuple[dict[str, dict[str, str]], di
 
 
 def messages(file: Bounded, index: Index) -> Iterator[tuple[Channel, Message]]:
-    """Messages of a file, as they lie in it.
+    """Messages of a file, in file order.
 
     Raises:
-        BROKEN: it is damaged.
+        BROKEN: the file is damaged.
     """
     allowance = Allowance(file.size)
     for at in sorted(each.chunk_start_offset for each in index.chunks):
@@ -297,10 +297,10 @@ def messages(file: Bounded, index: Index) -> Iterator[tuple[Channel, Message]]:
 
 
 def in_time(file: Bounded, index: Index) -> Iterator[tuple[Channel, Message]]:
-    """Messages of a file in the order of their times; those of one time as they lie in it.
+    """Messages of a file in order of time, equal times in file order.
 
     Raises:
-        BROKEN: it is damaged.
+        BROKEN: the file is damaged.
     """
     allowance, number = Allowance(file.size), 0
     waiting: list[tuple[int, int, int, Message]] = []

@@ -1,7 +1,8 @@
-"""What may be changed while it flies, as the sliders of a page.
+"""Numbers that may be changed in flight, described as the sliders of a page.
 
-Each is a name, a range, and how it reads and makes the values of keys that the processes let
-change (docs/control.md). Nothing here is checked: the processes do that, as they do a scenario.
+Each has a name, a range, and functions to read it from, and write it to, the keys that a process
+lets change (docs/control.md). Nothing is checked here: the processes check changes as they check a
+scenario.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,43 +22,43 @@ Write = Callable[[Values, float], dict[str, Any]]
 WAYS = ("network.uplink", "network.downlink")
 """Both directions of the network."""
 ALL_LOST = " & loss(1)"
-"""What cuts a direction that is written as a text."""
+"""Text appended to a direction's impairments to lose every packet."""
 MODES_OF_DELAY = {"none": "constant"}
-"""Law of the delay that packets get once they are to be delayed, by the law that they had."""
+"""Delay law that replaces the present one where packets are to be delayed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Knob:
-    """A number that can be changed."""
+    """Number that can be changed."""
 
     label: str
     hint: str
     process: str
-    """Process that has its keys: server, netem or client."""
+    """Process that owns the keys: server, netem or client."""
     key: str
-    """Key that the process lets change where the number can be changed."""
+    """Key that must be changeable for the number to be offered."""
     low: float
     high: float
-    """Largest value that is offered; more only where it is more already."""
+    """Upper end of the slider; raised if the present value is higher."""
     step: float
     read: Read
-    """Number that values of the process have."""
+    """Function that reads the number from the process's values."""
     write: Write
-    """Values by key that make it another, of the values before."""
+    """Function that returns the changed keys and values, given the present values."""
 
 
 def texts(values: Values) -> dict[str, str]:
-    """Directions of the network as texts, by key of the direction; none where none may change."""
+    """Network directions as texts, by key; empty where they may not change."""
     return {way: _direction(values, way).text for way in WAYS if f"{way}.impairments" in values}
 
 
 def is_written(values: Values) -> bool:
-    """Whether a direction is written as a text, which has no numbers to slide."""
+    """Whether a direction is written as a text, which sliders cannot change."""
     return any(values.get(f"{way}.impairments") for way in WAYS)
 
 
 def cut(values: Values) -> dict[str, Any]:
-    """Values that lose every packet from now on."""
+    """Changes that lose every packet from now on."""
     changed: dict[str, Any] = {}
     for way in WAYS:
         text = values.get(f"{way}.impairments")
@@ -66,7 +67,7 @@ def cut(values: Values) -> dict[str, Any]:
 
 
 def is_cut(values: Values) -> bool:
-    """Whether every packet is lost, as `cut` makes it."""
+    """Whether every packet is lost, as after `cut`."""
     return bool(values) and all(
         values[f"{way}.loss"] == 1.0 or values[f"{way}.impairments"].endswith(ALL_LOST)
         for way in WAYS
@@ -74,7 +75,7 @@ def is_cut(values: Values) -> bool:
 
 
 def healed(values: Values) -> dict[str, Any]:
-    """Values with which a link that is cut loses no packets for that."""
+    """Changes that undo `cut`."""
     changed: dict[str, Any] = {}
     for way in WAYS:
         text = values[f"{way}.impairments"].removesuffix(ALL_LOST)
@@ -94,7 +95,9 @@ def _own(key: str) -> tuple[Read, Write]:
 
 
 def _ways(name: str, scale: float) -> tuple[Read, Write]:
-    """A key of both directions, which may differ until it is changed; shown in another unit."""
+    """Slider for a key of both directions, which may differ until changed; shown in another
+    unit.
+    """
     return (
         lambda values: scale * max(float(values[f"{way}.{name}"]) for way in WAYS),
         lambda _, number: {f"{way}.{name}": number / scale for way in WAYS},
@@ -102,14 +105,14 @@ def _ways(name: str, scale: float) -> tuple[Read, Write]:
 
 
 def _delay(values: Values, number: float) -> dict[str, Any]:
-    """Values that delay packets by so much [ms] at least, where they were not delayed either."""
+    """Changes that delay packets by at least so much [ms], also where there was no delay."""
     laws = {f"{way}.delay": MODES_OF_DELAY.get(values[f"{way}.delay"]) for way in WAYS}
     least: dict[str, Any] = {f"{way}.minimum_s": number / 1e3 for way in WAYS}
     return least | {key: law for key, law in laws.items() if law and number}
 
 
 def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
-    """A number of a list that has one for each axis, or none at all."""
+    """Component of a list with one number per axis, or of an empty list."""
 
     def write(values: Values, number: float) -> dict[str, Any]:
         numbers = list(values[key]) or [0.0] * axes
@@ -125,7 +128,7 @@ def _compared(label: str, hint: str, name: str, high: float, step: float) -> Kno
 
 
 def knobs(axes: int) -> tuple[Knob, ...]:
-    """Numbers that can always be changed, of vehicles with so many axes."""
+    """Sliders for vehicles with so many axes that do not depend on the trigger."""
     up, air = "network.uplink", "vehicle"
     wind, steady = f"{air}.wind", f"{air}.steady_wind_mps"
     lossy = "Share of packets that are lost, both ways"
@@ -185,7 +188,7 @@ THRESHOLDS = (
         lambda _, number: {"control.period": round(number)},
     ),
 )
-"""Numbers that policies compare with: each is shown where the trigger has it."""
+"""Sliders for the thresholds of triggers, each offered where the present trigger compares it."""
 
 TRIGGERS = (
     "always",
@@ -195,11 +198,11 @@ TRIGGERS = (
     "deviation | silence(1)",
     "state_gap",
 )
-"""Triggers that are offered, where the scheme has what they compare."""
+"""Triggers offered to the user, where the scheme computes what they compare."""
 
 
 def triggers(scheme: str, present: str) -> tuple[str, ...]:
-    """Triggers to choose from with a scheme, the present one among them."""
+    """Triggers offered with a scheme, including the present one."""
 
     def has(trigger: str) -> bool:
         names = (each.name for each in policies.policies(policies.parse(trigger)))
@@ -210,7 +213,7 @@ def triggers(scheme: str, present: str) -> tuple[str, ...]:
 
 
 def compared(trigger: str) -> frozenset[str]:
-    """Keys of the numbers that a trigger compares with, as far as they do not stand in it."""
+    """Keys of the thresholds that a trigger uses and does not itself state."""
     try:
         found = tuple(policies.policies(policies.parse(trigger)))
     except PolicyError:

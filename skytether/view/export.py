@@ -1,9 +1,9 @@
 """Recordings as tables: one for each part of the record, and one of the events.
 
 A column is a number with its unit in its name, as in `position_x_m`; a plan has one for each of its
-inputs (`input_x_mps_0`). What the record has numbers for, and people words, is words: `mode`,
-`reason`, `direction`, `compared`. Times that pass are in ms, as in a summary, and `error_m` is how
-far a vehicle is from where it should be.
+inputs (`input_x_mps_0`). Codes of the record become words: `mode`, `reason`, `direction`,
+`compared`. Durations are in ms, as in a summary, and `error_m` is the distance of a vehicle from
+its desired position.
 """
 
 import io
@@ -26,13 +26,13 @@ from skytether.view.recording import Recorded
 from skytether.view.rows import Columns, readable
 
 PASSES_NS = ("age_ns", "solve_ns", "delay_ns")
-"""Columns of a time that passes [ns]; negative where none was measured."""
+"""Columns of durations [ns]; negative where none was measured."""
 STEPS = ("in_force", "observed_step")
-"""Columns of a step that there need not be; negative for none."""
+"""Columns of a step that may be missing; negative for none."""
 
 
 def tables(recorded: Recorded) -> dict[str, Columns]:
-    """Tables of a recording, by name; `time_s` is counted from its first message on.
+    """Tables of a recording, by name; `time_s` counts from the first message.
 
     Raises:
         RecordingError: the file is damaged.
@@ -68,14 +68,14 @@ def tables(recorded: Recorded) -> dict[str, Columns]:
 
 
 def _in_ms(name: str, column: NDArray[Any]) -> tuple[str, NDArray[Any]]:
-    """A column and its name, those of a time that passes in ms; NaN where none was measured."""
+    """Column and its name, durations converted to ms; NaN where none was measured."""
     if name not in PASSES_NS:
         return name, column
     return name.replace("_ns", "_ms"), np.where(column < 0, np.nan, column / MILLISECOND_NS)
 
 
 def _errors_m(scenario: Scenario, client: Rows, server: Rows | None) -> Array:
-    """Distance of each vehicle from where it should be, at each of its rows [m]; NaN if unknown."""
+    """Distance of each vehicle from its desired position, per row [m]; NaN if unknown."""
     errors_m = np.empty(len(client))
     for number in np.unique(client["vehicle"]):
         own = client["vehicle"] == number
@@ -84,13 +84,13 @@ def _errors_m(scenario: Scenario, client: Rows, server: Rows | None) -> Array:
 
 
 def csv(columns: Columns) -> str:
-    """A table as CSV text; what is not known is empty."""
+    """Table as CSV text; unknown values are empty."""
     values = [_known(name, column) for name, column in columns.items()]
     return to_csv(list(columns), zip(*values, strict=True))
 
 
 def parquet() -> Callable[[Columns], bytes]:
-    """What makes a Parquet file of a table.
+    """Writer of a table as Parquet.
 
     Raises:
         ImportError: pyarrow is not installed.
@@ -111,7 +111,7 @@ def parquet() -> Callable[[Columns], bytes]:
 
 
 def _known(name: str, column: NDArray[Any]) -> list[Any]:
-    """Values of a column; None for one that is not known: NaN, or -1 of a step."""
+    """Values of a column; None for an unknown one: NaN, or -1 for a step."""
     values: list[Any] = column.tolist()
     if name in STEPS:
         return [None if value < 0 else value for value in values]

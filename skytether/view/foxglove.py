@@ -1,7 +1,7 @@
 """Messages that Foxglove and Lichtblick draw, and their JSON schemas, by the names they document.
 
-All is in the frame WORLD: metres, third axis up. Both programs read of a schema only objects, lists
-and single types, and no list within a list.
+All positions are in the frame WORLD: metres, third axis up. The schemas use only objects, lists and
+single types, and no list within a list: both programs understand no more.
 """
 
 import math
@@ -92,11 +92,11 @@ BLUE, RED, GREY, GREEN = (
     {"r": red, "g": green, "b": blue, "a": 1.0}
     for red, green, blue in ((0.1, 0.5, 0.9), (0.85, 0.2, 0.2), (0.55, 0.55, 0.55), (0.2, 0.7, 0.3))
 )
-"""Colours of a vehicle, of where it should be, of the trajectory, and of a plan."""
+"""Colours of a vehicle, of its desired position, of the trajectory, and of a plan."""
 
 
 def log(time_ns: int, process: str, message: str, level: int) -> Json:
-    """A foxglove.Log: a sentence of a process."""
+    """Message foxglove.Log: a sentence of a process."""
     return {
         "timestamp": _time(time_ns),
         "level": level,
@@ -108,7 +108,7 @@ def log(time_ns: int, process: str, message: str, level: int) -> Json:
 
 
 def pose_in_frame(time_ns: int, state: Array) -> Json:
-    """A foxglove.PoseInFrame: a vehicle, heading where it moves.
+    """Message foxglove.PoseInFrame: a vehicle, heading in its direction of motion.
 
     Args:
         state: position [m] and velocity [m/s]; shape (axes, 2).
@@ -117,7 +117,9 @@ def pose_in_frame(time_ns: int, state: Array) -> Json:
 
 
 def transform(time_ns: int, vehicle: str, state: Array) -> Json:
-    """A foxglove.FrameTransform: the frame that a vehicle carries, so that a view may follow it."""
+    """Message foxglove.FrameTransform: a vehicle's own frame, so that a view may follow the
+    vehicle.
+    """
     pose = _pose(state)
     return {
         "timestamp": _time(time_ns),
@@ -129,7 +131,9 @@ def transform(time_ns: int, vehicle: str, state: Array) -> Json:
 
 
 def vehicle(time_ns: int, name: str, state: Array) -> Json:
-    """A foxglove.SceneUpdate: a vehicle as a sphere, with an arrow as long as it flies in 1 s."""
+    """Message foxglove.SceneUpdate: a vehicle as a sphere, with an arrow as long as it flies in 1
+    s.
+    """
     pose, speed = _pose(state), float(math.hypot(*state[:2, 1]))
     arrow = {
         "pose": pose,
@@ -143,12 +147,12 @@ def vehicle(time_ns: int, name: str, state: Array) -> Json:
 
 
 def point(time_ns: int, name: str, state: Array) -> Json:
-    """A foxglove.SceneUpdate: where a vehicle should be."""
+    """Message foxglove.SceneUpdate: a vehicle's desired position."""
     return _scene(time_ns, name, spheres=[_sphere(_pose(state), POINT_M, RED)])
 
 
 def line(time_ns: int, name: str, positions: Array, color: Json) -> Json:
-    """A foxglove.SceneUpdate: a path.
+    """Message foxglove.SceneUpdate: a path.
 
     Args:
         positions: its points [m]; shape (n, axes).

@@ -1,4 +1,4 @@
-"""Frames of a virtual flight, as its processes would have made them."""
+"""Frames of a virtual flight, equal to those that its processes would make."""
 
 from collections.abc import Iterator
 from heapq import merge
@@ -20,7 +20,7 @@ PROCESSES = {"client": "client", "server": "server", "plan": "server", "netem": 
 
 
 def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
-    """Frames of a flight in virtual time, in their order; time begins at 0.
+    """Frames of a flight in virtual time, in order of time; time begins at 0.
 
     Args:
         scenario: what was flown.
@@ -59,7 +59,7 @@ def _begins(flight: Record) -> Indices:
 
 
 def _times_ns(scenario: Scenario, part: str, rows: Rows, begins: Indices) -> Indices:
-    """Time of each row [ns], never before that of the row before it."""
+    """Time of each row [ns], raised so that it never decreases."""
     if part == "netem":
         times_ns = rows["arrived_ns"]
     else:

@@ -1,10 +1,10 @@
-"""Recordings of the processes of one flight, as one recording of the flight.
+"""Merging of the recordings of one flight's processes into one.
 
     frames of each, by the time of day → one file → summary of the first client's flight
 
-Each process has recorded its own part, with the scenario as it was started with. A key's value is
-that of the process that the key belongs to; what both ends predict with must be equal. Times are
-put on the clock of the first client: the difference is that of the times of day.
+Each process has recorded its own part, with its own scenario. A key's value is taken from the
+process that owns the key; keys that both ends predict with must be equal. Times are converted to
+the clock of the first client, by the difference of the times of day.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,15 +27,16 @@ from skytether.view.frames import Timed
 from skytether.view.recording import Recorded, Recording, summary_of
 
 OWNERS = {"client": Owner.VEHICLE, "server": Owner.SERVER, "netem": Owner.NETEM}
-"""Owner of the keys whose values a process's recording has, by the part that it has rows of."""
+"""Owner of the keys whose values a process's recording has, by the part of the record that it
+holds."""
 
 
 def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
-    """Write recordings of processes as one.
+    """Merge recordings of processes into one.
 
     Raises:
         OSError: the file cannot be written.
-        RecordingError: they are not of one flight, or one is damaged.
+        RecordingError: the recordings are not of one flight, or one is damaged.
     """
     first = next((each for each in recordings if "client" in each.columns()), recordings[0])
     about, scenario = first.about, _scenario(first, recordings)
@@ -47,7 +48,7 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
 
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
-    """The scenario of a flight, each value from whom it belongs to."""
+    """Scenario of a flight, each value from the process that owns the key."""
     table = to_table(first.scenario)
     for each in recordings:
         terms = first.scenario.terms(), each.scenario.terms()
@@ -61,7 +62,7 @@ def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
 
 
 def _moved(recorded: Recorded, offset_ns: int) -> Iterator[Timed]:
-    """Frames of a recording, on the clock of the one whose offset is given."""
+    """Frames of a recording, with times on the clock whose offset is given."""
     late_ns = recorded.about.offset_ns - offset_ns
     columns = recorded.columns()
     for time_ns, process, frame in recorded.timed():
@@ -69,7 +70,7 @@ def _moved(recorded: Recorded, offset_ns: int) -> Iterator[Timed]:
 
 
 def _later(frame: Frame, columns: Mapping[str, np.dtype[np.void]], late_ns: int) -> Frame:
-    """A frame with all its times moved."""
+    """Frame with all its times shifted."""
     moved = msgspec.structs.replace(frame, time_ns=frame.time_ns + late_ns)
     if isinstance(moved, Rows) and moved.part == "netem":
         rows = np.frombuffer(moved.rows, columns["netem"]).copy()
@@ -79,7 +80,7 @@ def _later(frame: Frame, columns: Mapping[str, np.dtype[np.void]], late_ns: int)
 
 
 def _parts(recordings: Sequence[Recorded]) -> dict[str, Table]:
-    """Rows of each part, of all recordings."""
+    """Rows of each part, from all recordings."""
     pieces: dict[str, list[Table]] = {}
     for each in recordings:
         for part, rows in each.parts().items():

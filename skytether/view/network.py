@@ -1,4 +1,4 @@
-"""The last minute of a network, in bins of a quarter of a second, made of the rows of netem."""
+"""Last minute of a network, in bins of 0.25 s, made of netem's rows."""
 
 from dataclasses import dataclass
 
@@ -19,9 +19,9 @@ BINS = int(SPAN_S * SECOND_NS) // BIN_NS
 DELAY_BIN_NS = 20 * MILLISECOND_NS
 """Width of a bin of a histogram of delays [ns]."""
 DELAY_BINS = 100
-"""Number of bins of a histogram of delays; the last takes all that is longer."""
+"""Number of bins of a histogram of delays; the last one holds all longer delays."""
 DIRECTIONS = {UPLINK: "up", DOWNLINK: "down"}
-"""What the directions are called: up to the vehicle, down from it."""
+"""Names of the directions: up to the vehicle, down from it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,17 +31,17 @@ class Traffic:
     packets_per_s: float
     bytes_per_s: float
     loss: float
-    """Share of its packets that were lost; NaN of none."""
+    """Share of its packets that were lost; NaN without packets."""
     delay_ms_p50: float
-    """Median of the delay of those that were not [ms]; NaN of none."""
+    """Median delay of its packets that arrived [ms]; NaN without packets."""
     delay_ms_p99: float
 
 
 class Network:
-    """The last minute of the network, in bins of a quarter of a second.
+    """Last minute of the network, in bins of 0.25 s.
 
     Args:
-        horizon_bytes: size from which on a packet up carries a horizon [B].
+        horizon_bytes: least size of an uplink packet that carries a horizon [B].
     """
 
     def __init__(self, horizon_bytes: int) -> None:
@@ -52,14 +52,14 @@ class Network:
         self._bytes = np.zeros(shape, np.int64)
         self._lost = np.zeros(shape, np.int64)
         self._delay_ns = np.zeros(shape, np.int64)
-        """Sum of the delays of those that were not lost [ns]."""
+        """Sum of the delays of packets that arrived [ns]."""
         self._delays = np.zeros((*shape, DELAY_BINS), np.int64)
         self._waiting = np.zeros(shape)
         """Packets under way at the end of each bin, as netem counted them."""
         self._horizons = np.zeros((BINS, 2), np.int64)
-        """Packets up that carry a horizon, and their bytes."""
+        """Number of uplink packets that carry a horizon, and their bytes."""
         self.heard_ns: dict[int, int] = {}
-        """Time at which a packet of each direction last got through [ns]."""
+        """Time at which a packet last arrived, by direction [ns]."""
 
     def take(self, rows: Table, *, time_ns: int) -> None:
         """Take rows of netem's part."""
@@ -81,13 +81,13 @@ class Network:
             self.heard_ns[int(each)] = time_ns
 
     def wait(self, waiting: Array, *, time_ns: int) -> None:
-        """Take how many packets are under way in each direction; shape (2,)."""
+        """Take the number of packets under way in each direction; shape (2,)."""
         at = self._at(time_ns)
         if at is not None:
             self._waiting[at] = waiting
 
     def _at(self, time_ns: int) -> int | None:
-        """Index of the bin of a time, emptied where it is new; None where it is not kept."""
+        """Index of the bin of a time, emptied if it is new; None for a time that is too old."""
         number = time_ns // BIN_NS
         at = number % BINS
         if self._bin[at] > number:
@@ -100,7 +100,7 @@ class Network:
         return int(at)
 
     def _since(self, seconds: float, now_ns: int) -> NDArray[np.bool_]:
-        """Which bins are of the last seconds, as far as they are over."""
+        """Mask of the bins of the last seconds, without the unfinished one."""
         last = now_ns // BIN_NS
         recent: NDArray[np.bool_] = (self._bin < last) & (
             self._bin >= last - round(seconds * SECOND_NS / BIN_NS)
@@ -108,7 +108,7 @@ class Network:
         return recent & (self._bin >= 0)
 
     def traffic(self, direction: int, seconds: float, now_ns: int) -> Traffic:
-        """What went one way in the last seconds."""
+        """Traffic of one direction in the last seconds."""
         recent = self._since(seconds, now_ns)
         packets = int(self._packets[recent, direction].sum())
         lost = int(self._lost[recent, direction].sum())
@@ -141,7 +141,9 @@ class Network:
         return self._by_second(self._bytes[:, direction], now_ns)
 
     def losses(self, direction: int, now_ns: int) -> Array:
-        """Share of packets lost in each of the last SPAN_S seconds, NaN of none."""
+        """Share of packets lost in each of the last SPAN_S seconds; NaN without packets; shape
+        (SPAN_S,).
+        """
         packets = self._by_second(self._packets[:, direction], now_ns)
         lost = self._by_second(self._lost[:, direction], now_ns)
         return np.where(packets > 0, lost / np.maximum(packets, 1), np.nan)
@@ -151,14 +153,16 @@ class Network:
         return self._by_second(self._waiting[:, direction], now_ns)
 
     def delays_s(self, direction: int, now_ns: int) -> Array:
-        """Mean delay in each of the last SPAN_S seconds [s], NaN of none; shape (SPAN_S,)."""
+        """Mean delay in each of the last SPAN_S seconds [s]; NaN without packets; shape
+        (SPAN_S,).
+        """
         through = self._packets[:, direction] - self._lost[:, direction]
         total_ns = self._by_second(self._delay_ns[:, direction], now_ns)
         count = self._by_second(through, now_ns)
         return np.where(count > 0, total_ns / np.maximum(count, 1), np.nan) / SECOND_NS
 
     def _by_second(self, counts: NDArray[np.int64] | Array, now_ns: int) -> Array:
-        """Sums of counts by the seconds that they are old, oldest first."""
+        """Sums of counts by second, oldest first."""
         recent = self._since(SPAN_S, now_ns)
         per_second = SECOND_NS // BIN_NS
         old = (now_ns // BIN_NS - 1 - self._bin[recent]) // per_second
@@ -167,6 +171,6 @@ class Network:
         return sums
 
     def horizon_bytes(self, now_ns: int) -> float:
-        """Mean size of the last minute's packets that carry a horizon [B]; NaN of none."""
+        """Mean size of the last minute's packets that carry a horizon [B]; NaN without any."""
         count, size = self._horizons[self._since(SPAN_S, now_ns)].sum(axis=0)
         return float(size / count) if count else np.nan

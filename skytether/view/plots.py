@@ -1,4 +1,4 @@
-"""The plots of a page: the last minute of one vehicle of each flight, and of their networks."""
+"""Plots of a page: the last minute of one vehicle of each flight, and of their networks."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,9 +20,9 @@ from skytether.view.state import Curves, State
 POINTS = 400
 """Number of points of a line."""
 SEEN = 4.0
-"""Thresholds above which what the trigger compares is cut off."""
+"""Upper limit of the trigger's plot, in thresholds."""
 SPARE = 6
-"""Number of zeros that are left at the end where they are cropped."""
+"""Number of zeros left at the end of a cropped plot."""
 HEIGHT = 150
 """Height of a plot [pixels]."""
 GREY = "#868e96"
@@ -31,7 +31,7 @@ MARK = "rgba(240, 62, 62, 0.6)"
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What the plots show of a flight at a time."""
+    """View of a flight that the plots show."""
 
     state: State
     curves: Curves
@@ -45,18 +45,18 @@ Values = Callable[[Look], Array]
 
 @dataclass(frozen=True, slots=True)
 class PlotLine:
-    """One line of a plot, drawn for each flight or for the first alone."""
+    """Line of a plot, drawn for each flight or only for the first."""
 
     label: str
     values: Values
     rgb: str = ""
-    """Its colour; that of the flight unless given."""
+    """Colour; that of the flight unless given."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
     marks: bool = False
-    """Whether it is 1 where a mark across the whole plot stands, and 0 elsewhere."""
+    """Whether the line is a mark: 1 for a bar across the whole plot, 0 for none."""
     once: bool = False
-    """Whether it is the same of all flights."""
+    """Whether the line is the same for all flights."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Plot:
     grid: Values = lambda look: look.curves.time_s
     log: bool = False
     crop: bool = False
-    """Whether it ends where nothing but zeros follows."""
+    """Whether trailing zeros are cropped."""
 
 
 def _axis(axis: int) -> tuple[PlotLine, ...]:
@@ -81,14 +81,14 @@ def _axis(axis: int) -> tuple[PlotLine, ...]:
 
 
 def _seconds(look: Look) -> Array:
-    """Times of flight of the last seconds, one each [s]."""
+    """Seconds of flight shown [s], one each."""
     ages_s = np.arange(-SPAN_S, 0.0) + 0.5
     return look.state.time_s(look.now_ns) + ages_s
 
 
 def _delays(direction: int) -> Values:
     def values(look: Look) -> Array:
-        """Mean delays on the grid, none within the seconds in which no packet got through."""
+        """Mean delays on the grid; NaN in seconds in which no packet arrived."""
         grid_s, seconds = look.curves.time_s, _seconds(look)
         delays_s = look.state.network.delays_s(direction, look.now_ns)
         known = ~np.isnan(delays_s)
@@ -121,7 +121,7 @@ def _deadline_ms(look: Look) -> Array:
 
 
 def _compared(look: Look) -> Array:
-    """What the trigger compares, as far as it can be seen beside its threshold."""
+    """Compared figure, cut off where it would hide its threshold."""
     most = np.where(look.curves.threshold > 0, SEEN * look.curves.threshold, np.inf)
     return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
 
@@ -135,7 +135,7 @@ BY_DELAY = Plot(
     grid=_bins_ms,
     crop=True,
 )
-"""Plot of how many packets took how long."""
+"""Histogram plot of packets by their delay."""
 
 
 APART = Plot(
@@ -151,7 +151,7 @@ APART = Plot(
         PlotLine("nearest", lambda look: look.state.nearest_m(look.vehicle, POINTS)),
     ),
 )
-"""Plot of how near a vehicle of a mission came to another."""
+"""Plot of the distance to the nearest other vehicle of a mission."""
 
 
 def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
@@ -181,7 +181,7 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
 
 
 def of_network(*, solves: bool) -> tuple[Plot, ...]:
-    """Plots of packets, and of what plans cost where inputs are planned."""
+    """Plots of the network, and of the cost of plans where inputs are planned."""
     packets = (
         Plot(
             "Packets up in a second",
@@ -205,7 +205,7 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
 
 
 def of_link() -> tuple[Plot, ...]:
-    """Plots of both directions of a network, whatever it carries."""
+    """Plots of both directions of a network, for any protocol."""
     return (
         _ways("Packets in a second", Network.rates),
         _ways("Payload in a second [kB]", Network.loads, 1e-3),
@@ -217,7 +217,7 @@ def of_link() -> tuple[Plot, ...]:
 
 
 def _ways(title: str, values: Callable[[Network, int, int], Array], scale: float = 1.0) -> Plot:
-    """A plot of what a network has of each direction in each of the last seconds, scaled."""
+    """Plot of a figure of both directions over the last seconds, scaled."""
 
     def line(direction: int) -> Values:
         return lambda look: scale * values(look.state.network, direction, look.now_ns)
@@ -227,12 +227,12 @@ def _ways(title: str, values: Callable[[Network, int, int], Array], scale: float
 
 
 class Plots:
-    """The plots of one browser.
+    """Plots of one browser.
 
     Args:
-        gui: where they are made.
+        gui: viser's interface that they are added to.
         titles: what the flights are called; empty for a flight that is alone.
-        plots: what is plotted.
+        plots: the plots.
     """
 
     def __init__(self, gui: viser.GuiApi, titles: Sequence[str], plots: Sequence[Plot]) -> None:
@@ -257,7 +257,7 @@ class Plots:
                     "scale": "marks" if line.marks else "y",
                 }
                 series.append(shown)
-        # What is no mark lies below the scale, and is not seen.
+        # Zeros lie below the scale's lower end, and so are not seen.
         marks: uplot.Scale = {"auto": False, "range": (0.5, 1.0)}
         scales: dict[str, uplot.Scale] = {"x": {"time": False}, "marks": marks}
         if plot.log:
@@ -275,7 +275,7 @@ class Plots:
         )
 
     def draw(self, looks: Sequence[Look]) -> None:
-        """Show flights as they are now; the first gives the times."""
+        """Redraw the flights; the first one determines the times."""
         for plot, handle in zip(self._plots, self._handles, strict=True):
             data = [plot.grid(looks[0])]
             for place, look in enumerate(looks):
@@ -285,13 +285,13 @@ class Plots:
 
 
 def cropped(data: Sequence[Array]) -> list[Array]:
-    """Data without the zeros that end all of it, but for a few."""
+    """Data without the trailing zeros, except for a few."""
     used = [int(np.flatnonzero(values).max(initial=0)) for values in data[1:]]
     return [values[: max(used) + SPARE] for values in data]
 
 
 def begun(data: Sequence[Array]) -> list[Array]:
-    """Data from where on anything is known of a line of which not all is."""
+    """Data from the first known value on."""
     missing = [np.isnan(values) for values in data[1:]]
     begin = [int(np.argmin(gone)) for gone in missing if gone.any() and not gone.all()]
     first = min(min(begin, default=0), len(data[0]) - 2)
@@ -299,9 +299,9 @@ def begun(data: Sequence[Array]) -> list[Array]:
 
 
 def drawable(data: Sequence[Array]) -> list[Any]:
-    """Data as uPlot takes it: nothing where a line has a gap; it draws no line that has a NaN.
+    """Data for uPlot: None in gaps, because uPlot draws no line that contains NaN.
 
-    A list, for viser would make numbers again of all that is in a tuple.
+    A list, because viser converts all that is in a tuple to numbers.
     """
     return [_with_gaps(values) if np.isnan(values).any() else values for values in data]
 

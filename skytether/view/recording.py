@@ -1,7 +1,7 @@
-"""Recordings: a flight as an MCAP file, written frame by frame, read back to the last bit, mended.
+"""Recordings: a flight as an MCAP file, written frame by frame, and read back to the last bit.
 
 The frames of the flight's processes (`shared.telemetry.feed`) are written as messages of JSON, a
-channel for each topic, in chunks that are whole as soon as they are written:
+channel for each topic, in chunks that are complete as soon as they are written:
 
     /opened              a process, its scenario and the columns of its rows
     /vehicle/N/flown     rows of the client's part, see `view.rows`
@@ -11,10 +11,10 @@ channel for each topic, in chunks that are whole as soon as they are written:
     /said                events, as a program reads them
     /figures/PROCESS     numbers counted so far
 
-Beside these, which are the flight, there is what Foxglove and Lichtblick draw of it: /events, and
+These messages are the flight. Further messages are drawn by Foxglove and Lichtblick: /events, and
 for each of the first VEHICLES_MAX vehicles /vehicle/N/pose, /vehicle/N/transform and, below
-/vehicle/N/scene, the vehicle, its plan, where it should be and its trajectory. The scenario lies
-beside the messages as an attachment, and so does the summary, at the end.
+/vehicle/N/scene, the vehicle, its plan, where it should be and its trajectory. The scenario and, at
+the end, the summary are attachments.
 """
 
 import tomllib
@@ -59,15 +59,15 @@ from skytether.view.container import (
 from skytether.view.frames import Timed
 
 FRAME = "frame"
-"""Key of a channel's metadata that names the kind of frame that its messages were made of."""
+"""Key in a channel's metadata: the kind of frame that its messages were made of."""
 OURS = "skytether"
-"""Name of the metadata that makes an MCAP file a recording, and of the library that writes it."""
+"""Name of the metadata that marks an MCAP file as a recording, and of the writing library."""
 SCENARIO, SUMMARY = "scenario.toml", "summary.json"
 """Names of the attachments."""
 VEHICLES_MAX = 64
-"""Most vehicles that are drawn; of those with larger numbers only the rows are recorded."""
+"""Most vehicles that are drawn; for larger numbers only rows are recorded."""
 CHUNK_BYTES = 256 * 1024
-"""Size of the messages in a chunk from which it is written, at the latest [B]."""
+"""Size of messages after which a chunk is written [B]."""
 POINTS_MAX = 400
 """Most points of a drawn trajectory."""
 WARNINGS = RecordIncomplete, Fault, Degraded, ChangeRefused, *Failure.__args__
@@ -78,7 +78,7 @@ SPAN_NS_MAX = 40 * 86_400 * SECOND_NS
 ROW_TEXT_MAX = 64 * 1024
 """Largest size of a row's message [B]."""
 TOGETHER = 1024
-"""Most messages that are decoded before rows are made of them."""
+"""Most messages that are decoded before they become rows."""
 
 _TOPICS = {"client": "flown", "server": "decided", "plan": "plan"}
 _SAID = {
@@ -102,14 +102,14 @@ _OPENED = {
 
 
 class EventLine(msgspec.Struct, frozen=True, kw_only=True):
-    """An event and the process that has told it."""
+    """Event and the process that reported it."""
 
     process: str
     event: Event
 
 
 class About(msgspec.Struct, frozen=True, kw_only=True):
-    """What a recording says of itself."""
+    """Facts about a recording, kept in its metadata."""
 
     scenario: str
     """Name of the scenario."""
@@ -118,23 +118,23 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     version: str
     """Version of Skytether that flew it."""
     began: str
-    """Time of day at which it began, ISO 8601; empty in virtual time."""
+    """Time of day at the beginning, ISO 8601; empty in virtual time."""
     offset_ns: int
-    """Time of a message minus time of the frame that it was made of [ns]."""
+    """Time of a message minus time of its frame [ns]."""
     secure: bool
-    """Whether the link was sealed."""
+    """Whether the link was encrypted."""
 
 
 class Recording:
-    """An MCAP file that is being written.
+    """Recording that is being written as an MCAP file.
 
     Args:
-        file: where it is written; nothing is read from it.
+        file: file opened for writing.
         scenario: what is flown.
-        about: what it says of itself.
+        about: facts for its metadata.
 
     Raises:
-        OSError: the file cannot be written; any method may say so.
+        OSError: the file cannot be written; any method may raise this.
     """
 
     def __init__(self, file: BinaryIO, scenario: Scenario, about: About) -> None:
@@ -158,7 +158,7 @@ class Recording:
         """Record a frame of a process.
 
         Raises:
-            ValueError: its rows are not what the process has said of them.
+            ValueError: the rows do not match the columns that the process announced.
         """
         self._now_ns = max(0, frame.time_ns + self._offset_ns)
         match frame:
@@ -176,11 +176,11 @@ class Recording:
                 self._add_rows(process, frame)
 
     def flush(self) -> None:
-        """Write what has been added; from here on not even a kill can lose it."""
+        """Write all that was added; after this, a kill does not lose it."""
         self._writer.flush()
 
     def finish(self, summary: Summary | None) -> None:
-        """Write the end of the file: the flight's summary where there is one, and an index."""
+        """Write the end of the file: the summary, if there is one, and an index."""
         if summary:
             self._attach(SUMMARY, "application/json", msgspec.json.encode(summary))
         self._writer.finish()
@@ -217,7 +217,7 @@ class Recording:
                 self._draw_row(frame.part, number, row)
 
     def _draw_row(self, part: str, number: int, row: np.void) -> None:
-        """Draw what a row says of a vehicle."""
+        """Add the drawn messages of a row."""
         at, name, now_ns = f"/vehicle/{number}", f"vehicle {number}", self._now_ns
         match part:
             case "client":
@@ -256,7 +256,7 @@ class Recording:
         message: Any,
         about: Mapping[str, str] | None = None,
     ) -> None:
-        """Add a message; its channel and schema, named here, come before the first of the topic."""
+        """Add a message; its channel and schema are written before the first message of a topic."""
         channel = self._channels.get(topic)
         if channel is None:
             content = name.encode() + msgspec.json.encode(schema)
@@ -271,7 +271,7 @@ class Recording:
 
 
 def _text(value: str | int) -> str:
-    """A value of metadata, which are texts alone: a number or flag is written as in JSON."""
+    """Metadata value as text, the only type there; numbers and flags as in JSON."""
     return value if isinstance(value, str) else msgspec.json.encode(value).decode()
 
 
@@ -283,7 +283,7 @@ def trajectory(scenario: Scenario) -> Array:
 
 
 def _schema_of(value: Any) -> dict[str, Any]:
-    """JSON schema of figures such as these; what has no figure yet is left out."""
+    """JSON schema of figures; groups that are still empty are left out."""
     kinds = {bool: "boolean", int: "integer", float: "number", str: "string"}
     properties = {
         key: _schema_of(each) if isinstance(each, Mapping) else {"type": kinds[type(each)]}
@@ -294,14 +294,14 @@ def _schema_of(value: Any) -> dict[str, Any]:
 
 
 class Recorded:
-    """A recording that is read.
+    """Recording that is read.
 
     Args:
         path: its file.
 
     Raises:
         OSError: the file cannot be read.
-        RecordingError: it is no recording, or has no end.
+        RecordingError: the file is no recording, or has no end.
     """
 
     def __init__(self, path: Path) -> None:
@@ -310,7 +310,7 @@ class Recorded:
         self._file, size = opened(path)
         self._bytes = Bounded(self._file, size)
         self._checked = False
-        """Whether all rows are known to be such as a flight has."""
+        """Whether all rows were checked to be those of a possible flight."""
         try:
             self._read_ends()
         except BaseException:
@@ -318,7 +318,7 @@ class Recorded:
             raise
 
     def _read_ends(self) -> None:
-        """Read what stands before and behind the messages."""
+        """Read the metadata and attachments."""
         path = self.path
         try:
             self._index = index_of(self._bytes)
@@ -341,7 +341,7 @@ class Recorded:
 
     @cached_property
     def summary(self) -> Summary | None:
-        """Summary of the flight, computed where it is not in the file; None where none has flown.
+        """Summary of the flight, computed if the file has none; None where nothing was flown.
 
         Raises:
             RecordingError: the file is damaged.
@@ -359,7 +359,7 @@ class Recorded:
         self._file.close()
 
     def parts(self) -> dict[str, Table]:
-        """Rows of each part of the record, in the order in which they were made, by its name.
+        """Rows of each part of the record by its name, in the order of recording.
 
         Raises:
             RecordingError: the file is damaged.
@@ -370,7 +370,7 @@ class Recorded:
         return made
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
-        """Messages as they lie in the file, with their channels.
+        """Messages in file order, with their channels.
 
         Raises:
             RecordingError: the file is damaged.
@@ -383,7 +383,7 @@ class Recorded:
         return self._columns
 
     def frames(self) -> Iterator[Timed]:
-        """Frames in the order of their times, which are counted from the first one's on [ns].
+        """Frames in order of time, counted from the first one [ns].
 
         Raises:
             RecordingError: the file is damaged.
@@ -394,12 +394,13 @@ class Recorded:
             yield time_ns - begin_ns, process, frame
 
     def timed(self) -> Iterator[Timed]:
-        """Frames in the order of the times of their messages [ns].
+        """Frames in order of their messages' time [ns].
 
         Raises:
             RecordingError: the file is damaged.
         """
-        if not self._checked:  # all rows at once cost a fifth of what one after the other does
+        # all rows of an instant at once cost a fifth of decoding them one by one
+        if not self._checked:
             self.parts()
         with reading(self.path):
             own = (
@@ -417,7 +418,7 @@ class Recorded:
 
 
 def summary_of(scenario: Scenario, about: About, parts: Mapping[str, Table]) -> Summary | None:
-    """Summary of the first vehicle's flight; None where none has flown."""
+    """Summary of the first vehicle's flight; None where nothing was flown."""
     client = parts.get("client")
     if client is None or not len(client):
         return None
@@ -429,10 +430,10 @@ def summary_of(scenario: Scenario, about: About, parts: Mapping[str, Table]) -> 
 def known_of(
     path: Path, metadata: Mapping[str, Mapping[str, str]], attached: Mapping[str, bytes]
 ) -> tuple[About, Scenario]:
-    """What a recording says of itself, and its scenario.
+    """Facts about a recording, and its scenario.
 
     Raises:
-        RecordingError: there is no such thing, or none that this version knows.
+        RecordingError: they are missing, or of an unknown version.
     """
     if OURS not in metadata or SCENARIO not in attached:
         raise RecordingError(f"{path}: it is no recording of Skytether, or nothing is whole of it")
@@ -443,15 +444,16 @@ def known_of(
         table = tomllib.loads(attached[SCENARIO].decode())
         try:
             return about, check(table, f"{path}: {SCENARIO}")
-        except ConfigError as error:  # another version's, or its trajectory's file is elsewhere
+        # written by another version, or its trajectory's file is on another machine
+        except ConfigError as error:
             raise RecordingError(str(error)) from None
 
 
 def parts_of(messages: Iterable[tuple[Channel, Message]], scenario: Scenario) -> dict[str, Table]:
-    """Rows of each part, of messages of which some hold rows.
+    """Rows of each part, from messages of any kind.
 
     Raises:
-        ValueError: they are no rows of such a scenario's flight.
+        ValueError: they are no rows of a flight of this scenario.
     """
     columns: dict[str, np.dtype[np.void]] = {}
     pieces: dict[str, list[bytes]] = {}
@@ -483,17 +485,17 @@ def parts_of(messages: Iterable[tuple[Channel, Message]], scenario: Scenario) ->
 
 @lru_cache(64)
 def _table(columns: str) -> rows.RowTable:
-    """What makes rows of messages, by their columns."""
+    """Converter of messages to rows, by their columns."""
     return rows.RowTable(columns_of(columns))
 
 
 @lru_cache(8)
 def _check_begun(scenario: str) -> None:
-    """Refuse the scenario of a process; the same one, told thousands of times, costs once.
+    """Check the scenario of a process; equal ones, which may come thousands of times, only once.
 
     Raises:
-        ConfigError: what is wrong with it.
-        ValueError: it is no TOML.
+        ConfigError: the scenario is invalid.
+        ValueError: the text is no TOML.
     """
     check(tomllib.loads(scenario), "the scenario of a process")
 
@@ -502,7 +504,7 @@ def columns_in(channel: Channel, scenario: Scenario) -> np.dtype[np.void]:
     """Columns of the rows of a channel.
 
     Raises:
-        ValueError: a flight of this scenario has no such part, or other columns in it.
+        ValueError: flights of this scenario have no such part, or other columns in it.
     """
     part, columns = channel.metadata["part"], _table(channel.metadata["columns"]).columns
     rows.check_columns(part, columns, scenario)
@@ -513,7 +515,7 @@ def _rows(channel: Channel, given: Sequence[bytes], scenario: Scenario) -> Table
     """Rows of the messages of a channel.
 
     Raises:
-        ValueError: they are none, or none of such a scenario's flight.
+        ValueError: they are no rows of a flight of this scenario.
     """
     if (most := max(map(len, given))) > ROW_TEXT_MAX:
         raise ValueError(f"a row of {most} B, expected at most {ROW_TEXT_MAX} B")
@@ -522,7 +524,7 @@ def _rows(channel: Channel, given: Sequence[bytes], scenario: Scenario) -> Table
 
 
 def _instant(time_ns: int, channel: Channel) -> tuple[int, str, str]:
-    """What the messages of a frame have in common: time, process and part."""
+    """Time, process and part, which all messages of a frame share."""
     about = channel.metadata
     return time_ns, about.get("process", ""), about.get("part", "")
 
@@ -530,7 +532,9 @@ def _instant(time_ns: int, channel: Channel) -> tuple[int, str, str]:
 def _frames(
     time_ns: int, messages: Iterable[tuple[int, Channel, bytes]], scenario: Scenario
 ) -> Iterator[tuple[str, Frame]]:
-    """Frames of the messages of an instant, with their processes: one of rows, or each its own."""
+    """Frames of an instant's messages, with their processes: rows share a frame, others have their
+    own.
+    """
     together = list(messages)
     first = together[0][1]
     if part := first.metadata.get("part"):

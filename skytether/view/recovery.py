@@ -1,12 +1,12 @@
-"""Recordings that are damaged, or end too early as those of killed processes: what is whole of one.
+"""Recovery of recordings that are damaged, or lack their end because a process was killed.
 
     index, where there is one ──┐
     next whole record ──────────┴→ records → a new file, with its summary and an index
 
-The index of a whole file knows where its chunks are, whatever has become of the bytes between them.
-Where there is none, or where nothing whole is at a place that it names, the search goes on at the
-next bytes that a chunk, the scenario or the metadata has: a chunk is as large as it says itself and
-known by its checksum, so a length that was changed costs nothing that lies behind it.
+The index of a file knows where its chunks are, even if bytes between them are damaged. Without an
+index, or where the indexed chunk is damaged, the search goes on at the next byte pattern of a
+chunk, the scenario or the metadata. A chunk contains its size and a checksum, so a damaged length
+does not lose the records behind it.
 """
 
 import os
@@ -51,43 +51,44 @@ from skytether.view.recording import (
 )
 
 SUMMED = {"client", "server", "netem"}
-"""Parts of the record that a summary is made of."""
+"""Parts of the record that a summary is computed from."""
 SIGNS = re.compile(
     rb"(?P<chunk>\x04\0\0\0zstd)|(?P<scenario>\r\0\0\0scenario\.toml)|(?P<about>\t\0\0\0skytether)"
 )
-"""Bytes that chunks, the scenario and the metadata have, each behind the length of a text."""
+"""Byte patterns by which chunks, the scenario and the metadata are found; each follows the length
+of a text."""
 SIGN_AT = {"chunk": HEAD.size + 28, "scenario": HEAD.size + 16, "about": HEAD.size}
-"""Where in its record each of them stands [B]."""
+"""Position of the pattern in its record [B]."""
 SEARCHED_BYTES = 1024 * 1024
 """Bytes that are searched at a time."""
 
 
 class Kept(NamedTuple):
-    """Report on what has been kept of a file."""
+    """Report on a recovery."""
 
     messages: int
     """Number of messages."""
     seconds: float
-    """Time from the first of them to the last [s]."""
+    """Time from the first message to the last [s]."""
     lost_bytes: int
-    """Size of what was not whole [B]."""
+    """Number of bytes that were not recovered [B]."""
     rows_before: int
-    """Number of rows that other commands could read of the file; none where it had no end."""
+    """Number of rows that other commands could read in the old file; 0 where it had no end."""
     rows: int
-    """Number of rows that they can read now."""
+    """Number of rows that other commands can read now."""
 
 
 def recover(path: Path, out: Path) -> Kept:
-    """Write a recording anew from all that is whole of it, with its summary and an index.
+    """Write a recording anew from all its intact records, with a summary and an index.
 
     Args:
         path: file that has no end, or is damaged.
-        out: file for the recording; may be the same, which is then replaced once the new one was
+        out: file for the recording; may be the same, which is replaced only after the new file was
             read and found to hold no fewer rows.
 
     Raises:
         OSError: a file cannot be read, or written.
-        RecordingError: it is no recording, or nothing of one; or it would hold less than before.
+        RecordingError: the file is no recording, or nothing in it is intact; or rows would be lost.
     """
     before = _readable(path)
     source, size = opened(path)
@@ -119,19 +120,19 @@ def recover(path: Path, out: Path) -> Kept:
 
 
 def _readable(path: Path) -> int:
-    """Number of rows that can be read of a recording as it is."""
+    """Number of rows that can be read from a recording as it is."""
     count = 0
     try:
         with Recorded(path) as recorded:
             for channel, _ in recorded.messages():
                 count += "part" in channel.metadata
     except RecordingError:
-        pass  # it has no end, or is read up to here
+        pass  # the file has no end, or is readable up to here
     return count
 
 
 class _Recovery:
-    """A recording that is written anew.
+    """Recovery of one recording.
 
     Args:
         path: name of the old file.
@@ -144,7 +145,7 @@ class _Recovery:
         self._file = file
         self._writer = Writer(out, chunk_size=CHUNK_BYTES)
         self._schemas: dict[int, int] = {}
-        """Number of each schema in the new file, by that in the old one."""
+        """Id of each schema in the new file, by its id in the old one."""
         self._channels: dict[int, tuple[int, Channel]] = {}
         try:
             self._index = index_of(file)
@@ -153,12 +154,12 @@ class _Recovery:
         self.times_ns: list[int] = []
         """Time of the first message and of the last [ns]."""
         self.messages = 0
-        """Number of messages that were kept."""
+        """Number of messages that were recovered."""
         self.lost_bytes = 0
-        """Size of what was not whole [B]."""
+        """Number of bytes that were not recovered [B]."""
 
     def run(self) -> None:
-        """Take all that is whole from the old file, and end the new one."""
+        """Copy all intact records from the old file, and end the new one."""
         about, scenario = self._known()
         self._writer.start(profile="", library=OURS)
         summary = summary_of(scenario, about, parts_of(self._taken(), scenario))
@@ -168,7 +169,7 @@ class _Recovery:
         self._writer.finish()
 
     def _known(self) -> tuple[About, Scenario]:
-        """What the old file says of itself, which stands before all messages."""
+        """Facts about the old file, which precede all its messages."""
         metadata: dict[str, dict[str, str]] = {}
         attached: dict[str, bytes] = {}
         for record in self._whole():
@@ -182,7 +183,7 @@ class _Recovery:
         return known_of(self._path, metadata, attached)
 
     def _taken(self) -> Iterator[tuple[Channel, Message]]:
-        """Write all records that are whole; yields those that a summary is made of."""
+        """Write all intact records; yields those that a summary is computed from."""
         writer = self._writer
         for record in self._whole():
             match record:
@@ -220,7 +221,7 @@ class _Recovery:
         return channel
 
     def _whole(self) -> Iterator[McapRecord]:
-        """Records that are whole; the end of a file, which is made anew, is not among them."""
+        """Intact records, except for the end of the file, which is made anew."""
         allowance = Allowance(self._file.size)
         chunks = {each.chunk_start_offset for each in self._index.chunks}
         hints = sorted(chunks | {*self._index.attachments, *self._index.metadata})
@@ -245,10 +246,11 @@ class _Recovery:
     def _record(
         self, at: int, allowance: Allowance, *, is_chunk: bool
     ) -> tuple[int, list[McapRecord]]:
-        """Where the record at a place ends, and it, or all of a chunk; nothing at the end of all.
+        """End of the record at a position, and the record, or all those of a chunk; none at the
+        file's end.
 
         Raises:
-            BROKEN: there is none that is whole.
+            BROKEN: no intact record is there.
         """
         file = self._file
         file.at = at
@@ -264,14 +266,14 @@ class _Recovery:
         if opcode == Opcode.METADATA:
             known = Metadata.read(ReadDataStream(file.stream))
             return file.at, [known]
-        Opcode(opcode)  # one that nobody knows is none
+        Opcode(opcode)  # a record of unknown type counts as damaged
         record = next(file.records(at))
         if file.at != at + HEAD.size + length:
             raise ValueError("a record has another size than it says")
         return file.at, [record]
 
     def _attachment(self, at: int) -> tuple[int, list[McapRecord]]:
-        """An attachment, as large as it says itself, if its checksum is right."""
+        """Attachment with the size that it claims, if its checksum is right."""
         file = self._file
         file.at = at + HEAD.size
         record = Attachment.read(ReadDataStream(file.stream))
@@ -283,7 +285,7 @@ class _Recovery:
         return end, [record]
 
     def _signs(self) -> Iterator[int]:
-        """Places where a record may begin, by the bytes that it has."""
+        """Positions where a record may begin, found by byte patterns."""
         at, overlap = 0, 32
         while at < self._file.size:
             self._file.at = at

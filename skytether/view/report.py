@@ -1,4 +1,4 @@
-"""The report of a recorded flight: a page that opens offline, with figures, summary and events."""
+"""Report of a recorded flight: a page that opens offline, with figures, summary and events."""
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,14 +40,14 @@ LETTERS |= {"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True}
 
 @dataclass(frozen=True, slots=True)
 class FlightReport:
-    """A report, drawn."""
+    """Report of one flight, with its figures drawn."""
 
     title: str
     """Heading of the page."""
     about: str
-    """One or two sentences on what was flown."""
+    """Introduction: one or two sentences on the scenario."""
     verdict: str
-    """One or two sentences on what came out."""
+    """Result: one or two sentences on the outcome."""
     tables: Sequence[Table]
     """Tables."""
     pictures: Sequence[Picture]
@@ -55,31 +55,31 @@ class FlightReport:
     events: Sequence[tuple[str, str, str]]
     """Time, process and sentence of each event."""
     untold: int
-    """Number of events for which there is no room."""
+    """Number of events that were left out for lack of room."""
     made: Mapping[str, str]
-    """Facts about the recording, by name."""
+    """Facts about the recording's origin, by name."""
     toml: str
-    """Scenario as a file."""
+    """Scenario as TOML."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReportedFlight:
-    """What is drawn of a flight: that of one vehicle, and of the network."""
+    """Data for the figures: one vehicle's flight, and the network."""
 
     scenario: Scenario
-    """What was flown."""
+    """Scenario that was flown."""
     client: Rows
     """Rows of the vehicle."""
     server: Rows
-    """Rows of the server about it."""
+    """Rows of the server about the vehicle."""
     netem: Rows
     """Rows of the network."""
     epoch_ns: int
-    """Time of step 0 [ns; clock of netem]."""
+    """Time of step 0 [ns; netem's clock]."""
 
     @property
     def time_s(self) -> Array:
-        """Time of each row of the vehicle [s]."""
+        """Time of each of the vehicle's rows [s]."""
         return self.time_of(self.client)
 
     def time_of(self, rows: Rows) -> Array:
@@ -88,7 +88,7 @@ class ReportedFlight:
         return time_s
 
     def spans(self) -> Iterator[tuple[Mode, slice]]:
-        """Modes one after the other, each with its rows and the first after them."""
+        """Modes in succession, each with its first row and the first row after it."""
         modes = self.client["mode"]
         begins = np.flatnonzero(np.diff(modes, prepend=-1))
         for begin, end in zip(begins, [*begins[1:], len(modes)], strict=True):
@@ -102,7 +102,7 @@ def page(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> str:
         summary: names and values of its summary.
 
     Raises:
-        RecordingError: no vehicle has flown in it, or the file is damaged.
+        RecordingError: nothing was flown in it, or the file is damaged.
     """
     return rendered("view/report.html.jinja", drawn=_drawn(recorded, summary))
 
@@ -152,7 +152,7 @@ def _drawn(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> FlightRepo
 
 
 def _events(recorded: Recorded) -> tuple[int, list[tuple[str, str, str]]]:
-    """Time of step 0 [ns], and the events with their times counted from it."""
+    """Time of step 0 [ns], and events with times counted from it."""
     columns = recorded.columns()
     dt_ns = recorded.scenario.dt_ns
     epoch_ns, said = None, []
@@ -174,7 +174,7 @@ def _colour(mode: Mode) -> str:
 
 
 def path(flown: ReportedFlight) -> Picture:
-    """The path from above, in the colours of the modes."""
+    """Path from above, coloured by mode."""
     with _figure(6.0) as figure:
         plane = figure.subplots()
         draw_reference(plane, flown.scenario, flown.client, flown.server)
@@ -193,7 +193,7 @@ def path(flown: ReportedFlight) -> Picture:
 
 
 def timeline(flown: ReportedFlight) -> Picture:
-    """What happened, over time, with the modes behind it."""
+    """Figures over time, with the modes as background."""
     with _figure(10.5) as figure:
         axes = figure.subplots(5, 1, sharex=True)
         for draw, below in zip((_positions, _error, _trigger, _ages, _packets), axes, strict=True):
@@ -221,7 +221,7 @@ def timeline(flown: ReportedFlight) -> Picture:
 
 
 def with_gaps(steps: NDArray[np.int64], values: Array) -> Array:
-    """Values of rows, and a NaN wherever the row of a step is missing: no line leads over it."""
+    """Values of rows, with NaN inserted for missing steps, so that lines have gaps there."""
     gaps = np.flatnonzero(np.diff(steps) > 1) + 1
     return np.insert(values.astype(np.float64), gaps, np.nan, axis=0)
 
@@ -263,7 +263,7 @@ def _trigger(below: "Axes", flown: ReportedFlight) -> None:
     style: Any = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
     below.vlines(sent, 0.0, 0.12, **style)
     threshold = server["threshold"][np.isfinite(server["threshold"])]
-    # What it compares spans decades while nothing can be sent; the threshold is what counts.
+    # The compared figure spans decades while nothing can be sent; only the threshold matters.
     below.set_yscale("symlog", linthresh=max(threshold.max(initial=0.0), 1e-6))
     below.set_ylim(bottom=0.0)
 
@@ -284,7 +284,7 @@ def _packets(below: "Axes", flown: ReportedFlight) -> None:
     if not len(flown.netem):
         return
     seconds = np.arange(int(flown.time_s[-1]) + 2)
-    # In seconds: a damaged file may have an epoch that is no number of 64 bits.
+    # In seconds: a damaged file may have an epoch that fits no 64-bit integer.
     arrived_s = flown.netem["arrived_ns"] / SECOND_NS - flown.epoch_ns / SECOND_NS
     for direction, name, color in ((UPLINK, "up", "k"), (DOWNLINK, "down", "#0072b2")):
         counts, _ = np.histogram(arrived_s[flown.netem["direction"] == direction], seconds)
@@ -295,7 +295,7 @@ def _packets(below: "Axes", flown: ReportedFlight) -> None:
 
 @contextmanager
 def _figure(height: float) -> "Iterator[Figure]":
-    """An empty figure of some height [inch]."""
+    """Empty figure of a height [inch]."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -304,7 +304,7 @@ def _figure(height: float) -> "Iterator[Figure]":
 
 
 def _name_modes(figure: "Figure", flown: ReportedFlight) -> None:
-    """A legend of the modes that occur."""
+    """Legend of the modes that occur."""
     from matplotlib.patches import Patch
 
     names: dict[str, list[str]] = {}

@@ -1,7 +1,7 @@
-"""Rows of the record as plain columns: a number each, with axis and unit in its name.
+"""Rows of the record as plain columns: one number each, with axis and unit in its name.
 
-They are what a recording and an exported table hold. A row lies in memory as before, only the names
-are others: so it comes back to the last bit. An array of the library has all axes of one quantity.
+A recording and an exported table hold plain columns. They are a view of the same memory under other
+names, so rows are restored to the last bit. An array of the library has all axes of one quantity.
 """
 
 from collections.abc import Iterable, Mapping
@@ -30,40 +30,40 @@ from skytether.shared.wire.protocol import Mode
 AXES = "xyz"
 """Names of the axes."""
 SHORT = {"inputs": "input"}
-"""Names of columns of velocities that have another one here."""
+"""Column names of velocities that become other names here."""
 NOT_FINITE = "not_finite"
-"""Key of a message for the columns that JSON has no numbers for."""
+"""Key of a message for numbers that JSON cannot express."""
 NAN = np.float64(np.nan)
-"""What is meant where a message has no value."""
+"""Value of a number that is missing in a message."""
 WORDS: Mapping[str, Mapping[int, str]] = {
     "mode": {mode: str(mode) for mode in Mode},
     "reason": {reason: str(reason) for reason in Reason},
     "compared": {figure: str(figure) for figure in Compared},
     "direction": {UPLINK: "uplink", DOWNLINK: "downlink"},
 }
-"""Words for the numbers of some columns."""
+"""Words for the codes of some columns."""
 FIGURES = {str(figure) for figure in Compared} | {"compared", "error"}
-"""Columns of the server's part that a recording may be without: older ones have others."""
+"""Columns of the server's part that a recording may lack: older recordings have other ones."""
 FLOWN_S_MAX = 2 * 86_400.0
 """Latest time of a step [s]: a scenario lasts for a day at most."""
 DELAY_NS_MAX = 86_400 * SECOND_NS
-"""Longest delay of a packet [ns]."""
+"""Longest delay of a packet that is accepted [ns]."""
 NUMBER_MAX = 1e100
-"""Largest number of a row: nothing that a flight measures, squared, overflows."""
+"""Largest number accepted in a row: squares of measured numbers do not overflow."""
 
 Columns = dict[str, NDArray[Any]]
 """Columns of a table, all of one length, by name."""
 
 
 def plain(columns: np.dtype[np.void]) -> np.dtype[np.void]:
-    """Plain columns in place of those of the record, at the same places in memory.
+    """Plain columns of the record's row type, at the same offsets in memory.
 
-    A state, of shape (axes, 2), becomes `position_x_m`, `velocity_x_mps` and so on, with its name
-    before it unless it is `state`. Velocities, of shape (axes,), or (axes, steps) of the inputs of
-    a plan, become `input_x_mps` and so on.
+    A state, of shape (axes, 2), becomes `position_x_m`, `velocity_x_mps` and so on, prefixed by its
+    name unless that is `state`. Velocities, of shape (axes,), or (axes, steps) of the inputs of a
+    plan, become `input_x_mps` and so on.
 
     Raises:
-        ValueError: a column is none of these, and no number.
+        ValueError: a column is of another kind, and no number.
     """
     fields: list[Any] = []
     for name in columns.names or ():
@@ -90,10 +90,10 @@ def plain(columns: np.dtype[np.void]) -> np.dtype[np.void]:
 
 
 class RowTable:
-    """Rows of a part as messages, and back.
+    """Converter of a part's rows to messages, and back.
 
-    A message has a key for each plain column. A number that is not finite is none in JSON: NaN is
-    left out, and what else there is stands in the list NOT_FINITE, as "column=bytes in memory".
+    A message has a key for each plain column. JSON has no numbers that are not finite: NaN is left
+    out, and other bit patterns stand in the list NOT_FINITE, as "column=bytes in memory".
 
     Args:
         columns: columns of the rows.
@@ -126,7 +126,7 @@ class RowTable:
         return {"type": "object", "properties": properties}
 
     def messages(self, rows: Rows) -> list[dict[str, Any]]:
-        """A message for each row."""
+        """Messages, one per row."""
         flat = np.ascontiguousarray(rows).view(self.plain)
         values = [flat[name].tolist() for name in self.names]
         messages = [dict(zip(self.names, each, strict=True)) for each in zip(*values, strict=True)]
@@ -141,10 +141,10 @@ class RowTable:
         return messages
 
     def rows(self, messages: Iterable[Mapping[str, Any]]) -> Rows:
-        """The rows that messages were made of.
+        """Rows that messages were made of.
 
         Raises:
-            ValueError: these are no messages of such rows.
+            ValueError: they are no messages of such rows.
         """
         given = list(messages)
         lists = {name: np.full(self.plain[name].shape, NAN) for name in self._lists}
@@ -167,9 +167,9 @@ class RowTable:
 
 
 def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> None:
-    """Refuse columns that no flight of a scenario has in a part of its record.
+    """Refuse columns that a part of the record of a scenario's flight cannot have.
 
-    There may be more of them, and other figures. Plans may have any number of inputs.
+    Additional columns and other figures are accepted. Plans may have any number of inputs.
 
     Raises:
         ValueError: with the part and the column.
@@ -203,10 +203,10 @@ def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> 
 
 
 def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
-    """Refuse rows with values that no flight of a scenario comes to.
+    """Refuse rows with impossible values for a flight of a scenario.
 
     Raises:
-        ValueError: with the part, the column, what it has and what was expected.
+        ValueError: with the part, the column, the value and what was expected.
     """
     most = {
         "step": int(FLOWN_S_MAX / scenario.control.dt),
@@ -233,7 +233,7 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
 
 
 def readable(rows: Rows) -> Columns:
-    """Plain columns of some rows, with words for modes, and a column for each input of a plan."""
+    """Plain columns of rows, with words for modes, and one column per input of a plan."""
     table = RowTable(rows.dtype)
     flat = np.ascontiguousarray(rows).view(table.plain)
     made: Columns = {}
@@ -251,7 +251,7 @@ def readable(rows: Rows) -> Columns:
 
 
 def arrays(rows: Rows) -> Columns:
-    """Plain columns of some rows, those of all axes together as one array.
+    """Plain columns of rows, those of all axes joined to one array.
 
     `position_x_m` and `position_y_m` become `position_m`, of shape (rows, axes); inputs of plans
     have the shape (rows, axes, steps).
@@ -270,7 +270,7 @@ def arrays(rows: Rows) -> Columns:
 
 
 def planned(scenario: Scenario, row: np.void) -> Array:
-    """Positions along a plan [m], from the state at its beginning on; shape (steps + 1, axes).
+    """Positions along a plan [m], from its initial state on; shape (steps + 1, axes).
 
     Args:
         scenario: what is flown.

@@ -1,4 +1,4 @@
-"""The scene of a page: vehicles, where they were, where they want to and where they should be.
+"""Scene of a page: vehicles, their trails, their plans, and their desired positions.
 
 Metres, third axis up. A flight in the plane is seen from above.
 """
@@ -19,43 +19,43 @@ from skytether.view.state import State, VehicleTrack
 FLIGHT_RGB: tuple[Rgb, ...] = ((56, 132, 255), (255, 140, 40), (160, 90, 220), (20, 170, 150))
 """Colours of flights, by their place on the page."""
 GOAL_RGB = PALETTE[GREY]
-"""Colour of what is desired."""
+"""Colour of desired positions."""
 
 FENCE_RGB = PALETTE[RED]
 """Colour of the fence."""
 GROUND_RGB: dict[bool, Rgb] = {False: (52, 55, 60), True: (222, 226, 230)}
 """Colour of the lines on the ground, by whether the page is light."""
 GRID_REACH = 3.0
-"""How far the lines on the ground reach over what is shown."""
+"""Size of the ground's grid over the extent of the flight."""
 BELOW = 1e-3
-"""How far below everything else they are, over what is shown."""
+"""Depth of the grid below everything else, over the extent of the flight."""
 TRAIL_S = 20.0
-"""Time of which the trail is drawn [s]."""
+"""Length of the drawn trail [s]."""
 GOAL_S = 1.0
-"""Time for which the newest desired position is shown [s]: until it is certain that none comes."""
+"""Age up to which a desired position is shown [s]; after it, no newer one is expected."""
 TRAIL_POINTS = 240
 """Most points of a vehicle's trail."""
 TRAIL_POINTS_ALL = 2000
 """Most points of all trails of a flight."""
 ROUND_S = 600.0
-"""Longest time of which the desired trajectory is drawn [s]."""
+"""Length of the drawn desired trajectory, at most [s]."""
 SIZE = 0.05
-"""Size of a vehicle over that of what is shown."""
+"""Size of a vehicle over the extent of the flight."""
 WIDE, NARROW = 1.5, 0.65
-"""Width over height of a window that is wide, and of one up to which it is narrow."""
+"""Aspect ratios (width over height) of a wide window, and of the widest narrow one."""
 FOV_RAD = 0.7
 """Vertical field of view [rad]."""
 
 
 def in_space(points: Array) -> NDArray[np.float32]:
-    """Points with a third coordinate; shape (n, 3)."""
+    """Points with a third coordinate added; shape (n, 3)."""
     placed = np.zeros((len(points), 3), np.float32)
     placed[:, : points.shape[1]] = points
     return placed
 
 
 def segments(points: Array, *, dashed: bool = False) -> NDArray[np.float32]:
-    """A line through points, as its pieces, none to or from a NaN; shape (pieces, 2, 3)."""
+    """Line through points, as its pieces; pieces with NaN are left out; shape (pieces, 2, 3)."""
     placed = in_space(points)
     pieces = np.stack([placed[:-1], placed[1:]], axis=1)
     pieces = pieces[~np.isnan(pieces).any(axis=(1, 2))]
@@ -63,7 +63,7 @@ def segments(points: Array, *, dashed: bool = False) -> NDArray[np.float32]:
 
 
 def grid(middle: Array, reach_m: float) -> NDArray[np.float32]:
-    """Lines on the ground around a middle, a round number of metres apart; shape (n, 2, 3)."""
+    """Grid lines on the ground around a centre, with a round spacing; shape (n, 2, 3)."""
     cell_m = 10.0 ** np.floor(np.log10(reach_m))
     most_m = cell_m * np.ceil(GRID_REACH * reach_m / cell_m)
     at_m = np.arange(-most_m, most_m + cell_m / 2, cell_m)
@@ -77,14 +77,16 @@ def grid(middle: Array, reach_m: float) -> NDArray[np.float32]:
 
 
 def extent(scenarios: Sequence[Scenario]) -> tuple[Array, float]:
-    """Middle of what flights fly through [m; shape (3,)] and how far it reaches from there [m]."""
+    """Centre [m; shape (3,)] and extent [m] of the volume of the flights."""
     points = np.concatenate([in_space(_desired(each)) for each in scenarios]).astype(np.float64)
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2, max(1.0, 1.25 * float((high - low).max()) / 2)
 
 
 def _desired(scenario: Scenario) -> Array:
-    """Points of the desired trajectory, or corners of where it may be [m]; shape (n, axes)."""
+    """Points of the desired trajectory, or corners of the box that contains it [m]; shape (n,
+    axes).
+    """
     shape, axes = scenario.reference.shape, scenario.model.axes
     if shape == "target":
         corner = np.zeros(axes)
@@ -99,7 +101,7 @@ def _desired(scenario: Scenario) -> Array:
         return np.array([middle - corner, middle + corner])
     try:
         reference = scenario.given_reference()
-    except (OSError, ValueError):  # a table that is on another machine
+    except (OSError, ValueError):  # the trajectory's table is on another machine
         return np.zeros((2, axes))
     if isinstance(reference, Mission):
         return reference.places
@@ -110,7 +112,7 @@ def _desired(scenario: Scenario) -> Array:
 
 
 def home(scenario: Scenario) -> Array:
-    """Where a flight begins, as far as its scenario says [m]; shape (1, axes)."""
+    """Starting point of a flight, if its scenario has one [m]; shape (1, axes)."""
     if scenario.vehicle.start_m:
         return np.array([scenario.vehicle.start_m])
     if scenario.vehicle.kind == "simulated":
@@ -119,11 +121,11 @@ def home(scenario: Scenario) -> Array:
 
 
 def fence(scenario: Scenario, reach_m: float) -> NDArray[np.float32]:
-    """Lines of a scenario's fence, as far as it has bounds; shape (pieces, 2, 3).
+    """Lines of a scenario's fence, along the bounds it has; shape (pieces, 2, 3).
 
     Args:
-        scenario: what is flown.
-        reach_m: how far a side is drawn that has no bound [m].
+        scenario: scenario that is flown.
+        reach_m: length to which an unbounded side is drawn [m].
     """
     fenced, begin = scenario.fence, in_space(home(scenario))[0]
     pieces = [np.zeros((0, 2, 3), np.float32)]
@@ -148,11 +150,11 @@ def fence(scenario: Scenario, reach_m: float) -> NDArray[np.float32]:
 
 
 def zones(kept: Zones, reach_m: float) -> NDArray[np.float32]:
-    """Lines around the zones of a mission; shape (pieces, 2, 3).
+    """Outlines of a mission's zones; shape (pieces, 2, 3).
 
     Args:
-        kept: the zones.
-        reach_m: height at which one is drawn that has no upper bound in space [m].
+        kept: zones to avoid.
+        reach_m: height to which a zone without upper bound is drawn [m].
     """
     pieces = [np.zeros((0, 2, 3), np.float32)]
     for zone in kept.zones:
@@ -200,7 +202,7 @@ def quadrotor(size: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 class _Marker:
-    """One vehicle in the scene."""
+    """Marker of one vehicle in the scene."""
 
     def __init__(self, scene: viser.SceneApi, name: str, size: float, rgb: Rgb) -> None:
         vertices, faces = quadrotor(size)
@@ -223,7 +225,7 @@ class _Marker:
         self._shown = ""
 
     def show(self, track: VehicleTrack, title: str) -> None:
-        """Put it where it is, in the colour of what it does."""
+        """Move the marker to the vehicle, in the colour of its mode."""
         assert track.row is not None
         self._frame.position = in_space(track.row["state"][None, :, 0])[0]
         does = track.does
@@ -235,7 +237,7 @@ class _Marker:
 
 
 class _Flight:
-    """One flight in the scene."""
+    """Flight in the scene."""
 
     def __init__(
         self, scene: viser.SceneApi, place: int, scenario: Scenario, reach_m: float, title: str
@@ -271,7 +273,7 @@ class _Flight:
         )
 
     def move(self, state: State) -> None:
-        """Put vehicles where they are."""
+        """Update marker positions."""
         for number, track in list(state.vehicles.items()):
             if track.row is None:
                 continue
@@ -285,7 +287,7 @@ class _Flight:
             vehicle.show(track, title)
 
     def draw(self, state: State) -> None:
-        """Draw where they were and want to, and where they must not be."""
+        """Draw trails, plans, desired positions, fence and zones."""
         if state.zones != self._zoned:
             self._zoned = state.zones
             self._set(self._zones, [zones(state.kept, self._reach_m)])
@@ -312,12 +314,12 @@ class _Flight:
 
 
 class Scene:
-    """What the flights of a page look like.
+    """Scene with the flights of a page.
 
     Args:
-        server: the page.
-        states: flights, all of which are known.
-        titles: what they are called, empty for a flight that is alone.
+        server: viser's server.
+        states: states of flights, all with known scenarios.
+        titles: titles of the flights; empty for a single flight.
     """
 
     def __init__(
@@ -328,7 +330,7 @@ class Scene:
         scene = server.scene
         scene.set_up_direction("+z")
         self.ground = grid(self.middle, self.reach_m)
-        """Lines on the ground, see `grid`."""
+        """Grid lines on the ground, see `grid`."""
         camera = server.initial_camera
         camera.fov = FOV_RAD
         camera.position, camera.look_at = self.camera(WIDE)
@@ -339,9 +341,9 @@ class Scene:
         ]
 
     def camera(self, aspect: float) -> tuple[Array, Array]:
-        """Position of a camera that sees all, and where it looks, in a window of this aspect.
+        """Position and target of a camera that sees everything, in a window of this aspect ratio.
 
-        In a narrow one the flight is in the upper half, for words lie over the lower.
+        In a narrow window the flight is in the upper half, because words lie over the lower.
         """
         away_m = self.reach_m / np.tan(FOV_RAD / 2) / min(1.0, aspect)
         down_m = 0.5 * self.reach_m / aspect if aspect < NARROW else 0.0
@@ -351,12 +353,12 @@ class Scene:
         return target + np.array([-0.4, -0.55, 0.45]) * away_m, target
 
     def move(self, states: Sequence[State]) -> None:
-        """Put vehicles where they are."""
+        """Update marker positions."""
         for flight, state in zip(self._flights, filter(_flies, states), strict=True):
             flight.move(state)
 
     def draw(self, states: Sequence[State]) -> None:
-        """Draw lines."""
+        """Draw all lines."""
         for flight, state in zip(self._flights, filter(_flies, states), strict=True):
             flight.draw(state)
 

@@ -1,9 +1,9 @@
-"""What a page shows of one flight: the last minute of it, made of the frames of its processes.
+"""State of one flight on a page: its last minute, made from its processes' frames.
 
     (process, Frame) → `State.take` → `State.vehicles`, `State.network`, `State.said`
 
-It holds the same amount of memory after a second as after a day: a ring for each vehicle, one for
-the network, and the newest events. Time is that of the frames; whoever draws says what time it is.
+Memory is bounded: a ring buffer for each vehicle, one for the network, and the newest events. Times
+are those of the frames; the drawing code passes the present time.
 """
 
 from collections import deque
@@ -40,70 +40,70 @@ from skytether.view.network import DIRECTIONS, SPAN_S, Network
 from skytether.view.rows import check_columns, check_values, planned
 
 SLOTS_MAX = 1200
-"""Most steps that are kept of a vehicle; where a minute has more, every second or third is."""
+"""Most steps that are kept of a vehicle; with more per minute, only every second or third is."""
 VEHICLES_MAX = 64
 """Most vehicles of a flight that are shown."""
 ZONED, GUIDED = "mission.zones", "mission.goals"
-"""Keys of the zones of a mission, and of the goals that are given."""
+"""Keys of a mission's zones, and of its goals changed in flight."""
 PLANS_MAX = 8
-"""Number of plans of a vehicle that are kept, copies included."""
+"""Number of plans of a vehicle that are kept, retransmissions included."""
 SAID_MAX = 50
 """Most events that are kept."""
 LED = "reference.points_m"
-"""Key that changes many times a second where a target is led: not worth a sentence each time."""
+"""Key that a dragged target changes many times a second; such changes are not logged."""
 LOSS_S = 10.0
 """Time over which loss is measured [s]."""
 LOSS_HIGH = 0.3
-"""Measured loss above which a link is called degraded."""
+"""Loss above which a link is called degraded."""
 TRAJECTORY_BYTES = 32
-"""Size between a heartbeat's and the shortest trajectory's [B], without a seal."""
+"""Size between those of a heartbeat and the shortest trajectory [B], without encryption."""
 
 VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms")
-"""Columns of a vehicle's ring that are NaN where nothing is known."""
+"""Columns of a vehicle's ring that are NaN where unknown."""
 ROUNDING = 1e-6
-"""Rounding tolerance of a time over the length of a slot."""
+"""Rounding tolerance of times, over the length of a slot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """Something in words, and its colour."""
+    """Word with an explanation and a colour."""
 
     word: str
-    """One word for it, as in GOOD or BRAKE."""
+    """Single word, such as GOOD or BRAKE."""
     text: str
-    """Sentence that says more, without a full stop."""
+    """Explanation, without a full stop."""
     colour: str
-    """Name of its colour: grey, green, amber, red or blue."""
+    """Name of the colour: grey, green, amber, red or blue."""
 
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """The last minute of a vehicle on a grid of times; NaN where nothing is known."""
+    """Last minute of a vehicle on a time grid; NaN where unknown."""
 
     time_s: Array
     """Time of flight [s]; shape (n,)."""
     position: Array
     """True position [m]; shape (n, axes)."""
     reference: Array
-    """Desired position as the server knew it then [m]; shape (n, axes)."""
+    """Desired position known to the server at the time [m]; shape (n, axes)."""
     figure: Array
-    """What the trigger compares; shape (n,)."""
+    """Figure that the trigger compares; shape (n,)."""
     threshold: Array
-    """What it compares that with; shape (n,)."""
+    """Threshold that the figure is compared with; shape (n,)."""
     event: Array
     """1 where a horizon was sent, 0 elsewhere; shape (n,)."""
     age_s: Array
-    """Age of the observation behind what is flown [s]; shape (n,)."""
+    """Age of the observation behind the input in force [s]; shape (n,)."""
     solve_ms: Array
-    """Time that both MPCs took [ms]; shape (n,)."""
+    """Computing time of both MPC problems [ms]; shape (n,)."""
 
 
 class VehicleTrack:
-    """The last minute of one vehicle.
+    """Last minute of one vehicle.
 
     Args:
         number: number of the vehicle.
-        scenario: what it flies.
+        scenario: scenario that it flies.
     """
 
     def __init__(self, number: int, scenario: Scenario) -> None:
@@ -111,7 +111,7 @@ class VehicleTrack:
         self._scenario = scenario
         steps = max(1, round(SPAN_S / scenario.control.dt))
         self._stride = -(-steps // SLOTS_MAX)
-        """Steps from one that is kept to the next."""
+        """Number of steps between two that are kept."""
         self._slot_s = self._stride * scenario.control.dt
         self._slots = -(-steps // self._stride)
         axes = scenario.model.axes
@@ -135,11 +135,11 @@ class VehicleTrack:
         self.row: np.void | None = None
         """Newest row of the client's part; None without any."""
         self.planned = 0
-        """Number of steps that the server has planned for, as far as they were seen."""
+        """Number of steps seen that the server has planned for."""
         self.sent = 0
-        """Number of horizons that it has sent at them."""
+        """Number of those steps at which it sent a horizon."""
         self._plans: deque[np.void] = deque(maxlen=PLANS_MAX)
-        """Newest plans that were sent to it, the newest last."""
+        """Newest plans sent to the vehicle, the newest last."""
         self._seen: np.void | None = None
         """Newest row of the server's part; None without any."""
 
@@ -173,11 +173,11 @@ class VehicleTrack:
             self._seen = rows[-1].copy()
 
     def lead(self, rows: Table) -> None:
-        """Take rows of the part "plan", of which the newest are shown."""
+        """Take rows of the part "plan"; the newest plans are shown."""
         self._plans.extend(row.copy() for row in rows[-PLANS_MAX:])
 
     def _at(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Index in the ring of each step, emptied where it is new; -1 where it is not kept."""
+        """Ring index of each step, emptied if it is new; -1 for a step that is not kept."""
         slots = steps // self._stride
         at = slots % self._slots
         there = np.maximum(self._ring["slot"][at], self._ring["slot"].max() - self._slots)
@@ -190,17 +190,17 @@ class VehicleTrack:
 
     @property
     def time_s(self) -> float:
-        """Time of flight of the newest step that is known [s]; 0 before the first."""
+        """Time of flight of the newest known step [s]; 0 before the first."""
         return max(0.0, float(self._ring["slot"].max()) * self._slot_s)
 
     @property
     def mode(self) -> Mode:
-        """What the vehicle does."""
+        """Mode of the vehicle."""
         return Mode.INIT if self.row is None else Mode(self.row["mode"])
 
     @property
     def does(self) -> Word:
-        """What the vehicle does and why, in words."""
+        """Mode of the vehicle and its reason, in words."""
         mode = self.mode
         if self.row is None:
             return Word("INIT", "nothing has been heard of it", GREY)
@@ -213,14 +213,14 @@ class VehicleTrack:
 
     @property
     def age_s(self) -> float:
-        """Age of the observation behind what it flies by at its newest step [s]; NaN for none."""
+        """Age of the observation behind the newest input [s]; NaN for none."""
         if self.row is None or self.row["age_ns"] < 0:
             return np.nan
         return float(self.row["age_ns"]) / SECOND_NS
 
     @property
     def known_s(self) -> float:
-        """Age of what the server knew of the vehicle when it planned last [s]; NaN for none."""
+        """Age of the server's newest observation when it planned last [s]; NaN for none."""
         if self._seen is None or self._seen["observed_step"] < 0:
             return np.nan
         behind = int(self._seen["step"] - self._seen["observed_step"])
@@ -232,7 +232,7 @@ class VehicleTrack:
         return position
 
     def goals(self, seconds: float = SPAN_S) -> Array:
-        """Desired positions of the last seconds, as `trail` has the true ones [m]."""
+        """Desired positions of the last seconds [m], in the form of `trail`."""
         reference: Array = self._kept(seconds)["reference"]
         return reference
 
@@ -255,7 +255,7 @@ class VehicleTrack:
     def motions(self) -> list[Array]:
         """Positions along each plan that may be flown, see `ahead`.
 
-        On a mission these are the plan in force and those that may still be accepted.
+        On a mission: the plan in force and those that may still be accepted.
         """
         if not self._scenario.is_mission or self.row is None:
             return [self.ahead()]
@@ -274,9 +274,9 @@ class VehicleTrack:
         return positions[min(max(flown, 0), len(positions)) :]
 
     def path(self, points: int) -> Array:
-        """Positions at so many times of the last minute [m]; shape (points, axes).
+        """Positions at evenly spaced times of the last minute [m]; shape (points, axes).
 
-        The last of them is the newest that is known; where none is, there is NaN.
+        The last one is the newest known position; unknown positions are NaN.
         """
         flown = ~np.isnan(self._ring["position"][:, 0])
         last = int(self._ring["slot"].max(where=flown, initial=-1))
@@ -285,7 +285,7 @@ class VehicleTrack:
         return position
 
     def curves(self, points: int, end_s: float | None = None) -> Curves:
-        """The last minute on a grid of so many times.
+        """Last minute on a time grid.
 
         Args:
             points: number of times.
@@ -305,7 +305,7 @@ class VehicleTrack:
         )
 
     def error_m(self, seconds: float) -> float:
-        """Root mean square of the distance to the reference in the last seconds [m], or NaN."""
+        """Root mean square distance to the reference in the last seconds [m]; NaN if unknown."""
         kept = self._kept(seconds)
         away = kept["position"] - kept["reference"]
         squares = (away**2).sum(axis=1)
@@ -313,20 +313,20 @@ class VehicleTrack:
         return float(np.sqrt(squares.mean())) if len(squares) else np.nan
 
     def _kept(self, seconds: float) -> NDArray[np.void]:
-        """Slots of the last seconds, oldest first, without what lies before the first of them."""
+        """Slots of the last seconds, oldest first, without empty ones at the start."""
         slots = self._ring["slot"]
         recent = slots[(slots >= 0) & (slots > slots.max() - seconds / self._slot_s)]
         return self._at_slots(np.arange(recent.min(), recent.max() + 1) if len(recent) else recent)
 
     def _at_slots(self, slots: NDArray[np.int64]) -> NDArray[np.void]:
-        """Slots by number; empty ones where nothing is known."""
+        """Slots by number; an empty slot where nothing is known."""
         found = self._ring[slots % self._slots]
         found[(found["slot"] != slots) | (slots < 0)] = self._empty
         return found
 
 
 def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
-    """A group of figures within others; empty where there is none."""
+    """Group of figures within others; empty where it is missing."""
     for name in names:
         found = figures.get(name)
         figures = found if isinstance(found, dict) else {}
@@ -334,46 +334,46 @@ def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 def told(figures: dict[str, Any], *names: str) -> float:
-    """A figure within groups of figures; NaN where there is none."""
+    """Figure within nested groups; NaN where it is missing."""
     value = group(figures, *names[:-1]).get(names[-1])
     return float(value) if isinstance(value, int | float) else np.nan
 
 
 @dataclass(slots=True)
 class _Process:
-    """A process whose frames come in."""
+    """Process that sends frames."""
 
     opened: Opened
     columns: dict[str, np.dtype[np.void]]
     newest_ns: int = 0
     """Time of its newest frame [ns]."""
     seen_ns: int = -1
-    """Time up to which what comes has come before [ns]."""
+    """Time up to which incoming frames are repetitions [ns]."""
     figures: dict[str, Any] = field(default_factory=dict)
 
 
 class State:
-    """What is shown of one flight."""
+    """State of one flight on a page."""
 
     def __init__(self) -> None:
         self._processes: dict[str, _Process] = {}
         self._lost: set[str] = set()
         self.flights = 0
-        """Number of flights that were begun."""
+        """Number of flights that have begun."""
         self._begin()
 
     def _begin(self) -> None:
-        """Forget what was flown."""
+        """Forget the previous flight."""
         self.name = ""
         """Name of the scenario; empty before anything is known."""
         self.scenario = Scenario()
-        """The scenario, as the process that was heard first flies it."""
+        """Scenario, as the first process heard flies it."""
         self.vehicles: dict[int, VehicleTrack] = {}
         """Vehicles by number."""
         self.omitted = 0
-        """Rows of vehicles beyond the VEHICLES_MAX that are shown."""
+        """Number of rows of vehicles beyond the VEHICLES_MAX that are shown."""
         self._zones: str | None = None
-        """Zones as they were changed in flight; None before that."""
+        """Zones as changed in flight; None before a change."""
         self.network = Network(0)
         self.said: deque[tuple[float, str]] = deque(maxlen=SAID_MAX)
         """Newest events, oldest first: time of flight [s] and sentence."""
@@ -385,10 +385,10 @@ class State:
     # -- what comes in -----------------------------------------------------------------------
 
     def take(self, process: str, frame: Frame) -> None:
-        """Take a frame of a process; what belongs to no flight is left out.
+        """Take a frame of a process; frames that belong to no flight are dropped.
 
         Raises:
-            ValueError: the frame makes no sense: its process is another version, or none of ours.
+            ValueError: the frame makes no sense: it comes from another version or another program.
         """
         if isinstance(frame, Opened):
             self._open(process, frame)
@@ -409,14 +409,15 @@ class State:
                 self.network.wait(np.nan_to_num(waiting), time_ns=frame.time_ns)
 
     def lose(self, process: str) -> None:
-        """Note that a process is not heard any more."""
+        """Note that a process's feed has ended."""
         self._lost.add(process)
 
     def _open(self, process: str, opened: Opened) -> None:
         self._lost.discard(process)
         known = self._processes.get(process)
         if known and known.opened.time_ns == opened.time_ns:
-            known.seen_ns = known.newest_ns  # what is kept for those who come late comes again
+            # after a reconnection, the feed repeats the frames that it keeps for new readers
+            known.seen_ns = known.newest_ns
             return
         try:
             scenario = msgspec.toml.decode(opened.scenario, type=Scenario)
@@ -484,11 +485,13 @@ class State:
 
     @property
     def flies(self) -> bool:
-        """Whether a vehicle or a server is known; netem may carry anything."""
+        """Whether a vehicle or a server is known; netem alone may carry any protocol."""
         return any(name != "netem" for name in self._processes)
 
     def time_s(self, time_ns: int) -> float:
-        """Time of flight [s] at a time [ns], 0 before it has begun; of netem alone that it runs."""
+        """Time of flight [s] at a time [ns], 0 before the flight; of netem alone, its running
+        time.
+        """
         begin_ns = self.begin_ns
         if begin_ns is None and not self.flies:
             begin_ns = min((each.opened.time_ns for each in self._processes.values()), default=None)
@@ -496,24 +499,24 @@ class State:
 
     @property
     def title(self) -> str:
-        """What the scenario shows, or else its name."""
+        """Title of the scenario, or else its name."""
         return self.scenario.title or self.name
 
     @property
     def zones(self) -> str:
-        """Zones of a mission, as they are written."""
+        """Zones of a mission, as TOML text."""
         return self.scenario.mission.zones if self._zones is None else self._zones
 
     @property
     def kept(self) -> Zones:
-        """Zones of a mission; none where a file of theirs is on another machine."""
+        """Zones of a mission; none where their file is on another machine."""
         try:
             return zones.parse(self.zones, self.scenario.model.axes)
         except (OSError, PolicyError):
             return Zones()
 
     def waits(self, number: int) -> str:
-        """What a vehicle of a mission waits for; empty for nothing."""
+        """Reason why a vehicle of a mission waits; empty for none."""
         said = group(self.figures("server"), "by_vehicle", str(number)).get("waits", "")
         return said if isinstance(said, str) else ""
 
@@ -536,7 +539,7 @@ class State:
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """Names of the processes that are not heard any more."""
+        """Names of the processes whose feeds have ended."""
         return tuple(sorted(self._lost))
 
     def figures(self, process: str) -> dict[str, Any]:
@@ -546,11 +549,11 @@ class State:
 
     @property
     def every_step(self) -> float:
-        """Packets a second that sending at every step would take, for all vehicles."""
+        """Packets per second of sending at every step, for all vehicles."""
         return max(1, len(self.vehicles)) / self.scenario.control.dt
 
     def link(self, number: int, now_ns: int) -> Word:
-        """How the link of a vehicle does, in words."""
+        """State of a vehicle's link, in words."""
         track = self.vehicles.get(number)
         if track is None or track.row is None or track.mode is Mode.INIT:
             return Word("NONE", "there is no session yet", GREY)

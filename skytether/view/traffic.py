@@ -1,8 +1,8 @@
-"""What passed netem, for other programs: traces of delays, and a capture in pcap's format.
+"""Packets that passed netem, for other programs: delay traces, and a capture in pcap format.
 
-A recording of netem's knows when each packet entered, how long it was delayed, its size and its
-fate, and nothing of its content. So the capture has headers that are made up (clients are 10.0.x.y,
-the server is 10.255.255.254) and the true lengths: enough to see rates, bursts and gaps.
+A recording of netem has each packet's time of entry, delay, size and fate, but not its content. So
+the capture has made-up headers (clients are 10.0.x.y, the server is 10.255.255.254) and true
+lengths: enough to see rates, bursts and gaps.
 """
 
 import struct
@@ -23,13 +23,16 @@ _UDP = 17
 
 
 def traces(packets: Rows) -> Mapping[str, str]:
-    """Traces that the impairment `trace` replays, by name: one a direction and flow, as CSV."""
+    """Delay traces that the impairment `trace` replays, as CSV by name: one per direction and
+    flow.
+    """
     found = {}
     for way, direction in WAYS.items():
         for flow in np.unique(packets["flow"]):
             rows = packets[(packets["direction"] == direction) & (packets["flow"] == flow)]
             rows = rows[np.argsort(rows["arrived_ns"], kind="stable")]
-            rows = rows[np.diff(rows["arrived_ns"], prepend=-1) > 0]  # a trace has one at a time
+            # a trace holds one packet per time
+            rows = rows[np.diff(rows["arrived_ns"], prepend=-1) > 0]
             if not len(rows):
                 continue
             time_s = (rows["arrived_ns"] - rows["arrived_ns"][0]) / SECOND_NS
@@ -40,15 +43,15 @@ def traces(packets: Rows) -> Mapping[str, str]:
 
 
 def pcap(packets: Rows, began_ns: int = 0) -> bytes:
-    """A capture of the packets as they left, behind netem; those that were lost are not in it.
+    """Capture of the packets that left netem; lost ones are not in it.
 
     Args:
-        began_ns: time of the clock that the packets' times are counted on [ns since 1970].
+        began_ns: zero of the packets' clock [ns since 1970].
     """
     rows = packets[~packets["lost"]]
     left_ns = rows["arrived_ns"] + rows["delay_ns"] + began_ns
     order = np.argsort(left_ns, kind="stable")
-    # Magic of times in nanoseconds; version 2.4; the header alone of each packet is kept.
+    # Magic number for nanosecond times; version 2.4; packets are cut after the headers.
     pieces = [struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, HEADER_BYTES, RAW_IP)]
     for row, time_ns in zip(rows[order], left_ns[order].tolist(), strict=True):
         size = int(row["bytes"]) + HEADER_BYTES

@@ -1,4 +1,4 @@
-"""What a page says of a flight, as HTML."""
+"""Words of a page about a flight, as HTML."""
 
 from collections.abc import Sequence
 from html import escape
@@ -19,22 +19,22 @@ CSS = {
 }
 """Colours of words, by name."""
 NEWEST = 3
-"""Number of events that stand beside the state of a vehicle."""
+"""Number of events shown beside a vehicle's state."""
 SAID_SHOWN = 50
 """Most events that are shown."""
 
 FATES = ("packets", "lost", "dropped", "reordered", "duplicated", "corrupted")
-"""What netem counts of a direction, and what is shown of that."""
+"""Counters of netem for a direction, and their titles."""
 
 FLOWN_S = "data-flown-s"
-"""Attribute that tells programs the time of flight [s]."""
+"""HTML attribute with the time of flight [s], for programs."""
 
 _BODY = "font-size:0.85em;line-height:1.45;padding:0 0.6em;color:var(--mantine-color-text)"
 _DIM = "color:var(--mantine-color-dimmed)"
 
 
 def badge(word: Word) -> str:
-    """A word in its colour, and the sentence behind it."""
+    """Word in its colour, with its explanation."""
     chip = (
         f"background:{CSS[word.colour]};color:#fff;border-radius:0.25em;padding:0.05em 0.5em;"
         "font-weight:600;margin-right:0.5em;display:inline-block"
@@ -43,12 +43,12 @@ def badge(word: Word) -> str:
 
 
 def number(value: float, form: str, unit: str = "") -> str:
-    """A number, or a dash where there is none."""
+    """Number as text, or a dash for an unknown one."""
     return "–" if np.isnan(value) else f"{value:{form}}{unit}"
 
 
 def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
-    """What a vehicle does and how its link is, in words and numbers."""
+    """State of a vehicle and its link, in words and numbers."""
     if not state.name:
         return f'<div style="{_BODY}">{escape(title)} Nothing has been heard of a flight yet.</div>'
     if not state.flies:
@@ -79,7 +79,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
 
 
 def _carried(state: State, now_ns: int, title: str) -> str:
-    """What netem carries for programs of others, in numbers."""
+    """Counters of netem where it carries other programs' packets."""
     counted = state.figures("netem")
     rows = [("clients", number(told(counted, "flows"), ".0f")), *_network(state, now_ns)]
     for way, name in (("uplink", "up"), ("downlink", "down")):
@@ -96,7 +96,7 @@ def _carried(state: State, now_ns: int, title: str) -> str:
 
 
 def _table(rows: Sequence[tuple[str, str]]) -> str:
-    """Names and values, a line each."""
+    """Table of names and values, one per line."""
     lines = "".join(
         f'<tr><td style="{_DIM};padding-right:0.8em;vertical-align:top">{escape(name)}</td>'
         f"<td>{escape(value)}</td></tr>"
@@ -106,7 +106,7 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _gone(state: State) -> str:
-    """Processes that are not heard any more; empty where there is none."""
+    """Sentence on processes whose feeds have ended; empty for none."""
     names = ", ".join(state.lost)
     return f'<div style="color:{CSS["red"]}">no feed of {names}</div>' if names else ""
 
@@ -125,7 +125,7 @@ def _link(state: State, vehicle: int, now_ns: int) -> Word:
 
 
 def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
-    """Rows of a vehicle on a mission; none without one."""
+    """Table rows of a vehicle on a mission; none without one."""
     if not state.scenario.is_mission:
         return []
     asked = f"at least {state.scenario.mission.separation_m:g} m"
@@ -140,7 +140,7 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
-    """Rows of what the vehicle's autopilot says of itself; none without one."""
+    """Table rows of the vehicle's autopilot; none without one."""
     says = group(state.figures("client"), "by_vehicle", str(vehicle), "autopilot")
     if not says:
         return []
@@ -156,7 +156,7 @@ def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 
 def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
-    """Rows of the network's table."""
+    """Table rows of the network."""
     rows = []
     for direction, name in ((UPLINK, "up"), (DOWNLINK, "down")):
         traffic = state.network.traffic(direction, LOSS_S, now_ns)
@@ -184,7 +184,7 @@ def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
 
 
 def said(states: Sequence[tuple[str, State]]) -> str:
-    """The newest events, newest first, a line each."""
+    """Newest events, newest first, one per line."""
     events = [
         (time_s, f"{title} {text}".strip())
         for title, state in states
@@ -199,12 +199,12 @@ def said(states: Sequence[tuple[str, State]]) -> str:
 
 
 def note(text: str) -> str:
-    """A remark."""
+    """Remark in small print."""
     return f'<div style="{_BODY};{_DIM}">{escape(text)}</div>'
 
 
 def answer(text: str, *, refused: bool) -> str:
-    """What was answered to a request; nothing before any."""
+    """Answer to a request; empty before any."""
     if not text:
         return ""
     colour = CSS["red"] if refused else CSS["green"]

@@ -456,7 +456,9 @@ def test_parameters_are_read_listed_and_set(flavour: FlavourName) -> None:
 
 @pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 100.0, 200.0])
 def test_a_stream_is_exact_by_its_own_stamp(rate: float) -> None:
-    """As both were measured, up to 200 Hz; more than that is not sent."""
+    """Streams keep the requested rate, up to 200 Hz; both real autopilots do, and send no
+    faster.
+    """
     companion = Companion()
     companion.run(1.0)
     companion.stream(rate)
@@ -589,7 +591,7 @@ def test_a_setpoint_that_cannot_be_flown_is_none(
 
 
 def test_it_heeds_its_own_number_alone() -> None:
-    """What is for another system, or says that it is this one, is counted and left."""
+    """Messages for another system, or with the autopilot's own id, are counted and ignored."""
     companion = Companion()
     companion.run(1.0)
     arm = dialect.MAVLink_command_long_message(2, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0)
@@ -647,7 +649,7 @@ def test_garbage_is_counted(garbage: list[bytes]) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_any_message_with_any_fields_is_survived(data: st.DataObject) -> None:
-    """What it handles, with whatever a float or an integer can be; nothing arms by itself."""
+    """Every message that it handles may have any float or integer; nothing arms by itself."""
     numbers = st.floats(width=32)
     companion = Companion(data.draw(st.sampled_from(BOTH)), ready_s=100.0)
     target = data.draw(st.sampled_from([0, 1, 2]))

@@ -50,7 +50,7 @@ def heartbeat(own: socket.socket) -> object:
 
 @pytest.mark.parametrize("line", LINES)
 def test_a_documented_autopilot_is_one(line: str, tmp_path: Path) -> None:
-    """As written, but for the ports: it answers whoever speaks, or speaks first."""
+    """The documented commands run, with other ports: it answers each sender, or speaks first."""
     counted = tmp_path / "counted.json"
     with companion() as own:
         port = own.getsockname()[1]
@@ -89,7 +89,7 @@ def test_what_cannot_be_is_refused_in_a_line(argv: list[str], said: str) -> None
 
 
 def test_an_insecure_one_may_be_reached() -> None:
-    """Where it is asked for."""
+    """The option --insecure allows an address that other machines can reach."""
     with Command("autopilot", "--bind", "0.0.0.0:0", "--insecure", "--log", "json") as command:
         assert listening(command)
         command.send_signal(signal.SIGTERM)

@@ -58,7 +58,7 @@ def test_a_frame_that_was_cut_off_takes_no_other_with_it(data: st.DataObject) ->
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(1, 40), max_size=20))
 def test_a_stream_may_come_in_any_pieces(sizes: list[int]) -> None:
-    """What is waited for is never more than a frame."""
+    """The decoder never waits for more than one frame."""
     codec, sent, read = Codec(255, 190, stream=True), b"".join(frames(5)), []
     for size in [*sizes, len(sent)]:
         read += codec.decode(sent[:size])
@@ -93,7 +93,9 @@ def test_a_frame_with_a_right_checksum_may_say_anything(payload: bytes, number: 
 
 @given(st.integers(-(2**31), 2**31 - 1).filter(lambda n: (n >> 22) & 0x1FF != 0x1FE))
 def test_an_integer_goes_bit_by_bit(value: int) -> None:
-    """As PX4 sends it; but for those that are signalling NaNs, which no float carries."""
+    """Integers are sent bit by bit, as by PX4, except for signalling NaNs, which no float can
+    carry.
+    """
     kind = parameters.type_of(value)
     sent = parameters.to_wire(value, bytewise=True)
     if not math.isnan(sent):
@@ -102,7 +104,7 @@ def test_an_integer_goes_bit_by_bit(value: int) -> None:
 
 @given(st.integers(-(2**24), 2**24))
 def test_an_integer_goes_as_a_number(value: int) -> None:
-    """As ArduPilot sends it, exact where a float of 32 bits is."""
+    """Integers are converted to floats, as by ArduPilot; they are exact up to 24 bits."""
     sent = parameters.to_wire(value, bytewise=False)
     assert parameters.from_wire(sent, parameters.INTEGER, bytewise=False) == value
 

@@ -91,7 +91,7 @@ def test_targets_leave_it_to_the_autopilot_to_regulate() -> None:
 def test_a_vehicle_that_was_where_it_should_be_is_told_the_desired_velocity(
     time_s: float, lead_s: float, age_s: float
 ) -> None:
-    """Whatever the lead and the age."""
+    """The set-point is the desired velocity, for every lead and age."""
     heard = Heard(time_s - age_s, EIGHT(np.array(time_s - age_s))[:, 0])
     chosen = setpoint(laws.make("led", lead_s), EIGHT, time_s, heard)
     np.testing.assert_allclose(chosen.velocity, EIGHT(np.array(time_s + lead_s))[:, 1])
@@ -153,7 +153,7 @@ def test_px4_is_flown_as_well_and_the_same_seed_flies_the_same() -> None:
 
 
 def test_half_of_all_packets_may_be_lost() -> None:
-    """What is asked for is asked again until it is done."""
+    """Every request is repeated until it is confirmed."""
     half = {"delay": "constant", "minimum_s": 0.2, "loss": 0.5}
     record = flown(network={"uplink": half, "downlink": half})
     assert record.failure is None
@@ -161,7 +161,7 @@ def test_half_of_all_packets_may_be_lost() -> None:
 
 
 def test_an_age_is_known_although_clocks_differ() -> None:
-    """By TIMESYNC: of a position 0.2 s under way it is 0.2 s and up to a step."""
+    """TIMESYNC gives the age of a position that was 0.2 s under way: 0.2 s to 0.2 s plus a step."""
     late = {"delay": "constant", "minimum_s": 0.2, "loss": 0.0}
     drifts = {"clock_drift_ppm": 500.0, "clock_offset_s": 1000.0}
     record = flown(network={"uplink": late, "downlink": late}, simulation=drifts)
@@ -288,7 +288,7 @@ def test_the_true_state_is_taken_at_the_time_of_each_step() -> None:
 
 
 def test_the_autopilot_records_where_it_truly_is_at_every_tick() -> None:
-    """By the driver's clock."""
+    """Times in the record are on the driver's clock."""
 
     class Sink(bytearray):
         def write(self, piece: bytes) -> None:

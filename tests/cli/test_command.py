@@ -40,7 +40,7 @@ from skytether.shell.log import LogLine
 from warm import Command, skytether
 
 PATIENCE_S = 30.0
-"""How long a test waits for something before it gives up."""
+"""Longest wait of a test for a condition [s]."""
 
 EXPECTED = "expected HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
 
@@ -329,7 +329,7 @@ def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_ends_the_flight_and_still_shows_it(tmp_path: Path) -> None:
-    """What was flown until then; nothing is left running."""
+    """The flight until Ctrl-C is shown; no process is left running."""
     command = [sys.executable, "-P", "-m", "skytether", "fly", "demo", *QUICK]
     environment = os.environ | {"TMPDIR": str(tmp_path)}
     with subprocess.Popen(
@@ -509,7 +509,7 @@ def call_as_strangers(port: int, count: int) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_workers_that_are_told_to_end_twice_end_in_order(number: signal.Signals) -> None:
-    """By a terminal or a supervisor, which tells every process, and by their parent."""
+    """A terminal or supervisor signals every process, and the parent signals its workers again."""
     argv = ["server", "demo", "--bind", "127.0.0.1:0", "--workers", "2"]
     with subprocess.Popen(
         [sys.executable, "-P", "-m", "skytether", *argv],

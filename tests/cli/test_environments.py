@@ -45,7 +45,7 @@ ENVIRONMENTS: dict[str, tuple[dict[str, str | None], str]] = {
         "ulimit -n 64; {} </dev/null >&- 2>&-",
     ),
 }
-"""What differs from this environment: variables, and the line of shell around a command."""
+"""Differences from this environment: variables, and the shell line around a command."""
 
 
 def run(argv: list[str], environment: str = "") -> subprocess.CompletedProcess[str]:
@@ -142,7 +142,7 @@ def test_a_terminal_that_cannot_move_its_cursor_is_not_told_to(term: str) -> Non
     ],
 )
 def test_too_few_open_files_are_told_before_anything_flies(argv: list[str], flag: str) -> None:
-    """How many are needed, how many there may be, and what to do."""
+    """The message has the number needed, the number allowed, and the remedy."""
     done = run(argv, "64 open files")
     assert done.returncode in (1, 2)
     said = f"{flag}: got 200, which takes 248 open files; expected at most 16, for 64 may be open"
@@ -201,7 +201,7 @@ def test_a_process_that_cannot_write_does_not_start(
 
 
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
-    """Where output goes to it, and where a file does."""
+    """The disk of standard output may be full, or that of an output file."""
     full = subprocess.run(
         ["sh", "-c", f"{shlex.join([*SKYTETHER, 'scenarios'])} >/dev/full"],
         capture_output=True,

@@ -107,7 +107,7 @@ def test_every_command_has_its_needs_told_here() -> None:
 
 
 def test_every_package_that_is_imported_is_asked_for() -> None:
-    """By name, not as what another one happens to bring."""
+    """The requirements name every imported package, and do not rely on another package's."""
     asked = {re.split("[^a-z0-9_-]", one)[0] for one in metadata.requires("skytether") or ()}
     ours = {"skytether", *(name.replace("-", "_") for name in asked)}
     imported = set()

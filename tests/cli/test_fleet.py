@@ -57,7 +57,7 @@ def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Clien
 
 
 def flown(count: int, *, together: bool) -> Rows:
-    """What so many vehicles record in virtual time, in one process or in one each."""
+    """Rows of a number of vehicles in virtual time, in one process or in one process each."""
     world = World()
     # Ticks 7 ms into the vehicles' steps: no horizon comes at the very instant that a step begins.
     server = world.add(
@@ -82,7 +82,7 @@ def flown(count: int, *, together: bool) -> Rows:
 
 
 def test_a_fleet_flies_as_its_vehicles_would_alone() -> None:
-    """To the last bit, each over a flow of its own."""
+    """Each vehicle of a fleet, with its own flow, flies bit for bit as it would alone."""
     together, alone = flown(5, together=True), flown(5, together=False)
     assert len(together) == 5 * 200
     np.testing.assert_array_equal(together, alone)
@@ -164,7 +164,9 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
 
 
 def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None:
-    """As many vehicles as it has; how near they came stands beside what they are asked to keep."""
+    """A mission has its own number of vehicles; the smallest and the required distance are
+    shown.
+    """
     flown = ("--virtual", "--reference.shape", "swap(4)", "--figure", str(tmp_path / "swap.png"))
     swap = fleet_command(tmp_path, "--mission", "swap", *flown)
     assert (tmp_path / "swap.png").stat().st_size > 10_000

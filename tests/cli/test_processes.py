@@ -124,7 +124,7 @@ def test_events_of_a_flight_stand_in_the_order_of_their_times(tmp_path: Path) ->
 
 
 async def test_a_line_without_end_hides_nothing_that_follows() -> None:
-    """Whatever a child prints, what it says later is heard."""
+    """Lines after an endless one are still read."""
     heard: list[LogLine] = []
     stream = asyncio.StreamReader(limit=1000)
     line = LogLine(process="client", time_ns=5, event=Flying(vehicle=1))

@@ -488,7 +488,7 @@ def test_a_low_battery_lands_by_the_autopilots_own_landing() -> None:
 
 
 def test_the_voltage_counts_as_well() -> None:
-    """Where a key says so; a sag of a second does not."""
+    """The voltage counts if its key is set; a sag of one second does not."""
     air = flying("ardupilot", mavlink={"battery_min_v": 5.0})
     codec = Codec(1, 1)
 
@@ -701,7 +701,7 @@ def test_a_late_heartbeat_does_not_end_the_climb() -> None:
 
 
 def test_an_autopilot_that_counts_anew_is_heard_after_a_pause() -> None:
-    """As after a reboot: its numbers are lower than before."""
+    """Lower sequence numbers are accepted after a pause, as after a reboot."""
     air = flying("ardupilot")
     (peer,) = air.autopilot._peers.values()
     air.tap.dumb = True
@@ -776,7 +776,7 @@ def test_a_bad_line_brings_it_into_the_air_as_well(flavour: FlavourName) -> None
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_line_of_bytes_may_come_in_any_pieces(flavour: FlavourName) -> None:
-    """As TCP and serial lines bring them; the autopilot is heard as over UDP."""
+    """Bytes over TCP and serial lines may come in pieces; the result equals that over UDP."""
     line = {"address": "tcp:127.0.0.1:5760"}
     air = Air(flavour, host="line", duration=3.0, vehicle=line)
     rng, inner, held = np.random.default_rng(2), air.tap.outbox, bytearray()
@@ -812,7 +812,7 @@ def test_setpoints_come_at_the_rate_of_steps_or_more(
 
 
 def test_a_stream_that_stops_is_asked_for_again() -> None:
-    """As after a reboot of the autopilot's link: it has forgotten the rates."""
+    """Streams are requested again when the autopilot has forgotten the rates, as after a reboot."""
     air = flying("ardupilot")
     (peer,) = air.autopilot._peers.values()
     number = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)

@@ -42,7 +42,7 @@ from skytether.shared.wire.protocol import (
 
 SERVER: Address = ("server", 0)
 OPENED = ModeChanged(vehicle=4, before="init", after="ready", reason="its session is open")
-"""What a vehicle says that holds its last input for ever: it takes a horizon at once."""
+"""Event of a vehicle that holds its last input for ever: it accepts a horizon at once."""
 
 
 def scenario(**changes: Any) -> Scenario:
@@ -231,7 +231,9 @@ def test_the_epoch_is_the_moment_the_session_opens() -> None:
 
 
 def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> None:
-    """By the time since step 0, less its stamp: all the server knows of the vehicle's clock."""
+    """Observations contain the arrival time minus the message's stamp, for the server's clock
+    map.
+    """
     server = flying()
     epoch_ns = server.now_ns
     (first,) = server.wake()
@@ -292,7 +294,7 @@ def test_ages_are_counted_from_a_clock_that_begins_with_the_flight_as_well() -> 
 def test_a_vehicle_that_does_not_know_its_true_state_records_its_estimate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As a real one does; all else is as ever."""
+    """Without a known true state, as on a real vehicle, the estimate is recorded in its place."""
     monkeypatch.setattr(SimulatedVehicle, "truth", lambda _: None)
     server = flying()
     said = [message for _ in range(3) for message in server.wake()]
@@ -335,7 +337,7 @@ def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
 
 
 def test_a_restarted_server_is_flown_with_in_its_new_session() -> None:
-    """What the old session still sends is dropped; steps go on."""
+    """Packets of the old session are dropped; steps go on."""
     server = flying()
     server.wake()
     server.session = 8
@@ -358,7 +360,7 @@ def test_an_answer_to_another_life_is_dropped() -> None:
 
 
 def test_the_flight_ends_after_its_duration() -> None:
-    """As many steps as fit, then no more wakes."""
+    """The flight has as many steps as fit, then no more wakes."""
     server = flying()
     for step in range(200):
         assert not server.client.finished
@@ -371,7 +373,7 @@ def test_the_flight_ends_after_its_duration() -> None:
 
 
 def test_an_exhausted_horizon_brakes_or_holds() -> None:
-    """As the scenario says: the paper's flies on for ever, others come to hover."""
+    """The scenario decides: the paper's flies on for ever, others brake to a hover."""
     speeds = {}
     for exhausted in ("hold", "brake"):
         server = flying(vehicle={"exhausted": exhausted})

@@ -42,7 +42,7 @@ def terms(*, scheme: str = "predictive", exhausted: str = "hold", feedback: bool
 
 
 def horizon(step: int, inputs: Array = INPUTS) -> Horizon:
-    """What the server made for `step`."""
+    """Horizon that the server made for `step`."""
     return Horizon(1, 1, step, 0, 0, inputs.astype(np.float32))
 
 
@@ -103,7 +103,7 @@ def test_brake_takes_the_speed_away_at_its_rate() -> None:
 @quick
 @given(st.floats(-1.8, 1.8), st.floats(-0.9, 0.9), st.integers(0, 40))
 def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> None:
-    """Whatever was flown last, its direction stays and its speed only falls."""
+    """While braking, the direction of the last input stays, and its speed only falls."""
     compensator = holding(0, np.tile([[x], [y]], H), exhausted="brake")
     last, now, then = (chosen(compensator, H - 1 + i, HERE) for i in (0, later, later + 1))
     assert last[0] * now[1] == pytest.approx(last[1] * now[0], abs=1e-12)
@@ -247,7 +247,9 @@ def test_without_compensation_the_first_input_is_braked_along_whatever_follows_i
 def test_a_horizon_that_comes_long_after_its_committed_steps_is_refused(
     scheme: str, d: int
 ) -> None:
-    """By more than a quarter of itself, two steps; the paper's scheme commits to nothing."""
+    """The limit is a quarter of the horizon, here two steps; the paper's scheme commits to
+    nothing.
+    """
     inputs = np.concatenate([np.zeros((2, d)), INPUTS], axis=1)
     in_time, late = Compensator(terms(scheme=scheme)), Compensator(terms(scheme=scheme))
     in_time.offer(horizon(100, inputs), 102 + d, 99)
@@ -354,7 +356,7 @@ def test_with_feedback_it_brakes_and_stays_where_it_is_in_wind(
 
 
 def test_a_horizon_that_is_dropped_leaves_no_feedback() -> None:
-    """What was flown last is braked along, whatever the state."""
+    """The last input is braked, whatever the state."""
     compensator = Compensator(terms(exhausted="brake", feedback=True))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     compensator.drop(104, np.array([0.6, 0.8]))

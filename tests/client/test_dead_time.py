@@ -130,7 +130,9 @@ def test_constant_wind_is_reckoned_with_while_inputs_are_on_their_way() -> None:
 
 @pytest.mark.parametrize("scheme", ["committed", "predictive", "trajectory"])
 def test_a_known_dead_time_costs_hardly_anything(scheme: str) -> None:
-    """Over a perfect network; ablation: the same vehicle, and a model that knows of none."""
+    """Error over a perfect network; ablation: the same vehicle with a model without dead time is
+    off.
+    """
     splines = scheme == "trajectory"
     control = {"scheme": scheme, "trigger": "cost_gap | silence(1)" if splines else "always"}
     control |= {"cost_gap": 0.01, "input_weight": 0.05}
@@ -181,7 +183,7 @@ def test_a_gain_that_is_known_leaves_no_error() -> None:
 
 
 def test_without_a_dead_time_nothing_is_predicted() -> None:
-    """What is reported is the estimate itself, and exact measurements pass no filter."""
+    """The report is the estimate itself, and exact measurements pass no filter."""
     known = Navigation(scenario())
     known.advance(simulated(scenario(), 1).measurements(now_ns=0), np.zeros(2), now_ns=0)
     assert known.predicted is known.estimate

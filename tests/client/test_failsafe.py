@@ -149,7 +149,7 @@ class Hand:
 
     @property
     def mode(self) -> Mode:
-        """What the vehicle says that it does."""
+        """Mode that the vehicle reports."""
         return Mode(self.said[-1].mode)
 
     @property
@@ -320,7 +320,7 @@ def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() ->
 
 
 def test_with_feedback_it_hovers_where_it_came_to_rest_in_whatever_wind() -> None:
-    """What is told is braked to zero, so it hovers; what it flies stands against the wind."""
+    """The prescribed input is braked to zero, so the vehicle hovers; feedback balances the wind."""
     wind = [0.4, -0.3]
     hand = Hand(control={"feedback": True}, vehicle={"steady_wind_mps": wind})
     hand.fly(1.2)
@@ -420,7 +420,7 @@ def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
 
 
 def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
-    """What the former life planned is dropped."""
+    """Plans of the server's earlier run are dropped."""
     hand = tracking()
     hand.session = 8
     hand.welcome(server_boot_id=2)
@@ -492,7 +492,7 @@ def test_horizons_for_impossible_times_end_in_a_new_session() -> None:
 
 
 def test_a_server_that_closes_the_session_ends_in_brake_at_once() -> None:
-    """What it sent before and what comes late is not heard; the vehicle asks for a session."""
+    """Later and earlier packets of the session are ignored; the vehicle asks for a new session."""
     hand = tracking()
     for _ in range(3):
         hand.say(Close(4, hand.session))
@@ -663,7 +663,7 @@ def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
     """Along the way that was chosen; what is over by rounding alone stays as it is."""
 
     def slowed(wanted: list[float], speed_max: float) -> list[float] | None:
-        """What is left of an input without feedback."""
+        """Input without feedback, after slowing down."""
         at_rest, loose = [0.0, 0.0], [9.0, 9.0]
         return clamped(wanted, at_rest, loose, 9.0, told=wanted, speed_max=speed_max)
 
@@ -673,7 +673,9 @@ def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
 
 
 def test_the_last_clamp_lets_feedback_through_while_braking() -> None:
-    """What is told is slowed from 5 to 2.5 m/s; the 1 m/s of feedback on top of it stays."""
+    """The prescribed input is slowed from 5 to 2.5 m/s; the 1 m/s of feedback on top of it
+    stays.
+    """
     loose = [0.0, 0.0], [9.0, 9.0], 9.0
     flown = clamped([2.0, 4.0], *loose, told=[3.0, 4.0], speed_max=2.5)
     assert flown == pytest.approx([0.5, 2.0])

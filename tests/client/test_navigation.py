@@ -1,4 +1,4 @@
-"""What a vehicle knows of its state: sensor, Kalman filter, and flights by them."""
+"""Navigation aboard: sensor, Kalman filter, and flights that use them."""
 
 import io
 from collections.abc import Iterable
@@ -34,7 +34,7 @@ from skytether.sim.flight import fly, fly_batch
 
 DT_NS = 50 * MILLISECOND_NS
 NOISE = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
-"""That of the scenario `target`."""
+"""Sensor noise of the scenario `target`."""
 POSITIONS = {"position_noise_m": 0.02, "position_every_s": 0.2, "velocity_every_s": "never"}
 """Positions alone, at 5 Hz."""
 
@@ -79,7 +79,7 @@ def wander(flown: Scenario, steps: int, seed: int) -> tuple[Array, Array]:
 
 
 def follow(flown: Scenario, inputs: Array, states: Array) -> tuple[Array, Array]:
-    """What is measured and estimated along a flight; each of the shape (steps + 1, axes, 2)."""
+    """Measurements and estimates along a flight; each of the shape (steps + 1, axes, 2)."""
     sensor, known = Sensor(flown, np.random.default_rng(0)), Navigation(flown)
     measured, estimates = [], []
     pairs = zip([np.zeros(states.shape[1]), *inputs], states, strict=True)
@@ -116,7 +116,7 @@ def test_what_ten_sigmas_of_noise_cannot_explain_is_a_leap(
 
 
 def test_a_sensor_without_imperfection_needs_no_filter() -> None:
-    """What is flown by and reported is the state itself, as ever."""
+    """The true state is reported and flown by."""
     exact = {"position_every_s": 0.05, "velocity_every_s": 0.01, "position_bias_m": [0.0, 0.0]}
     for sensor in ({}, exact, {"filter": "none"}):
         assert sensing(scenario(sensor=sensor)).exact
@@ -238,7 +238,7 @@ def test_the_gains_settle_where_the_riccati_equation_says() -> None:
 def test_it_is_the_kalman_filter_of_its_equations(
     sensor: dict[str, Any], tau_s: list[float]
 ) -> None:
-    """As written down with matrices, all measurements of a step taken at once."""
+    """The filter equals its matrix equations, with all measurements of a step taken at once."""
     flown = scenario(sensor=sensor, model={"tau_s": tau_s})
     inputs, states = wander(flown, 60, seed=1)
     measured, estimates = follow(flown, inputs, states)
@@ -300,7 +300,9 @@ def test_late_measurements_are_rolled_on_by_what_was_flown_since() -> None:
 
 
 def test_wind_that_stays_and_a_wrong_gain_leave_no_offset(monkeypatch: Any) -> None:
-    """With positions alone, at 5 Hz; ablation: a filter without w is off."""
+    """The filter uses positions alone, at 5 Hz; ablation: without w in the filter an offset
+    remains.
+    """
     vehicle = {"wind": 0.02, "steady_wind_mps": [0.3, -0.2], "gain": 0.8}
     flown = scenario(sensor=POSITIONS, vehicle=vehicle)
     plant = FirstOrderPlant(flown, Weather(flown, np.random.default_rng(0)))
@@ -452,7 +454,9 @@ def test_the_filter_goes_on_through_a_sleep() -> None:
 
 
 def test_a_measurement_between_two_steps_is_carried_to_the_step() -> None:
-    """By eq. (1), exactly; one at the step itself is taken as it is, to the last bit."""
+    """Eq. (1) moves it to the step exactly; a measurement at the step itself is used unchanged, to
+    the last bit.
+    """
     flown, u = scenario(), np.array([1.0, -0.5])
     tau, position, velocity = flown.tau_s, [1.0, 2.0], [0.3, 0.4]
     known = Navigation(flown)
@@ -497,7 +501,9 @@ class Restless(Vehicle):
 def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By stamps of its own; ablation: measurements taken as if they were of the step."""
+    """Measurements with their own timestamps give the same flight; ablation: stamps are ignored,
+    and measurements are taken as if made at the step.
+    """
     monkeypatch.setitem(VEHICLES, "restless", Entry(Restless, (), ""))
     flown = scenario(duration=20.0, settle=5.0, vehicle={"wind": 0.0, "steady_wind_mps": []})
     flown = msgspec.structs.replace(
@@ -513,7 +519,9 @@ def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
 
 
 def test_a_flight_begins_where_the_vehicle_was_measured_last() -> None:
-    """What it did before, flown by others, is no disturbance: here it has climbed for a second."""
+    """Motion before the flight, under another controller, is not taken for a disturbance: here the
+    vehicle has climbed for a second.
+    """
     flown = scenario("autopilot")
     measured = [
         Measurement(n * SECOND_NS // 50, [0.0, 0.0, 4.0 + n / 50], [0.0, 0.0, 2.0 - n / 25])

@@ -1,4 +1,4 @@
-"""What flies in simulation: the model exactly, and wind that is the stated noise."""
+"""Simulated vehicle: it is the model exactly, and wind is the stated noise."""
 
 import numpy as np
 import pytest
@@ -103,7 +103,7 @@ def test_dead_time_of_whole_steps_only_shifts(steps: int) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 500_000_000), st.floats(0.5, 2.0))
 def test_dead_time_is_exact_within_a_step(dead_time_ns: int, gain: float) -> None:
-    """As flown in pieces that end wherever the input changes."""
+    """The result equals that of pieces that end wherever the input changes."""
     tau, w = np.array([0.81, 0.3]), np.array([0.1, 0.0])
     flown = plant(dead_time_s=dead_time_ns / 1e9, gain=gain, steady_wind_mps=w.tolist())
     x = flown.state()
@@ -237,7 +237,7 @@ def test_axes_have_covariances_of_their_own() -> None:
 
 
 def test_wind_over_many_steps_varies_as_stated() -> None:
-    """What a step adds beyond the model has covariance wind² ∫ …, no mean, and no memory."""
+    """Wind adds noise of covariance wind² ∫ …, with zero mean and no correlation between steps."""
     flown = plant(wind=0.4)
     model = discretise(np.array([0.81, 0.3]), 0.05)
     states = np.concatenate([flown.state()[None], flight(flown, np.zeros((20_000, 2)))])

@@ -337,7 +337,7 @@ def test_turbulence_is_dryden_s(height_m: float) -> None:
 
 @kernel
 def mixed(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1) -> None:
-    """What `mix` makes of a thrust and torques."""
+    """Thrust and torques that `mix` produces."""
     mix(frame, thrust, torque, rotor_max, command)
 
 
@@ -346,7 +346,7 @@ def mixed(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1
 def test_no_rotor_is_asked_for_more_than_it_has(
     thrust: float, torque: tuple[float, ...], rotor_max: float
 ) -> None:
-    """Where all rotors can, they make just what is asked for, but for a limited torque of yaw."""
+    """Within the rotors' limits the result is exact, except for a limited yaw torque."""
     command = np.zeros(4)
     mixed(KG15, thrust, np.array(torque), rotor_max, command)
     assert (command >= 0.0).all()

@@ -133,7 +133,7 @@ def test_the_flights_are_what_they_are_called(
 
 
 def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
-    """So what it asks are the problems of the fleet that is measured, block by block."""
+    """Recording a fleet's problems does not change them, block by block."""
     scenario, count = tick.mixes()["half"], BLOCK + 2
     fleet = PlannedFleet(scenario, count)
     with listening() as listeners:
@@ -153,7 +153,7 @@ def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
 
 @pytest.mark.parametrize("name", sorted(contestants(TUNINGS[0]).keys() - {NOTHING}))
 def test_contestants_solve_the_same_problems(name: str, saturated: RecordedProblems) -> None:
-    """Whatever form they are given them in; at OSQP's own tolerance only roughly."""
+    """All forms of the problem have the same solution; OSQP at its own tolerance is only close."""
     entry = solvers.SolverEntry(contestants(TUNINGS[0])[name], saturated)
     for i in range(20):
         entry.tick(i)
@@ -187,7 +187,7 @@ def test_what_is_not_installed_does_not_compete() -> None:
 def test_the_reference_is_the_same_whoever_finds_it(
     monkeypatch: pytest.MonkeyPatch, saturated: RecordedProblems
 ) -> None:
-    """By quadprog or by scipy: what is proved is the one optimum."""
+    """Both quadprog and scipy find the same optimum, which is proved."""
     reference = Reference(saturated.problem.hessian[0], saturated.problem.mpc.bounds[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]

@@ -116,13 +116,13 @@ def flew(
     effort_mps: float = 0.1,
     saturated: float = 0.0,
 ) -> Values:
-    """What a point came to."""
+    """Figures of a point."""
     here = {"rmse_xy": rmse_xy, "event_ratio": event_ratio, "event_ratio_most": most}
     return {HERE: {**here, "effort_mps": effort_mps, "saturated": saturated}}
 
 
 def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
-    """Where the trigger decides, a candidate is scored by what other seeds may send."""
+    """If the trigger decides, a candidate is scored by the packets that other seeds may need."""
     event, every = weighs("state_gap"), weighs("always")
     assert event.score(flew(0.2, 0.08, 0.09)) == 0.2
     assert event.score(flew(0.2, 0.09, 0.11)) == pytest.approx(0.2 * 1.1**3)
@@ -207,7 +207,7 @@ def test_a_search_begins_where_it_was_told_to() -> None:
 
 
 def test_a_search_told_the_same_proposes_the_same() -> None:
-    """So that a journal takes the place of flights."""
+    """A journal of the scores therefore replaces the flights."""
     searches = [Optimiser(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1) for _ in range(2)]
     proposed = []
     for search in searches:
@@ -237,7 +237,7 @@ def flown(out: Path) -> list[SearchPoint]:
 
 
 def test_the_best_point_of_all_is_kept(searched: Path) -> None:
-    """As a scenario that flies."""
+    """The best point is written as a scenario that flies."""
     points = flown(searched)
     assert len(points) == 8
     best = min(points, key=lambda point: point.score)

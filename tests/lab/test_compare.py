@@ -252,7 +252,7 @@ def test_a_ratio_lies_in_its_interval_and_goes_with_what_is_compared(
 
 
 def test_an_interval_is_of_pairs() -> None:
-    """What varies from seed to seed for both alike does not widen it; unpaired it would."""
+    """Variation between seeds that both share does not widen the interval; unpaired, it would."""
     rng = np.random.default_rng(3)
     seeds = rng.uniform(0.1, 1.0, 50)
     found = ratio(flew("paper-event", 0.5 * seeds), flew("paper-periodic", seeds))
@@ -318,7 +318,7 @@ def test_ours_is_judged_with_the_most_that_it_may_spend() -> None:
 
 
 def test_a_claim_holds_with_all_of_its_interval_or_not_at_all() -> None:
-    """Where nothing is asked for, a claim neither holds nor fails."""
+    """A claim without a limit neither holds nor fails."""
     wide = (2.0, flew("committed-gap", [0.1, 0.1, 1.9], packets_per_s=1.5))
     judged = judge(CLAIM, within(TARGET, *THEIRS, wide))
     assert judged is not None
@@ -494,7 +494,7 @@ def test_the_second_time_it_only_draws(
 def test_other_weights_are_another_comparison(
     out: Path, tuned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What was flown with those of before is not mixed with them."""
+    """Flights with earlier weights are not mixed with those of new ones."""
     file = tmp_path / "mine.toml"
     weights = (tuned / "weights.toml").read_text()
     file.write_text(weights.replace("input_weight = ", "input_weight = 77", 1))
@@ -526,7 +526,7 @@ def test_weights_that_nobody_has_searched_for_are_refused(
 def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
     tuned: Path, tmp_path: Path
 ) -> None:
-    """What is in its journal stays there."""
+    """The points in the journal are kept."""
     argv = [*TUNE[:3], "--generations", "2", "--workers", "1", "--out", str(tmp_path)]
     journal = tmp_path / "searches" / "paper-every-step-target" / "journal.jsonl"
     with subprocess.Popen(

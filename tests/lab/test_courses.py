@@ -95,7 +95,7 @@ def test_what_is_flown_is_what_the_compiled_rule_says(scheme: str) -> None:
 
 
 def kept_at_the_server(scheme: Any, found: Foresight, row: int, i: int) -> tuple[Array, Array, int]:
-    """What the server keeps of what was sent last: numbers, feedback, and steps between knots."""
+    """Server's memory of the newest message: numbers, feedback, and steps between knots."""
     memory = scheme._memory
     if isinstance(scheme, Guidance):
         slot = (memory.vehicles["sent"][row] - 1) % trajectory.ROOM

@@ -244,7 +244,7 @@ def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, s
 def test_feedback_may_lead_back_after_a_horizon_s_end(
     *, feedback: bool, is_held: bool, away_m: float, outcome: str
 ) -> None:
-    """By a metre, and for as long as the horizon is held; at rest when it has ended."""
+    """Feedback may move it by a metre while the horizon is held; at the end it is at rest."""
     state, rest = PATH.copy(), PATH[400, :, 0]
     state[400:] = np.stack([rest, 0.0 * rest], axis=-1)
     state[500:, 0, 0] += away_m
@@ -266,7 +266,7 @@ def test_feedback_may_lead_back_after_a_horizon_s_end(
 def test_a_vehicle_that_moves_though_its_command_is_none_is_a_flyaway(
     moves_mps: float, has_mps: float, said: str
 ) -> None:
-    """By where it is, or by the speed that it has."""
+    """Its position, or its speed, shows the motion."""
     state = PATH.copy()
     state[400:, :, 0] = PATH[400, :, 0] + moves_mps * (TIME_S[400:, None] - 20.0) * [1.0, 0.0]
     state[400:, :, 1] = [has_mps, 0.0]
@@ -311,7 +311,7 @@ def test_a_state_that_is_no_number_is_a_flyaway() -> None:
 
 
 def test_wind_may_carry_a_vehicle_that_brakes() -> None:
-    """As far as it blows, and no further."""
+    """Wind may move it as far as it blows, and no further."""
     windy = changed(duration=40.0, vehicle__steady_wind_mps=[0.1, 0.0], vehicle__wind=0.0)
     state = np.zeros((STEPS, 2, 2))
     state[:, 0, 0], state[:, 0, 1] = 0.1 * TIME_S, 0.1

@@ -83,7 +83,7 @@ def test_hellos_get_as_far_as_they_are_meant_to(linked: Linked) -> None:
 
 
 def passes(forms: Iterable[Form], packets: Iterable[bytes]) -> list[bool]:
-    """Which packets come through to a socket that admits some forms, or has no filter."""
+    """Packets that pass a socket with a filter for some forms, or without a filter."""
     forms, came = tuple(forms), []
     with open_socket(("127.0.0.1", 0)) as sock, socket.socket(type=socket.SOCK_DGRAM) as sender:
         if forms:

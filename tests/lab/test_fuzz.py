@@ -83,7 +83,7 @@ def test_a_flight_goes_on_whatever_is_said_to_both_ends(scenario: Scenario) -> N
 
 
 def test_strangers_are_kept_out_at_every_place() -> None:
-    """What they send is dropped for every reason there is, and the flight goes on."""
+    """Strangers' packets are dropped for every possible reason, and the flight goes on."""
     strangers = Strangers()
     attack(strangers, 3_000)
     at_server, at_newcomer = strangers.server.dropped, strangers.newcomer.dropped
@@ -94,7 +94,9 @@ def test_strangers_are_kept_out_at_every_place() -> None:
 
 
 def test_the_holder_of_a_key_reaches_past_the_handshake() -> None:
-    """What is sealed in it is opened: it gets in as itself, or is dropped for what it says."""
+    """The content of its packets is opened: it is accepted as itself, or dropped for its
+    content.
+    """
     holder, rng, came = Holder(), Random(1), set()
     for _ in range(400):
         holder(holder.next(rng))
@@ -110,7 +112,7 @@ def test_the_holder_of_a_key_reaches_past_the_handshake() -> None:
 def test_a_decoder_that_does_not_look_at_shapes_is_found_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What is no array, or one of another shape, then raises something else than it may."""
+    """Arrays of another shape, or no arrays, then raise an undocumented error."""
     monkeypatch.setattr(
         protocol,
         "_array",

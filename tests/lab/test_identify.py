@@ -153,7 +153,7 @@ def test_too_few_steps_tell_nothing() -> None:
 
 
 def test_inputs_before_a_step_are_answered_as_well() -> None:
-    """What has not settled when the step comes is predicted with it."""
+    """The response that has not settled when the step comes is predicted with it."""
     changes = np.array([[-1.0, 1.0], [0.0, -1.0]])
     times = np.array([0.0, 0.1, 0.5])
     response = StepResponse(1.0, 0.0, changes, times, times)
@@ -196,7 +196,7 @@ def flown(
 
 
 def fits(endpoint: Identifying) -> list[Fit | None]:
-    """What was identified, of each axis."""
+    """Identified models of each axis."""
     steps = endpoint.experiment.steps
     return [
         fit(responses(endpoint.inputs, endpoint.measured, steps, axis))
@@ -227,7 +227,7 @@ def test_a_vehicle_comes_back_to_where_it_began() -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_an_experiment_stays_inside_the_fence(seed: int) -> None:
-    """Whatever the vehicle is like, with steps that the fence has room for or has not."""
+    """The vehicle may be of any kind, with steps that fit the fence or do not."""
     rng = np.random.default_rng(seed)
     low, high = -rng.uniform(2.5, 7.0, 2), rng.uniform(2.5, 7.0, 2)
     truth = {
@@ -469,7 +469,7 @@ def test_other_sizes_of_step_and_files_for_programs(
 def test_what_was_measured_until_ctrl_c_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What can be made of it is kept; no scenario is written."""
+    """The measurements are kept; no scenario is written."""
     monkeypatch.chdir(tmp_path)
     asked = iter(range(10**6))
 

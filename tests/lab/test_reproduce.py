@@ -180,7 +180,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Page(HTMLParser):
-    """What is on the page: identities, addresses, and the cells of each table."""
+    """Content of the page: ids, addresses, and the cells of each table."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -215,7 +215,9 @@ class Page(HTMLParser):
 
 
 def test_every_figure_is_there_three_times_and_in_a_size_to_look_at(out: Path) -> None:
-    """As PNG, PDF and CSV; the PNG of one or two columns' width at 220 dots an inch."""
+    """The files are PNG, PDF and CSV; the PNG has one or two columns' width at 220 dots per
+    inch.
+    """
     assert {path.stem for path in out.glob("*.png")} == FIGURES
     for name in FIGURES:
         png = (out / f"{name}.png").read_bytes()
@@ -259,7 +261,7 @@ def test_the_tables_on_the_page_are_those_of_the_csv_files(out: Path) -> None:
 
 
 def test_packets_really_took_what_was_drawn(out: Path) -> None:
-    """What netem added over UDP is (17), late by no more than a busy machine is."""
+    """The delay of netem over UDP is (17), late by no more than a busy machine is."""
     rows = list(csv.DictReader((out / "fig2.csv").read_text().splitlines()))
     lattice = [row for row in rows if row["probability"]]
     assert float(lattice[0]["delay_ms"]) == 400.0

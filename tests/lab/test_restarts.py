@@ -48,7 +48,7 @@ def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -
 
 
 def verdict(flown: ProcessLife, outage: Outage = GONE) -> restarts.RestartVerdict:
-    """What is said of a flight."""
+    """Verdict on a flight."""
     return judge(outage, [flown], restarts.scenario())
 
 
@@ -76,7 +76,7 @@ def test_a_vehicle_that_brakes_in_time_is_inside() -> None:
 def test_a_vehicle_that_brakes_late_or_softly_or_never_flies_again_is_outside(
     flown: ProcessLife, figure: str
 ) -> None:
-    """By the figure that it is about."""
+    """The figure of each fault puts it outside."""
     found, good = verdict(flown), verdict(life())
     assert not found.is_inside
     assert getattr(found, figure) > getattr(good, figure) + 0.01

@@ -22,7 +22,6 @@ import skytether.client.pilot
 import skytether.client.secure
 import skytether.lab.commands.torture
 import skytether.lab.torture
-import skytether.server.plausibility
 import skytether.shared.wire.channel
 from skytether.__main__ import main
 from skytether.client.failsafe import LOCKING, TABLE
@@ -270,12 +269,6 @@ def no_latch(patch: pytest.MonkeyPatch) -> None:
     )
 
 
-def no_plausibility(patch: pytest.MonkeyPatch) -> None:
-    """No doubt of observations at the server."""
-    judge = lambda *_: skytether.server.plausibility.BELIEVED  # noqa: E731
-    patch.setattr(skytether.server.plausibility.Plausibility, "judge", judge)
-
-
 def no_home(patch: pytest.MonkeyPatch) -> None:
     """Packets go only where the newest observation came from."""
 
@@ -339,7 +332,7 @@ def test_a_guard_that_is_switched_off_is_caught(
     faults: tuple[ScheduledFault, ...],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By its invariant; with the guard the same flight goes well."""
+    """Its invariant is violated; with the guard the same flight passes."""
     trial = Trial(PLANS, faults)
     assert not fly(trial).failure
     switch_off(monkeypatch)

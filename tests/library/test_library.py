@@ -122,7 +122,7 @@ print(*(name for name in {HEAVY} if name in sys.modules))
 
 
 def test_keys_lie_over_a_scenario_with_dots_or_as_tables() -> None:
-    """What they do not name stays as it was; numbers of numpy are numbers."""
+    """Keys that are not named stay unchanged; numpy's numbers are accepted."""
     keys = {"control.trigger": "always", "network.uplink.loss": np.float64(0.25)}
     dotted = skytether.load("demo", seed=np.int64(7), **keys)
     network = {"uplink": {"loss": 0.25}}
@@ -142,7 +142,7 @@ def test_a_scenario_is_loaded_from_a_path(tmp_path: Path) -> None:
 
 
 def test_a_scenario_made_by_hand_is_checked() -> None:
-    """As an object or as tables, also before it is flown."""
+    """It may be an object or tables, and is also checked before a flight."""
     assert skytether.check({"duration": 3, "model": {"axes": 3}}).model.axes == 3
     assert skytether.check(skytether.Scenario(seed=4), duration=3).steps == 60
     wrong = skytether.Scenario(title="mine", duration=-1.0)
@@ -361,7 +361,7 @@ def test_a_sweep_flies_every_combination() -> None:
 
 @pytest.mark.long
 def test_a_sweep_is_the_same_with_more_workers() -> None:
-    """Whatever process flies a run."""
+    """The result does not depend on which process flies a run."""
     alone = skytether.sweep("demo", GRID, runs=2, **SHORT)
     assert skytether.sweep("demo", GRID, runs=2, workers=2, **SHORT) == alone
 

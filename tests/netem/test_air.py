@@ -62,7 +62,7 @@ LAWS = {
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("text", LAWS)
 def test_delays_follow_their_law(text: str, seed: int) -> None:
-    """By a Kolmogorov-Smirnov test; a nanosecond of rounding is nothing to it."""
+    """A Kolmogorov-Smirnov test compares them; rounding to nanoseconds does not matter."""
     assert stats.kstest(delays_s(text, seed), LAWS[text].cdf).pvalue > P_MIN
 
 
@@ -76,7 +76,7 @@ def test_what_a_law_says_of_itself_is_so(text: str) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_papers_delays_follow_a_poisson_law(seed: int) -> None:
-    """By a chi-square test over the numbers of slots."""
+    """A chi-square test over the numbers of slots compares them."""
     slots = np.rint((delays_s("paper(0.4, 0.02, 2)", seed) - 0.4) / 0.02).astype(int)
     counts = np.bincount(np.minimum(slots, 7), minlength=8)
     shares = [*stats.poisson.pmf(range(7), 2), stats.poisson.sf(6, 2)]
@@ -114,7 +114,7 @@ def test_correlated_delays_keep_their_law_and_their_memory(law: str) -> None:
 def test_shares_are_those_asked_for(
     text: str, befell: Callable[[Fate], bool], share: float, seed: int
 ) -> None:
-    """By an exact binomial test; where packets are lost, the path says so, too."""
+    """An exact binomial test compares them; a path that loses packets says so."""
     count = sum(befell(fate) for fate in fates(text, seed))
     assert stats.binomtest(count, SAMPLES, share).pvalue > P_MIN
     if "loss" in text or "gilbert" in text:
@@ -163,7 +163,7 @@ def test_delays_add_up() -> None:
 
 
 def test_another_impairment_changes_no_draw_of_the_others() -> None:
-    """Who adds a loss meets the same delays, and who adds a delay the same losses."""
+    """Adding a loss changes no delay, and adding a delay changes no loss."""
     alone, both = fates("gamma(0, 0.1, 0.05)"), fates("loss(0.3) & gamma(0, 0.1, 0.05)")
     assert [fate.delay_ns for fate in alone] == [fate.delay_ns for fate in both]
     lost = [fate.lost for fate in fates("loss(0.3)")]
@@ -217,7 +217,7 @@ def test_short_keys_are_short_for_a_text(delay: Any, loss: float, burst_s: float
     ],
 )
 def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
-    """By what was given, and what was expected."""
+    """The line has the given value, and the expected one."""
     with pytest.raises(PolicyError) as raised:
         path(text)
     assert said in str(raised.value)
@@ -226,7 +226,7 @@ def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
 
 @given(st.text("()&,=.\"' -0123456789alosrtequnif_\n", max_size=60))
 def test_no_text_does_anything_but_be_refused(text: str) -> None:
-    """Whatever is written."""
+    """Any text is either an impairment, or refused with the documented error."""
     with suppress(PolicyError):
         path(text)
 
@@ -240,7 +240,7 @@ def test_arguments_may_have_names_and_defaults() -> None:
 
 
 def test_files_are_found_beside_the_scenario(tmp_path: Any) -> None:
-    """Whatever their names."""
+    """Any file name is possible."""
     assert with_files("trace(a.csv) & loss(0.1)", lambda file: f"/x/{file}") == (
         'trace("/x/a.csv", loop, auto) & loss(0.1)'
     )

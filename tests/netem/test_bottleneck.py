@@ -90,7 +90,7 @@ def test_fair_serves_each_flow_alike() -> None:
 
 
 def test_codel_keeps_the_queue_short() -> None:
-    """Where a tail drop lets it stand full, and drops nothing that comes in a short burst."""
+    """A tail drop keeps the queue full; CoDel does not, and drops nothing of a short burst."""
     every_ns = SECOND_NS * 100 // 12_000
     steady = [(number * every_ns, 100, 0) for number in range(6000)]
     waits = {}

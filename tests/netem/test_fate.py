@@ -91,7 +91,7 @@ def test_no_delay_is_none_whatever_the_minimum() -> None:
 
 @pytest.mark.parametrize("loss", [0.02, 0.1, 0.5])
 def test_the_share_of_lost_packets_is_as_asked(loss: float) -> None:
-    """By a binomial test."""
+    """A binomial test compares it."""
     drawn = first_fates(replace(PAPER, loss=loss), 17, count=SAMPLES)
     lost = sum(fate.lost for fate in drawn)
     assert stats.binomtest(lost, SAMPLES, loss).pvalue > 0.001
@@ -127,7 +127,9 @@ def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
 
 
 def test_packets_of_one_slot_have_fates_of_their_own() -> None:
-    """As CLOSE is sent three times at once, for one may be lost: by a binomial test."""
+    """CLOSE is sent three times at once, because one may be lost: a binomial test of their
+    losses.
+    """
     fates = Fates(PAPER, 17, "uplink", 0)
     triples = [[fates.at(slot, rank) for rank in range(3)] for slot in range(SAMPLES)]
     all_lost = sum(all(fate.lost for fate in triple) for triple in triples)
@@ -137,7 +139,7 @@ def test_packets_of_one_slot_have_fates_of_their_own() -> None:
 
 @pytest.mark.parametrize("mean", [0.0, 1e-9, 0.3, 40.0, 1e6])
 def test_any_number_of_slots_has_its_mean_and_variance(mean: float) -> None:
-    """As Poisson's law says, to four standard errors."""
+    """Mean and variance are those of Poisson's law, to four standard errors."""
     config = DirectionConfig(minimum_s=0.0, slot_s=1e-3, slots_mean=mean)
     slots = delays_ns(config, SAMPLES) / MILLISECOND_NS
     assert slots.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean / SAMPLES) + 1e-6)
@@ -208,7 +210,7 @@ def test_in_a_burst_everything_is_lost() -> None:
 @pytest.mark.parametrize("burst_s", [1e-9, 1e-3, 3600.0])
 @pytest.mark.parametrize(("loss", "share"), [(0.0, 0.0), (1.0, 1.0)])
 def test_certain_losses_are_certain_in_bursts(loss: float, share: float, burst_s: float) -> None:
-    """Whatever their length."""
+    """Bursts of any length are tested."""
     drawn = first_fates(replace(PAPER, loss=loss, burst_s=burst_s))
     assert np.mean([fate.lost for fate in drawn]) == share
 
@@ -245,7 +247,7 @@ def test_the_loss_rate_changes_no_delay(loss: float) -> None:
 
 @pytest.mark.parametrize("delay", ["constant", "none"])
 def test_the_delay_model_changes_no_loss(delay: str) -> None:
-    """Each has draws of its own."""
+    """Loss and delay have separate random draws."""
     lost = [fate.lost for fate in first_fates(replace(PAPER, delay=delay))]
     assert lost == [fate.lost for fate in first_fates()]
 

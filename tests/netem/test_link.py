@@ -141,7 +141,7 @@ def test_lost_packets_never_leave_and_are_counted() -> None:
 def test_a_full_queue_drops_what_comes_and_counts_it_apart_from_losses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What is under way keeps its place; once there is room, packets pass again."""
+    """Packets under way keep their places; once there is room, packets pass again."""
     monkeypatch.setattr(link_module, "QUEUE_MAX", 2)
     link, lane = make_link(), make_lane(9, 8, 1, 1)
     take(link, lane, "abc")
@@ -275,7 +275,7 @@ def test_the_delay_histogram_is_of_delays_as_drawn() -> None:
 
 
 def recorded(direction: int, lane: Lane, names: str) -> Rows:
-    """What a link writes down of packets 1 µs apart that all leave in the end."""
+    """Rows of a link for packets 1 µs apart that all leave in the end."""
     sink = io.BytesIO()
     link = Link(direction, 1472, Recorder(PACKET_COLUMNS, sink))
     for index, name in enumerate(names):
@@ -298,7 +298,7 @@ def test_the_fate_of_every_packet_is_written_down() -> None:
 
 
 def test_a_packet_meets_the_fate_of_when_it_enters() -> None:
-    """By its slot since the flow began and its rank in that, whatever has gone before."""
+    """The fate depends on the packet's slot since the flow began and its rank in the slot alone."""
     fates, began_ns = Fates(DirectionConfig(loss=0.0), 1, "uplink", 0), 500
     for before in ([], [0, 1, 2], [59] * 3, [60, 90]):  # the last: the clock went back
         link, lane = make_link(), Lane(0, fates, began_ns)

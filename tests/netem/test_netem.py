@@ -79,7 +79,7 @@ def running(line: str, folder: Path, until: str = "") -> Iterator["subprocess.Po
 
 
 def counted(said: str, name: str) -> tuple[int, int]:
-    """What netem has counted on the uplink and on the downlink, of what it says at its end."""
+    """Counters of netem for uplink and downlink, printed at its end."""
     found = re.search(rf"  {name} +(\d+) +(\d+)$", said, re.MULTILINE)
     assert found, said
     return int(found[1]), int(found[2])

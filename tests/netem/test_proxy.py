@@ -76,7 +76,7 @@ def test_every_client_address_is_a_flow_with_a_socket_of_its_own() -> None:
 
 
 def test_the_servers_answers_find_their_client() -> None:
-    """By the socket that they come in on, and leave by the one that is bound."""
+    """Answers are assigned by the socket that they arrive at, and leave by the bound one."""
     proxy = make_proxy()
     socket_of = {client: pass_on(proxy, b"?", client) for client in (ALICE, BOB, CAROL)}
     for client in (BOB, ALICE, CAROL):
@@ -210,7 +210,7 @@ def test_a_flood_of_strangers_shuts_nobody_out() -> None:
 def test_if_no_flow_gave_way_a_flood_would_shut_newcomers_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As it did while strangers were kept like anybody."""
+    """Ablation: strangers' flows are kept like all others, as in an early version."""
     proxy = make_proxy(flows=64)
     monkeypatch.setattr(proxy, "_oldest", lambda _: None)
     assert served_in_a_flood(proxy) == (8, 0)
@@ -264,7 +264,7 @@ def test_payloads_pass_unread(length: int) -> None:
 
 
 def test_a_datagram_longer_than_the_mtu_passes_neither_way() -> None:
-    """As on a path that does not fragment; the flow lives on."""
+    """The path does not fragment datagrams; the flow goes on."""
     proxy = make_proxy(mtu=1300)
     socket = pass_on(proxy, bytes(1300), ALICE)
     hear(proxy, bytes(1301), ALICE)

@@ -95,7 +95,7 @@ def test_garbage_is_none_of_these_packets(payload: bytes) -> None:
 
 @given(st.integers(0, 3), st.data())
 def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> None:
-    """Whatever byte of it changes."""
+    """Every byte is changed in turn."""
     session = bytes(range(SESSION_BYTES))
     messages = (
         Hello(b"12345678"),
@@ -130,7 +130,7 @@ def session_of(far: Listener, peer: tuple[str, int], now_ns: int) -> bytes:
 
 @given(st.lists(st.binary(max_size=300), max_size=20))
 def test_a_listener_answers_with_no_more_than_it_got(payloads: list[bytes]) -> None:
-    """Whatever is sent to it: nobody can have it send more to others."""
+    """Nobody can use the listener to amplify traffic."""
     far, peer = listener(), ("prober", 1)
     session = session_of(far, peer, 0)
     probes = [encode(Probe(session, n, n % 3, 0), 96 + n) for n in range(5)]
@@ -262,7 +262,7 @@ def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None
 
 
 def test_the_models_are_those_of_the_network_and_fly() -> None:
-    """As one text, which is a network."""
+    """The models form one text, which is a valid network."""
     text = "gamma(0.02, 0.06, 0.03) & gilbert_elliott(0.2, 0.5)"
     measured, _ = measure(text, text, seconds=300.0)
     told = outcome(measured, "x", secure=False).told
@@ -293,7 +293,7 @@ def test_the_law_of_delays_is_recognised(law: str) -> None:
 
 
 def test_an_interval_of_a_share_is_wilsons() -> None:
-    """As scipy has it."""
+    """The interval equals scipy's."""
     for lost, count in ((0, 50), (3, 100), (50, 100), (999, 1000)):
         known = stats.binomtest(lost, count).proportion_ci(method="wilson")
         low, high = analysis.wilson(lost / count, count)
@@ -342,7 +342,7 @@ def test_what_was_measured_is_replayed_as_a_trace(tmp_path: Path) -> None:
 
 
 def test_a_measurement_that_ends_early_leaves_out_what_is_under_way() -> None:
-    """What nothing is known of yet is not lost."""
+    """Packets of unknown fate are not counted as lost."""
     far = listener()
     near = Prober(
         PlainLink(), LISTENER, bytes(NONCE_BYTES), probes=100, period_ns=SECOND_NS // 20, size=200

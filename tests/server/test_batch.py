@@ -116,10 +116,10 @@ phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, ma
 
 @settings(max_examples=15, deadline=None)
 @given(st.one_of(scenarios, committing, guided), companies, phases_ms)
-def test_a_run_is_the_same_in_any_company(
+def test_a_run_in_a_batch_equals_the_same_run_alone(
     changes: dict[str, Any], seeds: list[int], phases: list[int] | None
 ) -> None:
-    """Whatever flies, whoever else flies, also where all that happens happens at once."""
+    """Every kind of flight in a batch equals the flight alone, also with simultaneous events."""
     with pytest.MonkeyPatch.context() as patch:
         if phases:
             given_ns = {
@@ -145,8 +145,8 @@ class Drawn:
         return cls(given_ns[seed]) if names == ("phase",) else chance.stream(seed, *names)
 
 
-def test_runs_are_the_same_in_another_order_and_in_larger_company() -> None:
-    """Five seeds, then those and three more, backwards."""
+def test_runs_are_equal_in_another_order_and_in_a_larger_batch() -> None:
+    """Five seeds are flown, then the same with three more, in reverse order."""
     flown = scenario(vehicle={"wind": 0.3})
     few = fly_batch(flown, range(3, 8))
     many = fly_batch(flown, range(9, 1, -1))
@@ -158,7 +158,9 @@ def test_runs_are_the_same_in_another_order_and_in_larger_company() -> None:
 def test_each_run_follows_the_target_of_its_own_seed(
     preview: float | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As if alone; ablation: with the first run's target for all, the others are not."""
+    """Each run equals its flight alone; ablation: with the first run's target for all, others
+    differ.
+    """
     flown = scenario(reference={"shape": "target", "preview": preview})
     runs = assert_as_alone(flown, (3, 1, 2))
     monkeypatch.setattr(Desired, "assign", lambda self, row, _: self._number.put(row, 1))
@@ -170,8 +172,8 @@ def test_each_run_follows_the_target_of_its_own_seed(
     ]
 
 
-def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:
-    """Half a minute unheard: alone, the server stops ticking; in company it ticks on."""
+def test_a_session_that_expires_alone_expires_in_a_batch_too() -> None:
+    """After 30 s of silence a lone server stops ticking, and one with further runs ticks on."""
     rare = {"downlink": {"delay": "none", "loss": 0.93}, "uplink": {"delay": "none", "loss": 0.0}}
     flown = scenario(
         duration=240.0, control={"dt": 1.0, "horizon": 3}, network=rare, link={"connect_s": 60.0}
@@ -180,8 +182,8 @@ def test_a_session_that_is_forgotten_is_forgotten_in_company_too() -> None:
     assert flights[0].figures["server"]["dropped"]["unknown session"] > 0
 
 
-def test_a_session_is_forgotten_at_the_same_time_in_any_company() -> None:
-    """The server looks for those that are gone on the grid of its clock, whoever flies."""
+def test_a_session_expires_at_the_same_time_alone_and_in_a_batch() -> None:
+    """The server looks for expired sessions on the grid of its own clock."""
     rare = {"downlink": {"delay": "none", "loss": 0.9}, "uplink": {"delay": "none", "loss": 0.0}}
     flown = scenario(
         duration=300.0, control={"dt": 0.9, "horizon": 3}, network=rare, link={"connect_s": 60.0}
@@ -192,10 +194,10 @@ def test_a_session_is_forgotten_at_the_same_time_in_any_company() -> None:
 
 
 @pytest.mark.parametrize("name", ["demo", "paper"])
-def test_a_run_whose_sessions_expire_is_the_same_in_any_company(
+def test_a_run_whose_sessions_expire_equals_the_same_run_alone(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Vehicles heard once in some seconds, by a server that forgets them after three."""
+    """Vehicles report every few seconds, and the server forgets a session after three."""
     monkeypatch.setattr(sessions, "SESSION_NS", 3 * SECOND_NS)
     table = reading.to_table(reading.load(name)) | {"duration": 20.0, "settle": 0.0}
     table["network"]["downlink"]["loss"] = 0.97

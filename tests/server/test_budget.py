@@ -125,7 +125,9 @@ def longest_wait_s() -> float:
 
 
 def test_nobody_starves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who is sent nothing for WAIT_S goes first; without that bound it is never sent anything."""
+    """A vehicle that was sent nothing for WAIT_S goes first; ablation: without the bound it
+    starves.
+    """
     assert longest_wait_s() <= WAIT_S + 3 * DT_S
     monkeypatch.setattr(budgets, "WAIT_S", np.inf)
     assert longest_wait_s() == pytest.approx(400 * DT_S)
@@ -216,7 +218,7 @@ def test_without_following_the_queue_grows(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize(("loss", "jitter_s"), [(0.0, 0.15), (0.5, 0.0), (0.7, 0.03)])
 def test_neither_loss_nor_jitter_lowers_the_rate(loss: float, jitter_s: float) -> None:
-    """Where there is no queue all that is wanted goes in the end, and goes on to."""
+    """Without a queue, all packets are sent in the end, and the rate stays."""
     air = Air(1e9, loss=loss, jitter_s=jitter_s).run(240.0, wanted=20_000.0)
     late = slice(len(air.rates) // 2, None)
     assert np.mean(air.rates[late]) > 0.9 * 20_000.0
@@ -234,7 +236,7 @@ def test_an_air_that_slows_down_is_followed() -> None:
 
 
 def test_a_rate_that_nobody_uses_does_not_rise() -> None:
-    """What was never sent says nothing of the air."""
+    """Unused capacity gives no information about the network."""
     air = Air(12_500.0).run(60.0, wanted=2_000.0)
     assert air.control.bytes_per_s == rates.START
 
@@ -291,7 +293,7 @@ def test_random_loss_costs_no_budget() -> None:
 
 
 @pytest.mark.long
-def test_a_run_with_a_budget_is_the_same_in_any_company() -> None:
+def test_a_run_with_a_budget_equals_the_same_run_alone() -> None:
     """Runs of a batch share a server, and no budget."""
     scenario = crowd({**AUTO, "duration": 4.0, "settle": 1.0})
     for seed, together in zip((1, 2), fly_batch(scenario, (1, 2)), strict=True):

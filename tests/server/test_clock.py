@@ -35,7 +35,7 @@ def listen(
     down_ns: int = 400 * MS,
     up_ns: int = 400 * MS,
 ) -> list[int]:
-    """How far the adopted offset is off at each time, delays being constant."""
+    """Error of the adopted offset at each time, with constant delays."""
     return [
         observe(clock, now, offset_ns(now), down_ns=down_ns, up_ns=up_ns) - offset_ns(now)
         for now in times_ns
@@ -181,7 +181,7 @@ def after_change(down_ns: int, up_ns: int, *, before: range, since: int) -> int:
 
 @pytest.mark.parametrize(("jump_ms", "bound_ms"), [(40, 380), (41, 400)])
 def test_step_is_a_change_by_more_than_40_ms(jump_ms: int, bound_ms: int) -> None:
-    """What is smaller waits for the window; here both delays stay and the clock jumps."""
+    """Smaller changes wait for the window; here both delays are constant and the clock jumps."""
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10), lambda _: 0)
     listen(clock, times(10, 13), lambda _: jump_ms * MS)

@@ -102,7 +102,7 @@ def test_what_every_packet_takes_raises_it_at_once_and_never_lowers_it() -> None
 
 
 def test_what_was_raised_falls_step_by_step() -> None:
-    """As after a late horizon: once none of the newest needed it."""
+    """The bound falls once none of the newest samples needs it, as after a late horizon."""
     bound, steps = estimated(), []
     begin(bound, 0, 9)
     at_least(bound, 0, 14)
@@ -153,7 +153,7 @@ SAMPLES = st.lists(
 @quick
 @given(SAMPLES, st.integers(1, MOST))
 def test_it_is_what_the_samples_say(delays: list[int], first: int) -> None:
-    """As the definition says it, one sample after the other."""
+    """It equals the definition, computed one sample after the other."""
     d, expected = first, []
     for count, sample in enumerate(delays, 1):
         d = max(d, min(sample, MOST))

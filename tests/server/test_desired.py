@@ -1,4 +1,4 @@
-"""What the server knows of desired trajectories: pages, preview, predictions, a live point."""
+"""Desired trajectories as the server knows them: pages, preview, predictions, a live point."""
 
 from collections.abc import Callable
 from typing import Any
@@ -98,7 +98,7 @@ def test_a_vehicle_with_dead_time_is_planned_along_the_reference_that_much_later
 
 @pytest.mark.parametrize("preview_s", [0.0, 0.2, 0.5])
 def test_a_dead_time_lets_nobody_see_further_ahead(preview_s: float) -> None:
-    """What lies behind the preview is predicted from there, also within the dead time."""
+    """Beyond the preview the server predicts, also within the dead time."""
     flown = late(preview=preview_s)
     desired, sample, step = make(flown), flown.make_reference(), 40
     (found,) = window(desired, np.array([step]), np.array([2]))
@@ -223,7 +223,7 @@ TURN = 60
 
 
 def turning(scale: float) -> Reference:
-    """A target that goes on from TURN in a way of its own."""
+    """Target that changes its motion at TURN."""
 
     def sample(t: Array) -> Array:
         t = np.asarray(t, dtype=np.float64)
@@ -267,7 +267,7 @@ def first_difference(flights: list[Record]) -> int:
 def test_a_server_never_sees_ahead(
     preview: float | str, reach: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a target will do later changes nothing of what is planned and sent before."""
+    """The future motion of a target does not affect earlier plans and packets."""
     # At TURN itself the target is where it would have been, and as fast.
     assert first_difference(flights_that_turn(preview, monkeypatch)) == TURN + 1 - reach
 
@@ -281,7 +281,7 @@ def test_a_server_that_sees_all_plans_for_what_comes(monkeypatch: pytest.MonkeyP
 
 
 def test_a_prediction_that_turns_round_at_the_bounds_is_better() -> None:
-    """By as much as docs/targets.md says; an acceleration taken from the past is far worse."""
+    """The gain is that in docs/targets.md; an acceleration estimated from the past is far worse."""
     ahead_s, times = 2.0, np.arange(1.0, 300.0, 0.5)
     errors: dict[str, list[Array]] = {"turns": [], "goes on": [], "accelerates": []}
     for seed in range(1, 41):
@@ -435,7 +435,9 @@ def test_a_leap_makes_no_velocity_that_no_vehicle_can_fly() -> None:
 
 
 def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a centimetre, 50 times a second; ablation: the difference of two alone is useless."""
+    """Errors are 1 cm at 50 moves a second; ablation: the difference of two moves alone is
+    useless.
+    """
 
     def spread() -> float:
         rng, moved, velocities = np.random.default_rng(1), point(), []

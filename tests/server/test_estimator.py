@@ -27,7 +27,7 @@ DT, TAU_S = 0.05, [0.81, 0.3]
 MODEL = discretise(TAU_S, DT)
 ROW = np.array([0])
 SENT = np.array([True])
-"""Which vehicles are sent their horizon; (12) does not ask."""
+"""Mask of vehicles that are sent their horizon; (12) does not depend on it."""
 
 
 def seen(step: int, state: Array) -> Observation:
@@ -88,7 +88,7 @@ def estimate(estimator: Estimator, step: int) -> Array:
 
 
 def flown(x: Array, inputs: Array) -> Array:
-    """Where the model leads from x, input by input."""
+    """State predicted by the model from x, input by input."""
     for u in inputs:
         x = MODEL.step(x, u)
     return x
@@ -149,7 +149,7 @@ def test_order_of_arrival_does_not_matter(order: list[int]) -> None:
 
 
 def test_estimate_keeps_its_own_copy_of_the_state() -> None:
-    """Whatever the caller does to its array afterwards."""
+    """Later changes of the caller's array have no effect."""
     estimator, x = make(compensate=False), np.ones((2, 2))
     estimator.observe(0, seen(0, x))
     x[:] = 9.0
@@ -207,7 +207,7 @@ def test_asking_for_estimates_changes_no_later_one() -> None:
 
 
 def test_observation_from_ahead_is_taken_as_it_is() -> None:
-    """Where the clocks disagree by a step there is nothing to fly on by."""
+    """If the clocks disagree by a step there is nothing to predict."""
     estimator = make()
     remember(estimator, np.ones((10, 2)))
     x = np.array([[1.0, 2.0], [3.0, 4.0]])
@@ -307,7 +307,9 @@ def test_a_disturbance_is_learned_from_the_inputs_that_were_flown(every: int) ->
 
 @pytest.mark.parametrize("every", [1, 5])
 def test_where_there_is_none_none_is_learned(every: int) -> None:
-    """By inputs that change, either; to rounding where every step is seen."""
+    """Changing inputs are tested too; the estimate is exact to rounding if every step is
+    seen.
+    """
     np.testing.assert_allclose(
         watch(learning(), 0.0 * WIND, every), 0.0, atol=1e-9 if every == 1 else 5e-3
     )
@@ -329,7 +331,7 @@ def test_the_disturbance_is_flown_on_with_every_input() -> None:
 
 
 def test_what_was_learned_is_forgotten_with_the_vehicle() -> None:
-    """That of another stays."""
+    """Another vehicle's estimate is kept."""
     estimator, found = learning(), foresight(2, 2, H, 1)
     for row in (0, 1):
         watch(estimator, WIND, row=row)

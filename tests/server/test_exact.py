@@ -68,7 +68,7 @@ def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Arr
 
 
 def residual(problem: Problem, inputs: Array, gradient: Array) -> float:
-    """How far inputs are from meeting the optimality conditions, relative to the gradient."""
+    """Violation of the optimality conditions, relative to the gradient."""
     slope = np.einsum("akl,nal->nak", problem.hessian, inputs) + gradient
     at_bound = np.abs(inputs) >= U_MAX[:, None]
     wrong = np.where(at_bound, np.maximum(np.sign(inputs) * slope, 0.0), slope)
@@ -181,7 +181,7 @@ def test_a_problem_that_is_not_finite_fails_alone() -> None:
 
 
 def test_a_batch_equals_its_singles_on_every_run() -> None:
-    """To the last bit, in any company."""
+    """Every problem in a batch has the same solution as alone, to the last bit."""
     problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=3)
     solver = ExactSolver(problem)
@@ -192,7 +192,7 @@ def test_a_batch_equals_its_singles_on_every_run() -> None:
 
 
 def test_the_guess_decides_nothing_but_the_time() -> None:
-    """Whatever set it starts from, it ends at the one optimum."""
+    """Every initial set leads to the one optimum."""
     problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=4)
     solver = ExactSolver(problem)

@@ -73,9 +73,9 @@ class Plan(NamedTuple):
     planned: Array
     """Planned state x_p(k|k-1) [m, m/s]; shape (n, axes, 2)."""
     figures: Figures
-    """What the plans are worth; shape (n,)."""
+    """Figures of the plans; shape (n,)."""
     horizons: Array
-    """What may be sent [m/s]; shape (n, axes, 2 H)."""
+    """Horizons that may be sent [m/s]; shape (n, axes, 2 H)."""
 
     @property
     def tracked(self) -> Array:
@@ -252,7 +252,7 @@ def test_tracker_follows_all_of_the_trajectory() -> None:
 
 @pytest.mark.parametrize("anew", ["gap", "forget"])
 def test_vehicle_starts_anew_after_a_long_gap_or_when_forgotten(anew: str) -> None:
-    """As a vehicle never seen before does, to the last bit."""
+    """The result equals that of a new vehicle, to the last bit."""
     used, step = make(), 3 + H
     for past in (0, 1, 2):
         run(used, past, elsewhere(past))
@@ -504,7 +504,7 @@ def test_plan_is_good_only_if_both_problems_were_solved(who: int) -> None:
 
 
 def test_vehicle_without_any_plan_hovers() -> None:
-    """Where even the first problem has no answer."""
+    """Even the first problem has no solution here."""
     assert not run(make_faulty({GENERATOR, TRACKER}), 0, START).tracked.any()
 
 

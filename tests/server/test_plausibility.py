@@ -1,4 +1,4 @@
-"""Which observations are believed: those that a vehicle can make, and those that repeat."""
+"""Plausibility: observations are accepted if a vehicle can make them, or if they repeat."""
 
 import random
 from itertools import count
@@ -42,7 +42,7 @@ BACKWARD_NS = DELAY_NS - BEGAN_NS
 
 
 def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
-    """What a vehicle says that flies a circle of 2 m at 0.5 m/s, with some fields changed."""
+    """Observation of a vehicle on a circle of 2 m at 0.5 m/s, with some fields changed."""
     angle, pace = 0.25 * step * TERMS.dt_s, 0.5
     x = 2.0 * np.array([[np.cos(angle), 0.0], [np.sin(angle), 0.0]])
     x[:, 1] = -pace * np.sin(angle), pace * np.cos(angle)
@@ -71,7 +71,7 @@ def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: 
 
 
 def after(count: int = 5) -> Plausibility:
-    """What has believed the steps from 100 on, so many of them."""
+    """Plausibility filter that has accepted the steps from 100 on."""
     plausibility = Plausibility(TERMS, 2)
     for step in range(100, 100 + count):
         assert judge(plausibility, seen(step)) == Belief.BELIEVED
@@ -112,7 +112,7 @@ ODD: dict[str, tuple[dict[str, Any], Belief]] = {
     "a jump in speed": ({"state": moved(0.0, 5.0)}, Belief.JUMP),
     "the end of the world": ({"state": moved(1e300, 1e300)}, Belief.JUMP),
 }
-"""What is odd in the observation of step 105, and what is said of it."""
+"""Odd observations at step 105, and the verdict on each."""
 
 
 @pytest.mark.parametrize(("changed", "verdict"), ODD.values(), ids=ODD)
@@ -129,13 +129,13 @@ def test_an_odd_observation_is_not_believed_and_changes_nothing(
 
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
-    """What is odd for one may be the first that is heard of another."""
+    """An observation that is odd for one vehicle may be the first of another."""
     expected = Belief.JUMP if row == 0 else Belief.BELIEVED
     assert judge(after(), elsewhere(105), row=row) == expected
 
 
 def elsewhere(step: int, metres: float = 100.0) -> Observation:
-    """What the vehicle says once it has been carried away."""
+    """Observation of the vehicle after it has been moved."""
     told = seen(step)
     return told._replace(state=told.state + np.array([[metres, 0.0], [0.0, 0.0]]))
 
@@ -196,7 +196,7 @@ def test_a_late_observation_tells_of_the_clocks_alone() -> None:
 
 
 def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
-    """As one that was never heard; its neighbour is not forgotten."""
+    """It is treated as one that was never heard; its neighbour is not forgotten."""
     plausibility = after()
     assert judge(plausibility, seen(100), row=1) == Belief.BELIEVED
     plausibility.forget(0)

@@ -32,7 +32,7 @@ def scenario(name: str = "paper", **changes: Any) -> Scenario:
 
 
 TOLD_M = 2e-7
-"""How exactly float32 tells a position of some metres [m]."""
+"""Resolution of float32 for positions of some metres [m]."""
 
 
 def lossy(loss: float, down: float = 0.1) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def by_rule(replay: Replay, step: int, in_force: int) -> Array:
 
 
 def foresee(replay: Replay, step: int) -> Foresight:
-    """What is foreseen of the one vehicle at a step."""
+    """Predicted state of the one vehicle at a step."""
     found = foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found
@@ -203,7 +203,7 @@ def test_many_horizons_are_kept_and_no_more() -> None:
     sent = plans(3, *[BOUND + H] * 40)
 
     def told(in_force: int) -> list[float]:
-        """What is known of the input at step 40, with that horizon in force."""
+        """Known input at step 40, with that horizon in force."""
         replay = make(small(age_max_s=1.0))  # a ring of 16
         for step, inputs in enumerate(sent):
             see(replay, max(step - 1, 0), np.zeros((2, 2)), NO_HORIZON)
@@ -344,7 +344,7 @@ def test_a_packet_at_every_step_hides_what_is_lost() -> None:
 
 
 def test_every_lost_horizon_is_counted(sparse: tuple[Scenario, Record]) -> None:
-    """As many as netem has lost, but for those too young to be known."""
+    """The count equals netem's, except for horizons too new to be known."""
     _, flight = sparse
     netem = flight.netem[flight.netem["direction"] == UPLINK]
     horizons = netem[netem["bytes"] > HORIZON_BYTES]
@@ -472,7 +472,9 @@ def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
 
 
 def test_the_observer_sees_past_feedback_aboard() -> None:
-    """What feedback does against steady wind is no disturbance, nor is the wind forgotten."""
+    """Feedback against steady wind is not learned as a disturbance, and the wind is not
+    forgotten.
+    """
     reference = {"shape": "hover", "points_m": [[0.0, 0.0]]}
     control = {
         "scheme": "committed",

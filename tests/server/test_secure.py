@@ -57,7 +57,7 @@ def link(seed: int = 2, key: VehicleKey = KEYS[1, 5]) -> SecureLink:
 
 
 def called(server: Gate, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> Call:
-    """What a datagram that the server accepts says."""
+    """Content of a datagram that the server accepts."""
     call = server.open(Datagram(datagram, peer), now_ns=now_ns)
     assert call is not None
     return call
@@ -118,7 +118,7 @@ def test_a_handshake_takes_two_round_trips_and_opens_a_channel() -> None:
 
 
 def test_the_bytes_of_a_handshake() -> None:
-    """As the table in docs/security.md has them; the header names vehicle and key."""
+    """The bytes are those of the table in docs/security.md; the header names vehicle and key."""
     client, server = link(), gate()
     first = client.hello(HELLO, now_ns=0)
     assert first[:5].hex() == "0101010005"
@@ -382,7 +382,7 @@ OBSERVER = [("observer", port) for port in range(50)]
 
 
 def asked(client: SecureLink, server: Gate, now_ns: int, *, foreign_first: bool) -> list[bytes]:
-    """What answers a HELLO that an observer has copied, and the challenges he was given.
+    """Answers to a HELLO that an observer has copied, and the challenges sent to him.
 
     Args:
         foreign_first: whether his challenges come to the vehicle before its own, or behind it.
@@ -536,7 +536,7 @@ def rekeyed(client: SecureLink, server: Gate, now_ns: int) -> None:
 
 
 def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
-    """What is under way in the old channel is opened at both ends, for 10 s."""
+    """Packets under way in the old channel are opened at both ends, for 10 s."""
     client, server = joined()
     line = called(server, client.seal(OBSERVATION)).line
     assert not client.wants_hello(FRESH_NS - 1)
@@ -724,7 +724,7 @@ def test_with_fewer_pending_channels_it_does_not(monkeypatch: pytest.MonkeyPatch
 
 
 def replayed(flight: Flight, peer: Address) -> tuple[Counter[bytes], list[int]]:
-    """What is accepted of all that was ever sent, and the sizes of answers less what drew them."""
+    """Packets accepted of all that were ever sent, and the growth of answers over requests."""
     accepted = Counter[bytes]()
     excess = []
     for to_server, datagram in flight.sent:

@@ -90,7 +90,7 @@ class Vehicles:
         return self.answers()
 
     def answers(self) -> list[tuple[Message, Address]]:
-        """What is in the outbox, decoded."""
+        """Messages in the outbox, decoded."""
         return [(decode(out.payload, self.terms), out.peer) for out in self.server.outbox()]
 
     def ask(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:

@@ -39,7 +39,7 @@ Delay = Callable[[float], float]
 TIGHT = {"feedback": False, "input_weight": 0.01, "input_reference": False}
 """Keys of committed inputs alone, at weights that answer all at once."""
 OUTSIDE_M = 3.2
-"""How far from the centre of the figure eight, of 2 m, a vehicle may get."""
+"""Largest allowed distance from the centre of the figure eight of 2 m [m]."""
 
 
 def scenario(

@@ -32,7 +32,7 @@ def problems(seed: int, vehicles: int, size: float = 60.0) -> tuple[Array, Array
 
 
 def residual(gradient: Array, u: Array) -> float:
-    """How far from optimal: the step that the projected gradient still wants to make [m/s]."""
+    """Residual of optimality: the remaining projected-gradient step [m/s]."""
     slope = np.einsum("akl,nal->nak", PROBLEM.hessian, u) + gradient
     bound = U_MAX[:, None]
     return float(np.abs(np.clip(u - slope, -bound, bound) - u).max())
@@ -117,7 +117,7 @@ def test_caller_keeps_its_arrays() -> None:
 @quick
 @given(st.lists(st.tuples(st.integers(0, 2**32 - 1), st.floats(0.0, 1e4)), max_size=5))
 def test_answer_depends_on_problem_and_guess_alone(history: list[tuple[int, float]]) -> None:
-    """Whatever was solved before, the same question has the same answer, to the last bit."""
+    """Earlier problems have no effect: equal questions have equal answers, to the last bit."""
     gradient, guess = problems(6, 1)
     used = OsqpSolver(PROBLEM)
     for seed, size in history:

@@ -62,7 +62,7 @@ def scenario(vehicles: int, loss: float = 0.1, duration: float = 60.0, **keys: A
 
 
 def each_of(flown: Record) -> list[Rows]:
-    """What each vehicle recorded."""
+    """Rows of each vehicle."""
     numbers = np.unique(flown.client["vehicle"])
     return [flown.client[flown.client["vehicle"] == number] for number in numbers]
 
@@ -180,7 +180,7 @@ def observation(step: int, in_force: int, place: tuple[float, float]) -> Observa
 
 
 def alone() -> Together:
-    """What decides for two vehicles that swap places."""
+    """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
     return Together(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1)

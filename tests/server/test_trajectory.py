@@ -200,12 +200,12 @@ def test_what_is_held_goes_on_for_ever() -> None:
 
 
 class Moved(Desired):
-    """What is known of targets that are moved by hand."""
+    """Targets that are moved by hand, as the server knows them."""
 
     moved = np.zeros((1, 2, 1, 2))
 
     def window(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:  # noqa: ARG002
-        """Where they are, and no more."""
+        """Positions of the targets, without a preview."""
         n = len(rows)
         states = np.repeat(self.moved, n, axis=0)
         return Window(states, np.arange(n), np.zeros(n, dtype=np.int64))
@@ -326,7 +326,7 @@ def test_what_is_known_to_be_lost_is_followed_by_nobody() -> None:
 
 
 def test_the_longer_an_observation_knows_nothing_of_it_the_less_likely_it_comes() -> None:
-    """By Bayes' rule from the delays that were seen and the share that is lost."""
+    """The probability follows from Bayes' rule, the measured delays and the loss."""
     server = Server(scenario(control={"delay_bound": 1.0}))
     made, delays = 0, [2, 2, 4, 8]
     server.observe(0)
@@ -424,7 +424,7 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
 def test_what_a_vehicle_is_told_can_be_flown(
     start: tuple[float, float], places: list[float]
 ) -> None:
-    """Whatever is desired: its motion goes on from where it is led, by inputs within bounds."""
+    """Any desired trajectory gives motions that continue smoothly, by inputs within bounds."""
     flown = scenario(control={"horizon": 40}, reference={"preview": "all"})
     terms = flown.terms()
     nominal = make_nominal(terms, flown.control, capacity=1)
@@ -476,7 +476,7 @@ def test_bounds_shape_what_is_told() -> None:
 
 
 def message(step: int, knots: Floats, *, age: int = 9, spacing: int = 5) -> Trajectory:
-    """What the server sends at a step."""
+    """Message that the server sends at a step."""
     return Trajectory(65535, 2**32 - 1, step, 2**32 - 1, age, spacing, knots)
 
 
@@ -661,7 +661,7 @@ def test_inputs_flown_are_those_of_the_spline_that_the_server_keeps() -> None:
 
 
 def test_a_key_stands_in_for_the_number_of_the_policy() -> None:
-    """So that a search can move it."""
+    """A search can therefore change it."""
     flown = scenario(control={"trigger": "expected_gap", "cost_gap": 0.55})
     assert set(fly(flown).server["threshold"]) == {0.55}
 
@@ -763,7 +763,7 @@ def test_steady_wind_is_taken_off_by_the_vehicle_itself(
 def test_a_vehicle_along_a_spline_reports_where_it_leaves_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In still air the server foresees it, and hears little; ablation: foreseen to stand still."""
+    """In still air the server predicts the vehicle, so reports are few; ablation: it stands."""
     uncompile(monkeypatch)
     silent = {"wind": 0.0, "report": "deviation(0.01) | silence(1)"}
     table = reading.to_table(reading.load("demo")) | {"duration": 20.0}

@@ -42,7 +42,7 @@ def figures_of(
     cost_gap: float = 0.0,
     deviation_m: float = 0.0,
 ) -> Figures:
-    """What is known of n vehicles alike."""
+    """Known figures of n equal vehicles."""
     figures = np.zeros(n, dtype=FIGURES)
     figures["step"], figures["state_gap"], figures["fresh"] = step, error, fresh
     figures["cost_gap"], figures["deviation_m"] = cost_gap, deviation_m
@@ -60,7 +60,7 @@ KNOWN = Known(
     owed=np.array([False, True]),
     desired=lambda rows, *_: np.zeros((len(rows), 2, 4, 2)),
 )
-"""What is known of two vehicles at most."""
+"""Known state of two vehicles at most."""
 
 
 def facing(rows: Indices, figures: Figures) -> Situation:
@@ -80,7 +80,7 @@ def tell(trigger: Trigger, step: int, error: float = 0.0) -> None:
 
 
 def trigger_of(text: str, *, dt: float = 0.1, capacity: int = 1) -> Trigger:
-    """What a scenario means by this text, with CONTROL's weights."""
+    """Trigger of a scenario with this text and CONTROL's weights."""
     return make_trigger(msgspec.structs.replace(CONTROL, trigger=text, dt=dt), capacity)
 
 
@@ -215,7 +215,7 @@ def events(trigger: Trigger, first: int, last: int, *, unsent: tuple[int, ...] =
 
 
 def test_periodic_sends_at_the_first_step_and_every_so_many_after() -> None:
-    """Whatever the error; period 1 is every step."""
+    """The error has no effect; period 1 is every step."""
     assert events(trigger_of("periodic(4)"), 3, 16) == [3, 7, 11, 15]
     assert events(trigger_of("periodic(1)"), 0, 4) == [0, 1, 2, 3, 4]
     verdict = ask(trigger_of("periodic"), 0, 2.0, fresh=True)
@@ -489,12 +489,12 @@ trees = st.recursive(
 
 
 def written(tree: Any) -> str:
-    """As a scenario has it."""
+    """Trigger in the form of a scenario."""
     return tree if isinstance(tree, str) else f"({written(tree[0])} {tree[1]} {written(tree[2])})"
 
 
 def encounters(rng: np.random.Generator, n: int, ticks: int) -> Iterator[Figures]:
-    """What n vehicles meet at random, in steps of their own; some are new at times."""
+    """Random situations of n vehicles, each with its own steps; some are new at times."""
     step = rng.integers(0, 20, n)
     for tick in range(ticks):
         figures = np.zeros(n, dtype=FIGURES)

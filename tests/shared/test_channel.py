@@ -136,7 +136,7 @@ def test_a_window_lets_the_oldest_in_and_nothing_older() -> None:
 
 
 def test_the_bytes_of_a_packet() -> None:
-    """As the table in docs/security.md has them."""
+    """The bytes are those of the table in docs/security.md."""
     vehicle, _ = ends(vehicle=0x0201, number=0x06050403)
     vehicle.seal(b"")
     packet = vehicle.seal(b"message")
@@ -228,7 +228,7 @@ def test_an_end_shows_no_key() -> None:
 # -- forgeries ---------------------------------------------------------------------------------
 
 Forger = Callable[[random.Random, bytes, bytes], bytes]
-"""What makes a packet that was never sent from two that were."""
+"""Function that forges a packet from two sent ones."""
 
 
 def flip_bit(rng: random.Random, packet: bytes, _: bytes) -> bytes:

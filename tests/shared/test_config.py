@@ -357,11 +357,11 @@ WRONG = {
         "reference.points_m: got [1.0, 2.0, 3.0], expected 2 numbers a point",
     ),
 }
-"""What is wrong: a scenario, and what is said of it after the name of the file."""
+"""Invalid scenarios, and the message about each after the file's name."""
 
 
 def refusal(path: Path | str) -> str:
-    """What is said of a scenario that cannot be flown."""
+    """Message about a scenario that cannot be flown."""
     with pytest.raises(ConfigError) as caught:
         reading.load(str(path))
     return str(caught.value)
@@ -412,7 +412,7 @@ def test_a_delay_that_no_clock_can_count_is_refused(key: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize(("horizon", "dt"), [(40, 0.011), (44, 0.01), (22, 0.02)])
 def test_a_horizon_that_just_covers_the_delay_is_right(horizon: int, dt: float) -> None:
-    """Whatever floating point makes of 40 · 0.011 s = 0.44 s."""
+    """Rounding of 40 · 0.011 s = 0.44 s does not matter."""
     control = {"scheme": "predictive", "trigger": "always", "horizon": horizon, "dt": dt}
     table = {"control": control}
     assert reading.check(table, "mine.toml").control.horizon == horizon
@@ -533,7 +533,7 @@ def test_extends_needs_the_name_of_a_scenario(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.toml", "../{folder}/a.toml"])
 def test_scenarios_that_extend_each_other_are_refused(name: str, tmp_path: Path) -> None:
-    """By whatever path they name each other."""
+    """Every form of path is recognised."""
     path = write(tmp_path, "a.toml", 'extends = "b.toml"')
     write(tmp_path, "b.toml", f'extends = "{name.format(folder=tmp_path.name)}"')
     said = refusal(path)
@@ -563,7 +563,7 @@ def test_extends_lays_a_scenario_over_another_key_by_key(tmp_path: Path) -> None
 
 
 def test_a_scenario_may_extend_one_that_comes_with_skytether(tmp_path: Path) -> None:
-    """By its name, from any folder."""
+    """The name works from any folder."""
     path = write(tmp_path, "mine.toml", 'extends = "paper"\nseed = 9')
     ours, theirs = (
         reading.to_table(reading.load("paper")),
@@ -597,13 +597,13 @@ def test_a_scenario_survives_being_written_and_read(name: str, tmp_path: Path) -
 
 
 def test_a_scenario_survives_being_a_table() -> None:
-    """As the command line lays its flags over one."""
+    """The command line lays its flags over such a table."""
     scenario = reading.load("demo")
     assert reading.check(reading.to_table(scenario), "flags") == scenario
 
 
 def test_the_names_of_scenarios_are_sorted_and_the_papers_are_there() -> None:
-    """As `skytether scenarios` lists them."""
+    """The order is that of `skytether scenarios`."""
     assert reading.names() == sorted(reading.names())
     assert {"demo", "paper", "paper-every-step", "paper-no-compensation"} <= set(reading.names())
 

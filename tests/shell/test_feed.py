@@ -537,7 +537,7 @@ class Passing(Proxy):
 
 
 class Seen:
-    """What a subscriber has seen, by process."""
+    """Frames that a subscriber has received, by process."""
 
     def __init__(self) -> None:
         self.frames: dict[str, list[Frame]] = defaultdict(list)

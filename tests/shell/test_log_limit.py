@@ -1,4 +1,4 @@
-"""How much is said: a few events of a kind in a second, and how many more there were."""
+"""Limit of the log: a few events of a kind per second, and the number of further ones."""
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Event, Flying, Omitted, SessionEnded

@@ -79,7 +79,7 @@ def figures() -> dict[str, dict[str, Any]]:
 
 
 def numbers(process: str, told: dict[str, Any]) -> dict[tuple[str, tuple[str, ...]], float]:
-    """What is served of figures, as Prometheus's own parser reads it."""
+    """Metrics made of figures, read by Prometheus's own parser."""
     collected, registry = Collected(process, "demo", 0.05), CollectorRegistry(auto_describe=False)
     collected.take(told)
     registry.register(collected)

@@ -126,7 +126,7 @@ def test_the_summary_counts_what_the_network_saw() -> None:
 
 
 def test_two_contenders_of_a_seed_meet_the_same_network() -> None:
-    """What enters at one time meets one fate, whoever sent it and however much before."""
+    """Packets that enter at one time meet one fate, for any contender and earlier traffic."""
     met: list[dict[tuple[int, int], tuple[int, bool]]] = []
     bursts = {"uplink": {"burst_s": 0.5}, "downlink": {"burst_s": 0.5}}
     for trigger, scheme in (("always", "predictive"), ("periodic(7)", "committed")):
@@ -212,7 +212,7 @@ def test_it_flies_in_space_with_a_time_constant_for_each_axis() -> None:
 
 
 def test_two_vehicles_share_one_server() -> None:
-    """Each through a flow of its own, both as well as one alone."""
+    """Each vehicle has its own flow, and both fly as well as one alone."""
     flown = packaged("paper-every-step", duration=20.0)
     flight = fly(flown, vehicles=2)
     for vehicle in (1, 2):

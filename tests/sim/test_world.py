@@ -98,7 +98,7 @@ def test_a_datagram_arrives_at_once_with_the_senders_address() -> None:
 
 
 def test_a_datagram_to_nobody_is_lost() -> None:
-    """As UDP would have it."""
+    """As with UDP, the sender is not told."""
     world = World()
     world.add("here", Probe([50], answer_to=("nobody", 0)))
     world.run(never, limit_ns=SECOND_NS)
@@ -134,7 +134,7 @@ def test_a_computing_host_sends_late_and_hears_at_once() -> None:
 
 
 def test_a_wake_during_computing_comes_late() -> None:
-    """How a deadline is missed in virtual time."""
+    """A deadline can so be missed in virtual time."""
     world, busy = World(), Probe([50, 60])
     world.add("busy", busy, compute_ns=30)
     world.run(never, limit_ns=SECOND_NS)
@@ -303,7 +303,7 @@ def test_datagrams_wait_for_a_frozen_host_and_it_wakes_late() -> None:
 
 
 def test_a_frozen_host_can_be_taken_down_and_a_host_that_is_down_not_frozen() -> None:
-    """As a process can be killed that is stopped, and no process be stopped that is gone."""
+    """As with processes: a stopped one can be killed, and a dead one cannot be stopped."""
     world, old, new = World(), Probe([50]), Probe([60])
     world.add("host", old)
     for time_ns, action in ((10, world.freeze), (20, world.stop), (30, world.freeze)):
@@ -316,7 +316,7 @@ def test_a_frozen_host_can_be_taken_down_and_a_host_that_is_down_not_frozen() ->
 
 @pytest.mark.parametrize("step_ns", [1000, -1000])
 def test_a_timer_counts_on_where_the_clock_is_set(step_ns: int) -> None:
-    """What is asked for later is reckoned by the clock as it is then."""
+    """Later requests use the clock as it is then."""
     world, probe = World(), Probe([50, 60 + step_ns])
     world.add("host", probe)
     at(world, 30, world.set_clock, "host", step_ns=step_ns)

@@ -81,7 +81,7 @@ def told(browser: ClientConnection, kind: str) -> dict[str, Any]:
 
 
 def counts(page: Page) -> dict[TurnedAway, int]:
-    """How often each reason for a refusal was met."""
+    """Number of refusals, by reason."""
     return dict(page._guard.counts)
 
 
@@ -221,7 +221,7 @@ def test_what_a_reader_leaves_unread_is_bounded(page: Page) -> None:
 def test_nothing_is_drawn_for_who_does_not_read(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever reads gets everything."""
+    """Browsers that read get everything."""
     with closing(opened(page.port)) as sock, joined(page) as reader:
         sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
         until(lambda: any(each.paused for each in page._connections.values()))
@@ -247,7 +247,7 @@ def test_nothing_is_drawn_for_who_does_not_read(
 def test_a_value_that_makes_no_sense_costs_nobody_else_the_page(
     page: Page, message: dict[str, Any]
 ) -> None:
-    """Who has sent it is turned away, at most."""
+    """At most, the browser that sent it is refused."""
     with joined(page) as other, joined(page) as browser:
         send(other, **CAMERA)
         assert element(other)

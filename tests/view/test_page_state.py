@@ -1,4 +1,4 @@
-"""What a page shows of a flight: values of a flight in virtual time, and bounds."""
+"""State of a page: values of a flight in virtual time, and bounds."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -57,7 +57,7 @@ def demo(cut_s: float = 0.0, vehicles: int = 1, name: str = "demo-committed") ->
 
 
 def state_of(frames: tuple[tuple[int, str, Frame], ...]) -> State:
-    """What is shown once all of these frames have come."""
+    """State after all of these frames."""
     state = State()
     for _, process, frame in frames:
         state.take(process, frame)

@@ -251,7 +251,7 @@ def test_a_recording_with_one_column_for_all_figures_is_read(
 
 
 def fault(message: Any, schema: Mapping[str, Any]) -> str:
-    """What is wrong with a message by its schema, as far as ours use JSON schema."""
+    """Fault of a message by its schema, as far as these schemas use JSON schema."""
     match schema["type"]:
         case "object":
             if not isinstance(message, dict):
@@ -271,7 +271,7 @@ def fault(message: Any, schema: Mapping[str, Any]) -> str:
 
 
 def undrawable(schema: Mapping[str, Any]) -> str:
-    """What Foxglove and Lichtblick cannot read in a schema."""
+    """Parts of a schema that Foxglove and Lichtblick cannot read."""
     if schema.get("type") not in {"object", "array", "number", "integer", "string", "boolean"}:
         return f"type {schema.get('type')!r}"
     if schema["type"] == "array":
@@ -404,7 +404,7 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @cache
 def chunks(path: Path) -> list[tuple[int, int]]:
-    """Where each chunk of a torn file ends [B], and number of messages up to there."""
+    """End of each chunk of a torn file [B], and number of messages up to there."""
     found, count, content = [], 0, path.read_bytes()
     stream = io.BytesIO(content)
     try:
@@ -535,7 +535,7 @@ def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def places(path: Path) -> dict[str, list[int]]:
-    """Where the records of a whole file begin that its index knows [B], by what they are."""
+    """Positions of a file's indexed records [B], by type."""
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -573,7 +573,7 @@ def test_a_length_that_was_changed_costs_nothing(
 def test_recovery_never_holds_less_than_could_be_read(
     data: st.DataObject, chunked: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """Whatever bits were changed; the file has as many rows as are told."""
+    """For any flipped bits; the file has as many rows as reported."""
     content = bytearray(chunked.read_bytes())
     heads = [at + byte for kind in places(chunked).values() for at in kind for byte in range(46)]
     where = st.sampled_from(heads) | st.integers(8, len(content) - 1)
@@ -666,7 +666,7 @@ def test_a_killed_recorder_loses_less_than_a_second(tmp_path: Path) -> None:
 def test_without_its_flush_a_recorder_would_lose_all(
     flush_s: float, kept: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it was told is in the file soon, though no more comes."""
+    """Rows reach the file soon, even if no more follow."""
     monkeypatch.setattr(recorder, "Subscriber", Feeds)
     monkeypatch.setattr(recorder, "FLUSH_S", flush_s)
     path, feeds = tmp_path / "live.mcap", {"client": tmp_path / "nobody"}
@@ -947,7 +947,7 @@ def other_mcap(path: Path) -> None:
 def test_what_is_no_recording_is_refused_in_a_line(
     made: Any, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By each command, which names it, and leaves nothing behind."""
+    """Each command names the file, and leaves no output behind."""
     path = tmp_path / "it.mcap"
     made(path)
     before = set(tmp_path.iterdir())
@@ -1039,7 +1039,7 @@ def date(found: list[Any]) -> None:
 def test_what_no_flight_says_is_refused_in_a_line(
     change: Any, why: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By each command that reads it, for its reason, and before memory is taken for it."""
+    """Each command refuses it with the reason, before memory is allocated."""
     path = changed(recording, tmp_path / "it.mcap", change)
     for of, flags in (
         (export, ["--csv", str(tmp_path / "tables")]),

@@ -63,7 +63,7 @@ def probe(scenario: Scenario = DEMO) -> tuple[Probe, Running]:
 
 
 def answer(running: Running, request: bytes) -> Answer:
-    """What is answered to a request."""
+    """Answer to a request."""
     return msgspec.json.decode(running.answer(request, now_ns=7), type=Answer)
 
 
@@ -393,7 +393,7 @@ def test_without_its_rows_in_the_table_a_disarmed_vehicle_would_fly_on(
 
 
 def test_what_is_refused_in_flight_is_an_event_and_the_flight_is_the_same() -> None:
-    """By the endpoint that has the key, and keys of nobody by the server."""
+    """The endpoint that owns the key reports it; unknown keys are reported by the server."""
     flown = scenario()
     changes: list[tuple[float, dict[str, Any]]] = [
         (3.0, {"network.uplink.loss": 2, "network.downlink.loss": 0.5}),

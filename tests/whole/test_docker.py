@@ -180,7 +180,7 @@ class Containers:
     """Identifiers of the containers, by service; they stay the same from `up` to `down`."""
 
     def compose(self, *arguments: str) -> str:
-        """What Compose printed."""
+        """Output of Compose."""
         return run(*self.argv(*arguments), more_env=self.flight)
 
     def attempt(self, *arguments: str) -> tuple[int, str]:
@@ -200,11 +200,11 @@ class Containers:
 
     @property
     def flight(self) -> dict[str, str]:
-        """What the environment says of the flight."""
+        """Figures of the flight in the environment."""
         return {"FLIGHT_SECONDS": str(self.seconds), "SCENARIO": "demo"}
 
     def docker(self, *arguments: str) -> str:
-        """What Docker printed."""
+        """Output of Docker."""
         return run("docker", *arguments)
 
     def id(self, service: str) -> str:
@@ -491,7 +491,7 @@ def run(*command: str, more_env: Mapping[str, str] = MappingProxyType({})) -> st
 
 
 def number(name: str, figures: str) -> int:
-    """What figures count under a name; 0 where there is none of it."""
+    """Number of a figure by its name; 0 if it is missing."""
     found = re.search(rf"(?m): +{name} +(\d+)$", figures)
     return int(found[1]) if found else 0
 
@@ -500,7 +500,7 @@ T = TypeVar("T")
 
 
 def until(what: str, condition: Callable[[], T | None], within_s: float = 30.0) -> T:
-    """What a condition gives once it holds."""
+    """Result of a condition once it holds."""
     deadline_s = time.monotonic() + within_s
     while not (value := condition()):
         assert time.monotonic() < deadline_s, f"in {within_s:g} s not come: {what}"

@@ -35,7 +35,7 @@ from skytether.sim.flight import fly as fly_virtually
 
 LOOPBACK_6: Address = ("::1", 0)
 LATE_NS = SECOND_NS // 4
-"""How late anything may come on a busy machine before a test gives up on it."""
+"""Longest lateness that a test accepts on a busy machine."""
 
 
 class Echo(Endpoint):
@@ -280,7 +280,7 @@ def test_a_name_means_its_ipv4_address_if_it_has_one(
 
 @pytest.mark.ipv6
 def test_an_ipv6_socket_hears_ipv6_alone() -> None:
-    """So that one port may be bound in both families."""
+    """One port may therefore be bound in both families."""
     with open_socket(("::", 0)) as six:
         port = six.getsockname()[1]
         with open_socket(("0.0.0.0", port)) as four:

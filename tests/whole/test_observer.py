@@ -77,7 +77,7 @@ class Observer(Endpoint):
 
 @dataclass
 class Outcome:
-    """What came of a flight."""
+    """Figures of a flight."""
 
     rmse_m: float
     changes: list[tuple[str, str]] = field(default_factory=list)

@@ -22,7 +22,7 @@ SOMEBODY_ELSE = "raise SystemExit('somebody else')"
 
 
 def hatchling(source: Path, target: str, folder: Path) -> Path:
-    """What hatchling builds of a source: "sdist" or "wheel"."""
+    """Files that hatchling builds of a source: "sdist" or "wheel"."""
     command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
     subprocess.run(command, cwd=source, check=True, capture_output=True)
     (built,) = folder.iterdir()
@@ -152,7 +152,7 @@ def environment(folder: Path) -> tuple[Path, Path]:
 
 
 def names(folder: Path) -> set[str]:
-    """What lies in a folder."""
+    """Names of the files in a folder."""
     return {path.name for path in folder.iterdir()}
 
 

@@ -13,6 +13,26 @@ FILES = [
     for folder in ("skytether", "server", "client", "netem", "shared", "tests")
     for file in sorted((ROOT / folder).rglob("*.py"))
 ]
+NOT_YET = {
+    "skytether/lab/benchmarks/footprint.py",
+    "skytether/lab/benchmarks/harness.py",
+    "skytether/lab/benchmarks/missions.py",
+    "skytether/lab/benchmarks/motions.py",
+    "skytether/lab/benchmarks/published.py",
+    "skytether/lab/benchmarks/tick.py",
+    "skytether/lab/benchmarks/together.py",
+    "skytether/lab/benchmarks/versions.py",
+    "skytether/shell/driver.py",
+}
+"""Files whose docstrings are not all rewritten yet; the set may only shrink."""
+NOUN_FIRST = [
+    name
+    for name in FILES
+    if name.startswith("skytether/")
+    and name.split("/")[1] not in {"server", "client", "netem", "shared"}
+    and name not in NOT_YET
+]
+"""Files whose docstrings begin with the noun that they describe, or with a verb."""
 DEFINITIONS = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
@@ -32,7 +52,7 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[ast.Constant, bool]]:
 
 
 def fault(text: str, *, of_attribute: bool) -> str:
-    """What is wrong with a docstring; empty where nothing is."""
+    """Fault of a docstring; empty for none."""
     text = text.strip()
     if text[:1].islower():
         return "begins with a small letter"
@@ -65,6 +85,19 @@ def test_a_docstring_stands_alone(name: str) -> None:
         if (found := fault(str(text.value), of_attribute=of_attribute))
     ]
     assert not faults, "\n".join(faults)
+
+
+@pytest.mark.parametrize("name", NOUN_FIRST)
+def test_a_docstring_begins_with_what_it_describes(name: str) -> None:
+    """None begins with a pronoun or an adverb such as "Who" or "Where"; "Whether" is fine."""
+    tree = ast.parse((ROOT / name).read_text())
+    words = r"(Who|What|Where|Whoever|Whatever|How|As|Which|So|Nor|Nobody)\b"
+    found = [
+        f"{name}:{text.lineno}: {text.value[:60]!r}"
+        for text, _ in docstrings(tree)
+        if re.match(words, str(text.value).strip())
+    ]
+    assert not found, "\n".join(found)
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -1,1 +1,1 @@
-"""What Skytether costs, measured beside what others cost in the same run."""
+"""Benchmarks: costs of Skytether, measured beside those of other programs in the same run."""

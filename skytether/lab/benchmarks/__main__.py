@@ -1,6 +1,6 @@
 """Every benchmark, one after the other; the figures go into results.json and docs/.
 
-With --only, the figures of the others stay as they were.
+With --only, the figures of the other benchmarks are kept.
 """
 
 import json
@@ -76,13 +76,13 @@ def write(
     document: Path = DOCUMENT,
     folder: Path = DOCUMENT.parent,
 ) -> None:
-    """Put new figures beside those of other sections, and all into the document.
+    """Merge new figures with those of other sections, and write all into the document.
 
     Args:
-        results: what was measured, by section.
-        file: the figures.
-        document: where the tables are.
-        folder: for what is drawn.
+        results: measured figures, by section.
+        file: file of the figures.
+        document: document with the tables.
+        folder: folder for pictures.
     """
     if "tick" in results:
         tick.draw(results["tick"], folder / tick.FIGURE.name)
@@ -100,7 +100,7 @@ def write(
 
 
 def machines(results: Mapping[Section, Any]) -> TextTable:
-    """Machine that each section was measured on, and how late it woke meanwhile."""
+    """Machine that each section was measured on, and how late it woke a sleeping process."""
     rows = []
     for name, figures in results.items():
         on, wake = figures["machine"], figures.get("wake")

@@ -1,8 +1,8 @@
-"""How right the exact solver is: max |u - u*| over 100 000 problems, against proved answers.
+"""Accuracy of the exact solver: max |u - u*| over 100 000 problems, against proved answers.
 
 Half of the problems are recorded in flight, smooth and saturated, and half are random, from
-gradients that leave all bounds alone to such that hold nearly every input at one. No time is
-measured here; both cores work.
+gradients that activate no bound to such that hold nearly every input at a bound. No time is
+measured, so all cores may work.
 """
 
 import multiprocessing
@@ -27,7 +27,7 @@ from skytether.sim.flight import fly
 HORIZONS = (1, 30, 50, 100)
 STEPS_S = (0.02, 0.05, 0.1)
 INPUT_WEIGHTS = (1e-3, 1.93)
-"""Values of R: hardly any, and the default."""
+"""Values of R: nearly none, and the default."""
 TAU_S = [0.4, 0.855]
 """Time constants of the two axes [s]."""
 SCALES = (0.1, 1.0, 3.0, 10.0, 30.0)
@@ -39,10 +39,10 @@ SEED = 1
 
 @dataclass(frozen=True)
 class AccuracyCounts:
-    """How much to check, for each of the 24 combinations of H, Δt and R."""
+    """Number of problems to check, for each of the 24 combinations of H, Δt and R."""
 
     ticks: int = 260
-    """Number of ticks of either flight; four problems each."""
+    """Number of ticks of each of both flights; four problems each."""
     random: int = 210
     """Number of vehicles of each scale; two problems each."""
     horizons: tuple[int, ...] = HORIZONS
@@ -53,7 +53,7 @@ FULL, QUICK = AccuracyCounts(), AccuracyCounts(ticks=20, random=10)
 
 @dataclass(frozen=True)
 class AccuracyTask:
-    """A pile of problems: those of one flight, or random ones of one scale."""
+    """Set of problems: those of one flight, or random ones of one scale."""
 
     horizon: int
     dt_s: float
@@ -72,14 +72,15 @@ class AccuracyTask:
         changes["settle"] = 0.0
         if self.reference == "square":
             changes["reference"] = SATURATED
-        if self.horizon * self.dt_s < 0.5:  # no network that it could bridge
+        # the paper's delays are longer than so short a horizon bridges
+        if self.horizon * self.dt_s < 0.5:
             none = {"delay": "none"}
             changes["network"] = {"uplink": none, "downlink": none}
         return derive("paper-every-step", **changes)
 
 
 def tasks(counts: AccuracyCounts) -> list[AccuracyTask]:
-    """Tasks, the longest horizons first: they take longest."""
+    """Tasks, the longest horizons first, because they take longest."""
     piles = []
     for H, dt_s, R in product(sorted(counts.horizons, reverse=True), STEPS_S, INPUT_WEIGHTS):
         piles += [
@@ -90,7 +91,7 @@ def tasks(counts: AccuracyCounts) -> list[AccuracyTask]:
 
 
 def measure(counts: AccuracyCounts, workers: int | None = None) -> dict[str, Any]:
-    """Figures of all problems, by H, computed by so many processes."""
+    """Figures of all problems, by H, computed by several processes."""
     piles = tasks(counts)
     with multiprocessing.get_context("spawn").Pool(workers or os.cpu_count()) as pool:
         checked = pool.imap_unordered(check, piles)
@@ -109,7 +110,7 @@ def _together(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def check(task: AccuracyTask) -> dict[str, Any]:
-    """Solve a pile twice, and prove every answer."""
+    """Solve all problems of a task twice, and prove every answer optimal."""
     figures: dict[str, Any] = dict.fromkeys(
         ("problems", "active", "fallbacks", "unsolved", "unproved", "outside", "other_bits"), 0
     )
@@ -157,7 +158,7 @@ def _problems(task: AccuracyTask) -> Iterator[tuple[Problem, Array, Array]]:
     rng = np.random.default_rng([SEED, *where, round(10 * task.scale)])
     axes, bound = terms.axes, problem.mpc.bounds[:, None]
     x = rng.normal(0.0, task.scale, (task.count, axes, 2))
-    # Targets that wander off by about as much as a vehicle could fly in the time.
+    # Targets that drift about as far as a vehicle could fly in the time.
     drift = rng.normal(
         0.0, task.scale * np.sqrt(task.dt_s), (task.count, axes, task.horizon + 1, 2)
     )

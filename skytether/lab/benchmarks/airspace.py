@@ -1,7 +1,7 @@
-"""Vehicles that fly what a server plans for them, without a network: the server's work alone.
+"""Vehicles that fly the server's plans without a network, to measure the server's work alone.
 
-A state is heard of some steps late, as over the paper's network, so that the estimator has as much
-to do as there. The vehicles are spread along the reference and flown by the model, with noise.
+Observations arrive some steps late, as over the paper's network, so that the estimator has as much
+work as there. The vehicles are spread along the reference and flown by the model, with noise.
 """
 
 from collections import deque
@@ -43,11 +43,11 @@ PERIOD_S = 27.5
 
 
 class Vehicles:
-    """Vehicles on their way, flown by the model.
+    """Vehicles in flight, simulated by the model.
 
     Args:
-        scenario: what they fly.
-        count: n.
+        scenario: scenario that they fly.
+        count: number of vehicles, n.
     """
 
     def __init__(self, scenario: Scenario, count: int) -> None:
@@ -67,11 +67,11 @@ class Vehicles:
 
 
 class PlannedFleet:
-    """A planner, and vehicles whose states it knows, planned for a block at a time as in a server.
+    """Planner with vehicles whose states it knows, planned in blocks as in a server.
 
     Args:
-        scenario: what they fly.
-        count: how many.
+        scenario: scenario that they fly.
+        count: number of vehicles.
     """
 
     def __init__(self, scenario: Scenario, count: int) -> None:
@@ -96,17 +96,17 @@ class PlannedFleet:
             self._planner.plan(rows, self._vehicles.step[rows], self._found)
 
     def fly(self) -> None:
-        """Fly a step as planned."""
+        """Fly one step as planned."""
         self._vehicles.fly(self._planner.inputs[:, :, 0])
 
 
 class Airspace:
-    """A server, and vehicles in session with it.
+    """Server, and vehicles in session with it.
 
     Args:
-        scenario: what they fly; it must be told to send at every step.
-        count: how many.
-        stopwatch: the server's.
+        scenario: scenario that they fly, with a trigger that sends at every step.
+        count: number of vehicles.
+        stopwatch: stopwatch of the server.
     """
 
     def __init__(self, scenario: Scenario, count: int, stopwatch: Stopwatch | None = None) -> None:
@@ -131,13 +131,13 @@ class Airspace:
         return vehicle, welcome.session, address
 
     def _observe(self) -> None:
-        """Give the server an observation of every vehicle, late."""
+        """Give the server an observation of every vehicle, with a delay."""
         now_ns, late_ns = self._due_ns - MILLISECOND_NS, self._late * self._dt_ns
         step = (self._vehicles.step - self._late).tolist()
         for (vehicle, session, address), k, x in zip(
             self._sessions, step, self._past[0], strict=True
         ):
-            # What the server sent at now - 2 late came at now - late.
+            # Packets that the server sent at step now - 2 late arrived at now - late.
             backward_us = stamp_us(k * self._dt_ns - self._due_ns + 2 * late_ns)
             observation = Observation(
                 vehicle,
@@ -159,7 +159,7 @@ class Airspace:
         self.server.wake(now_ns=self._due_ns)
 
     def prepare(self) -> None:
-        """Fly the step before, and give the server an observation of every vehicle."""
+        """Fly the previous step, and give the server an observation of every vehicle."""
         sent = len(self.server.outbox())
         if sent:
             assert sent == len(self._sessions), "a vehicle was sent no horizon"

@@ -1,10 +1,10 @@
-"""Flights of an autopilot over a bad network, beside what people do without Skytether.
+"""Flights of an autopilot over a bad network, by Skytether and by set-points alone.
 
 `python -m skytether.lab.benchmarks.autopilots` flies a figure eight over the paper's network with
 both of the scripted autopilot's flavours, in calm air and in wind, in virtual time: Skytether with
-`vehicle.kind = "mavlink"`, and set-points sent straight by each of the laws of `station.laws`.
-Their networks and winds are those of the same seeds, from when each of them starts. Each flight is
-flown once more with the network cut for a while. With --write, the tables go into docs/straight.md.
+`vehicle.kind = "mavlink"`, and set-points sent straight by each of the laws of `station.laws`. All
+meet the networks and winds of the same seeds, counted from each one's start. Each flight is
+repeated with the network cut for a while. With --write, the tables go into docs/straight.md.
 """
 
 import io
@@ -58,14 +58,14 @@ OURS: dict[str, dict[str, dict[str, Any]]] = {
         "link": {"heartbeat_s": 0.1, "timeout_s": 8.0, "age_max_s": 12.0},
     },
 }
-"""Contenders that are Skytether, with the keys that differ from the scenario's, which sends the
-desired trajectory. The others send inputs; the patient one flies its plan to the end, 8 s, however
-silent the server is, where the first two brake in two seconds and in one."""
+"""Contenders that are Skytether, with the keys that differ from the scenario, which sends the
+desired trajectory. The others send inputs. The patient one flies its plan to the end, 8 s, however
+long the server is silent; the first two brake after two seconds and after one."""
 CALM: Air = "calm"
 WIND: Air = "wind"
 LEADS: dict[FlavourName, tuple[float, float]] = {"ardupilot": (0.55, 1.1), "px4": (0.85, 1.4)}
-"""Leads [s] of `targets` and `led`, fitted by hand in calm air: of ArduCopter to an actual one, of
-PX4 to the scripted one."""
+"""Leads [s] of `targets` and `led`, fitted by hand in calm air: for ArduCopter to a real one, for
+PX4 to the simulated one."""
 MODELS: dict[FlavourName, dict[str, Any]] = {
     "ardupilot": {},
     "px4": {
@@ -74,8 +74,8 @@ MODELS: dict[FlavourName, dict[str, Any]] = {
         "dead_time_s": [0.13, 0.13, 0.04],
     },
 }
-"""Keys of the model as it was measured at a step of 1 m/s, where they differ from the scenario's:
-nothing of Skytether is fitted to what is flown here."""
+"""Keys of the model as measured by steps of 1 m/s, where they differ from the scenario: nothing of
+Skytether is tuned to these flights."""
 SAFE: dict[FlavourName, dict[str, float]] = {
     "ardupilot": {"GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5, "SYSID_MYGCS": 245},
     "px4": {"COM_OBL_RC_ACT": 4},
@@ -90,16 +90,16 @@ ACTUAL: dict[tuple[str, Air], float] = {
     ("targets, led", WIND): 0.262,
     ("led, gain 0.3", WIND): 0.069,
 }
-"""RMSE xy of an actual ArduCopter 4.5.6, in its own simulator, over the same netem [m]."""
+"""RMSE xy of ArduCopter 4.5.6 in its own simulator, over the same netem [m]."""
 BLOWS = {"steady_wind_mps": [6.0, 0.0, 0.0], "turbulence_mps": 6.0}
 """Keys of the vehicle in wind: 6 m/s, turbulent."""
 CUT_S, HEALED_S, WATCHED_S = 15.0, 20.0, 32.0
-"""Times of the flight at which the network is cut, and whole again, and until which the largest
-error is looked for [s]."""
+"""Times of flight at which the network is cut and restored, and until which the largest error is
+sought [s]."""
 
 
 class Cell(NamedTuple):
-    """What is flown with one seed."""
+    """Combination that is flown with one seed."""
 
     contender: str
     flavour: FlavourName
@@ -108,22 +108,22 @@ class Cell(NamedTuple):
 
 
 class Flown(msgspec.Struct, frozen=True, kw_only=True):
-    """A flight of a contender, and one more with the network cut for a while."""
+    """Flight of a contender, and its repetition with the network cut for a while."""
 
     contender: str
     flavour: FlavourName
     air: Air
     seed: int
     whole: Summary
-    """Figures with the network whole; packets are those from the first step to the last."""
+    """Figures with an intact network; packets are counted from the first step to the last."""
     cut: Summary
-    """Figures of the flight that was cut."""
+    """Figures of the flight with the cut."""
     largest_m: float
-    """Largest error of that from the cut on, until it is well over [m]."""
+    """Largest error in the flight with the cut, from the cut until well after its end [m]."""
 
 
 def contenders(flavour: FlavourName) -> dict[str, laws.Law | None]:
-    """Laws of the contenders by name; None of one that is Skytether."""
+    """Laws of the contenders by name; None for Skytether."""
     targets_s, led_s = LEADS[flavour]
     return {
         "velocity": laws.make("velocity"),
@@ -136,10 +136,10 @@ def contenders(flavour: FlavourName) -> dict[str, laws.Law | None]:
 
 
 def scenario_of(cell: Cell, model: Mapping[str, Any] | None = None) -> Scenario:
-    """What is flown in a cell: the same for all contenders, but for keys of our own.
+    """Scenario of a cell: the same for all contenders, except for keys that only Skytether uses.
 
     Args:
-        model: keys of the model that Skytether flies by; those of `MODELS` unless given.
+        model: keys of the model that Skytether uses; those of `MODELS` unless given.
     """
     table = reading.to_table(reading.load("autopilot"))
     table["seed"] = cell.seed
@@ -175,11 +175,11 @@ def fly(
 
 
 def as_it_was(scenario: Scenario, flown: Record, truth: Rows) -> Record:
-    """Record of a flight of ours with true states, and packets from the first step to the last.
+    """Record of Skytether's flight with true states, and packets from the first step to the last.
 
     Args:
-        scenario: what was flown.
-        flown: its record, with states as the client knew them.
+        scenario: scenario that was flown.
+        flown: record of the flight, with states as the client knew them.
         truth: rows of `record.TRUTH_COLUMNS`, on the clock of the record's events.
     """
     times_ns = began_ns(flown) + flown.client["step"] * scenario.dt_ns
@@ -207,7 +207,7 @@ def fly_cell(cell: Cell) -> Flown:
 def judged(
     cell: Cell, scenario: Scenario, whole: Record, cut: Record, *, secure: bool = False
 ) -> Flown:
-    """Figures of the two flights of a cell: with the network whole, and cut for a while."""
+    """Figures of both flights of a cell: with an intact network, and cut for a while."""
     times_s = cut.client["step"] * scenario.control.dt
     watched = (times_s >= CUT_S) & (times_s < WATCHED_S)
     errors = np.linalg.norm(position_error(scenario, cut.client)[watched], axis=1)
@@ -240,7 +240,7 @@ HEADINGS = [
 
 
 def tables(flights: Sequence[Flown]) -> dict[str, TextTable]:
-    """A table for each flavour and air, by its name, and one of what was measured elsewhere."""
+    """Tables by name: one for each flavour and air, and one of measurements elsewhere."""
     made = {}
     for flavour, air in product(get_args(FlavourName), get_args(Air)):
         of_case = [each for each in flights if (each.flavour, each.air) == (flavour, air)]
@@ -254,7 +254,7 @@ def tables(flights: Sequence[Flown]) -> dict[str, TextTable]:
 
 
 def _near(flights: Sequence[Flown]) -> list[list[str]]:
-    """Rows of figures of an actual ArduCopter, with those of the simulated one."""
+    """Rows of ArduCopter's figures, with those of the simulated one."""
     rows = []
     for (name, air), actual_m in ACTUAL.items():
         case = name, "ardupilot", air
@@ -265,7 +265,7 @@ def _near(flights: Sequence[Flown]) -> list[list[str]]:
 
 
 def row(name: str, flights: Sequence[Flown]) -> list[str]:
-    """Row of a contender: means over its flights, and of errors also the largest."""
+    """Row of a contender: means over its flights; for errors also the largest."""
     errors = [each.whole.rmse_xy or np.nan for each in flights]
 
     def a_second(key: str) -> float:
@@ -291,7 +291,7 @@ def row(name: str, flights: Sequence[Flown]) -> list[str]:
 
 @dataclass(frozen=True)
 class AutopilotBenchmarkOptions:
-    """What to fly."""
+    """Options of this benchmark."""
 
     seeds: int = 5
     """Number of seeds, from 1 on."""
@@ -300,11 +300,11 @@ class AutopilotBenchmarkOptions:
     flavours: tuple[FlavourName, ...] = get_args(FlavourName)
     """Flavours of the autopilot."""
     airs: tuple[Air, ...] = get_args(Air)
-    """Calm air, and wind of 6 m/s."""
+    """Air: calm, or wind of 6 m/s."""
     jobs: int = 1
     """Number of flights at once."""
     json: Path | None = None
-    """File for the figures of every flight; those that are there already are kept."""
+    """File for the figures of every flight; flights already in the file are not repeated."""
     write: bool = False
     """Put the tables into docs/straight.md."""
 

@@ -1,11 +1,11 @@
-"""Flights of an autopilot over real UDP, sealed, by a model that `skytether identify` has found.
+"""Flights of an autopilot over real UDP, encrypted, with a model from `skytether identify`.
 
-`python -m skytether.lab.benchmarks.autopilots_udp FOLDER` does with both of the scripted
-autopilot's flavours what its user does, each process as a command starts it: has the model
-identified in calm air, at the size of step that is flown, and flies with it over netem, with a key.
-Beside it flies the best law of set-points on the same seeds. Each flight is flown once more with
-the network cut for a while. It takes as long as it takes: four minutes to identify, and then 70 s
-for each flight. With --write, the table goes into docs/straight.md.
+`python -m skytether.lab.benchmarks.autopilots_udp FOLDER` repeats a user's steps with both flavours
+of the simulated autopilot, each process started by its command: it identifies the model in calm
+air, with steps of the size that is flown, and flies with the model over netem, with a key. The best
+law of set-points flies on the same seeds. Each flight is repeated with the network cut for a while.
+All of it runs in real time: four minutes to identify, and 70 s for each flight. With --write, the
+table goes into docs/straight.md.
 """
 
 import asyncio
@@ -52,14 +52,14 @@ from skytether.station import laws
 from skytether.station.joined import joined
 
 CONTENDERS = ("led, gain 0.5", "skytether", "skytether, inputs")
-"""Names of what is flown, see `autopilots.contenders`."""
+"""Names of the contenders, see `autopilots.contenders`."""
 
 
 async def identify(flavour: FlavourName, out: Path) -> None:
-    """Have a flavour's model identified; its scenario comes to lie in a folder.
+    """Identify a flavour's model; the scenario is written to a folder.
 
     Raises:
-        CommandError: it was not.
+        CommandError: the identification failed.
     """
     pilots = ("autopilot", f"--flavour={flavour}", f"--ready={READY_S}", *ANYWHERE)
     async with started("autopilot", *pilots) as pilot:
@@ -72,16 +72,16 @@ async def identify(flavour: FlavourName, out: Path) -> None:
 
 
 async def fly(scenario: Scenario, cell: Cell, parts: Path, *, cut: bool) -> Record:
-    """Fly a contender, to the end; the record is as that of `autopilots.fly`.
+    """Fly a contender to the end; returns a record like that of `autopilots.fly`.
 
     Args:
-        scenario: what to fly.
+        scenario: scenario to fly.
         cell: contender and flavour.
-        parts: empty folder for what the processes leave.
+        parts: empty folder for the processes' files.
         cut: whether the network is cut for a while.
 
     Raises:
-        CommandError: it did not come to its end.
+        CommandError: the flight did not reach its end.
     """
     law = contenders(cell.flavour)[cell.contender]
     file, keys = parts / "scenario.toml", ("--keys", str(parts / "keys"))
@@ -167,11 +167,11 @@ def table(flights: list[Flown]) -> TextTable:
 
 @dataclass(frozen=True)
 class UdpBenchmarkOptions:
-    """What to fly."""
+    """Options of this benchmark."""
 
     folder: tyro.conf.Positional[Path]
-    """Folder of what is identified, for each flavour a folder with its scenario, and of the figures
-    of every flight; what is there already is kept."""
+    """Folder of the identified scenarios, one folder per flavour, and of the figures of every
+    flight; existing results are kept."""
     seeds: int = 2
     """Number of seeds, from 1 on."""
     jobs: int = 1
@@ -181,7 +181,7 @@ class UdpBenchmarkOptions:
 
 
 async def fly_all(options: UdpBenchmarkOptions) -> list[Flown]:
-    """Identify and fly what is not there yet; returns all there is."""
+    """Identify and fly what is missing; returns all results."""
     free = asyncio.Semaphore(options.jobs)
     flavours = get_args(FlavourName)
 

@@ -1,9 +1,8 @@
 """The page in Chromium, and pictures of it.
 
 `python -m skytether.lab.benchmarks.browser FOLDER` flies the demonstration over UDP and takes
-pictures of its page, light and dark, in a wide window and in a narrow one, of a link that is cut,
-and of a duel in virtual time: half a minute each. Chromium is the one that `CHROMIUM` or PATH
-names.
+pictures of its page, light and dark, in a wide window and in a narrow one, with the link cut, and
+of a duel in virtual time; each takes half a minute. Chromium is found by `CHROMIUM` or PATH.
 """
 
 import os
@@ -24,18 +23,18 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
-"""Chromium's executable; empty where there is none."""
+"""Chromium's executable; empty if there is none."""
 FLAGS = (
     "--no-sandbox",
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 )
-"""Flags with which it draws in software."""
+"""Flags that make Chromium render in software."""
 SIZES = {"wide": (1400, 900), "narrow": (420, 860)}
 """Width and height of windows [pixels]."""
 PATIENCE_S = 90.0
-"""Longest time to wait for something to become true [s]."""
+"""Longest time to wait for a condition [s]."""
 SHOWN_S = 25.0
 """Time of flight at which pictures are taken [s]."""
 
@@ -53,10 +52,10 @@ def chromium() -> "Iterator[Browser]":
 
 @contextmanager
 def served(*arguments: str) -> Iterator[str]:
-    """Run a command that serves a page; yields its address.
+    """Run a command that serves a page; yields the page's address.
 
     Raises:
-        RuntimeError: it serves none.
+        RuntimeError: the command serves none.
     """
     command = [sys.executable, "-P", "-m", "skytether", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -86,10 +85,10 @@ def opened(browser: "Browser", address: str, size: str = "wide") -> "Iterator[Pa
 
 
 def until(true: Callable[[], object], what: str) -> None:
-    """Wait until something is true.
+    """Wait until a condition holds.
 
     Raises:
-        TimeoutError: it does not become so.
+        TimeoutError: the condition did not hold in time.
     """
     ends_s = time.monotonic() + PATIENCE_S
     while not true():
@@ -99,19 +98,19 @@ def until(true: Callable[[], object], what: str) -> None:
 
 
 def status(page: "Page", place: int = 0) -> str:
-    """What is said of a flight; empty before anything is."""
+    """Status text of a flight; empty before any."""
     words = page.locator(".skytether-status")
     return words.nth(place).inner_text() if words.count() > place else ""
 
 
 def flown_s(page: "Page", place: int = 0) -> float:
-    """Time of flight that is shown [s]; 0 before any."""
+    """Time of flight on the page [s]; 0 before any."""
     words = page.locator(".skytether-status")
     return float(words.nth(place).get_attribute(FLOWN_S) or 0) if words.count() > place else 0.0
 
 
 def plotted_s(page: "Page") -> float:
-    """Newest time that the first plot has [s]; 0 before any."""
+    """Newest time in the first plot [s]; 0 before any."""
     newest = """() => {
         const plots = Object.values((window.__viserTestpoints || {}).uplots || {});
         return plots.length ? plots[0].chart.data[0].at(-1) : 0;
@@ -128,7 +127,7 @@ def put(page: "Page", label: str, value: float | str) -> None:
 
 
 def picture(page: "Page", file: Path) -> None:
-    """Keep a picture, without the browser's remark on how it draws."""
+    """Save a picture, without the browser's notice about software rendering."""
     remark = page.locator(".mantine-Notification-closeButton")
     for _ in range(remark.count()):
         remark.first.click()

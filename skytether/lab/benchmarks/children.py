@@ -1,4 +1,4 @@
-"""Processes of a flight as children: started, heard, killed and stopped; none outlives a stack."""
+"""Processes of a flight as children: started, listened to, killed and stopped; a stack ends all."""
 
 import contextlib
 import os
@@ -22,24 +22,24 @@ from skytether.shell.workers import die_with_parent
 
 HOST = "127.0.0.1"
 PATIENCE_S = 60.0
-"""Longest time to wait for what a process is to say [s]: it may have to compile first."""
+"""Longest time to wait for an event of a process [s]; it may have to compile first."""
 
 
 class ChildProcess:
     """A process of a flight, from its start to its end.
 
     Args:
-        stack: kills the process at its end, whatever it does then.
+        stack: kills the process when the stack closes.
         name: module to run: server, netem or client.
-        arguments: its command line, beside `--log json`.
-        python: what runs it.
+        arguments: its arguments, besides `--log json`.
+        python: Python interpreter that runs it.
     """
 
     def __init__(
         self, stack: ExitStack, name: str, *arguments: str, python: str = sys.executable
     ) -> None:
         self.name = name
-        # -P: a folder called like one of ours, where the user happens to be, is not ours.
+        # -P: a folder in the user's working directory must not shadow our package.
         command = [python, "-P", "-m", f"skytether.{name}", *arguments, "--log", "json"]
         self.process = subprocess.Popen(
             command,
@@ -49,9 +49,9 @@ class ChildProcess:
         )
         stack.callback(self.kill)
         self.lines: list[LogLine] = []
-        """What it has said, as events."""
+        """Events that the process has logged."""
         self.words: list[str] = []
-        """What else it has printed."""
+        """Other lines that it has printed."""
         self._heard = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -69,10 +69,10 @@ class ChildProcess:
                     self._heard.notify_all()
 
     def wait_for(self, kind: type[Event], count: int = 1) -> LogLine:
-        """The line of the event of a kind that comes as number `count`, waited for.
+        """Wait for the event number `count` of a kind, and return its log line.
 
         Raises:
-            TimeoutError: it has not come; the message has what the process printed last.
+            TimeoutError: the event has not come; the message contains the process's last output.
         """
         with self._heard:
             if not self._heard.wait_for(lambda: len(self.all(kind)) >= count, PATIENCE_S):
@@ -81,22 +81,22 @@ class ChildProcess:
             return self.all(kind)[count - 1]
 
     def all(self, kind: type[Event]) -> list[LogLine]:
-        """All lines so far that are about events of a kind."""
+        """All log lines so far with events of a kind."""
         return [line for line in self.lines if isinstance(line.event, kind)]
 
     @property
     def address(self) -> Address:
-        """Address that it listens on, waited for."""
+        """Address that the process listens on, waited for."""
         event = self.wait_for(Listening).event
         assert isinstance(event, Listening)
         return event.host, event.port
 
     def listening_ns(self) -> int:
-        """Time from which it has listened [ns; CLOCK_MONOTONIC], waited for."""
+        """Time since which the process has listened [ns; CLOCK_MONOTONIC], waited for."""
         return self.wait_for(Listening).time_ns
 
     def figures(self) -> dict[str, Any]:
-        """What it has counted so far, as it says when it is asked."""
+        """Figures of the process, requested by SIGUSR1."""
         count = len(self.all(Counted)) + 1
         self.process.send_signal(signal.SIGUSR1)
         event = self.wait_for(Counted, count).event
@@ -104,7 +104,9 @@ class ChildProcess:
         return event.figures
 
     def kill(self) -> int:
-        """End it with SIGKILL, and wait until it is gone; returns the time of the kill [ns]."""
+        """Kill the process with SIGKILL, and wait for its end; returns the time of the kill
+        [ns].
+        """
         killed_ns = time.monotonic_ns()
         self.process.kill()
         self.process.wait()
@@ -112,7 +114,7 @@ class ChildProcess:
         return killed_ns
 
     def stop(self) -> int:
-        """Let it end in order; returns its exit code."""
+        """Stop the process in order; returns its exit code."""
         with contextlib.suppress(ProcessLookupError):
             self.process.terminate()
         code = self.process.wait(PATIENCE_S)
@@ -120,7 +122,7 @@ class ChildProcess:
         return code
 
     def freeze(self, seconds: float) -> tuple[int, int]:
-        """Stop it with SIGSTOP for some time; returns when it began and ended [ns]."""
+        """Stop the process with SIGSTOP for some time; returns beginning and end [ns]."""
         began_ns = time.monotonic_ns()
         self.process.send_signal(signal.SIGSTOP)
         try:
@@ -131,12 +133,12 @@ class ChildProcess:
         return began_ns, ended_ns
 
     def cpu_s(self) -> float:
-        """CPU time that it has used [s]."""
+        """CPU time of the process so far [s]."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def resident_bytes(self) -> int:
-        """Memory that it occupies [B]."""
+        """Resident memory of the process [B]."""
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
 
@@ -145,10 +147,10 @@ class Lab:
     """Server, netem and clients of one scenario, with keys, on loopback.
 
     Args:
-        stack: ends whatever is still alive.
-        folder: for the scenario, the keys and the records.
-        scenario: what they fly.
-        vehicles: numbers of the vehicles that have a key.
+        stack: ends all processes when it closes.
+        folder: folder for the scenario, the keys and the records.
+        scenario: scenario that they fly.
+        vehicles: ids of the vehicles that have a key.
     """
 
     def __init__(
@@ -164,16 +166,16 @@ class Lab:
         self.key_file.write_text("".join(keys.write(vehicle, 1, it) for vehicle, it in secrets))
 
     def server(self, bind: Address = (HOST, 0), *more: str) -> ChildProcess:
-        """A server."""
+        """Start a server."""
         return self._start("server", "--bind", address_text(*bind), *self._keys(), *more)
 
     def netem(self, server: Address, bind: Address = (HOST, 0), *, seed: int = 1) -> ChildProcess:
-        """A network of its own chance in front of a server."""
+        """Start netem in front of a server, with a random network of its own."""
         arguments = ("--bind", address_text(*bind), "--server", address_text(*server))
         return self._start("netem", *arguments, "--seed", str(seed))
 
     def client(self, server: Address, record: Path, vehicle: int = 1, *more: str) -> ChildProcess:
-        """A vehicle that records its flight."""
+        """Start a vehicle that records its flight."""
         arguments = ("--server", address_text(*server), "--id", str(vehicle))
         return self._start("client", *arguments, *self._keys(), "--record", str(record), *more)
 

@@ -1,8 +1,8 @@
-"""Who solves the same QPs: each a `server.control.solver.Solver` for one vehicle, set up once.
+"""Solvers for the same QPs: each a `server.control.solver.Solver` for one vehicle, set up once.
 
 The QP of an axis is given to a solver in one of two forms: condensed, in the H inputs alone, or
-sparse, in inputs and states, with (4) as constraints. The free response is eliminated from the
-sparse form too (its states start at zero), so that the same gradient makes the same problem:
+sparse, in inputs and states, with (4) as constraints. In the sparse form the free response is
+eliminated as well (its states start at zero), so that both forms share one gradient:
 
     minimise  Σ ½ xᵢ₊₁ᵀ Wᵢ xᵢ₊₁ + ½ ρᵢ uᵢ² + gᵢ uᵢ,   xᵢ₊₁ = A xᵢ + B uᵢ,   x₀ = 0,   |uᵢ| ≤ u_max
 """
@@ -40,7 +40,7 @@ def weights(problem: Problem) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Block:
-    """One QP: minimise ½ zᵀPz + qᵀz, lower ≤ Cz ≤ upper; z begins with the inputs of some axes."""
+    """QP: minimise ½ zᵀPz + qᵀz, lower ≤ Cz ≤ upper; z begins with the inputs of some axes."""
 
     P: sparse.csc_matrix
     C: sparse.csc_matrix
@@ -94,7 +94,9 @@ FORMS: dict[str, Form] = {
 
 @dataclass(frozen=True)
 class Tuning:
-    """Tuning of OSQP at a tolerance of 1e-6: its step size is fixed, so it never refactorises."""
+    """OSQP's settings at a tolerance of 1e-6; the step size is fixed, so OSQP never
+    refactorises.
+    """
 
     form: str
     rho: float
@@ -105,7 +107,7 @@ class Tuning:
         return f"{self.form}, eps 1e-6, rho {self.rho:g}, {scaled}, check every 10"
 
     def make(self, problem: Problem) -> Solver:
-        """OSQP with this tuning."""
+        """OSQP with these settings."""
         return Osqp(
             problem,
             FORMS[self.form],
@@ -122,7 +124,7 @@ TUNINGS = [Tuning(*choice) for choice in product(FORMS, (1.0, 2.0, 3.0, 5.0), (0
 
 
 class Osqp:
-    """OSQP through its own interface, warm-started from its own answer of the step before."""
+    """OSQP through its own interface, warm-started from its answer of the previous step."""
 
     def __init__(self, problem: Problem, form: Form, **settings: Any) -> None:
         self._bound = problem.mpc.bounds[:, None]
@@ -154,7 +156,7 @@ class Osqp:
 
 
 class Daqp:
-    """DAQP, condensed: a workspace an axis, its active set kept."""
+    """DAQP, condensed: one workspace per axis, with a warm active set."""
 
     def __init__(self, problem: Problem) -> None:
         self._models = []
@@ -175,14 +177,14 @@ class Daqp:
 
 
 class Quadprog:
-    """The solver quadprog, condensed: the factor of the Hessian is made once; no warm start."""
+    """Solver quadprog, condensed: the Hessian is factored once; no warm start."""
 
     def __init__(self, problem: Problem) -> None:
         import quadprog
 
         self._solve = quadprog.solve_qp
         H = problem.hessian.shape[1]
-        # It wants the inverse of the upper factor R, where the Hessian is RᵀR.
+        # quadprog takes the inverse of the upper factor R of the Hessian RᵀR.
         self._factors = [np.linalg.inv(np.linalg.cholesky(h).T) for h in problem.hessian]
         self._rows = np.hstack([np.eye(H), -np.eye(H)])
         self._limits = [np.full(2 * H, -bound) for bound in problem.mpc.bounds]
@@ -243,14 +245,16 @@ class QpOases:
 
 
 class Hpipm:
-    """HPIPM, a Riccati interior point, as it comes with CasADi: all axes in one problem."""
+    """HPIPM, a Riccati interior-point solver, as distributed with CasADi: all axes in one
+    problem.
+    """
 
     def __init__(self, problem: Problem) -> None:
         import casadi
 
         axes, H = problem.hessian.shape[:2]
         of_states, of_inputs = weights(problem)
-        width = 3 * axes  # of a stage: the states of all axes, then their inputs
+        width = 3 * axes  # in each stage: the states of all axes, then their inputs
         columns, states = H * width + 2 * axes, 2 * axes
         rows, diagonal = np.zeros((H * states, columns)), np.zeros(columns)
         A, B = problem.model.A, problem.model.B
@@ -264,7 +268,7 @@ class Hpipm:
             diagonal[then : then + states] = np.tile(of_states[i], axes)
         P, C = casadi.DM(sparse.diags(diagonal, format="csc")), casadi.DM(sparse.csc_matrix(rows))
         options = {"N": H, "nx": [states] * (H + 1), "nu": [axes] * H + [0], "ng": [0] * (H + 1)}
-        # With CasADi's own 1e8 for "no bound" it does not converge.
+        # With CasADi's default 1e8 for "no bound" HPIPM does not converge.
         options |= {"inf": 1e3, "hpipm": {"mode": "speed"}}
         options |= {"print_time": False, "error_on_fail": False}
         self._solver = casadi.conic("qp", "hpipm", {"h": P.sparsity(), "a": C.sparsity()}, options)
@@ -277,7 +281,7 @@ class Hpipm:
             "lbx": -limit,
             "ubx": limit,
         }
-        # Where the inputs are; shape (axes, H).
+        # Positions of the inputs in the solution; shape (axes, H).
         self._inputs = np.arange(H) * width + states + np.arange(axes)[:, None]
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
@@ -317,7 +321,7 @@ class Ipopt:
 
 
 class Nothing:
-    """No solver: what the measurement itself takes."""
+    """Empty solver: the cost of the measurement itself."""
 
     def __init__(self, problem: Problem) -> None:  # noqa: ARG002 - like any other
         self._solved = np.array([True])

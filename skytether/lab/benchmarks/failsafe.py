@@ -1,10 +1,9 @@
-"""Faults in the flight of an autopilot: what the vehicle did, how far it went, and how it ended.
+"""Faults in flights of an autopilot: the vehicle's reaction, its distances, and its end state.
 
 `python -m skytether.lab.benchmarks.failsafe` flies the scenario `autopilot`, a figure eight over
 the paper's network, in calm air and in virtual time, with both of the scripted autopilot's
-flavours. FAULT_S into each flight something goes wrong, and it is watched for WATCHED_S. Where it
-flies on, distances are those until it does. With --write, the tables go into
-docs/fly-a-real-one.md.
+flavours. A fault happens FAULT_S into each flight, and the vehicle is observed for WATCHED_S. If it
+flies on, distances are those until then. With --write, the tables go into docs/fly-a-real-one.md.
 """
 
 import io
@@ -43,15 +42,15 @@ from skytether.sim.world import Clock, World
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "fly-a-real-one.md"
 FAULT_S, WATCHED_S, FOR_A_WHILE_S = 15.0, 40.0, 5.0
-"""Time of the flight at which something goes wrong, time for which the vehicle is watched from then
-on, and length of what ends by itself [s]."""
+"""Time of flight of the fault, time for which the vehicle is observed after it, and length of a
+fault that ends by itself [s]."""
 DURATION_S = FAULT_S + WATCHED_S + 5.0
-"""Length of the flight [s]: its own end must not be what is seen."""
+"""Length of the flight [s], so long that its regular end is not observed."""
 LAUNCH_S = 60.0
 """Longest time until the flight begins [s]."""
 TRACK = str(Mode.TRACK).upper()
 STILL_MPS = 0.1
-"""Speed in the plane below which the vehicle stands [m/s]."""
+"""Horizontal speed below which the vehicle is at rest [m/s]."""
 
 CaseName = Literal[
     "link cut",
@@ -71,16 +70,16 @@ SCRIPTED: dict[CaseName, FaultName] = {
     "battery low": "battery",
     "estimate lost": "estimate",
 }
-"""Faults of the autopilot's own."""
+"""Faults of the autopilot itself."""
 ENDING = frozenset({"link cut for 5 s", "autopilot sends nothing for 5 s"})
 """Faults that end by themselves."""
 Ending = Literal["flies on", "hovers", "moves", "has landed", "pilot has it"]
 Changes = tuple[tuple[str, float], ...]
-"""Modes in order, and the time at which each began, from the fault on [s]."""
+"""Modes in order, and the time at which each began, counted from the fault [s]."""
 
 
 class FaultOutcome(NamedTuple):
-    """A vehicle after a fault."""
+    """Vehicle's behaviour after a fault."""
 
     case: CaseName
     flavour: FlavourName
@@ -90,36 +89,36 @@ class FaultOutcome(NamedTuple):
     autopilot: Changes
     """Modes of the autopilot."""
     moved_m: float
-    """Largest distance in the plane from where it was at the fault [m]."""
+    """Largest horizontal distance from its position at the fault [m]."""
     off_path_m: float
-    """Largest distance in the plane from the nearest point of its desired path [m]."""
+    """Largest horizontal distance from the nearest point of its desired path [m]."""
     off_reference_m: float
-    """Largest distance in the plane from its reference, which goes on [m]."""
+    """Largest horizontal distance from its moving reference [m]."""
     still_s: float
-    """Time until its speed in the plane was below STILL_MPS [s]; NaN: it never was."""
+    """Time until its horizontal speed was below STILL_MPS [s]; NaN for never."""
     down_s: float
-    """Time until its motors were off [s]; NaN: they never were."""
+    """Time until its motors were off [s]; NaN for never."""
     ending: Ending
 
 
 def scenario_of(flavour: FlavourName, seed: int) -> Scenario:
-    """What is flown."""
+    """Scenario that is flown."""
     cell = autopilots.Cell("skytether", flavour, autopilots.CALM, seed)
     return msgspec.structs.replace(autopilots.scenario_of(cell), duration=DURATION_S)
 
 
 class Watched:
-    """A flight that is watched from a fault on.
+    """Flight that is observed after a fault.
 
     Args:
-        scenario: what is flown.
-        flavour: which autopilot.
+        scenario: scenario that is flown.
+        flavour: flavour of the autopilot.
     """
 
     def __init__(self, scenario: Scenario, flavour: FlavourName) -> None:
         self.scenario = scenario
         self.truth = io.BytesIO()
-        """Where the vehicle truly was: rows of TRUTH_COLUMNS."""
+        """True states: rows of TRUTH_COLUMNS."""
         self.autopilot = Autopilot(
             scenario,
             flavour,
@@ -131,11 +130,11 @@ class Watched:
         self.began_ns: int | None = None
         """Time at which the first step began [ns]."""
         self.modes: list[tuple[str, int]] = []
-        """Modes of the client's failsafe, and when each began [ns]."""
+        """Modes of the client's failsafe, and the time at which each began [ns]."""
         self.flown: list[tuple[str, int]] = []
-        """Modes of the autopilot, and when each began [ns]."""
+        """Modes of the autopilot, and the time at which each began [ns]."""
         self.down_ns: int | None = None
-        """Time at which the motors were off again [ns]."""
+        """Time at which the motors were switched off [ns]."""
         self.netem = Proxy(scenario, server=("server", 0), flows=1)
         client = Client(
             scenario,
@@ -160,7 +159,7 @@ class Watched:
             self.modes.append((event.after.upper(), time_ns))
 
     def run(self, until: Callable[[], bool], limit_ns: int) -> None:
-        """Let time pass until something is so, or until a time of the world."""
+        """Run until a condition holds, or until a time of the world."""
         flight = self.autopilot.flight
 
         def over() -> bool:
@@ -173,7 +172,7 @@ class Watched:
         self.world.run(over, limit_ns=limit_ns)
 
     def fail(self, case: CaseName) -> None:
-        """Have something go wrong now."""
+        """Inject the fault now."""
         for_ns = seconds_to_ns(FOR_A_WHILE_S) if case in ENDING else None
         if case == "client killed":
             self.world.stop("client")
@@ -189,7 +188,7 @@ class Watched:
             self._cut(for_ns)
 
     def _cut(self, for_ns: int | None) -> None:
-        """Have netem lose all packets from now on, for ever or for a while."""
+        """Make netem lose all packets from now on, for ever or for a while."""
         loss, both = self.scenario.network.uplink.loss, ("uplink", "downlink")
         now_s = self.world.now_ns / SECOND_NS
         changes = [(now_s, {f"network.{way}.loss": 1.0 for way in both})]
@@ -200,7 +199,7 @@ class Watched:
 
 
 def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
-    """Fly with a fault, and say what came of it."""
+    """Fly with a fault, and return the vehicle's behaviour."""
     scenario = scenario_of(flavour, seed)
     watched = Watched(scenario, flavour)
     world = watched.world
@@ -240,7 +239,7 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
 
 
 def _reference(scenario: Scenario, times_s: Array) -> Array:
-    """Reference in the plane [m] at some times of the flight [s], shape (n,); (n, 2)."""
+    """Horizontal reference positions [m] at some times of flight [s], shape (n,); shape (n, 2)."""
     return scenario.make_reference()(times_s)[:, :2, 0]
 
 
@@ -256,11 +255,11 @@ def _off_path(scenario: Scenario, positions: Array) -> float:
 
 
 def _ending(watched: Watched, speed: float, modes: Changes) -> Ending:
-    """How it stands at the end.
+    """End state of the vehicle, in words.
 
     Args:
         watched: the flight.
-        speed: its speed in the plane at the end [m/s].
+        speed: its horizontal speed at the end [m/s].
         modes: modes of the client after the fault.
     """
     flight = watched.autopilot.flight
@@ -301,7 +300,7 @@ def tables(outcomes: Sequence[FaultOutcome]) -> dict[str, TextTable]:
 
 
 def _row(case: CaseName, outcomes: Sequence[FaultOutcome]) -> list[str]:
-    """Row of a fault: times from the least to the most of its flights, and largest distances."""
+    """Row of a fault: range of times over its flights, and largest distances."""
     return [
         case,
         "gone" if case == "client killed" else _sequences([each.modes for each in outcomes]),
@@ -316,7 +315,7 @@ def _row(case: CaseName, outcomes: Sequence[FaultOutcome]) -> list[str]:
 
 
 def _sequences(changes: Sequence[Changes]) -> str:
-    """Modes of some flights, and the times of each: all that went through the same ones at once."""
+    """Sequences of modes, and the times of each; flights with equal sequences are merged."""
     alike: dict[tuple[str, ...], list[list[float]]] = {}
     for each in changes:
         names = tuple(name for name, _ in each)
@@ -329,7 +328,7 @@ def _sequences(changes: Sequence[Changes]) -> str:
 
 
 def _span(times_s: Sequence[float]) -> str:
-    """Least and most of some times; "never" of those that never came."""
+    """Range of some times; "never" for those that never came."""
     known = [time_s for time_s in times_s if not np.isnan(time_s)]
     if not known:
         return "never"
@@ -340,7 +339,7 @@ def _span(times_s: Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class FailsafeBenchmarkOptions:
-    """What to fly."""
+    """Options of this benchmark."""
 
     seeds: int = 3
     """Number of seeds, from 1 on."""

@@ -1,11 +1,11 @@
-"""What readers of the server's feed cost its ticks: none, one and three of them by turns.
+"""Cost of the feed's readers to the server's ticks: none, one and three readers by turns.
 
-The server is driven here as its process drives it; vehicles and readers are processes of their own.
-Readers come and go every few seconds, in an order that is drawn anew each round, so that whatever
-else the machine does hits all alike. Of each tick three times are taken: the CPU time of this
-thread, the wall-clock time, and how long after its deadline the last packet was out.
+The server runs in this process; vehicles and readers are processes of their own. The number of
+readers changes every few seconds, in a random order each round, so that disturbances by other
+programs affect all numbers alike. Three times are taken of each tick: the CPU time of this thread,
+the wall-clock time, and how long after the deadline the last packet was sent.
 
-`python -m skytether.lab.benchmarks.feed` takes three minutes; docs/feed.md has what it said. With
+`python -m skytether.lab.benchmarks.feed` takes three minutes; docs/feed.md has the results. With
 `--pages` each reader is a page in a browser: a process that serves it, and a tab of Chromium on
 this machine.
 """
@@ -46,36 +46,37 @@ from skytether.view.browser.page import Page
 READERS = (0, 1, 3)
 """Numbers of readers that are compared."""
 SETTLE_S = 1
-"""Time after readers have come or gone that does not count [s]: they catch up with the backlog."""
+"""Time after a change of readers that is not counted [s], in which new readers receive the
+backlog."""
 WITHIN = 1.1
-"""Largest ratio of the p99 of ticks with the most readers to that with none."""
+"""Largest allowed ratio of the p99 of ticks with the most readers to that without readers."""
 
 
 @dataclass(frozen=True)
 class FeedBenchmarkOptions:
-    """How much to measure."""
+    """Options of this benchmark."""
 
     rounds: int = 12
-    """Number of times that each number of readers has its turn."""
+    """Number of turns of each number of readers."""
     seconds: int = 5
     """Length of a turn [s], of which the first does not count."""
     vehicles: int = 10
-    """Number of vehicles, which are sent a horizon at each of 50 steps a second."""
+    """Number of vehicles, each of which is sent 50 horizons a second."""
     pages: bool = False
     """Whether readers are pages, each open in a browser."""
 
 
 @dataclass
 class Ticks:
-    """Times of the ticks with some number of readers [ns]."""
+    """Times of the ticks with a number of readers [ns]."""
 
     cpu_ns: list[int] = field(default_factory=list)
     wall_ns: list[int] = field(default_factory=list)
     out_ns: list[int] = field(default_factory=list)
     busy_ns: int = 0
-    """CPU time of this process in all, with what it does between ticks."""
+    """Total CPU time of this process, including work between ticks."""
     passed_ns: int = 0
-    """Time in all."""
+    """Total wall-clock time."""
 
     def figures(self) -> dict[str, float]:
         """Quantiles [µs], by name."""
@@ -88,10 +89,10 @@ class Ticks:
 
 
 class Timed(Shell):
-    """Shell that takes the times of its ticks."""
+    """Shell that measures its ticks."""
 
     ticks: Ticks | None = None
-    """Where they are kept, while they count."""
+    """Collection of the times; None while they are not counted."""
 
     def _wake(self) -> None:
         due_ns = self.endpoint.next_wake_ns()
@@ -105,13 +106,13 @@ class Timed(Shell):
 
 
 class Looker:
-    """A process that looks on when it is told to, as a page does.
+    """Process that reads the feed on command, as a page does.
 
     Args:
-        stack: ends it.
-        does: function of this package, MODULE.NAME, which is told on the standard input to "come"
-            or to "go".
-        at: what to look at: the argument of that function.
+        stack: ends the process.
+        does: function of this package, MODULE.NAME, which reads the commands "come" and "go" from
+            its standard input.
+        at: argument of the function: what to read.
     """
 
     def __init__(self, stack: ExitStack, does: str, at: str) -> None:
@@ -127,13 +128,13 @@ class Looker:
         stack.callback(self._pipe.close)
 
     def tell(self, word: bytes) -> None:
-        """Tell it to come or to go."""
+        """Send the command "come" or "go"."""
         self._pipe.write(word + b"\n")
         self._pipe.flush()
 
 
 def look(folder: str) -> None:
-    """Read each frame of the server, between the words "come" and "go" on the standard input."""
+    """Read each frame of the server between the commands "come" and "go"."""
 
     def take(_: str, frame: Frame) -> None:
         assert frame
@@ -147,8 +148,8 @@ def look(folder: str) -> None:
 
 
 def show(folder: str) -> None:
-    """Show the flight in a browser between the words "come" and "go" on the standard input."""
-    os.nice(10)  # browsers are on other machines
+    """Show the flight in a browser between the commands "come" and "go"."""
+    os.nice(10)  # a browser usually runs on another machine, so here it yields to the server
     flight = PageFlight()
     feeds = {name: Path(folder) / f"{name}.feed" for name in ("server", "client")}
     with closing(Page("127.0.0.1", 0, [flight])) as page, chromium() as browser, ExitStack() as now:
@@ -161,13 +162,13 @@ def show(folder: str) -> None:
 
 
 class Turns:
-    """Who looks on when, second by second.
+    """Schedule of the readers, second by second.
 
     Args:
-        options: how long each turn is.
-        shell: whose ticks are taken.
+        options: options with the length of a turn.
+        shell: shell whose ticks are measured.
         lookers: readers that come and go.
-        ticks: where the times are kept, by the number of readers.
+        ticks: collections of times, by the number of readers.
     """
 
     def __init__(
@@ -182,10 +183,10 @@ class Turns:
         self._seconds = [(int(count), i) for count in order for i in range(options.seconds)]
         self._shell, self._lookers, self._ticks = shell, lookers, ticks
         self._began_ns = 0, 0
-        """Time, and CPU time of this process, at which the second began."""
+        """Time, and CPU time of this process, at the beginning of the second."""
 
     def each_second(self) -> bool:
-        """Let a second begin; returns whether there was one left."""
+        """Begin the next second; returns whether there was one left."""
         now_ns = time.monotonic_ns(), time.process_time_ns()
         if self._shell.ticks is not None:
             self._shell.ticks.passed_ns += now_ns[0] - self._began_ns[0]
@@ -211,9 +212,9 @@ def measure(
     """Figures of ticks by the number of readers.
 
     Args:
-        options: how much to measure.
+        options: options of the benchmark.
         readers: numbers of readers that are compared.
-        lookers_at: the processes that are readers, of the feeds in a folder.
+        lookers_at: starts the readers of the feeds in a folder.
     """
     scenario = derive("paper-every-step", control={"dt": 0.02, "horizon": 50})
     ticks = {count: Ticks() for count in readers}
@@ -251,7 +252,7 @@ def measure(
 
 
 def _server(scenario: Scenario, vehicles: int, feed: Feed) -> Server:
-    """A server as its process makes it, which records for the feed alone."""
+    """Server as its process creates it, recording only into the feed."""
     axes, planned = scenario.model.axes, scenario.control.horizon
     recorders = {}
     for part, columns in (
@@ -274,7 +275,7 @@ def _server(scenario: Scenario, vehicles: int, feed: Feed) -> Server:
 
 
 def table(results: dict[str, Any]) -> TextTable:
-    """Times of ticks, and how many times as long they are as with nobody looking on."""
+    """Table of ticks' times, and their ratios to those without readers."""
     none, rows = results["readers"]["0"], []
     for count, figures in results["readers"].items():
         row = [count, f"{figures['ticks']:.0f}", f"{100 * figures['cores']:.1f} %"]
@@ -302,7 +303,7 @@ def main() -> int:
 
 
 def ratio(results: dict[str, Any]) -> float:
-    """How many times as long a tick's CPU time is with the most readers as with none (p99)."""
+    """Ratio of a tick's CPU time with the most readers to that with none (p99)."""
     none, *_, most = (figures["cpu_p99_us"] for figures in results["readers"].values())
     CONSOLE.print(f"CPU time, p99: {most / none:.3f} times that with none")
     if results["dropped"]:

@@ -1,13 +1,13 @@
 """Floods beside a flight over real UDP: forged packets, and HELLOs from ever new ports.
 
-Five vehicles of `demo-committed` fly on a sealed link, 100 observations a second; the network
-between is not impaired, so that whatever is lost, the flood has displaced. Somebody on the way
-has recorded what passes, and floods the server's port: with packets whose header, length and
-channel are those of a vehicle's own, half and half with random bytes; or with HELLOs, random ones
-under a good header, half and half with real ones that are repeated, each from a port of its own.
-Meanwhile one more vehicle starts. The same flight without a flood stands beside.
+Five vehicles of `demo-committed` fly on a sealed link, 100 observations a second; the network is
+not impaired, so every loss is due to the flood. An attacker on the path has recorded packets, and
+floods the server's port: either with forged packets, half of them with the header, length and
+channel of a vehicle's, half random bytes; or with HELLOs, half of them random bytes under a valid
+header, half repetitions of real ones, each from its own port. Meanwhile one more vehicle starts.
+The same flight without a flood is measured for comparison.
 
-The senders send by absolute deadlines, a batch each millisecond.
+The flood is sent by absolute deadlines, one batch per millisecond.
 """
 
 import ctypes
@@ -46,17 +46,17 @@ NEWCOMER = VEHICLES + 1
 AFTER_S = 2.0
 """Time of flight after the flood [s]."""
 POOL = 4096
-"""Number of different packets that are sent, over and over."""
+"""Number of different packets, which are sent repeatedly."""
 PORTS_MAX = 500
-"""Number of sockets that a sender of HELLOs keeps open, for answers find nobody else's."""
+"""Number of sockets that a sender of HELLOs keeps open, so that answers reach no other process."""
 NONE, FORGED, HELLOS = KINDS = ("none", "forged packets", "HELLOs")
 HANDLED, SESSION_S, GROWTH_BYTES = 0.999, 3.0, 5_000_000
-"""Targets: share of good packets that are handled, time to a session, growth of the memory."""
+"""Targets: share of valid packets handled, time to a session, growth of memory."""
 
 
 @dataclass(frozen=True)
 class FloodCounts:
-    """How long and how much to flood."""
+    """Size of the benchmark."""
 
     seconds: int
     forged: int
@@ -76,31 +76,31 @@ class Flood:
 
     kind: str
     sent: float
-    """Number of packets of the flood a second."""
+    """Flood packets sent per second."""
     read: float
-    """Number of them that the server read and dropped, a second."""
+    """Flood packets per second that the server read and dropped."""
     kept_out: float
-    """Number of them a second that the kernel kept from the server for their form."""
+    """Flood packets per second that the kernel's filter rejected."""
     unread: float
-    """Number of datagrams a second that the kernel dropped beside these: there was no room."""
+    """Datagrams per second that the kernel dropped for lack of room."""
     good: int
     """Number of observations sent."""
     lost: int
-    """Number of these that the server never handled."""
+    """Number of the sent observations that the server never handled."""
     share: float
-    """Share handled of those sent during the flood."""
+    """Share handled of the observations sent during the flood."""
     missed: int
-    """Number of ticks that the server missed meanwhile."""
+    """Number of ticks that the server missed during the flood."""
     rmse_m: float
-    """RMSE of the vehicles meanwhile [m]."""
+    """RMSE of the vehicles during the flood [m]."""
     session_s: float
-    """Time from the first HELLO of a vehicle that starts meanwhile to its session [s]."""
+    """Time from the first HELLO to the session of the vehicle that starts during the flood [s]."""
     growth_bytes: int
     """Growth of the server's memory [B]."""
     server_cpu: float
     """Share of a core that the server used."""
     server_waited: float
-    """Share of the time that it had work, but no core to do it on."""
+    """Share of the time that the server was ready to run, but waited for a core."""
     sender_cpu: float
     """Share of a core that the senders used."""
 
@@ -109,7 +109,7 @@ class Flood:
 
 
 class Tap(Proxy):
-    """A way to the server that keeps one packet of each type."""
+    """Relay to the server that keeps one packet of each type."""
 
     def __init__(self, scenario: Scenario, server: tuple[str, int]) -> None:
         super().__init__(scenario, server=server)
@@ -124,7 +124,9 @@ class Tap(Proxy):
 
 
 def tap(pipe: Connection, port: int) -> None:
-    """Pass packets on to the server's port; tells its own port, and when asked what it recorded."""
+    """Forward packets to the server's port; reports its own port, and on request the kept
+    packets.
+    """
     ideal = {"delay": "none", "loss": 0.0}
     endpoint = Tap(derive("demo", network={"uplink": ideal, "downlink": ideal}), (HOST, port))
     shell = driver.Shell(endpoint, (HOST, 0), [(HOST, port)])
@@ -142,7 +144,7 @@ def tap(pipe: Connection, port: int) -> None:
 
 
 def forgeries(good: bytes) -> list[bytes]:
-    """Packets that nobody with the key has made: random bytes, and a good packet's header.
+    """Forged packets: random bytes under a valid packet's header, and random bytes alone.
 
     Args:
         good: a packet of a channel that is in use.
@@ -154,7 +156,7 @@ def forgeries(good: bytes) -> list[bytes]:
             packets.append(rng.bytes(len(good)))
             continue
         vehicle, used = channel.address(good)
-        # Counters that are still to come: an old one would be refused for its age.
+        # Counters ahead of the newest: an old one would be refused for its age.
         counter = 10_000 + int(rng.integers(100_000))
         header = channel.HEADER.pack(channel.VERSION, channel.DATA, vehicle, used, counter)
         packets.append(header + rng.bytes(len(good) - len(header)))
@@ -198,13 +200,13 @@ class _Piece(ctypes.Structure):
 def flood(
     pipe: Connection, port: int, packets: list[bytes], rate: int, seconds: int
 ) -> tuple[int, int]:
-    """Send packets, many in a call of the kernel; how many, and the CPU time it took [ns]."""
+    """Send packets, many per system call; returns their number, and the CPU time [ns]."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.connect((HOST, port))
     buffers = [ctypes.create_string_buffer(packet, len(packet)) for packet in packets]
     count = len(packets)
     pieces = (_Piece * count)(*(_Piece(ctypes.addressof(b), len(b)) for b in buffers))
-    sendings = (_Sending * (2 * count))()  # twice, so that a batch never wraps
+    sendings = (_Sending * (2 * count))()  # the pool twice, so that a batch never wraps around
     for i, sending in enumerate(sendings):
         sending.message.pieces = ctypes.addressof(pieces) + (i % count) * ctypes.sizeof(_Piece)
         sending.message.pieces_count = 1
@@ -221,7 +223,7 @@ def flood(
 def call(
     pipe: Connection, port: int, packets: list[bytes], rate: int, seconds: int
 ) -> tuple[int, int]:
-    """Send each packet from a port of its own; how many, and the CPU time it took [ns]."""
+    """Send each packet from its own port; returns their number, and the CPU time [ns]."""
     sockets: deque[socket.socket] = deque()
     sent, used_ns = 0, 0
     for due in _batches(pipe, rate, seconds):
@@ -236,7 +238,7 @@ def call(
 
 
 def _batches(pipe: Connection, rate: int, seconds: int) -> Iterator[int]:
-    """Each millisecond from the start on, how many are to be sent by then; none is caught up."""
+    """Number of packets due by each millisecond; missed batches are not caught up with."""
     pipe.send("ready")
     pipe.recv()
     start_ns, end_ns = time.monotonic_ns(), seconds * SECOND_NS
@@ -261,19 +263,19 @@ def measure(counts: FloodCounts) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _State:
-    """What is known of the server at a moment."""
+    """Counters of the server at a moment."""
 
     time_ns: int
     dropped: int
-    """Number of datagrams that it has dropped."""
+    """Number of datagrams that the server has dropped."""
     gone: int
-    """Number of those that the kernel has dropped."""
+    """Number of datagrams that the kernel has dropped."""
     missed: int
     bytes: int
     used_ns: int
-    """Time for which it has run."""
+    """CPU time of the server."""
     waited_ns: int
-    """Time for which it has waited for a core."""
+    """Time for which the server has waited for a core."""
 
     @classmethod
     def of(cls, server: ChildProcess) -> "_State":
@@ -292,7 +294,7 @@ class _State:
 def _fly(kind: str, counts: FloodCounts, lateness: Lateness) -> Flood:
     """One flight, with one kind of flood or none."""
     duration_s = counts.lead_s + counts.seconds + AFTER_S
-    # A report at each step: what is missing has been lost.
+    # A report at every step: a missing one was lost.
     flown = derive("demo-committed", duration=duration_s, settle=0.0, vehicle={"report": "always"})
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-")))
@@ -354,14 +356,14 @@ def _fly(kind: str, counts: FloodCounts, lateness: Lateness) -> Flood:
 
 
 def is_admitted(packet: bytes) -> bool:
-    """Whether the kernel of a server with keys lets a packet come through."""
+    """Whether the kernel's filter of a server with keys accepts a packet."""
     return any(
         packet.startswith(form.head) and form.least <= len(packet) <= form.most for form in FORMS
     )
 
 
 def _packets(kind: str, recorded: Mapping[int, bytes]) -> list[bytes]:
-    """Packets of a flood, made of what was recorded."""
+    """Packets of a flood, made from recorded ones."""
     if kind == FORGED:
         return forgeries(recorded[channel.DATA])
     return hellos(recorded[handshake.INITIATION]) if kind == HELLOS else []
@@ -370,7 +372,7 @@ def _packets(kind: str, recorded: Mapping[int, bytes]) -> list[bytes]:
 def _sender(
     stack: ExitStack, kind: str, counts: FloodCounts, port: int, packets: list[bytes]
 ) -> Connection | None:
-    """A process that is ready to flood, if there is to be a flood."""
+    """Process that is ready to flood, if there is to be a flood."""
     match kind:
         case "forged packets":
             sender = start(stack, flood, port, packets, counts.forged, counts.seconds)
@@ -383,7 +385,7 @@ def _sender(
 
 
 def floods_of(result: Mapping[str, Any]) -> list[Flood]:
-    """Floods in the figures of `measure`."""
+    """Names of the floods in the figures of `measure`."""
     return [Flood(**each) for each in result["floods"]]
 
 

@@ -1,9 +1,9 @@
-"""What heartbeats are worth: losses of a link that works, and how soon a dead one is noticed.
+"""Heartbeats: false losses of a working link, and how soon a dead link is noticed.
 
-A model of one direction of a link at rest, where nothing but heartbeats is sent: the sender's timer
-on its grid of steps, netem's fates of packets, and the listener's `Hearing` and time-out. It flies
-nothing, and so an hour takes well under a second. What the listener asks for reaches the sender
-without loss or delay.
+The model has one direction of an idle link, on which only heartbeats are sent: the sender's timer
+on its grid of steps, netem's fates of packets, and the listener's `Hearing` and time-out. Nothing
+is flown, so an hour takes well under a second. The silence that the listener asks for reaches the
+sender without loss or delay.
 
     python -m skytether.lab.benchmarks.heartbeats --hours 100
 """
@@ -24,7 +24,7 @@ from skytether.shell import options
 STEP_NS = 50 * MILLISECOND_NS
 """Length of a step of both ends [ns]."""
 LIFE_S = 600
-"""Length of a session, which knows nothing of the loss at first [s]."""
+"""Length of a session, which begins without knowledge of the loss [s]."""
 NETWORKS = (
     ("0", DirectionConfig(loss=0.0)),
     ("0.1", DirectionConfig(loss=0.1)),
@@ -32,42 +32,42 @@ NETWORKS = (
     ("0.5", DirectionConfig(loss=0.5)),
     ("0.1 in bursts of 0.5 s", DirectionConfig(loss=0.1, burst_s=0.5)),
 )
-"""Share of packets that are lost; delays are the paper's."""
+"""Networks by the share of packets lost; delays are the paper's."""
 LINKS = ((1.0, 0.1), (2.0, 0.5), (2.0, None), (4.0, None))
-"""Time-out [s], and time from one heartbeat to the next [s]; None where it follows the loss."""
+"""Time-out [s], and time between heartbeats [s]; None where the time follows the loss."""
 
 
 class KeptAlive(NamedTuple):
-    """What a link at rest has come to."""
+    """Results of an idle link."""
 
     false_per_h: float
-    """Times an hour that it was taken for lost while it worked."""
+    """False losses per hour."""
     packets_per_s: float
-    """Heartbeats a second."""
+    """Heartbeats per second."""
     noticed_s: tuple[float, float]
-    """Mean and largest time from when it was cut to when that was noticed [s]."""
+    """Mean and largest time from the cut until it was noticed [s]."""
 
 
 class WaitingEnd:
-    """One end that hears nothing but heartbeats."""
+    """Receiving end of an idle link."""
 
     def __init__(self, timeout_ns: int, fixed_ns: int | None) -> None:
         self._timeout_ns = timeout_ns
         self.hearing = Hearing(timeout_ns, STEP_NS, fixed_ns)
-        """What silence it asks for."""
+        """Estimator of the silence that the end asks for."""
         self._under_way: list[tuple[int, int]] = []
-        """When each packet comes [ns], and its number; a heap."""
+        """Heap of packets under way: time of arrival [ns] and number."""
         self.heard_ns: int | None = None
-        """When it heard something last [ns]."""
+        """Time of the newest arrival [ns]."""
         self.false = 0
-        """Number of times that it took the link for lost, and heard something later."""
+        """Number of false losses: the link was taken for lost, and a packet came later."""
 
     def send(self, at_ns: int, number: int) -> None:
-        """Let a packet be under way that comes at a time."""
+        """Send a packet that arrives at a given time."""
         heappush(self._under_way, (at_ns, number))
 
     def hear(self, until_ns: int) -> None:
-        """Take what comes until a time."""
+        """Receive all packets up to a time."""
         while self._under_way and self._under_way[0][0] <= until_ns:
             at_ns, number = heappop(self._under_way)
             self.false += self.heard_ns is not None and at_ns - self.heard_ns > self._timeout_ns
@@ -78,7 +78,7 @@ class WaitingEnd:
 def keep(
     network: DirectionConfig, timeout_s: float, heartbeat_s: float | None, lives: int
 ) -> KeptAlive:
-    """Keep a link at rest alive for so many sessions of LIFE_S, and cut it at the end of each."""
+    """Keep a link alive for a number of sessions of LIFE_S, and cut it at the end of each."""
     timeout_ns, end_ns = seconds_to_ns(timeout_s), LIFE_S * SECOND_NS
     fixed_ns = None if heartbeat_s is None else seconds_to_ns(heartbeat_s)
     false, sent, noticed_s = 0, 0, []
@@ -101,7 +101,7 @@ def keep(
 
 
 def computed(loss: float, timeout_s: float, heartbeat_s: float | None) -> float:
-    """False losses of a link that are to be expected an hour, with independent losses."""
+    """Expected number of false losses per hour with independent packet losses."""
     timeout_ns = seconds_to_ns(timeout_s)
     if heartbeat_s is not None:
         return false_per_h(seconds_to_ns(heartbeat_s), timeout_ns, loss)
@@ -119,7 +119,7 @@ class HeartbeatOptions:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Print how often each link is taken for lost while it works, and when it is cut."""
+    """Print false losses and detection times of each link."""
     argv = sys.argv[1:] if argv is None else argv
     given = options.read(HeartbeatOptions(), argv, "heartbeats", main.__doc__)
     lives = max(1, round(given.hours * 3600 / LIFE_S))

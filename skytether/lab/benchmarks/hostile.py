@@ -1,9 +1,9 @@
-"""Hostile browsers beside a flight: what they cost the page's memory and the server's ticks.
+"""Hostile browsers during a flight: their cost in the page's memory and the server's ticks.
 
-`python -m skytether.lab.benchmarks.hostile` has 20 of them at the page of a flight for a minute,
-and nobody for another, by turns of five seconds: websites of other origins that try to open its
-websocket, uploads, frames of a megabyte, and browsers that never read and ping. They begin anew
-whenever they are turned away. docs/page.md has what it said.
+`python -m skytether.lab.benchmarks.hostile` connects 20 of them to the page of a flight for a
+minute in total, and none for another, in turns of five seconds: websites of other origins that try
+to open its websocket, uploads, frames of a megabyte, and browsers that never read and ping. They
+reconnect whenever they are refused. docs/page.md has the results.
 """
 
 import base64
@@ -45,12 +45,12 @@ PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 BROWSERS = 20
 """Number of hostile browsers."""
 PAUSE_S = 0.02
-"""Time from one thing that each of them does to the next [s]."""
+"""Pause between two actions of a hostile browser [s]."""
 GROWTH_MB = 50.0
 """Largest growth of the page's memory [MB]."""
 WEIGH_S = 0.25
 TEXT, BINARY, PING = 1, 2, 9
-"""Opcodes of frames."""
+"""Opcodes of websocket frames."""
 CAMERA = {
     "type": "ViewerCameraMessage",
     "wxyz": [1.0, 0.0, 0.0, 0.0],
@@ -63,11 +63,11 @@ CAMERA = {
     "look_at": [0.0, 0.0, 0.0],
     "up_direction": [0.0, 0.0, 1.0],
 }
-"""What a browser of viser's says first: without it there is no panel."""
+"""First message of a viser browser; without it the server creates no panel."""
 
 
 def frame(opcode: int, payload: bytes, *, last: bool = True) -> bytes:
-    """A frame as a browser sends it; its mask is zeros."""
+    """Websocket frame of a browser; its mask is zeros."""
     size = len(payload)
     if size < 126:
         length = bytes([0x80 | size])
@@ -79,10 +79,10 @@ def frame(opcode: int, payload: bytes, *, last: bool = True) -> bytes:
 
 
 def opened(port: int, origin: str = "") -> socket.socket:
-    """Open the page's websocket by hand, with little room for what comes.
+    """Open the page's websocket on a raw socket with a small receive buffer.
 
     Raises:
-        OSError: it is refused.
+        OSError: the connection is refused.
     """
     sock = socket.socket()
     try:
@@ -109,17 +109,17 @@ def opened(port: int, origin: str = "") -> socket.socket:
 
 
 def foreign(port: int) -> None:
-    """Read as a website of another origin."""
+    """Connect and read as a website of another origin."""
     with closing(opened(port, "http://evil.example")) as sock:
         while sock.recv(65536):
             pass
 
 
 def element(browser: Connection) -> str:
-    """Name of an element of the page that a browser is sent, which it could change.
+    """Id of an element of the page that the browser could change.
 
     Raises:
-        ConnectionClosed: it is turned away.
+        ConnectionClosed: the browser is refused.
     """
     while True:
         payload = browser.recv()
@@ -139,7 +139,7 @@ def uploaded(uuid: str, number: int) -> tuple[bytes, bytes]:
 
 
 def upload(port: int) -> None:
-    """Upload for ever."""
+    """Upload endlessly."""
     with connect(
         f"ws://127.0.0.1:{port}/",
         subprotocols=[PROTOCOL],
@@ -166,7 +166,7 @@ def huge(port: int) -> None:
 
 
 def deaf(port: int) -> None:
-    """Never read, and ask for answers."""
+    """Never read, and send pings."""
     with closing(opened(port)) as sock:
         sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
         while True:
@@ -178,8 +178,8 @@ KINDS: tuple[Callable[[int], None], ...] = (foreign, upload, huge, deaf)
 
 
 def attack(port: str) -> None:
-    """Attack a page between the words "come" and "go" on the standard input."""
-    os.nice(10)  # browsers are on other machines
+    """Attack a page between the commands "come" and "go" on the standard input."""
+    os.nice(10)  # browsers usually run on other machines, so here they yield to the server
     come = threading.Event()
 
     def act(kind: Callable[[int], None]) -> None:
@@ -195,10 +195,10 @@ def attack(port: str) -> None:
 
 
 def main(seconds: int = 60) -> int:
-    """Measure what hostile browsers cost; the exit code is 1 where it is too much.
+    """Measure the cost of hostile browsers; the exit code is 1 if a limit is exceeded.
 
     Args:
-        seconds: time with them, and as long without [s].
+        seconds: time with hostile browsers, and again without [s].
     """
     options = FeedBenchmarkOptions(rounds=-(-seconds // FeedBenchmarkOptions.seconds))
     weighed_mb: list[float] = []

@@ -1,11 +1,11 @@
-"""Impairments over real UDP, against theory; and netem beside other relays in user space.
+"""Impairments over real UDP compared with theory; and netem beside other user-space relays.
 
     python -m skytether.lab.benchmarks.impairments
 
-Packets go through a real netem process on 127.0.0.1. What came is held against the distribution
-that was asked for (Kolmogorov-Smirnov, after the median of netem's own error is taken off), the
-share lost against its 95 % interval, the bytes that came against the rate. Beside it: what other
-relays add to a delay and take of a core, as far as they can be had on this machine.
+Packets go through a real netem process on 127.0.0.1. Measured delays are compared with the
+requested distribution (Kolmogorov-Smirnov, after subtracting the median of netem's own error), the
+share lost with its 95 % interval, and received bytes with the rate. A second table has the added
+delay and CPU use of other relays that are installed on this machine.
 """
 
 import shutil
@@ -50,7 +50,7 @@ DELAYS = {
         np.sqrt(np.log(1 + 0.75**2)), 0.02, 0.04 / np.sqrt(1 + 0.75**2)
     ),
 }
-"""Laws of delays, and their distributions where these are continuous."""
+"""Delay laws, and their distributions if continuous."""
 LOSSES = ("loss(0.1)", "gilbert_elliott(0.2, 0.1)", "outages(1, 0.25)")
 RATES = ("rate(50000)", "rate(50000, drop=codel)", "rate(50000, serve=fair)")
 RELAY = """
@@ -66,27 +66,27 @@ transport, _ = loop.run_until_complete(
 print(transport.get_extra_info("sockname")[1], flush=True)
 loop.run_forever()
 """
-"""What people write for themselves: a relay of asyncio with a timer for each packet."""
+"""Typical self-written relay: asyncio with one timer per packet."""
 
 
 @dataclass(frozen=True)
 class ImpairmentsBenchmarkOptions:
-    """How much to measure."""
+    """Options of this benchmark."""
 
     seconds: int = 10
     """Duration of each run [s]."""
     rate: int = 1000
-    """Number of packets a second; the relays also carry ten times as many."""
+    """Number of packets per second; the relays also carry ten times as many."""
 
 
 @dataclass(frozen=True)
 class Passage:
-    """What came of the packets of a run."""
+    """Packets received in a run."""
 
     delays_s: Array
-    """Measured delays of those that came [s]; shape (n,)."""
+    """Measured delays of the received packets [s]; shape (n,)."""
     numbers: Array
-    """Their numbers; shape (n,)."""
+    """Numbers of the received packets; shape (n,)."""
     sent: int
     took_s: float
     """Time from the first arrival to the last [s]."""
@@ -97,7 +97,7 @@ class Passage:
 def carried(
     stack: ExitStack, options: NetemBenchmarkOptions, port: int, receiver: Any, pid: int
 ) -> Passage:
-    """Send packets to a port, and take them as they come to the receiver."""
+    """Send packets to a port, and receive them at the other end."""
     sender = start(stack, send, options, port)
     answer(sender)
     used_ns, start_ns = scheduled_ns(pid), time.monotonic_ns() + SECOND_NS // 10
@@ -113,7 +113,9 @@ def carried(
 
 
 def through_netem(text: str, options: NetemBenchmarkOptions) -> tuple[Passage, Array]:
-    """Packets through netem, and the delays that it says they had, by number [s], NaN if lost."""
+    """Packets through netem, and the delays that netem recorded, by number [s]; NaN for lost
+    ones.
+    """
     with ExitStack() as stack:
         receiver = start(stack, receive, options)
         record = Path(stack.enter_context(TemporaryDirectory())) / "netem.rec"
@@ -130,7 +132,7 @@ def through_netem(text: str, options: NetemBenchmarkOptions) -> tuple[Passage, A
 
 
 def through_relay(command: Sequence[str], options: NetemBenchmarkOptions) -> Passage:
-    """Packets through another relay, which prints its port, or is given it as {port}."""
+    """Packets through another relay, which prints its port, or gets it as {port}."""
     with ExitStack() as stack:
         receiver = start(stack, receive, options)
         to = answer(receiver)
@@ -142,14 +144,14 @@ def through_relay(command: Sequence[str], options: NetemBenchmarkOptions) -> Pas
         stack.callback(relay.kill)
         assert relay.stdout is not None
         if "{port}" in " ".join(command):
-            time.sleep(0.5)  # until it listens: it says nothing
+            time.sleep(0.5)  # this relay prints nothing: wait until it listens
         else:
             port = int(relay.stdout.readline())
         return carried(stack, options, port, receiver, relay.pid)
 
 
 def theory_table(options: NetemBenchmarkOptions) -> TextTable:
-    """What came of each impairment, beside what was asked for."""
+    """Results of each impairment beside the requested values."""
     rows = []
     for text in progress([*DELAYS, *LOSSES, *RATES], "impairments"):
         passage, drawn_s = through_netem(text, options)
@@ -164,7 +166,7 @@ def theory_table(options: NetemBenchmarkOptions) -> TextTable:
 def judged(
     text: str, passage: Passage, error_s: float, options: NetemBenchmarkOptions
 ) -> tuple[str, str, str]:
-    """What was asked for, what was seen, and how likely that is."""
+    """Requested value, measured value, and how likely the difference is."""
     delays_s, law = passage.delays_s - error_s, DELAYS.get(text)
     if text in DELAYS:
         asked, seen = f"{path(text).mean_s * 1e3:.1f} ms", f"{delays_s.mean() * 1e3:.1f} ms"

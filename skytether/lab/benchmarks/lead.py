@@ -1,10 +1,10 @@
-"""A live point led through the control socket over real UDP, beside the same in virtual time.
+"""Live point moved through the control socket over real UDP, and the same in virtual time.
 
-The point goes where a target of the scenario's seed goes: 20 times a second its position and
+The point follows the path of a target with the scenario's seed: 20 times a second its position and
 velocity are sent to the server's socket, as `skytether set` sends them once. In virtual time the
-same values change at the same times. Target and wind are the same in both, to the last bit. Packets
-enter the network at other milliseconds, and so have other fates: what chance alone makes of a
-flight is told by more of them in virtual time, each in another network and wind.
+same values change at the same times. Target and wind are equal in both, to the last bit. But
+packets enter the network at other milliseconds, and so have other fates: the spread due to chance
+alone is measured by more flights in virtual time, each with another network and wind.
 
 `python -m skytether.lab.benchmarks.lead` flies three seeds of 60 s, which takes about four minutes.
 """
@@ -41,16 +41,16 @@ from skytether.shell.log import LogLine
 from skytether.sim.flight import fly
 
 RATE_HZ = 20
-"""Number of times a second that the point is moved."""
+"""Rate at which the point is moved [1/s]."""
 WITHIN = 0.05
-"""Share by which the figures of all seeds together may differ."""
+"""Largest allowed relative difference of the figures of all seeds together."""
 HEADINGS = ["seed", "UDP", "virtual", "mean", "s.d.", "UDP / virtual", "UDP / mean", "moves", "ms"]
-"""RMSE over UDP, in virtual time, mean and spread over networks; moves and how long one takes."""
+"""Headings: RMSE over UDP and in virtual time, mean and spread over networks, and the moves."""
 
 
 @dataclass(frozen=True)
 class LeadBenchmarkOptions:
-    """What to fly."""
+    """Options of this benchmark."""
 
     seeds: tuple[int, ...] = (1, 2, 3)
     """Seeds of target, wind and network."""
@@ -59,11 +59,11 @@ class LeadBenchmarkOptions:
     networks: int = 20
     """Number of networks in virtual time, for each seed; the first is that of the seed."""
     scenario: str = "target-committed"
-    """Scenario whose target is led."""
+    """Scenario whose target's path the point follows."""
 
 
 def main() -> int:
-    """Fly as the command line says; the exit code is 1 where UDP is far from the mean of all."""
+    """Fly and print a table; the exit code is 1 if UDP deviates from the mean of all."""
     options = tyro.cli(LeadBenchmarkOptions, description=__doc__)
     rows: list[list[str]] = []
     each: list[tuple[float, float, float]] = []
@@ -105,7 +105,7 @@ def error(summary: Summary) -> float:
 
 
 def live(base: Scenario) -> Scenario:
-    """The scenario with a live point, at rest at the origin at first, in place of its target."""
+    """Scenario with a live point in place of its target, at rest at the origin at first."""
     origin = (0.0,) * base.model.axes
     reference = msgspec.structs.replace(
         base.reference, shape="live", points_m=(origin,), velocity_mps=origin
@@ -115,18 +115,18 @@ def live(base: Scenario) -> Scenario:
 
 
 def states(base: Scenario) -> Array:
-    """Where the target is at each move, and how fast [m, m/s]; shape (moves, axes, 2)."""
+    """States of the target at each move [m, m/s]; shape (moves, axes, 2)."""
     return base.make_reference()(np.arange(0.0, base.duration, 1.0 / RATE_HZ))
 
 
 def moved(state: Array) -> dict[str, Any]:
-    """Values of the keys that say where the point is."""
+    """Keys and values that move the point."""
     position, velocity = state.T.tolist()
     return {"reference.points_m": [position], "reference.velocity_mps": velocity}
 
 
 def virtually(led: Scenario, way: Array) -> Summary:
-    """Fly in virtual time; the point is moved from the moment that the vehicle flies."""
+    """Fly in virtual time; the point moves from the moment that the vehicle flies."""
     short = msgspec.structs.replace(led, duration=led.control.dt, settle=0.0)
     began_s = began(fly(short))
     changes = [(began_s + i / RATE_HZ, moved(state)) for i, state in enumerate(way)]
@@ -135,13 +135,13 @@ def virtually(led: Scenario, way: Array) -> Summary:
 
 
 def began(flown: Record) -> float:
-    """Time at which the vehicle has begun to fly [s]."""
+    """Time at which the vehicle began to fly [s]."""
     times_s = (told.time_ns / SECOND_NS for told in flown.events if isinstance(told.event, Flying))
     return next(times_s)
 
 
 def really(led: Scenario, way: Array) -> tuple[Summary, Sequence[float]]:
-    """Fly over UDP; also the time that each move took to be answered [ms]."""
+    """Fly over UDP; returns also the response time of each move [ms]."""
     answered_ms: list[float] = []
     flying, over = threading.Event(), threading.Event()
 
@@ -160,7 +160,7 @@ def really(led: Scenario, way: Array) -> tuple[Summary, Sequence[float]]:
                 asked_ns = time.monotonic_ns()
                 try:
                     answer = caller.ask(moved(state))
-                except ControlError:  # the flight has ended meanwhile
+                except ControlError:  # the flight has ended
                     return
                 assert not answer.refused, answer.refused
                 answered_ms.append((time.monotonic_ns() - asked_ns) / 1e6)

@@ -1,10 +1,10 @@
-"""The least that a vehicle-step can cost a server: memory, system calls and cipher, each alone.
+"""Lower bounds of a server's cost per vehicle and step: memory, system calls and cipher.
 
     python -m skytether.lab.benchmarks.least
 
-Beside each figure stands what Skytether needs for the part of a step that this belongs to, measured
-in the same run by turns: planning beside copying the memory that it reads and writes, everything
-between two datagrams beside sending and receiving them, and sealed packets beside the cipher.
+Beside each bound stands the cost of the corresponding part of Skytether, measured alternately in
+the same run: planning beside copying the memory that planning reads and writes, everything between
+two datagrams beside sending and receiving them, and sealing packets beside the cipher.
 """
 
 import socket
@@ -25,12 +25,12 @@ from skytether.shared.wire.protocol import Horizon, Observation, decode, encode
 
 SYSTEM_CALLS = "two system calls: receive an observation, send a horizon"
 UNCOUNTED = 5
-"""Turns that only warm up, in which plans begin anew."""
+"""Number of warm-up turns, which are not counted."""
 
 
 @dataclass(frozen=True)
 class LeastOptions:
-    """How much to measure."""
+    """Size of the benchmark."""
 
     vehicles: int = 1000
     turns: int = 100
@@ -44,11 +44,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measure(options: LeastOptions) -> TextTable:
-    """Table of the least and of what is needed, for a vehicle and step [µs]."""
+    """Table of lower bounds and measured costs per vehicle and step [µs]."""
     n, scenario = options.vehicles, tick.mixes()["rarely"]
     terms = scenario.terms()
     fleet = PlannedFleet(scenario, n)
-    # A plan's memory: both MPCs' inputs and the generator's states, read before, written after.
+    # Memory of a plan: both MPCs' inputs and the generator's states, read before, written after.
     axes, H = terms.axes, terms.horizon
     numbers = np.zeros((n, axes, 2 * H + 2 * (H + 1)))
     space, told = Airspace(scenario, n), {type(each): each for each in messages(terms)}

@@ -1,9 +1,10 @@
-"""What sealing the link costs: side by side with plaintext, by packet, by vehicle, and in flight.
+"""Cost of encryption, compared with plaintext: per packet, per vehicle, and in flight.
 
 Packets are sealed, opened and refused by the two ends themselves (`server.secure`, `client.secure`)
-with nothing between them, H = 50 and two axes. A handshake is all that one end does for it: a HELLO
-without a cookie, the challenge, the HELLO with it and the WELCOME. The server's work is that of a
-fleet in virtual time, every vehicle with its own key, sealed and in plaintext by turns.
+without a network, with H = 50 and two axes. The cost of a handshake is all work of one end: a HELLO
+without a cookie, the challenge, the HELLO with the cookie and the WELCOME. The server's work is
+that of a fleet in virtual time, each vehicle with its own key, alternately encrypted and in
+plaintext.
 """
 
 import itertools
@@ -44,12 +45,12 @@ from skytether.sim import flight
 PEER: Address = ("127.0.0.1", 1024)
 NOW_NS = 86_400 * SECOND_NS
 LARGER = 1.01
-"""Target for the RMSE of sealed flights over that of flights in plaintext."""
+"""Largest allowed ratio of the RMSE of encrypted flights to that of plaintext flights."""
 
 
 @dataclass(frozen=True)
 class LinkCounts:
-    """How much to measure."""
+    """Size of the benchmark."""
 
     packets: int = 20_000
     handshakes: int = 2000
@@ -68,7 +69,7 @@ QUICK = LinkCounts(packets=1000, handshakes=100, vehicles=5, seconds=2.0, turns=
 
 
 class Ends:
-    """Both ends of one vehicle's link, which have shaken hands unless told otherwise.
+    """Both ends of one vehicle's link, after a handshake unless told otherwise.
 
     Args:
         gate: the server's end.
@@ -89,12 +90,12 @@ class Ends:
         self.begin()
 
     def begin(self) -> None:
-        """Take a new link for the vehicle, which draws the same numbers as the one before."""
+        """Create a new link for the vehicle, with the same random numbers as the previous one."""
         entropy = stream(1, "link", self._vehicle).bytes
         self.link = client.SecureLink(self._key, entropy=entropy)
 
     def challenge(self) -> None:
-        """Exchange HELLO and challenge; keep them, and the HELLO with the cookie."""
+        """Exchange HELLO and challenge; keep both, and the HELLO with the cookie."""
         first = self.link.hello(self._hello, now_ns=NOW_NS)
         assert self._gate.open(Datagram(first, PEER), now_ns=NOW_NS) is None
         (answer,) = self._gate.outbox()
@@ -103,7 +104,9 @@ class Ends:
         self.second = self.link.hello(self._hello, now_ns=NOW_NS)
 
     def welcome(self) -> Call:
-        """Exchange the HELLO with the cookie and the WELCOME; keep that. The call of the HELLO."""
+        """Exchange the HELLO with the cookie and the WELCOME; keep the WELCOME. Returns the HELLO's
+        call.
+        """
         call = self._gate.open(Datagram(self.second, PEER), now_ns=NOW_NS)
         assert call is not None
         self.response = call.line.seal(self._welcome)
@@ -111,18 +114,18 @@ class Ends:
         return call
 
     def adopt(self) -> None:
-        """Let the vehicle use the channel of the WELCOME."""
+        """Let the vehicle adopt the channel of the WELCOME."""
         self.link.open(self.response, now_ns=NOW_NS)
         self.link.adopt(now_ns=NOW_NS)
 
     def as_server(self) -> None:
-        """What a server does for a handshake."""
+        """Server's part of a handshake."""
         self._gate.open(Datagram(self.first, PEER), now_ns=NOW_NS)
         self._gate.outbox()
         self.welcome()
 
     def as_client(self) -> None:
-        """What a vehicle does for a handshake."""
+        """Vehicle's part of a handshake."""
         self.begin()
         self.link.hello(self._hello, now_ns=NOW_NS)
         self.link.open(self.challenged, now_ns=NOW_NS)
@@ -143,7 +146,7 @@ def measure(counts: LinkCounts) -> dict[str, Any]:
 
 
 def _packets(counts: LinkCounts, lateness: Lateness) -> dict[str, Any]:
-    """Sizes of the messages, and what a packet costs either end."""
+    """Sizes of the messages, and the cost of a packet to either end."""
     terms = derive("paper-every-step", control={"dt": 0.02, "horizon": 50}).terms()
     known = {type(message).__name__.upper(): encode(message) for message in messages(terms)}
     hello, welcome = known["HELLO"], known["WELCOME"]
@@ -199,7 +202,9 @@ def _gate(vehicles: int) -> tuple[server.SecureGate, Keyring]:
 
 
 def _handshakes(counts: LinkCounts, lateness: Lateness) -> dict[str, Any]:
-    """What a handshake costs either end; each is another vehicle's, for a vehicle may do few."""
+    """Cost of a handshake to either end; each is another vehicle's, because their rate is
+    limited.
+    """
     terms, count = load("demo").terms(), counts.handshakes
     hello = encode(Hello(1, 2**60, terms))
     welcome = encode(Welcome(1, 2**31, 2**60, 2**60, NOW_NS, 0, terms))
@@ -224,7 +229,7 @@ KINDS = {"plaintext": False, "sealed": True}
 
 
 def _fleet(counts: LinkCounts) -> dict[str, Any]:
-    """The server's work for a vehicle and step [µs], by kind of link and stage."""
+    """Server's work per vehicle and step [µs], by kind of link and stage."""
     scenario = msgspec.structs.replace(load("fleet"), duration=counts.seconds)
     turns: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
     flights = [kind for _ in range(counts.turns) for kind in KINDS]

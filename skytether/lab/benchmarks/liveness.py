@@ -1,11 +1,11 @@
-"""How often a link that works is taken for lost, and how soon a dead one is noticed.
+"""Liveness of a link: false losses while it works, and how soon a dead link is noticed.
 
-Both directions of a link are kept alive for as many hours as are asked for by what the two ends
-have for it, and by nothing else: the vehicle's `Failsafe` and `Hearing`, the server's `Session` and
-`Hearing`, each with the grid of its own steps, and netem's fates of packets. There is no vehicle
-and no plan, so nothing but heartbeats is said, each asking the other end for its silence. Sessions
-last SESSION_S and are cut at their end. Beside that stand what `shared.law.heartbeat` computes, and
-flights of the scenario `demo` with the scheme "trajectory".
+Both directions of a link are kept alive for the requested hours by the real code of both ends: the
+vehicle's `Failsafe` and `Hearing`, the server's `Session` and `Hearing`, each on its own grid of
+steps, and netem's fates of packets. There is no vehicle and no plan, so only heartbeats are sent,
+each with the silence that its sender allows. Sessions last SESSION_S and are cut at their end. The
+table also has the values computed by `shared.law.heartbeat`, and flights of the scenario `demo`
+with the scheme "trajectory".
 
     python -m skytether.lab.benchmarks.liveness --hours 100 --flown-hours 10
 
@@ -43,43 +43,43 @@ DOCUMENT = Path(__file__).parents[3] / "docs" / "protocol.md"
 TIMEOUT_S = 2.0
 """Time-out of both ends [s]."""
 STEP_NS = 50 * MILLISECOND_NS
-"""Length of a step of both ends [ns]; the server's begin half of it later."""
+"""Length of a step of both ends [ns]; the server's steps begin half a step later."""
 SESSION_S = 600
 """Length of a session [s]."""
 LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
-"""Shares of packets that are lost, each independently."""
+"""Shares of packets lost independently."""
 BURSTS = ((0.1, 0.5), (0.1, 2.0))
-"""Shares of packets that are lost in bursts, and their mean length [s]."""
+"""Shares of packets lost in bursts, and mean length of a burst [s]."""
 FLOWN = (0.1, 0.3)
-"""Losses with which the scenario is flown as well."""
+"""Losses with which the scenario is also flown."""
 FLIGHT_S, COMPANY = 1800.0, 20
-"""Length of these flights [s], and number of them at once."""
+"""Length of these flights [s], and number flown at once."""
 CUTS = 50
-"""Number of flights that are cut, for each of these."""
+"""Number of flights with a cut, for each loss."""
 CUT_S = (40.0, 50.0)
-"""Time at which they are cut, and time at which they end [s]."""
+"""Time of the cut, and end of the flight [s]."""
 
 
 class Alive(NamedTuple):
-    """How a link was kept alive."""
+    """Results of a link."""
 
     hours: float
-    """Time for which it was [h]."""
+    """Time for which the link was kept alive [h]."""
     false: int
-    """Number of times that the vehicle took it for lost while it worked."""
+    """Number of times that the vehicle took the working link for lost."""
     noticed_s: list[float]
-    """Times from when it was cut to when the vehicle took it for lost [s]."""
+    """Times from the cut until the vehicle took the link for lost [s]."""
 
 
 def keep(network: DirectionConfig, sessions: int) -> Alive:
-    """Keep a link at rest alive for so many sessions, and cut it at the end of each."""
+    """Keep an idle link alive for a number of sessions, and cut it at the end of each."""
     kept = [_session(network, seed) for seed in range(1, sessions + 1)]
     hours = sessions * SESSION_S / 3600.0
     return Alive(hours, sum(false for false, _ in kept), [noticed_s for _, noticed_s in kept])
 
 
 def _session(network: DirectionConfig, seed: int) -> tuple[int, float]:
-    """Number of false losses in one session, and how soon its end is noticed [s]."""
+    """Number of false losses in one session, and how soon its end was noticed [s]."""
     timeout_ns, end_ns = round(TIMEOUT_S * SECOND_NS), SESSION_S * SECOND_NS
     up, down = (Fates(network, seed, name, 0) for name in ("uplink", "downlink"))
     ear = Hearing(timeout_ns, STEP_NS, None)
@@ -92,7 +92,7 @@ def _session(network: DirectionConfig, seed: int) -> tuple[int, float]:
     false, is_lost, never_ns = 0, False, 2 * end_ns
     failsafe.heard(now_ns=0)
     under_way: list[tuple[int, bool, int, int]] = []
-    """When each comes [ns], whether to the vehicle, its number, what it asks [half steps]."""
+    """Heap: arrival time [ns], whether to the vehicle, number, requested silence [half steps]."""
     now_ns = 0
     while True:
         at_ns = under_way[0][0] if under_way else never_ns
@@ -128,7 +128,7 @@ def _session(network: DirectionConfig, seed: int) -> tuple[int, float]:
 
 
 class _Unsealed:
-    """Way back of a session without a wire."""
+    """Way back of a session without encryption."""
 
     def seal(self, payload: bytes) -> bytes:
         """See `WayBack`."""
@@ -136,7 +136,7 @@ class _Unsealed:
 
 
 def _grid(time_ns: int, phase_ns: int) -> int:
-    """First begin of a step at a time or later [ns]."""
+    """First beginning of a step at a time or later [ns]."""
     return -(-(time_ns - phase_ns) // STEP_NS) * STEP_NS + phase_ns
 
 
@@ -158,7 +158,7 @@ def _send(
 
 
 def scenario_of(loss: float, duration_s: float) -> Scenario:
-    """The scenario that is flown."""
+    """Scenario that is flown."""
     table = reading.to_table(reading.load("demo"))
     keys = {
         "duration": duration_s,
@@ -175,7 +175,7 @@ def scenario_of(loss: float, duration_s: float) -> Scenario:
 
 
 def flown(loss: float, hours: int) -> Alive:
-    """Fly for so many hours, and cut the link of some more flights."""
+    """Fly for a number of hours, and cut the link of some more flights."""
     false, flights = 0, math.ceil(hours * 3600.0 / FLIGHT_S)
     for first in range(0, flights, COMPANY):
         seeds = range(first, min(first + COMPANY, flights))
@@ -186,7 +186,7 @@ def flown(loss: float, hours: int) -> Alive:
 
 
 def noticed_s(loss: float, seed: int) -> float:
-    """Time from when the link of a flight is cut to when the vehicle takes it for lost [s]."""
+    """Time from the cut of a flight's link until the vehicle takes it for lost [s]."""
     cut_s, end_s = CUT_S
     cut = {f"network.{direction}.loss": 1.0 for direction in ("uplink", "downlink")}
     scenario = msgspec.structs.replace(scenario_of(loss, end_s), seed=seed)
@@ -225,7 +225,7 @@ class LivenessOptions:
 
 
 def _rate(alive: Alive) -> str:
-    """False losses an hour, with how many were seen in how many hours."""
+    """False losses per hour, with the number seen and the hours."""
     return f"{alive.false / alive.hours:.2g} ({alive.false} in {alive.hours:g} h)"
 
 
@@ -234,7 +234,7 @@ def _noticed(alive: Alive) -> str:
 
 
 def table_of(hours: float, flown_hours: int) -> TextTable:
-    """A row for each network."""
+    """Table with a row per network."""
     networks = [(f"{loss:g}", DirectionConfig(loss=loss)) for loss in LOSSES]
     networks += [
         (f"{loss:g} in bursts of {burst_s:g} s", DirectionConfig(loss=loss, burst_s=burst_s))
@@ -253,7 +253,7 @@ def table_of(hours: float, flown_hours: int) -> TextTable:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Print how often a link that works is taken for lost, and how soon a dead one is noticed."""
+    """Print false losses of working links, and detection times of dead ones."""
     argv = sys.argv[1:] if argv is None else argv
     given = options.read(LivenessOptions(), argv, "liveness", main.__doc__)
     table = table_of(given.hours, given.flown_hours)

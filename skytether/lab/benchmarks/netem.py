@@ -1,12 +1,12 @@
-"""How exactly netem delays: 20 000 packets/s through a real netem process on 127.0.0.1.
+"""Timing error of netem: 20 000 packets/s through a real netem process on 127.0.0.1.
 
-A sender numbers and stamps its packets; the kernel stamps them as they reach the receiver. What
-netem drew for each stands in its record. So the added-delay error is
+A sender numbers and timestamps its packets; the kernel timestamps them at the receiver. The delay
+that netem drew for each is in netem's record. So the error of the added delay is
 
     (received - sent) - drawn
 
-and has in it, besides netem, two crossings of the kernel. The machine's own share is measured
-beside it: how late a process wakes that only sleeps, and how long netem waited for a core.
+and includes two passages through the kernel. The machine's share is measured as well: how late a
+process that only sleeps wakes, and how long netem waited for a core.
 
 The sender sends in batches, four a millisecond: no process can sleep for 50 µs.
 """
@@ -53,15 +53,15 @@ from skytether.shell.udp import kernel_drops, open_socket
 
 HOST = "127.0.0.1"
 HEAD = struct.Struct("<qq")
-"""Head of a packet: its number, and when it was sent [ns]; the rest is zeros."""
+"""Header of a packet: its number and time of sending [ns]; the rest is zeros."""
 BATCH_NS = MILLISECOND_NS // 4
 SO_TIMESTAMPNS = 35
 QUIET_S = 2
-"""Silence after which no packet is on its way: the paper's delay is far shorter."""
+"""Silence after which no packet is under way [s]: the paper's delays are far shorter."""
 PATIENCE_S = 90.0
 """Longest wait for an answer [s]; the longest run takes 60 s."""
 TARGET_MS = 1.0
-"""Target for the median over the runs of the error's p99 [ms]."""
+"""Target of the median over all runs of the error's p99 [ms]."""
 
 SPAWN = multiprocessing.get_context("spawn")
 
@@ -79,7 +79,8 @@ class NetemBenchmarkOptions:
     size: int = 600
     """UDP payload of each [B]."""
     realtime: bool = False
-    """Whether to run before all other programs (needs the right to), so that these do not count."""
+    """Whether to run with real-time priority (needs the permission), so that other programs do not
+    disturb."""
     json: Path | None = None
     """File for the figures."""
 
@@ -89,7 +90,7 @@ class NetemBenchmarkOptions:
         return self.rate * self.seconds
 
     def is_bounded(self) -> bool:
-        """Whether the numbers are small enough to flood nothing."""
+        """Whether all numbers are small enough for one machine."""
         few = 1 <= self.runs <= 100 and 1 <= self.seconds <= 60 and 1 <= self.rate <= 100_000
         return few and HEAD.size <= self.size <= 65_507
 
@@ -104,33 +105,35 @@ class NetemRun:
     sent: int
     received: int
     dropped_before: int
-    """Number of packets dropped before netem read them: its receive buffer was full."""
+    """Number of packets dropped before netem read them, because its receive buffer was full."""
     dropped_within: int
-    """Number of packets dropped by netem: its queue was full, or the kernel refused to send."""
+    """Number of packets dropped by netem, because its queue was full or the kernel refused to
+    send."""
     dropped_after: int
-    """Number of packets dropped behind netem: the receiver's buffer was full."""
+    """Number of packets dropped after netem, because the receiver's buffer was full."""
     measured: int
-    """Number of packets whose drawn delay is known: all before the first that netem never read."""
+    """Number of packets whose drawn delay is known: those before the first that netem never
+    read."""
     error_ms_p50: float
     error_ms_p99: float
     error_ms_max: float
     netem_ms_p99: float
-    """Error as netem reports it [ms]: from due to being handed to the driver."""
+    """Error that netem itself reports [ms]: from the due time until handed to the driver."""
     netem_cpu: float
     """Share of a core that netem used."""
     netem_waited: float
-    """Share of the time that netem had work but no core to do it on."""
+    """Share of the time that netem was ready to run, but waited for a core."""
     wake_ms_p50: float
-    """Median of how late a process woke that only slept in the same seconds [ms]."""
+    """Median lateness of a sleeping process in the same seconds [ms]."""
     wake_ms_p99: float
     wake_ms_max: float
-    """Largest lateness of that process [ms]."""
+    """Largest lateness of the sleeping process [ms]."""
 
 
 def work(task: Callable[..., object], pipe: Connection, *args: object) -> None:
-    """Do a task in this process, give its answer, and wait to be killed.
+    """Run a task in this process, send its result, and wait to be killed.
 
-    Ending by itself would take a core for 20 ms, in the middle of the measurement.
+    The end of a Python process takes a core for 20 ms, which would disturb the measurement.
     """
     gc.disable()
     pipe.send(task(pipe, *args))
@@ -138,7 +141,7 @@ def work(task: Callable[..., object], pipe: Connection, *args: object) -> None:
 
 
 def send(pipe: Connection, options: NetemBenchmarkOptions, port: int) -> int:
-    """Number, stamp and send packets by absolute deadlines; how many."""
+    """Number, timestamp and send packets by absolute deadlines; returns how many."""
     sock = open_blocking()
     sock.connect((HOST, port))
     packet, number = bytearray(options.size), 0
@@ -154,20 +157,20 @@ def send(pipe: Connection, options: NetemBenchmarkOptions, port: int) -> int:
 
 
 def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, list[int], int]:
-    """Note when packets come; their heads, their arrivals [ns], and the kernel's drops."""
+    """Receive packets; returns headers, arrival times [ns], and the kernel's drops."""
     sock = open_blocking()
     pipe.send(sock.getsockname()[1])
     pipe.recv()
-    # The kernel's own time-out: Python's would ask poll() before every packet.
+    # The kernel's own time-out: Python's would call poll() before every packet.
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", QUIET_S, 0))
     sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     packet, heads = bytearray(options.size), bytearray()
     arrivals: list[int] = []
-    with contextlib.suppress(BlockingIOError):  # quiet
+    with contextlib.suppress(BlockingIOError):  # no packet for QUIET_S
         while len(arrivals) < options.packets:
             _, ((_, _, stamp),), _, _ = sock.recvmsg_into([packet], 64)
             seconds, ns = struct.unpack("ll", stamp)
-            # The kernel stamps by the wall clock.
+            # The kernel's timestamps are on the wall clock.
             wall_to_monotonic_ns = time.monotonic_ns() - time.time_ns()
             arrivals.append(seconds * SECOND_NS + ns + wall_to_monotonic_ns)
             heads += packet[: HEAD.size]
@@ -175,7 +178,7 @@ def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, li
 
 
 def sleep(pipe: Connection, options: NetemBenchmarkOptions) -> list[int]:
-    """Sleep until every next millisecond; how late that was [ns]."""
+    """Sleep until every next millisecond; returns the lateness of each wake [ns]."""
     pipe.send("ready")
     start_ns, late_ns = pipe.recv(), []
     for due_ns in range(start_ns, start_ns + options.seconds * SECOND_NS, MILLISECOND_NS):
@@ -185,14 +188,14 @@ def sleep(pipe: Connection, options: NetemBenchmarkOptions) -> list[int]:
 
 
 def open_blocking() -> socket.socket:
-    """A socket on a free port, with large buffers, that waits."""
+    """Blocking socket on a free port, with large buffers."""
     sock = open_socket((HOST, 0))
     sock.setblocking(True)
     return sock
 
 
 def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
-    """One run: netem, sender, receiver and sleeper, each a process; none outlives it."""
+    """One run with netem, sender, receiver and sleeper as processes, all ended with it."""
     with ExitStack() as stack:
         receiver = start(stack, receive, options)
         record = Path(stack.enter_context(TemporaryDirectory())) / "netem.rec"
@@ -216,7 +219,7 @@ def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
     assert isinstance(counted, Counted)
     downlink = counted.figures["downlink"]
     taken = downlink["packets"]
-    # A packet that netem never read has no number there, and shifts those of all that follow.
+    # A packet that netem never read has no row there, and shifts the numbers after it.
     known = sent if taken == sent else first_missing(numbers)
     error_ns = (np.array(arrivals) - stamps - drawn_ns[numbers])[numbers < known]
     return NetemRun(
@@ -239,7 +242,7 @@ def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
 
 
 def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Connection:
-    """Do a task in a process that ends with the stack; the pipe to it."""
+    """Run a task in a process that ends with the stack; returns the pipe to it."""
     ours, theirs = SPAWN.Pipe()
     process = SPAWN.Process(target=work, args=(task, theirs, *args), daemon=True)
     process.start()
@@ -256,8 +259,8 @@ def start_netem(
     record: Path,
     network: Sequence[str] = ("--network.downlink.loss=0",),
 ) -> tuple[subprocess.Popen[str], int]:
-    """Run netem, by default with the paper's delays and no losses; the process and its port."""
-    # -P: without it, a `netem` in the working directory would come first.
+    """Run netem, by default with the paper's delays and without loss; returns process and port."""
+    # -P: without it, a folder `netem` in the working directory would be run.
     command = [sys.executable, "-P", "-m", "skytether.netem", "paper", f"--seed={seed}"]
     command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--log=json"]
     command += [*network, f"--record={record}"]
@@ -271,14 +274,14 @@ def start_netem(
 
 
 def answer(pipe: Connection) -> Any:
-    """Answer of a process, waited for."""
+    """Result of a task's process, waited for."""
     if not pipe.poll(PATIENCE_S):
         raise TimeoutError("a process of the benchmark does not answer")
     return pipe.recv()
 
 
 def scheduled_ns(pid: int) -> NDArray[np.int64]:
-    """How long a process has run, and has waited for a core to run on [ns]; shape (2,)."""
+    """CPU time of a process, and the time that it has waited for a core [ns]; shape (2,)."""
     return np.array(Path(f"/proc/{pid}/schedstat").read_text().split()[:2], dtype=np.int64)
 
 
@@ -291,7 +294,7 @@ def drawn_delays_ns(record: Path, count: int) -> NDArray[np.int64]:
 
 
 def first_missing(numbers: NDArray[np.int64]) -> int:
-    """Lowest number that is not among these."""
+    """Lowest number that is missing."""
     present = np.zeros(numbers.max(initial=-1) + 2, bool)
     present[numbers] = True
     return int(present.argmin())
@@ -342,7 +345,7 @@ def runs_of(result: Mapping[str, Any]) -> list[NetemRun]:
 
 
 def show(result: Mapping[str, Any], options: NetemBenchmarkOptions) -> None:
-    """Print a table with a row for every run, and whether the target is met."""
+    """Print a table with a row per run, and whether the target is met."""
     runs = runs_of(result)
     tables(result)["netem"].show(f"netem, {options.rate} packets/s of {options.size} B")
     for number, run in enumerate(runs, start=1):
@@ -359,12 +362,12 @@ def show(result: Mapping[str, Any], options: NetemBenchmarkOptions) -> None:
 
 
 def lost(run: NetemRun) -> int:
-    """Number of packets that never came; netem was told to lose none."""
+    """Number of packets that never arrived; netem was configured to lose none."""
     return run.sent - run.received
 
 
 def where(run: NetemRun) -> str:
-    """Places where packets were lost, in words."""
+    """Sentence on where packets were lost."""
     places = {
         "unread by netem": run.dropped_before,
         "dropped by netem": run.dropped_within,

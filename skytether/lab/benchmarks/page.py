@@ -1,9 +1,9 @@
-"""What the page costs, and how old what it shows is, in Chromium.
+"""Page in Chromium: its memory, and the latency of what it shows.
 
-`python -m skytether.lab.benchmarks.page latency` flies the demonstration over UDP and takes, of
-each position that comes to a browser, how long ago the vehicle was there. With `memory` in place of
-`latency` it replays an hour of flight at 16 times its speed and weighs the page's process and the
-browser's tab every 20 s. Chromium is the one that `CHROMIUM` or PATH names.
+`python -m skytether.lab.benchmarks.page latency` flies the demonstration over UDP and measures, for
+each position that arrives at a browser, how long ago the vehicle was there. With `memory` in place
+of `latency` it replays an hour of flight at 16 times real time and measures the memory of the
+page's process and of the browser's tab every 20 s. Chromium is found by `CHROMIUM` or PATH.
 """
 
 import re
@@ -37,27 +37,28 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 LATENCY_S = 30.0
-"""Time for which positions are taken [s]."""
+"""Time for which latencies are measured [s]."""
 WITHIN_MS = 150.0
-"""Largest median latency [ms]."""
+"""Largest allowed median latency [ms]."""
 SPEED = 16
-"""Speed of the replay over that of the flight."""
+"""Speed of the replay relative to real time."""
 HOUR_S = 3600.0
 WEIGH_EVERY_S = 20.0
-"""Time from one weighing to the next [s]."""
+"""Time between two measurements of memory [s]."""
 SETTLED_S = 300.0
-"""Time of flight after which everything that is bounded is full [s]: five times what is shown."""
+"""Time of flight after which all bounded buffers are full [s]: five times the length shown."""
 WITHIN = 1.05
-"""Largest growth of memory from then on."""
+"""Largest allowed growth of memory from then on."""
 
 
 class Truth:
-    """Where the vehicle has been, as the client's feed tells it."""
+    """True positions of the vehicle, from the client's feed."""
 
     def __init__(self) -> None:
         self._columns: Any = None
         self.times_ns: dict[bytes, int] = {}
-        """Time at which it was at a position, by the position as a browser gets it."""
+        """Time at which the vehicle was at a position, by the position in the form that a browser
+        gets."""
 
     def take(self, _: str, frame: Frame) -> None:
         """Take a frame of the client's feed."""
@@ -69,25 +70,25 @@ class Truth:
 
 
 def key(position: Any) -> bytes:
-    """A position in the plane, as both ends have it."""
+    """Horizontal position as a key, in the form that both ends use."""
     return np.round(np.array(position[:2], dtype=np.float32), 5).tobytes()
 
 
 def messages(payload: bytes) -> list[dict[str, Any]]:
-    """What viser tells a browser at once."""
+    """Messages that viser sends a browser at once."""
     size = int.from_bytes(payload[8:16], "little")
     inner = msgspec.msgpack.decode(zstandard.decompress(payload[16 : 16 + size]))
     return [each[1] if isinstance(each, list) else each for each in inner["messages"]]
 
 
 def positions(payload: bytes) -> list[Any]:
-    """Positions of whatever is moved in what viser tells a browser."""
+    """Positions of all markers moved by viser's messages."""
     told = messages(payload)
     return [each["position"] for each in told if each.get("type") == "SetPositionMessage"]
 
 
 def latency() -> int:
-    """Take latencies, and say their quantiles; returns the exit code."""
+    """Measure latencies, and print their quantiles; returns the exit code."""
     found_ms: list[float] = []
     truth = Truth()
     with tempfile.TemporaryDirectory(prefix="skytether-") as name, chromium() as browser:
@@ -121,7 +122,7 @@ def latency() -> int:
 
 
 def process_mb(pid: int) -> float:
-    """Memory of a process that is its own or its share of what is shared [MB]."""
+    """Memory of a process: private, and its share of shared pages [MB]."""
     rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
     found = re.search(r"^Pss:\s+(\d+) kB", rollup, re.MULTILINE)
     assert found
@@ -129,14 +130,14 @@ def process_mb(pid: int) -> float:
 
 
 def tab_pid(browser: "Browser") -> int:
-    """Process of the browser that shows the one page there is: of several, the largest."""
+    """Browser process that shows the page: the largest of several."""
     told = browser.new_browser_cdp_session().send("SystemInfo.getProcessInfo")
     pids = [each["id"] for each in told["processInfo"] if each["type"] == "renderer"]
     return max(pids, key=process_mb)
 
 
 def replaying() -> int:
-    """Process that replays: the newest of that command."""
+    """Process that replays: the newest one with that command line."""
     found = subprocess.run(
         ["pgrep", "-n", "-f", "skytether replay"], capture_output=True, check=True
     )
@@ -144,7 +145,7 @@ def replaying() -> int:
 
 
 def weigh(browser: "Browser", page: "Page", weighed: list[tuple[float, float, float]]) -> None:
-    """Weigh the page's process and the tab's until an hour has been shown."""
+    """Measure the memory of the page's process and of the tab until an hour was shown."""
     session = page.context.new_cdp_session(page)
     ours, theirs = replaying(), tab_pid(browser)
     while True:
@@ -158,7 +159,7 @@ def weigh(browser: "Browser", page: "Page", weighed: list[tuple[float, float, fl
 
 
 def memory() -> int:
-    """Weigh page and tab during an hour of flight, and say by how much they grow."""
+    """Measure the memory of page and tab during an hour of flight, and print their growth."""
     weighed: list[tuple[float, float, float]] = []
     with tempfile.TemporaryDirectory(prefix="skytether-") as name, chromium() as browser:
         file = Path(name) / "hour.mcap"
@@ -183,10 +184,10 @@ def memory() -> int:
 
 
 def main(what: Literal["latency", "memory"], /) -> int:
-    """Measure what the page costs.
+    """Measure the page.
 
     Args:
-        what: latency, or memory.
+        what: `latency` or `memory`.
     """
     if not CHROMIUM:
         CONSOLE.print("there is no Chromium")

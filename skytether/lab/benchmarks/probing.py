@@ -1,10 +1,10 @@
-"""What `skytether probe` finds of networks that are known.
+"""Results of `skytether probe` on known networks.
 
     python -m skytether.lab.benchmarks.probing
 
-Each setting is a network of ours in virtual time, with the same impairments both ways and a
-listener whose clock is an hour ahead and drifts. What the measurement says is held against what the
-network is, and against what it did: netem records every packet.
+Each setting is a netem network in virtual time, with equal impairments both ways and a listener
+whose clock is an hour ahead and drifts. The measurement is compared with the network's settings,
+and with the fate of every packet, from netem's record.
 """
 
 import re
@@ -42,14 +42,14 @@ SETTINGS = (
     "gamma(0.02, 0.04, 0.01) & loss(0.05) & rate(50000)",
     "lognormal(0.01, 0.02, 0.005) & gilbert_elliott(0.1, 0.4) & rate(12500, queue=20000)",
 )
-"""Networks, both ways alike."""
+"""Networks, equal both ways."""
 CLOCK = Clock(3600 * SECOND_NS, 20_000)
 """Clock of the listener: an hour ahead, and 20 ppm fast."""
 
 
 @dataclass(frozen=True)
 class ProbingOptions:
-    """How much to measure."""
+    """Options of this benchmark."""
 
     seconds: float = 600.0
     """Length of each measurement [s]."""
@@ -74,18 +74,18 @@ def measure(
     seed: int = 1,
     clock: Clock = CLOCK,
 ) -> tuple[Measured, Rows]:
-    """Measure a network of ours in virtual time.
+    """Measure a netem network in virtual time.
 
     Args:
         uplink, downlink: impairments.
         seconds: length of the measurement [s].
         rate: packets a second.
         size: UDP payload of each packet [B].
-        seed: that of the network.
-        clock: that of the listener.
+        seed: seed of the network.
+        clock: clock of the listener.
 
     Returns:
-        What was measured, and netem's rows.
+        The measurement, and netem's rows.
     """
     network = NetworkConfig(
         uplink=DirectionConfig(impairments=uplink), downlink=DirectionConfig(impairments=downlink)
@@ -109,13 +109,13 @@ def measure(
 
 
 def number(text: str, name: str, place: int) -> float | None:
-    """An argument of an impairment in a text; None where that impairment is not in it."""
+    """Argument of an impairment in a text; None if the text lacks that impairment."""
     found = re.search(rf"\b{name}\(([^)]*)\)", text)
     return float(found[1].split(",")[place]) if found else None
 
 
 def against(found: float | None, asked: float | None, form: str) -> str:
-    """A figure, and its error against what was asked for; a dash where there is none."""
+    """Figure with its error relative to the set value; a dash if there is none."""
     if not found or not asked:
         return "-"
     return f"{found:{form}} ({found / asked - 1.0:+.1%})"
@@ -127,11 +127,11 @@ def models(text: str) -> set[str]:
 
 
 def row(text: str, told: PathTold, name: str) -> list[str]:
-    """What was found of a direction, beside what it is.
+    """Measured figures of a direction, beside the set ones.
 
     Args:
-        text: its impairments, those of the other direction as well.
-        told: what was found.
+        text: impairments of both directions.
+        told: measured figures.
         name: uplink or downlink.
     """
     way: WayTold = getattr(told, name)
@@ -169,7 +169,7 @@ def table(options: ProbingOptions) -> TextTable:
 
 
 def main() -> int:
-    """Measure as the command line says, and print what was found."""
+    """Measure as the command line says, and print the table."""
     options = tyro.cli(ProbingOptions, description=__doc__)
     found = table(options)
     found.show(f"probed for {options.seconds:g} s, {options.rate:g} packets a second")

@@ -1,4 +1,4 @@
-"""The problems of the benchmarks: recorded in flight, in the order of the flight."""
+"""QPs for the benchmarks, recorded in flight and in order."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ from skytether.sim.flight import fly
 
 
 def derive(name: str, **sections: Any) -> Scenario:
-    """A scenario that comes with Skytether, with some keys changed: `control={"dt": 0.02}`."""
+    """Scenario that comes with Skytether, with some keys changed: `control={"dt": 0.02}`."""
     table = reading.to_table(reading.load(name))
     for key, value in sections.items():
         table[key] = {**table[key], **value} if isinstance(value, dict) else value
@@ -33,11 +33,11 @@ def gradients(
     """Gradient g of the QPs of n vehicles; shape (n, axes, H).
 
     Args:
-        problem: what poses them.
+        problem: problem with the common matrices.
         x: state at stage 0 [m, m/s]; shape (n, axes, 2).
         target: desired states at the stages 0 … H [m, m/s]; shape (n, axes, H + 1, 2).
-        previous: horizon before, as seen now [m/s]; shape (n, axes, H).
-        disturbance: what is added to every input on its way [m/s]; shape (n, axes).
+        previous: previous horizon, shifted to the present [m/s]; shape (n, axes, H).
+        disturbance: disturbance that is added to every input [m/s]; shape (n, axes).
     """
     mpc, which, found = problem.mpc, problem.which, np.empty(previous.shape)
     drift, fresh = np.empty((previous.shape[2], 2)), problem.which == FIRST
@@ -55,14 +55,14 @@ def saturated(inputs: Array, problem: Problem) -> float:
 
 @dataclass(frozen=True)
 class RecordedProblems:
-    """The QPs of one vehicle's flight; two a tick, the generator's and the tracker's."""
+    """QPs of one vehicle's flight; two per tick, the generator's and the tracker's."""
 
     problem: Problem
-    """What they have in common."""
+    """Common matrices of the QPs."""
     gradient: Array
     """Gradients of the QPs; shape (2, ticks, axes, H)."""
     guess: Array
-    """The shifted horizon of the step before [m/s]; shape (2, ticks, axes, H)."""
+    """Shifted horizon of the previous step [m/s]; shape (2, ticks, axes, H)."""
 
     @property
     def ticks(self) -> int:
@@ -77,7 +77,7 @@ class RecordedProblems:
 
 
 class Listener:
-    """An exact solver that notes what generator and tracker ask it by turns."""
+    """Exact solver that records the problems of generator and tracker in turn."""
 
     def __init__(self, problem: Problem) -> None:
         self._solver = ExactSolver(problem)
@@ -85,12 +85,12 @@ class Listener:
         self._asked: list[tuple[Array, Array]] = []
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """Note the problems and solve them (see `Solver`)."""
+        """Record the problems and solve them (see `Solver`)."""
         self._asked.append((gradient, guess))
         return self._solver.solve(gradient, guess)
 
     def heard(self, turns: int = 0) -> tuple[Array, Array]:
-        """Gradients and guesses of the last turns, or all; each of shape (2, problems, axes, H).
+        """Recorded gradients and guesses, the last or all; each of shape (2, problems, axes, H).
 
         The generator's come first, then the tracker's.
         """
@@ -103,18 +103,18 @@ class Listener:
         return gradient, guess
 
     def forget(self) -> None:
-        """Forget what was asked."""
+        """Delete the recorded problems."""
         self._asked.clear()
 
 
 class ByTurns:
-    """Two solvers, one for the generator and one for the tracker: each keeps its warm start."""
+    """Two solvers in turn, for the generator and for the tracker: each keeps its own warm start."""
 
     def __init__(self, make: Callable[[Problem], Solver], problem: Problem) -> None:
         self._next, self._other = make(problem), make(problem)
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """Let the one whose turn it is solve (see `Solver`)."""
+        """Solve with the solver whose turn it is (see `Solver`)."""
         solver = self._next
         self._next, self._other = self._other, solver
         return solver.solve(gradient, guess)
@@ -122,7 +122,7 @@ class ByTurns:
 
 @contextmanager
 def solving(make: Callable[[Problem], Solver]) -> Iterator[None]:
-    """Planners made meanwhile solve by `make(problem)`, whatever their scenario says."""
+    """Within the block, new planners solve by `make(problem)`, whatever their scenario says."""
 
     def make_solver(control: ControlConfig, problem: Problem) -> Solver:  # noqa: ARG001
         return make(problem)
@@ -133,9 +133,9 @@ def solving(make: Callable[[Problem], Solver]) -> Iterator[None]:
 
 @contextmanager
 def listening() -> Iterator[list[Listener]]:
-    """Planners made meanwhile solve exactly, and are listened to.
+    """Within the block, new planners solve exactly, and their problems are recorded.
 
-    Gives the listener to first steps and the one to later steps.
+    Yields the recorder of first steps and that of later steps.
     """
     listeners: list[Listener] = []
 

@@ -23,28 +23,28 @@ FLOWN: dict[str, tuple[Frame, Gains]] = {
     "sih, PX4's loops": (SIH, PX4),
     "crazyflie, its firmware's loops": (CRAZYFLIE, FIRMWARE),
 }
-"""Frames, each with the loops of what flies it."""
+"""Frames, each with the control loops that fly it."""
 SIZES = (0.3, 1.0, 2.0, 4.0)
 """Sizes of the steps [m/s]."""
 MEASURED = {0.30: 0.1, 0.60: 0.5, 0.72: 0.63, 1.32: 0.9}
-"""Share of a step of 1 m/s that an actual ArduCopter 4.5.6 had reached after so long [s]."""
+"""Share of a step of 1 m/s that ArduCopter 4.5.6 had reached by time [s], as measured."""
 STEP_MS = 10
 SECONDS = 3.0
 """Length of a step that is drawn and fitted [s]."""
 
 
 class StepFit(NamedTuple):
-    """First order with dead time, and what is left over."""
+    """First order with dead time, fitted to a step, and its residual."""
 
     gain: float
     tau_s: float
     dead_s: float
     rms_mps: float
-    """Residual, root of its mean square [m/s]."""
+    """Root mean square of the residual [m/s]."""
 
 
 def step(frame: Frame, gains: Gains, velocity: Array) -> Array:
-    """Velocities every STEP_MS from a step in hover on; shape (n, 3)."""
+    """Velocities every STEP_MS after a step from hover; shape (n, 3)."""
     flown = Quadrotor(frame, gains, np.random.default_rng(0), position=np.array([0.0, 0.0, 5.0]))
     flown.advance(np.zeros(3), 2_000_000_000)
     rows = [flown.velocity()]
@@ -55,7 +55,7 @@ def step(frame: Frame, gains: Gains, velocity: Array) -> Array:
 
 
 def fitted(values: Array, size: float) -> StepFit:
-    """First order with dead time that fits velocities best."""
+    """First-order model with dead time that fits velocities best."""
     times = np.arange(len(values)) * STEP_MS / 1000.0
 
     def residual(p: Array) -> Array:
@@ -84,7 +84,7 @@ def table(axis: int, sizes: tuple[float, ...]) -> TextTable:
 
 
 def draw(path: Path) -> None:
-    """Draw steps of 1 m/s, and what was measured of an actual ArduCopter."""
+    """Draw steps of 1 m/s, and ArduCopter's measured response."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")
@@ -100,7 +100,7 @@ def draw(path: Path) -> None:
 
 
 def main() -> int:
-    """Print the tables, and draw the picture where there is a file for it."""
+    """Print the tables, and draw the picture if a file is given."""
     print(table(0, SIZES).markdown(), table(2, (0.5,)).markdown(), sep="\n")
     for path in sys.argv[1:]:
         draw(Path(path))

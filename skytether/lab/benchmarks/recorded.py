@@ -1,10 +1,11 @@
-"""Schemes over five recorded 5G links: after a target, and on a route that the server sees ahead.
+"""Schemes over five recorded 5G links: following a target, and on a route known ahead to the
+server.
 
     python -m skytether.lab.benchmarks.recorded
 
 Contenders fly at the weights that `skytether compare` found for them on the paper's network, in
-virtual time. Without compensation the server plans from the last observation as if it were of now,
-at every step, with the weights of committed inputs at every step.
+virtual time. Without compensation the server plans from the last observation as if it were of the
+present, at every step, with the weights of committed inputs sent at every step.
 """
 
 from collections.abc import Sequence
@@ -38,12 +39,12 @@ CONTENDERS = {
     "feedback, cost gap; reports by event": "feedback-gap",
     "trajectory, expected gap; reports by event": "trajectory-expected",
 }
-"""Contenders and the tables of compare.toml that have their weights."""
+"""Contenders, and the tables of compare.toml with their weights."""
 
 
 @dataclass(frozen=True)
 class RecordedBenchmarkOptions:
-    """What to fly."""
+    """Options of this benchmark."""
 
     seeds: int = 20
     """Number of flights of each contender over each link."""
@@ -56,16 +57,16 @@ class Flown:
     """Flights of one contender over one link."""
 
     rmse_m: float
-    """Mean RMSE xy [m]; NaN where it cannot fly."""
+    """Mean RMSE xy [m]; NaN if it cannot fly."""
     packets: float
     """Mean number of packets a second, both ways."""
 
 
 def contender(name: str, case: str, link: str, duration_s: float) -> Scenario:
-    """What a contender flies.
+    """Scenario of a contender.
 
     Raises:
-        ConfigError: it cannot be flown over this link.
+        ConfigError: the scenario cannot be flown over this link.
     """
     scenario = reading.load(f"compare/{CONTENDERS[name]}-{case}")
     table = reading.to_table(scenario)
@@ -79,7 +80,7 @@ def contender(name: str, case: str, link: str, duration_s: float) -> Scenario:
 
 
 def network(link: str) -> NetworkConfig:
-    """Network of a scenario."""
+    """Network texts of a scenario."""
     return reading.load(link).network
 
 
@@ -87,7 +88,7 @@ def flown(scenario: Scenario, seeds: Sequence[int]) -> Flown:
     """Fly a scenario with each seed."""
     rmse, packets = [], []
     for seed, flight in zip(seeds, fly_batch(scenario, seeds), strict=True):
-        own = msgspec.structs.replace(scenario, seed=seed)  # it makes the target
+        own = msgspec.structs.replace(scenario, seed=seed)  # the seed also determines the target
         summary = summarise(own, "", flight.client, flight.server, flight.netem)
         rmse.append(np.nan if summary.rmse_xy is None else summary.rmse_xy)
         sent = (summary.uplink_packets or 0) + (summary.downlink_packets or 0)

@@ -1,8 +1,8 @@
-"""The right answers: found by others' algorithms, then proved optimal.
+"""Reference solutions of QPs, found by other solvers and then proved optimal.
 
-quadprog (or, where it is not installed, bounded least squares of scipy) says which inputs are at
-their bound. With these fixed, a dense Cholesky factor gives the others, and the conditions of
-optimality are checked: every free input within the box, and no multiplier of the wrong sign.
+quadprog (or, if it is not installed, bounded least squares of scipy) finds the inputs that are at a
+bound. With these fixed, a dense Cholesky factorisation gives the others, and the optimality
+conditions are checked: every free input within the box, and no multiplier of the wrong sign.
 """
 
 from importlib.util import find_spec
@@ -14,15 +14,15 @@ from scipy.optimize import lsq_linear
 from skytether.shared.law.model import Array
 
 AT_BOUND = 1e-7
-"""Distance from its bound within which an input counts as at it, before it is proved [m/s]."""
+"""Distance from a bound within which an input is assumed to be at it, before the proof [m/s]."""
 ROUNDS_MAX = 10
-"""Number of times that this may turn out to be wrong."""
+"""Most corrections of the assumed set of inputs at a bound."""
 ROUNDING = 1e-11
 """Rounding error of a multiplier relative to the gradient, and of an input to its bound."""
 
 
 class NoReference(Exception):
-    """Error: no answer was found that is proved optimal."""
+    """Error: no solution was found that is proved optimal."""
 
 
 class Reference:
@@ -30,7 +30,7 @@ class Reference:
 
     Args:
         hessian: shape (H, H).
-        bound: of every input [m/s].
+        bound: bound of every input [m/s].
     """
 
     def __init__(self, hessian: Array, bound: float) -> None:
@@ -41,10 +41,10 @@ class Reference:
         self._rows, self._limits = np.hstack([np.eye(H), -np.eye(H)]), np.full(2 * H, -bound)
 
     def solve(self, gradient: Array) -> Array:
-        """The optimal inputs, right to rounding [m/s]; gradient of shape (H,).
+        """Optimal inputs, exact to rounding [m/s]; gradient of shape (H,).
 
         Raises:
-            NoReference: none could be proved.
+            NoReference: no solution could be proved.
         """
         first = self._first(gradient)
         near = self._bound - AT_BOUND
@@ -70,7 +70,7 @@ class Reference:
         return lsq_linear(self._root, aim, (-self._bound, self._bound), "bvls", tol=1e-15).x
 
     def _polish(self, side: Array, gradient: Array) -> Array:
-        """The best inputs with those at a side fixed to their bound; shape (H,)."""
+        """Optimal inputs with those at a side fixed to their bound; shape (H,)."""
         inputs, free = side * self._bound, side == 0.0
         if free.any():
             toward = -gradient[free] - self._hessian[np.ix_(free, ~free)] @ inputs[~free]

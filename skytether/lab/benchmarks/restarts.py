@@ -1,24 +1,24 @@
-"""Restarts under way: server, netem and client are killed and stopped in a flight over real UDP.
+"""Restarts in flight: server, netem and client are killed and stopped during flights over real UDP.
 
 A vehicle flies the demonstration's figure eight, sealed, over a network of 30 to 50 ms each way
-that loses 5 % of the packets. Again and again one of the three processes is killed with SIGKILL
-and started anew, at once or after 3 s in which nothing listens at its port, or it is stopped with
-SIGSTOP for 3 s. What the vehicle made of it is read from its own record.
+that loses 5 % of the packets. Again and again one of the three processes is killed with SIGKILL and
+restarted, at once or after 3 s in which nothing listens at its port, or stopped with SIGSTOP for 3
+s. The vehicle's reaction is read from its own record.
 
-Speed is held against the braking curve from the step at which the vehicle brakes, and from 1.2 s
-after the process was gone at the latest: 1 s of silence makes it brake, and 0.2 s are for packets
-still under way and for the step that has begun. With v the speed commanded at that step and
-a = `vehicle.brake_mps2`,
+Speed is compared with the braking curve from the step at which the vehicle brakes, or from 1.2 s
+after the process was gone at the latest: 1 s of silence makes the vehicle brake, and 0.2 s are
+allowed for packets still under way and for the step that has begun. With v the speed commanded at
+that step and a = `vehicle.brake_mps2`,
 
     commanded   b(t) = max(0, v - a t)
     true        τ ds/dt = b(t) - s,   s(0) = the true speed at that step
 
-The vehicle follows its command with the lag τ, and each axis alike, so that its speed is at most
-the lag of the commanded one; in still air, as it is here, nothing else moves it. A curve without
-the lag would ask for what no braking could do. It holds until the first horizon that was made after
-the process was back: from there on it flies again. A vehicle whose own process was stopped brakes
-when that wakes, which its time counts from; one that was killed begins a new life, at rest, and has
-to stay there until it flies.
+The vehicle follows its command with the lag τ, equal on each axis, so that its speed is at most the
+lagged commanded one; in still air, as here, nothing else moves the vehicle. A curve without the lag
+would demand what no braking can achieve. The curve applies until the first horizon that was made
+after the process was back: then the vehicle flies again. A vehicle whose own process was stopped
+brakes when the process wakes, and its times count from there; a vehicle whose process was killed
+starts again at rest, and must stay at rest until it flies.
 """
 
 import math
@@ -47,13 +47,13 @@ from skytether.shared.wire.protocol import Mode
 
 FIGURE = Path(__file__).parents[3] / "docs" / "restarts.png"
 DOWN_S = 3.0
-"""Time for which nothing listens, or a process is stopped [s]."""
+"""Length of an outage with a closed port, or of a stop [s]."""
 BRAKES_S = 1.2
-"""Target for the time from an outage to braking [s]."""
+"""Target of the time from an outage to braking [s]."""
 RETURNS_S = 3.0
-"""Target for the time from the return of a process to flying again [s]."""
+"""Target of the time from the return of a process to flying again [s]."""
 ROUNDING_MPS = 1e-6
-"""Speed by which arithmetic alone may leave a curve [m/s]."""
+"""Rounding tolerance of speeds against a curve [m/s]."""
 
 Subject = Literal["server", "netem", "client"]
 Way = Literal["killed", "killed, nothing listens for 3 s", "stopped for 3 s"]
@@ -64,16 +64,16 @@ KILLED, CLOSED, STOPPED = WAYS
 
 @dataclass(frozen=True)
 class RestartsCounts:
-    """How often to do what, to each of the processes."""
+    """Numbers of outages of each process."""
 
     kills: int
-    """Number of kills; every other one leaves the port closed for 3 s."""
+    """Number of kills; after every other one the port stays closed for 3 s."""
     stops: int
-    """Number of times that it is stopped."""
+    """Number of stops by SIGSTOP."""
     flight_s: float
     """Least time of flight between two of them [s]."""
     subjects: tuple[Subject, ...] = SUBJECTS
-    """What is killed and stopped."""
+    """Processes that are killed and stopped."""
 
 
 FULL, QUICK = (
@@ -83,19 +83,19 @@ FULL, QUICK = (
 
 
 class Outage(NamedTuple):
-    """What was done to a process."""
+    """Outage of a process."""
 
     subject: Subject
     way: Way
     began_ns: int
-    """Time at which it was killed or stopped."""
+    """Time of the kill or stop."""
     back_ns: int
-    """Time from which it listened again."""
+    """Time since which the process listened again."""
 
 
 @dataclass(frozen=True)
 class ProcessLife:
-    """Record of one life of the vehicle."""
+    """Record of one run of the vehicle's process."""
 
     time_ns: NDArray[np.int64]
     """Time at which each row's step begins; shape (n,)."""
@@ -106,13 +106,13 @@ class ProcessLife:
     off_m: Array
     """Distance from the reference [m]; shape (n,)."""
     in_force: NDArray[np.int64]
-    """Step that the horizon was made for, -1 for none; shape (n,)."""
+    """Step that the horizon in force was made for, -1 for none; shape (n,)."""
     mode: NDArray[np.uint8]
-    """What the vehicle does, a `Mode`; shape (n,)."""
+    """Mode of the vehicle, a `Mode`; shape (n,)."""
 
     @classmethod
     def of(cls, rows: Rows, epoch_ns: int, scenario: Scenario) -> "ProcessLife":
-        """Life of a record whose step 0 began at the epoch."""
+        """Record of a run whose step 0 began at the epoch."""
         state = rows["state"]
         reference = scenario.make_reference()(rows["step"] * scenario.control.dt)
         return cls(
@@ -127,26 +127,26 @@ class ProcessLife:
 
 @dataclass(frozen=True)
 class RestartVerdict:
-    """What the vehicle made of an outage; what does not apply is None."""
+    """Vehicle's reaction to an outage; None for what does not apply."""
 
     subject: Subject
     way: Way
     down_s: float
-    """Time for which the process was gone [s]."""
+    """Length of the outage [s]."""
     brakes_s: float | None
-    """Time to braking [s]; None where the process was back before."""
+    """Time to braking [s]; None if the process was back before."""
     over_commanded_mps: float | None
-    """Most by which the commanded speed was over its curve, less than 0 below it [m/s]."""
+    """Largest excess of the commanded speed over its curve, negative if below [m/s]."""
     over_true_mps: float | None
-    """Most by which the true speed was over its curve [m/s]."""
+    """Largest excess of the true speed over its curve [m/s]."""
     flies_s: float
-    """Time from the return to flying again [s]; infinite where it never did."""
+    """Time from the return to flying again [s]; infinite for never."""
     on_path_s: float
     """Time from the return until it was within half a metre of the reference [s]."""
 
     @property
     def is_inside(self) -> bool:
-        """Whether it meets its targets."""
+        """Whether all targets are met."""
         over = (self.over_commanded_mps, self.over_true_mps)
         braked = self.brakes_s is None or self.brakes_s <= BRAKES_S
         return (
@@ -169,7 +169,7 @@ def scenario() -> Scenario:
 
 
 def schedule(counts: RestartsCounts) -> list[tuple[Subject, Way]]:
-    """What is done, in order: the processes take turns."""
+    """Sequence of outages: the processes take turns."""
     kills: list[tuple[Subject, Way]] = [
         (subject, CLOSED if number % 2 else KILLED)
         for number in range(counts.kills)
@@ -182,11 +182,11 @@ def schedule(counts: RestartsCounts) -> list[tuple[Subject, Way]]:
 
 
 class Processes:
-    """Server, netem and a vehicle, each of which can be taken away.
+    """Server, netem and a vehicle, each of which can be killed or stopped.
 
     Args:
-        stack: ends them.
-        folder: for their files.
+        stack: ends the processes.
+        folder: folder for their files.
     """
 
     def __init__(self, stack: ExitStack, folder: Path) -> None:
@@ -194,7 +194,7 @@ class Processes:
         self._folder = folder
         self._lives = 0
         self._parts: list[tuple[Path, ChildProcess]] = []
-        """Record and process of each life of the vehicle."""
+        """Record and process of each run of the vehicle."""
         self._children = {"server": self._lab.server()}
         self._addresses = {"server": self._children["server"].address}
         self._children["netem"] = self._start("netem")
@@ -203,7 +203,7 @@ class Processes:
         self.wait_for_flight()
 
     def _start(self, subject: str) -> ChildProcess:
-        """The process anew, at the address that it had."""
+        """Start a process again, at the address that it had."""
         self._lives += 1
         addresses = self._addresses
         match subject:
@@ -218,7 +218,7 @@ class Processes:
         return child
 
     def suffer(self, subject: Subject, way: Way) -> Outage:
-        """Take a process away, and give it back."""
+        """Kill or stop a process, and bring it back."""
         child = self._children[subject]
         if way == STOPPED:
             return Outage(subject, way, *child.freeze(DOWN_S))
@@ -229,7 +229,7 @@ class Processes:
         return Outage(subject, way, began_ns, child.listening_ns())
 
     def wait_for_flight(self) -> None:
-        """Wait until the vehicle says that it flies a plan, unless it does so already."""
+        """Wait until the vehicle reports that it flies a plan, unless it does already."""
         client = self._children["client"]
         while True:
             told = [line.event for line in client.all(ModeChanged)]
@@ -238,7 +238,7 @@ class Processes:
             client.wait_for(ModeChanged, len(told) + 1)
 
     def end(self) -> list[ProcessLife]:
-        """All lives of the vehicle that flew, in order."""
+        """All runs of the vehicle that flew, in order."""
         self._children["client"].stop()
         flown = scenario()
         lives = []
@@ -249,10 +249,10 @@ class Processes:
 
 
 def judge(outage: Outage, lives: Sequence[ProcessLife], scenario: Scenario) -> RestartVerdict:
-    """What the record says of an outage."""
+    """Reaction to an outage, from the record."""
     life = _life(outage, lives)
     died = outage.subject == "client" and outage.way != STOPPED
-    # A vehicle that was asleep can brake when it wakes, and no sooner.
+    # A vehicle whose process was stopped can brake only when it wakes.
     zero_ns = outage.back_ns if outage.subject == "client" else outage.began_ns
     time_s = (life.time_ns - zero_ns) / SECOND_NS
     known = life.in_force[life.time_ns < outage.back_ns].max(initial=-1)
@@ -278,7 +278,7 @@ def judge(outage: Outage, lives: Sequence[ProcessLife], scenario: Scenario) -> R
 
 
 def _life(outage: Outage, lives: Sequence[ProcessLife]) -> ProcessLife:
-    """The life that goes on, or begins, after an outage."""
+    """Run of the vehicle that goes on, or begins, after an outage."""
     for life in lives:
         if life.time_ns[-1] > outage.back_ns:
             return life
@@ -286,7 +286,7 @@ def _life(outage: Outage, lives: Sequence[ProcessLife]) -> ProcessLife:
 
 
 def _first(which: NDArray[np.bool_]) -> int:
-    """Index of the first that is true; their number without any."""
+    """Index of the first true value; the length if there is none."""
     return int(which.argmax()) if which.any() else len(which)
 
 
@@ -295,7 +295,7 @@ def _at(values: Array, index: int) -> float:
 
 
 def _over(life: ProcessLife, rows: slice, scenario: Scenario) -> tuple[float, float]:
-    """Most by which commanded and true speed are over their curves [m/s]."""
+    """Largest excesses of commanded and true speed over their curves [m/s]."""
     time_ns, commanded, speed = life.time_ns[rows], life.commanded[rows], life.speed[rows]
     since_s = (time_ns - time_ns[0]) / SECOND_NS
     curve, lagged = curves(float(commanded[0]), float(speed[0]), since_s, scenario)
@@ -305,24 +305,24 @@ def _over(life: ProcessLife, rows: slice, scenario: Scenario) -> tuple[float, fl
 def curves(
     commanded: float, speed: float, since_s: Array, scenario: Scenario
 ) -> tuple[Array, Array]:
-    """The curves of commanded and true speed [m/s].
+    """Braking curves of commanded and true speed [m/s].
 
     Args:
         commanded: v, the commanded speed at the first time [m/s].
-        speed: the true one [m/s].
+        speed: true speed at the first time [m/s].
         since_s: times at which steps begin, the first of them 0 [s]; shape (n,).
     """
     curve = np.maximum(0.0, commanded - scenario.vehicle.brake_mps2 * since_s)
     tau_s, lagged = float(scenario.true_tau_s.max()), np.empty_like(curve)
     lagged[0] = speed
     for i, passed_s in enumerate(np.diff(since_s)):
-        # Between two steps the command stays.
+        # Between two steps the command is constant.
         lagged[i + 1] = curve[i] + (lagged[i] - curve[i]) * math.exp(-passed_s / tau_s)
     return curve, lagged
 
 
 def measure(counts: RestartsCounts) -> dict[str, Any]:
-    """What the vehicle made of every outage, and its speed around each."""
+    """Reactions to all outages, and the speed around each."""
     lateness, rng, outages = Lateness(), np.random.default_rng(1), []
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-"))
@@ -330,7 +330,8 @@ def measure(counts: RestartsCounts) -> dict[str, Any]:
         for subject, way in progress(schedule(counts), "restarts"):
             lateness.sleep(counts.flight_s + float(rng.random()))
             outages.append(flight.suffer(subject, way))
-            lateness.sleep(BRAKES_S)  # what was back sooner may not be missed yet
+            # after a short outage, the vehicle may not have missed the process yet
+            lateness.sleep(BRAKES_S)
             flight.wait_for_flight()
         lateness.sleep(counts.flight_s)
         lives = flight.end()
@@ -366,7 +367,7 @@ def verdicts_of(result: Mapping[str, Any]) -> list[RestartVerdict]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Table with a row for each process and each way of taking it away."""
+    """Table with a row for each process and kind of outage."""
     headings = ["process", "times", "gone\n[s]", f"brakes [s]\n(≤ {BRAKES_S:g})", "\nworst"]
     headings += ["over curve\n[m/s]", "\ntrue", f"flies [s]\n(≤ {RETURNS_S:g})", "\nworst"]
     headings += ["within\n0.5 m [s]", "\nworst", "out-\nside"]
@@ -396,7 +397,7 @@ def _row(those: Sequence[RestartVerdict]) -> list[str]:
 
 
 def _both(values: Iterable[float | None]) -> list[str]:
-    """Median and largest of those that there are."""
+    """Median and largest of the known values."""
     known = [each for each in values if each is not None]
     return [f"{np.median(known):.2f}", f"{max(known):.2f}"] if known else ["–", "–"]
 
@@ -407,7 +408,7 @@ def _worst(values: Iterable[float | None], spec: str) -> str:
 
 
 def draw(result: Mapping[str, Any], path: Path = FIGURE) -> None:
-    """Draw the speeds around all kills over each other, a panel for each process."""
+    """Draw the speeds around all kills superimposed, one panel per process."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 9.0), layout="constrained")
@@ -425,7 +426,7 @@ def draw(result: Mapping[str, Any], path: Path = FIGURE) -> None:
                 for i, speeds in enumerate((commanded, speed)):
                     fastest[i] = max(fastest[i], *speeds[flies], 0.0)
             panel.plot(each["down_s"], 0.0, "|", color=colours[each["way"]], markersize=12)
-        if subject != "client":  # which is at rest when it begins anew
+        if subject != "client":  # its new process begins at rest
             since_s = np.arange(0.0, AROUND_S[1] - BRAKES_S, flown.control.dt)
             for curve, line in zip(
                 curves(fastest[0], fastest[1], since_s, flown), ("k--", "k-"), strict=True

@@ -1,4 +1,4 @@
-"""What a tick's two solves cost: one vehicle, H = 50, Δt = 0.02 s, two axes, hot and paced."""
+"""Cost of the two solves of a tick: one vehicle, H = 50, Δt = 0.02 s, two axes, hot and paced."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,25 +35,25 @@ from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.schema import Scenario
 
 TARGETS = {"hot": {"p50": 15.0, "p99": 10.0}, "paced": {"p50": 7.0, "p99": 5.0}}
-"""Targets: tuned OSQP's time over ours, by pace and quantile."""
+"""Targets: ratio of tuned OSQP's time to the exact solver's, by pace and quantile."""
 PACES = {"hot": HOT, "paced": PACED}
 
 
 @dataclass(frozen=True)
 class SolversCounts:
-    """How much to measure."""
+    """Size of the benchmark."""
 
     hot: int = 1000
     paced: int = 500
     tuning: int = 100
-    """Number of ticks of which the best tuning of OSQP is found."""
+    """Number of ticks with which OSQP is tuned."""
 
 
 FULL, QUICK = SolversCounts(), SolversCounts(hot=100, paced=60, tuning=20)
 
 
 def flights() -> dict[str, Scenario]:
-    """Scenarios of a flight that never meets its bounds, and of one that does at every corner."""
+    """Scenarios of a flight that never reaches its bounds, and of one that does at every corner."""
     control = {"dt": 0.02, "horizon": 50}
     square = {"shape": "square", "period_s": 6.0}
     return {
@@ -94,7 +94,7 @@ def _measure_flight(
     spent = compete("hot", *factories)
     for key in factories:
         figures[key]["hot"] = spent[key] | {"ratio": ratios(spent[key], spent[OURS])}
-    # A server has one solver, so here each meets ours alone: others would empty the caches.
+    # A real server has one solver, so each runs against ours alone: more would empty the caches.
     for key in factories.keys() - {OURS}:
         pair = compete("paced", OURS, key)
         figures[key]["paced"] = pair[key] | {"ratio": ratios(pair[key], pair[OURS])}
@@ -110,11 +110,11 @@ def _measure_flight(
 
 
 class SolverEntry:
-    """One contestant, with a solver for the generator and one for the tracker."""
+    """Contestant, with one solver for the generator and one for the tracker."""
 
     def __init__(self, make: Factory, recorded: RecordedProblems) -> None:
         self._generator, self._tracker = (make(recorded.problem) for _ in range(2))
-        # Cut up beforehand, for that would cost as much as a solve.
+        # Sliced in advance, because slicing would cost as much as a solve.
         pairs = [
             [(gradient[None], guess[None]) for gradient, guess in zip(*half, strict=True)]
             for half in zip(recorded.gradient, recorded.guess, strict=True)
@@ -128,7 +128,7 @@ class SolverEntry:
         self._answers[i] = (self._generator.solve(*generator), self._tracker.solve(*tracker))
 
     def inputs(self) -> Array:
-        """Inputs answered so far [m/s]; shape (2, ticks, axes, H)."""
+        """Inputs solved so far [m/s]; shape (2, ticks, axes, H)."""
         answers = (self._answers[i] for i in sorted(self._answers))
         return np.array([[inputs[0] for inputs, _ in both] for both in answers]).swapaxes(0, 1)
 
@@ -140,7 +140,7 @@ class SolverEntry:
 def tune(
     recorded: RecordedProblems, count: int, lateness: Lateness
 ) -> tuple[Tuning, dict[str, dict[str, float]]]:
-    """The tuning of OSQP with the smallest median, and the best of each form [µs]."""
+    """Tuning of OSQP with the smallest median time, and the best of each form [µs]."""
     entries = {str(tuning): SolverEntry(tuning.make, recorded) for tuning in TUNINGS}
     runs = {name: entry.tick for name, entry in entries.items()}
     spent = interleave(runs, count, HOT, lateness, "tuning OSQP")

@@ -1,4 +1,4 @@
-"""What the wire costs: encode and decode of each message, H = 50, two axes."""
+"""Cost of encoding and decoding each message, H = 50, two axes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ NOTHING = "nothing"
 
 @dataclass(frozen=True)
 class WireCounts:
-    """How much to measure."""
+    """Size of the benchmark."""
 
     each: int = 20_000
 

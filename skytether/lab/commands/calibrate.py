@@ -1,4 +1,6 @@
-"""`skytether calibrate`: search for the numbers that the paper does not print, or the best ones."""
+"""`skytether calibrate`: search for parameters that the paper does not print, or for the best
+ones.
+"""
 
 import math
 from collections.abc import Sequence
@@ -25,7 +27,7 @@ from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 BEST = "best.toml"
-"""File of the best point, a scenario."""
+"""File of the best point, as a scenario."""
 POPULATION_MIN, POPULATION_MAX = 4, 1000
 """Fewest and most points in a generation."""
 
@@ -35,28 +37,28 @@ class CalibrateOptions:
     """Options of `skytether calibrate`."""
 
     scenario: ScenarioName = "paper"
-    """Name of a scenario (see `skytether scenarios`) or path of a .toml file, where the search
-    starts."""
+    """Scenario from which the search starts: a name (see `skytether scenarios`) or a .toml file."""
     objective: Literal["table1", "rmse"] = "table1"
-    """What to search for: table1, the paper's Table 1, or rmse, the smallest mean RMSE xy."""
+    """Goal of the search: table1, to reproduce the paper's Table 1, or rmse, the smallest mean RMSE
+    xy."""
     packets: float = 0.1
-    """Largest share of steps that may send, with the objective rmse and a trigger that looks at
-    the flight."""
+    """Largest share of steps that may send; with the objective rmse, and a trigger that looks at
+    the state."""
     effort: Annotated[float, tyro.conf.arg(metavar="MPS")] = math.inf
     """Largest effort with the objective rmse, the RMS change of the command from step to step
     [m/s]; no limit unless given."""
     free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=LOW:HIGH")] = ()
     """Keys that may change, each within its bounds, on a logarithmic scale. Unless given, table1
-    changes weights and plant, and rmse the weights (but the position's, for only ratios matter) and
-    the keys of scheme and trigger."""
+    changes weights and plant, and rmse the weights (except the position's, as only ratios matter)
+    and the keys of scheme and trigger."""
     runs: int = 10
     """Number of flights of each point (for table1 in each column), with seeds from --seed on."""
     generations: int = 40
-    """Number of generations; a search in OUT goes on until it has so many."""
+    """Number of generations; a search in OUT continues up to this number."""
     population: int = 10
     """Number of points in a generation."""
     sigma: float = SIGMA
-    """First step, as a share of the range of each key."""
+    """Initial step size, as a share of each key's range."""
     pool: PoolFlags = Flags()
     out: Path = Path("calibration")
     """Folder for every point flown (journal.jsonl) and for the best one (best.toml)."""
@@ -64,11 +66,11 @@ class CalibrateOptions:
 
 
 def calibrate(argv: Sequence[str]) -> None:
-    """Search for the values of some keys that give the paper's Table 1, or the smallest error.
+    """Search for the values of some keys that reproduce the paper's Table 1, or minimise the error.
 
     Every point is flown in virtual time with the same seeds. OUT/best.toml is the best scenario,
-    which flies like any other. Everything flown is kept: after Ctrl-C, or a crash, the same command
-    goes on.
+    and can be flown like any other. All flights are kept: after Ctrl-C or a crash, the same command
+    continues.
     """
     options = command.parse(CalibrateOptions(), argv, "skytether calibrate", calibrate.__doc__)
     command.check_count("--runs", options.runs, 1000)
@@ -132,7 +134,7 @@ def _print_rmse(points: Sequence[SearchPoint]) -> None:
 
 
 def _print_table_1(points: Sequence[SearchPoint]) -> None:
-    """Print the best point beside Table 1, and what all points within tolerance span."""
+    """Print the best point beside Table 1, and the ranges of all points within tolerance."""
     found, console = best(points), Console()
     console.print(_entries(found.values))
     near = [point for point in points if calibration.is_admissible(point.values)]
@@ -147,7 +149,7 @@ def _print_table_1(points: Sequence[SearchPoint]) -> None:
 
 
 def _entries(values: Values) -> Table:
-    """Table 1, the paper's figures beside those of a point."""
+    """Entries of Table 1, the paper's figures beside those of a point."""
     table = Table(title="Table 1")
     for heading in ("", "entry", "paper", "here", "off"):
         table.add_column(heading)

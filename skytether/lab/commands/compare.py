@@ -23,7 +23,7 @@ from skytether.shell import command
 from skytether.shell.options import read
 
 WEIGHTS = "weights.toml"
-"""File of the weights that a search has found."""
+"""File of the weights found by a search."""
 
 
 @dataclass(frozen=True)
@@ -31,30 +31,30 @@ class CompareOptions:
     """Options of `skytether compare`."""
 
     runs: Annotated[int, tyro.conf.arg(metavar="N")] = 100
-    """Number of flights of each contender in each case within each budget, with seeds from 1 on."""
+    """Number of flights of each contender per case and budget, with seeds from 1 on."""
     out: Path = Path("compare")
-    """Folder for the report, and for weights and their searches; the same command goes on with
-    what it holds."""
+    """Folder for the report, and for weights and their searches; the same command continues
+    there."""
     quick: bool = False
-    """Take a first look: few flights, cases and thresholds."""
+    """Fly only a first look: few flights, cases and thresholds."""
     cases: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CASE")] = ()
-    """Cases that are flown; all unless given."""
+    """Cases to fly; all unless given."""
     tune: bool = False
-    """Only search for the weights of every contender in every case, with the same effort for each,
-    and write them to OUT/weights.toml."""
+    """Only search for the weights of every contender in every case, each with the same effort, and
+    write them to OUT/weights.toml."""
     generations: Annotated[int, tyro.conf.arg(metavar="N")] = 16
     """Number of generations of each of these searches."""
     weights: Annotated[str, tyro.conf.arg(metavar="FILE")] = reading.COMPARED
-    """File of the weights, as --tune writes it; those that come with Skytether unless given."""
+    """File of the weights, as written by --tune; the included ones unless given."""
     pool: PoolFlags = Flags()
 
 
 def compare(argv: Sequence[str]) -> None:
-    """Fly every scheme with every trigger after a target that only the server sees.
+    """Compare schemes and triggers on a target whose motion only the server sees.
 
-    OUT/report.html has the tables and figures, and opens anywhere; each is in OUT as CSV, PNG and
-    PDF as well. Everything flown is kept: after Ctrl-C, or a crash, the same command goes on; once
-    all is flown, it only draws anew.
+    OUT/report.html has the tables and figures, and opens offline; each is in OUT as CSV, PNG and
+    PDF as well. All flights are kept: after Ctrl-C or a crash, the same command continues; after
+    the last flight, it only draws the report again.
     """
     options = read(CompareOptions(), argv, "skytether compare", compare.__doc__)
     command.check_count("--runs", options.runs, 100_000)
@@ -97,7 +97,7 @@ def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) 
 
 
 def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
-    """What stands beside the contenders of a case that has its own weights."""
+    """Baselines beside the contenders of a case that has its own weights."""
     if plan.case.weights:
         return Baselines()
     work = Work(plan)

@@ -1,4 +1,4 @@
-"""`skytether crowd`: how many vehicles fly on one shared air, scheme by scheme."""
+"""`skytether crowd`: number of vehicles that can share one network, scheme by scheme."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -32,32 +32,32 @@ class CrowdOptions:
     """Options of `skytether crowd`."""
 
     out: Path = Path("crowd")
-    """Folder for the results; the same command goes on there with what it holds."""
+    """Folder for the results; the same command continues there."""
     scenario: ScenarioName = "crowd"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
     schemes: Annotated[tuple[Scheme, ...], tyro.conf.arg(metavar="SCHEME")] = get_args(Scheme)
-    """Schemes: paper (a packet at every step), threshold (the scenario's trigger for each vehicle)
-    and budget (the same, and control.shared_bytes_per_s)."""
+    """Schemes to compare: paper (a packet at every step), threshold (the scenario's trigger for
+    each vehicle) and budget (the same trigger, with control.shared_bytes_per_s)."""
     vehicles: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")] = ()
-    """Numbers of vehicles; unless given, more and more until they no longer fly, and then between
-    the last that does and the first that does not."""
+    """Numbers of vehicles to fly; unless given, increasing numbers until they fail, then between
+    the largest that flies and the smallest that fails."""
     most: Annotated[int, tyro.conf.arg(metavar="N")] = 256
-    """Largest number of vehicles that is tried, unless they are given."""
+    """Largest number of vehicles that is tried, unless numbers are given."""
     limit: Annotated[float, tyro.conf.arg(metavar="M")] = 1.0
-    """Root mean square error with which vehicles no longer fly [m]."""
+    """Root mean square error above which vehicles count as failed [m]."""
     udp: bool = False
-    """Fly over real UDP on loopback, in real time; in virtual time else."""
+    """Fly over real UDP on loopback, in real time, instead of virtual time."""
     plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
 
 def crowd(argv: Sequence[str]) -> None:
-    """Find how many vehicles fly on one air, for each scheme: with one more, it is too many.
+    """Find the largest number of vehicles that can share one network, for each scheme.
 
-    All vehicles share the rates and queues of the scenario's network, one for each direction.
-    They fly where none brakes and their error stays within --limit. OUT/crowd.csv has a row for
-    each flight, OUT/crowd.png shows error, queueing delay and loss over the number of vehicles.
-    Everything flown is kept: after Ctrl-C the same command goes on.
+    All vehicles share the rates and queues of the scenario's network, one for each direction. A
+    number of vehicles flies if none brakes and the error stays within --limit. OUT/crowd.csv has a
+    row for each flight, OUT/crowd.png shows error, queueing delay and loss over the number of
+    vehicles. All flights are kept: after Ctrl-C the same command continues.
     """
     options = command.parse(CrowdOptions(), argv, "skytether crowd", crowd.__doc__)
     command.check_count("--most", options.most, VEHICLES_MAX)
@@ -93,7 +93,7 @@ def crowd(argv: Sequence[str]) -> None:
 
 
 def partial_bar(bar: Bar, done: int) -> Callable[[str], None]:
-    """What shows a text beside so many schemes that are done."""
+    """Function that shows a text in a bar at a number of finished schemes."""
     return lambda text: bar(done, text)
 
 
@@ -105,7 +105,7 @@ def _fly_all(
     tell: Callable[[str], None],
     interrupted: Callable[[], bool],
 ) -> bool:
-    """Fly what is not done of a scheme; False where that was broken off."""
+    """Fly the missing points of a scheme; returns False if interrupted."""
     while True:
         flown = Flown.of(journal.entries, scheme, options.limit)
         known = {point.vehicles for point in flown.points}
@@ -126,7 +126,7 @@ def _fly(
     tell: Callable[[str], None],
     interrupted: Callable[[], bool],
 ) -> CrowdPoint | None:
-    """Fly so many vehicles; None where the flight was broken off."""
+    """Fly a number of vehicles; returns None if interrupted."""
     scenario = plan.of(scheme)
 
     def on_second(time_s: float) -> None:
@@ -155,7 +155,7 @@ def _fly(
 
 
 def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
-    """Write and print what was flown."""
+    """Write and print the results."""
     flown = {scheme: Flown.of(points, scheme, options.limit) for scheme in TITLES}
     where = "over UDP" if options.udp else "in virtual time"
     title = f"{options.scenario}, {where}, seed {options.config.seed}"

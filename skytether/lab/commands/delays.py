@@ -1,4 +1,4 @@
-"""Measurement of how long packets really take through netem, over UDP on loopback."""
+"""Measurement of the true delays of packets through netem, over UDP on loopback."""
 
 import asyncio
 import time
@@ -20,19 +20,19 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
 EVERY_S = 0.002
 """Time between packets [s]."""
 BYTES = 350
-"""Size of a packet [B]: that of a horizon."""
+"""Size of a packet [B], that of a horizon."""
 LAST_S = 1.0
-"""Time for which the last packets are waited for, beyond the mean delay [s]."""
+"""Wait for the last packets, beyond the mean delay [s]."""
 
 
 class _End(asyncio.DatagramProtocol):
-    """One end: notes when each packet comes that the other end has stamped and numbered."""
+    """End of the path: records the arrival of the other end's numbered and timestamped packets."""
 
     def __init__(self, answers: bool) -> None:
         self._answers = answers
         self._sent = 0
         self.delays_ns: dict[int, int] = {}
-        """Delay of each packet that came [ns], by its number."""
+        """Delay of each received packet [ns], by its number."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See `asyncio.DatagramProtocol`."""
@@ -56,16 +56,16 @@ class _End(asyncio.DatagramProtocol):
 def measure(
     scenario: Scenario, folder: Path, packets: int, on_second: Callable[[float], None]
 ) -> Array:
-    """Send packets through netem, and as many back as come.
+    """Send packets through netem, and the received ones back.
 
     Args:
-        scenario: `network` and `seed` of it are used.
+        scenario: scenario, of which `network` and `seed` are used.
         folder: folder for the scenario file that netem is given, and for its record.
         packets: number of packets to send.
-        on_second: called with the time that it takes so far [s], often.
+        on_second: called often with the elapsed time [s].
 
     Returns:
-        Delays of the packets that came, as measured and as drawn [ms]; shape (packets, 2).
+        Delays of the received packets, measured and drawn [ms]; shape (packets, 2).
 
     Raises:
         CommandError: netem failed.
@@ -95,7 +95,7 @@ async def _measure(
     finally:
         back.close()
         forth.close()
-    # Packets enter in the order of their numbers.
+    # The rows of netem are in order of entry, and so of the packets' numbers.
     drawn, rows = read(record), []
     for direction, end in ((DOWNLINK, server), (UPLINK, client)):
         of = drawn[drawn["direction"] == direction]

@@ -1,4 +1,6 @@
-"""`skytether envelope`: which networks and settings a scenario bears, by flights at many points."""
+"""`skytether envelope`: networks and settings under which a scenario flies, tested at many
+points.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,7 +21,7 @@ from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
-"""Most points that are printed with their command lines."""
+"""Most bad points that are printed with their command lines."""
 
 
 @dataclass(frozen=True)
@@ -27,27 +29,27 @@ class EnvelopeOptions:
     """Options of `skytether envelope`."""
 
     out: Path
-    """Folder for the results; the same command, with more points if you like, goes on there."""
+    """Folder for the results; the same command continues there, also with more points."""
     scenario: ScenarioName = "demo-committed"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
     points: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
-    """Number of points, which follow from --seed: the first N of always the same ones."""
+    """Number of points; point n depends only on --seed and n."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
 
 
 def envelope(argv: Sequence[str]) -> None:
-    """Find out what networks and settings a scenario bears: fly it in virtual time with others.
+    """Find the networks and settings under which a scenario flies, by flights in virtual time.
 
     A point has a delay of up to 3 s and a loss of up to 0.99 in each direction, steps of 5 ms to
-    0.5 s, horizons of 1 to 120 steps, and the scheme committed or feedback; all else is the
-    scenario's. It is "flown" within 1 m of the reference, "refused" in one line, or ends without a
-    plan and brakes, "hovering". What moves when it should brake, or leaves the reference's
-    surroundings, is a "flyaway": the exit code is then 1, and a command line flies the point again.
-    docs/envelope.md explains each outcome.
+    0.5 s, horizons of 1 to 120 steps, and the scheme committed or feedback; all other keys are the
+    scenario's. A point is "flown" if it stays within 1 m of the reference, "refused" with one line,
+    or "hovering" if it ends without a plan and brakes. A vehicle that moves when it should brake,
+    or leaves the reference's surroundings, is a "flyaway": the exit code is then 1, and the printed
+    command line flies the point again. docs/envelope.md explains each outcome.
 
-    OUT/points.csv has a row for each point, OUT/envelope.png shows what came of them. Everything
-    flown is kept: after Ctrl-C, or a crash, the same command goes on.
+    OUT/points.csv has a row for each point, OUT/envelope.png shows the outcomes. All flights are
+    kept: after Ctrl-C or a crash, the same command continues.
     """
     options = command.parse(
         EnvelopeOptions(tyro.MISSING), argv, "skytether envelope", envelope.__doc__
@@ -75,10 +77,10 @@ def envelope(argv: Sequence[str]) -> None:
 
 
 def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
-    """Write and print what came of all points.
+    """Write and print the outcomes of all points.
 
     Raises:
-        CommandError: some of them are bad.
+        CommandError: some points are bad.
     """
     title = f"{options.scenario}, {len(points)} points, in virtual time, seed {plan.scenario.seed}"
     write(options.out / "points.csv", plan.csv(points).encode())

@@ -1,4 +1,4 @@
-"""`skytether identify`: the model of a vehicle, from small steps that it flies."""
+"""`skytether identify`: identify a vehicle's model from small steps of velocity."""
 
 import math
 import sys
@@ -47,7 +47,7 @@ SCENARIO, PICTURE, MEASURED = "scenario.toml", "steps.png", "measured.csv"
 """Files in the folder of an identification, beside the one for programs."""
 OUTCOME = "identified.json"
 NUMBER = 1
-"""Number of the vehicle, in what it says."""
+"""Number of the vehicle in its events."""
 REPEATS_MAX, HOLD_MAX_S = 100, 60.0
 """Most repetitions, and the longest time after a step [s]."""
 VIRTUAL_MAX_NS = 7200 * SECOND_NS
@@ -59,41 +59,43 @@ class IdentifyOptions:
     """Options of `skytether identify`."""
 
     kind: Annotated[str, Argument(metavar="KIND", positional=True)] = ""
-    """Vehicle to fly (see `skytether vehicles`), in place of `vehicle.kind`. One that talks to
-    hardware, as mavlink does, flies in real time; others fly in virtual time."""
+    """Vehicle to fly (see `skytether vehicles`), in place of `vehicle.kind`. Kinds with real
+    hardware, such as mavlink, fly in real time; others fly in virtual time."""
     scenario: str = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file: what will be flown, which the
-    scenario that is written extends."""
+    """Scenario to be flown later: a name (see `skytether scenarios`) or a .toml file. The written
+    scenario extends it."""
     speed: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
-    """Size of step [m/s], one for all axes or one each. Unless given, the largest speed of the
-    desired trajectory on the axis, and at least half of that on any axis."""
+    """Size of step [m/s], one for all axes or one for each. Unless given, the largest speed of the
+    desired trajectory on the axis, but at least half of its largest speed on any axis."""
     also: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
-    """Other sizes of step to fly as well [m/s], to see what a wrong size costs."""
+    """Further sizes of step to fly [m/s], to see the error of a model identified at another
+    size."""
     hold: float | None = None
-    """Time after each step [s]: four time constants of the scenario's model, and 3 to 6 s, unless
-    given."""
+    """Time after each step [s]; unless given, four time constants of the scenario's model, but 3 to
+    6 s."""
     repeats: int = 3
-    """Number of times that each axis flies its four steps, out and back and out and back."""
+    """Number of repetitions on each axis, of four steps: out, back, out to the other side, back."""
     set_parameters: bool = False
-    """Set the autopilot's parameters that decide what it does in silence, where they are not safe;
-    without it, they are told, and nothing is armed."""
+    """Set those parameters of the autopilot to safe values that decide what it does when
+    set-points stop. Without --set-parameters, unsafe values are only reported, and the vehicle
+    is not armed."""
     out: Path = Path("identified")
-    """Folder for the scenario (scenario.toml), the picture (steps.png), what was measured
-    (measured.csv) and the outcome for a program (identified.json)."""
+    """Folder for the scenario (scenario.toml), the picture (steps.png), the measurements
+    (measured.csv) and the results for programs (identified.json)."""
     plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
 
 @dataclass(frozen=True, slots=True)
 class SizeFlown:
-    """What was flown with steps of one size."""
+    """Results of steps of one size."""
 
     flight: Identifying
     axes: list[AxisOutcome]
 
 
 class IdentificationTold(msgspec.Struct, frozen=True):
-    """What came of an identification, for a program."""
+    """Results of an identification, as written to identified.json."""
 
     scenario: str
     kind: str
@@ -109,9 +111,9 @@ def identify(argv: Sequence[str]) -> None:
     """Identify the model of a vehicle: gain, time constant and dead time of each axis.
 
     The vehicle takes off, flies small steps of velocity out and back inside its fence, one axis
-    after another, and lands. What is fitted to them is told with 95 % intervals, in words, as a
-    picture, and as a scenario that flies by it at once. Without a fence in its scenario the vehicle
-    stays near where it began. Ctrl-C makes it land, and what was measured is kept.
+    after another, and lands. The fitted model is printed with 95 % intervals, drawn, and written as
+    a scenario that can be flown at once. If the scenario has no fence, the vehicle stays near its
+    starting point. Ctrl-C makes the vehicle land; its measurements are kept.
     """
     options = command.parse(
         IdentifyOptions(), argv, "skytether identify", identify.__doc__, leads=False
@@ -137,10 +139,10 @@ def identify(argv: Sequence[str]) -> None:
 
 
 def _asked(options: IdentifyOptions) -> tuple[Scenario, list[ExperimentPlan]]:
-    """The scenario with the kind of vehicle that is asked for, and what is to be flown with it.
+    """Scenario with the requested kind of vehicle, and the experiment to fly.
 
     Raises:
-        CommandError, ConfigError: it cannot be.
+        CommandError, ConfigError: the request cannot be flown.
     """
     table = reading.to_table(options.config)
     if options.kind:
@@ -160,7 +162,7 @@ def _size(scenario: Scenario, flag: str, given: Sequence[float]) -> tuple[float,
     """Size of step on each axis [m/s].
 
     Raises:
-        CommandError: it is none that can be flown.
+        CommandError: a size cannot be flown.
     """
     axes = scenario.model.axes
     if len(given) not in (1, axes):
@@ -176,13 +178,13 @@ def _size(scenario: Scenario, flag: str, given: Sequence[float]) -> tuple[float,
 
 
 def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
-    """Fly an experiment, in real time where the vehicle has hardware; what came of it.
+    """Fly an experiment, in real time if the vehicle has hardware; returns the results.
 
     Args:
         sets: whether parameters of its hardware may be set.
 
     Raises:
-        CommandError: its line cannot be opened.
+        CommandError: the connection to its hardware cannot be opened.
     """
     flies = vehicles.make(scenario, NUMBER)
     if sets and not flies.set_parameters():
@@ -213,7 +215,7 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
 
 
 def _doing(flight: Identifying) -> str:
-    """What a flight is at."""
+    """Present activity of a flight, in words."""
     if not flight.flown_s:
         return "on its way into the air"
     return f"{len(flight.experiment.steps)} steps" if not flight.is_over else "landing"
@@ -235,10 +237,10 @@ def _virtually(flight: Identifying, show: Callable[[], None]) -> None:
 
 
 def _really(flight: Identifying, scenario: Scenario, show: Callable[[], None]) -> None:
-    """Fly in real time, over the line to the vehicle's hardware.
+    """Fly in real time, over the connection to the vehicle's hardware.
 
     Raises:
-        CommandError: the line cannot be opened.
+        CommandError: the connection cannot be opened.
     """
     line = parse_line("vehicle.address", scenario.vehicle.address)
     try:
@@ -252,11 +254,11 @@ def _say(line: Event | str) -> None:
     print(line, file=sys.stderr)
 
 
-# -- what came of it -------------------------------------------------------------------------
+# -- results ---------------------------------------------------------------------------------
 
 
 def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlown]) -> None:
-    """Write what was measured and what it came to, and print it."""
+    """Write and print measurements and results."""
     first, out = flown[0], options.out
     costs = _costs(flown) if len(flown) > 1 else []
     told = IdentificationTold(
@@ -286,7 +288,7 @@ def _all_told(flown: SizeFlown) -> list[AxisTold]:
 
 
 def _measured(flight: Identifying, axes: int) -> str:
-    """All that was measured, and the input that was flown then, as CSV text."""
+    """All measurements, each with the input in force, as CSV text."""
     names = AXES[:axes]
     header = ["time_s", *(f"{what}_{name}" for what in ("p", "v", "u") for name in names)]
     inputs, nothing, rows, at = flight.inputs, [None] * axes, [], 0
@@ -301,7 +303,7 @@ def _measured(flight: Identifying, axes: int) -> str:
 
 
 def _table(flown: SizeFlown) -> Table:
-    """Numbers of each axis, as a table."""
+    """Model of each axis, as a table."""
     table = Table(title="first order with dead time, 95 % intervals", title_justify="left")
     heading = ("axis", "step [m/s]", "steps", "gain", "time constant [s]", "dead time [s]")
     for each in (*heading, "left over, rms", "largest"):
@@ -317,7 +319,7 @@ def _table(flown: SizeFlown) -> Table:
 
 
 def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
-    """Largest difference from the steps of the size asked for, by models of each size."""
+    """Largest errors, for the requested size of step, of models identified at each size."""
     measured = [axis.responses for axis in flown[0].axes]
 
     def off(model: Fit | None, axis: int) -> float:
@@ -335,7 +337,7 @@ def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
 
 
 def _cost_table(flown: Sequence[SizeFlown], costs: Sequence[dict[str, float]]) -> Table:
-    """What a wrong size of step costs, as a table."""
+    """Table of the errors of models identified at other sizes of step."""
     table = Table()
     for each in ("model of [m/s]", *costs[0]):
         table.add_column(Text(each))
@@ -346,10 +348,10 @@ def _cost_table(flown: Sequence[SizeFlown], costs: Sequence[dict[str, float]]) -
 
 
 def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: SizeFlown) -> None:
-    """Write the scenario that flies by what was identified, and see that it can be flown.
+    """Write the scenario with the identified model, and check that it can be flown.
 
     Raises:
-        CommandError: there is none, or it cannot.
+        CommandError: there is no model, or the scenario cannot be flown.
     """
     base = reading.load(options.scenario)
     text = outcome.scenario_text(scenario, options.scenario, base, flown.axes)

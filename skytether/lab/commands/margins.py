@@ -1,4 +1,4 @@
-"""`skytether margins`: whether a scenario's loop is stable, and with which vehicles."""
+"""`skytether margins`: stability of a scenario's loop, and the vehicles for which it holds."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -35,42 +35,44 @@ class MarginsOptions:
     scenario: ScenarioName = "demo"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
     runs: Annotated[int, tyro.conf.arg(metavar="N")] = 16
-    """Number of flights whose timing is taken, with seeds that count up from the scenario's."""
+    """Number of flights whose packet timing is used, with seeds that count up from the
+    scenario's."""
     json: Path | None = None
     """File for the figures."""
     maps: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Folder for maps, which are flown: for each vehicle of a box whether it comes to rest without
-    wind. The same command goes on with what the folder holds."""
+    """Folder for maps, made by flights: for each vehicle of a box, whether it comes to rest without
+    wind. The same command continues with the folder's results."""
     tau: tuple[float, ...] = (0.5, 1.0, 2.0)
-    """Time constants of the box, over those of the model."""
+    """Time constants of the box, relative to the model's."""
     gain: tuple[float, ...] = (0.7, 1.0, 1.3)
-    """Gains of the box, over those of the model."""
+    """Gains of the box, relative to the model's."""
     dead_time: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
-    """Dead times of the box, less those of the model [s]."""
+    """Dead times of the box, minus the model's [s]."""
     burst: tuple[float, ...] = (0.0, 2.0)
-    """Mean lengths of bursts of loss, both ways, of the box [s]."""
+    """Mean burst lengths of loss in the box, both ways [s]."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
 
 
 def margins(argv: Sequence[str]) -> None:
-    """Say whether a scenario's loop is stable, computed for it and for vehicles that differ.
+    """Compute whether a scenario's loop is stable, for its own vehicle and for others.
 
-    Where no bound is active the loop is linear, given which packet arrives when. Along the timing
-    of some flights it is computed how the square of a push, on average, dies away, which tells
+    While no bound is active, the loop is linear for a given timing of packets. Along the timings of
+    some flights, the decay of the mean square after a disturbance is computed:
 
-      growth   of that at each step; below 1 the loop is stable in the mean square
+      growth   of the mean square per step; below 1 the loop is stable in the mean square
       RMS      of the position's deviation, under the scenario's white wind and noise alone
-      bound    share of the steps at which an input would lie beyond its bound: where it is more
-               than some percent, the loop is not linear, and RMS is less than what is flown
+      bound    share of the steps at which an input would exceed its bound: above some percent
+               the loop is not linear, and the true RMS is larger
 
-    The server plans with the scenario's model. The vehicle is the scenario's own in the first row;
-    in the others it differs as they say, which shows how far the model may be wrong. Of a trigger
-    that looks at the state the loop is not linear; it is computed for a packet as often.
+    The server plans with the scenario's model. The first row has the scenario's own vehicle; in the
+    other rows the vehicle differs as stated, which shows how wrong the model may be. With a trigger
+    that looks at the state the loop is not linear; then a periodic trigger with the same rate is
+    used.
 
     With --maps FOLDER every vehicle of a box is flown as well, without wind: FOLDER/points.csv has
-    a row for each, FOLDER/maps.png shows where it ends in a limit cycle, and its RMSE. The box of
-    72 vehicles takes some minutes; --tau, --gain, --dead-time and --burst set another.
+    a row for each, FOLDER/maps.png shows where the flight ends in a limit cycle, and the RMSE. The
+    box of 72 vehicles takes some minutes; --tau, --gain, --dead-time and --burst set another.
     """
     options = command.parse(MarginsOptions(), argv, "skytether margins", margins.__doc__)
     command.check_count("--runs", options.runs, 1000)
@@ -113,11 +115,11 @@ def margins(argv: Sequence[str]) -> None:
 
 
 def _box(options: MarginsOptions, trigger: str) -> Box:
-    """The box that the options describe.
+    """Box given by the options.
 
     Raises:
-        CommandError: it is empty, or too large.
-        ConfigError: one of its values is none that a vehicle or a network can have.
+        CommandError: the box is empty, or too large.
+        ConfigError: a value is impossible for a vehicle or a network.
     """
     box = Box(
         options.scenario,
@@ -136,7 +138,7 @@ def _box(options: MarginsOptions, trigger: str) -> Box:
 
 
 def _map(options: MarginsOptions, folder: Path, trigger: str) -> None:
-    """Fly the points of the box that are not flown yet; write and print what came of all."""
+    """Fly the missing points of the box; write and print the results of all."""
     box = _box(options, trigger)
     count = len(box.places)
     title = f"flying vehicles like {options.scenario}'s"

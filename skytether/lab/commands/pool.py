@@ -1,4 +1,4 @@
-"""Who flies the flights of sweeps and searches: processes of this machine, or a Dask cluster."""
+"""Workers for the flights of sweeps and searches: processes of this machine, or a Dask cluster."""
 
 import multiprocessing
 import os
@@ -38,9 +38,9 @@ from skytether.shell.plugins import Plugin
 from skytether.shell.workers import die_with_parent
 
 UNDER_WAY_MAX = 256
-"""Largest number of tasks handed out at once: more than any machine has cores."""
+"""Most tasks handed out at once: more than any machine has cores."""
 POLL_S = 0.2
-"""Time after which Ctrl-C is noticed [s]."""
+"""Interval at which Ctrl-C is checked [s]."""
 CONNECT_S = 10.0
 """Time that a scheduler may take to answer [s]."""
 
@@ -53,16 +53,16 @@ class Flags:
     """Options of every command that has a pool."""
 
     workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Number of processes that fly; one for each core unless given."""
+    """Number of worker processes; one per core unless given."""
     scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
-    """Address of a Dask scheduler whose workers fly instead of processes of this machine."""
+    """Address of a Dask scheduler, whose workers fly instead of processes of this machine."""
     plugin: command.Plugins = ()
 
     def check(self) -> None:
-        """Refuse options that cannot be.
+        """Refuse impossible options.
 
         Raises:
-            CommandError: with what would do.
+            CommandError: with the values that are accepted.
         """
         if self.workers is not None:
             command.check_count("--workers", self.workers, 1024)
@@ -74,7 +74,7 @@ PoolFlags = Annotated[Flags, tyro.conf.arg(name="")]
 
 
 class Interrupted(CommandError):
-    """Ctrl-C, after which the same command goes on."""
+    """Error: interrupted by Ctrl-C; the same command continues the work."""
 
     def __init__(self, done: float, total: float, unit: str) -> None:
         said = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
@@ -83,7 +83,7 @@ class Interrupted(CommandError):
 
 @dataclass(slots=True)
 class Spent:
-    """What was flown by this command."""
+    """Resources used by this command."""
 
     cpu_s: float = 0.0
     """CPU time of the workers [s]."""
@@ -95,29 +95,29 @@ class Spent:
 
 @dataclass(slots=True)
 class Crew:
-    """Workers, and a bar that shows how far they are."""
+    """Workers, with a progress bar."""
 
     executor: Executor
     bar: Bar
     total: float
-    """Amount of work that there is, what is done with it."""
+    """Amount of work in total, in the unit."""
     unit: str
-    """What the work is counted in."""
+    """Unit of the work."""
     interrupted: Callable[[], bool]
     done: float = 0.0
-    """Amount of work that is done."""
+    """Amount of finished work."""
     spent: Spent = field(default_factory=Spent)
 
     def advance(self, amount: float, text: str = "") -> None:
-        """Count work that is done, and show it."""
+        """Count finished work, and show it."""
         self.done += amount
         self.bar(self.done, text)
 
     def fly(self, plan: Sweep, journal: Journal[Done], text: str = "") -> None:
-        """Fly what is not done of a sweep.
+        """Fly the missing tasks of a sweep.
 
         Args:
-            text: what the bar says meanwhile.
+            text: text of the bar.
 
         Raises:
             CommandError: interrupted, or a worker has died.
@@ -138,7 +138,7 @@ class Crew:
         self.share(partial(work, files=journal.files), todo, keep)
 
     def flown(self, plan: Sweep, folder: Path, text: str) -> Results:
-        """All results of a sweep, after what was missing has been flown; see `fly`.
+        """All results of a sweep, after flying the missing tasks; see `fly`.
 
         Args:
             folder: folder of the sweep's journal.
@@ -150,10 +150,10 @@ class Crew:
     def search(
         self, search: Search, journal: Journal[Generation], generations: int, text: str = ""
     ) -> list[SearchPoint]:
-        """All points of a search, after what was missing has been flown.
+        """All points of a search, after flying the missing ones.
 
         Args:
-            text: what the bar says before the best score.
+            text: text of the bar, before the best score.
 
         Raises:
             CommandError: interrupted, or a worker has died.
@@ -172,7 +172,7 @@ class Crew:
         return points
 
     def map(self, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
-        """Results of a function for all items, in their order; see `share`."""
+        """Results of a function for all items, in order; see `share`."""
         results: dict[int, R] = {}
         self.share(function, items, results.__setitem__)
         return [results[number] for number in range(len(items))]
@@ -180,13 +180,13 @@ class Crew:
     def share(
         self, function: Callable[[T], R], items: Sequence[T], on_done: Callable[[int, R], None]
     ) -> None:
-        """Have a function done for all items, in any order.
+        """Run a function for all items in the workers, in any order.
 
         Args:
             on_done: called with the number of an item and its result.
 
         Raises:
-            CommandError: interrupted, a worker has died, or the cluster has gone.
+            CommandError: interrupted, a worker has died, or the cluster is lost.
         """
         waiting = iter(enumerate(items))
         equipped = partial(_equipped, function, plugins.loaded())
@@ -213,12 +213,12 @@ class Crew:
 
 @contextmanager
 def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator[Crew]:
-    """A crew, with a bar on stderr; Ctrl-C ends its work in order.
+    """Workers with a bar on stderr; Ctrl-C ends their work in order.
 
     Args:
-        total: amount of work that there is, what is done with it, in the unit.
+        total: amount of work in total, including finished work, in the unit.
     """
-    if not flags.scheduler:  # or each worker would compile all of them
+    if not flags.scheduler:  # compile now: otherwise each worker would compile all kernels
         command.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
@@ -230,10 +230,10 @@ def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator
 
 @contextmanager
 def writing(out: Path) -> Iterator[None]:
-    """Name the file or folder that cannot be written, in one line.
+    """Turn an OSError within the block into one line that names the file or folder.
 
     Raises:
-        CommandError: something within it raised an OSError.
+        CommandError: the block raised an OSError.
     """
     try:
         yield
@@ -243,7 +243,7 @@ def writing(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Keep Ctrl-C, which is for the command alone, from workers that are started within it."""
+    """Start workers with SIGINT ignored: Ctrl-C is for the command alone."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -252,17 +252,17 @@ def _deaf() -> Iterator[None]:
 
 
 def _equipped(function: Callable[[T], R], plugged: tuple[Plugin, ...], item: T) -> R:
-    """Result of a function for an item; called in a worker, which is given the plug-ins first.
+    """Result of a function for an item; called in a worker, which first loads the plug-ins.
 
-    They come with their content: a worker may be on another machine, or be started later, and
-    nothing that is written into a file meanwhile is flown.
+    Plug-ins are passed with their content: a worker may be on another machine, or be started later,
+    and edits of a file after the start must have no effect.
     """
     plugins.use(plugged)
     return function(item)
 
 
 def work(task: FlightTask, files: Mapping[str, str]) -> tuple[Done, float]:
-    """What came of a task, and the CPU time that it took [s]; called in a worker.
+    """Result of a task, and its CPU time [s]; called in a worker.
 
     Args:
         files: see `pinned`.
@@ -284,13 +284,13 @@ def _fly_point(
 
 @contextmanager
 def pinned(scenario: Scenario, files: Mapping[str, str]) -> Iterator[Scenario]:
-    """A scenario that refers to a copy of its file, which nobody edits while it is flown.
+    """Scenario that refers to a copy of its trajectory's file, so that later edits have no effect.
 
     Args:
-        files: digest that each file must have, by its path; others are left as they are.
+        files: expected digest of each file, by its path; other files are not copied.
 
     Raises:
-        ConfigError: the file has changed since the work began, or is another one on this machine.
+        ConfigError: the file has changed since the work began, or differs on this machine.
     """
     reference = scenario.reference
     if reference.shape not in TABLES or reference.file not in files:
@@ -316,7 +316,7 @@ def _executor(flags: Flags) -> AbstractContextManager[Executor]:
 
 @contextmanager
 def _processes(count: int) -> Iterator[Executor]:
-    """Processes of this machine, a core each; at the end none of them goes on."""
+    """Worker processes on this machine, one per core; all have ended at the end of the block."""
     for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
     pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _start, (os.getpid(),))
@@ -330,15 +330,15 @@ def _processes(count: int) -> Iterator[Executor]:
 
 
 def _start(parent: int) -> None:
-    """Begin a worker, which ends with the command."""
+    """Initialise a worker, which ends with the command."""
     die_with_parent()
-    if os.getppid() != parent:  # it was gone before
+    if os.getppid() != parent:  # the command had ended before
         os._exit(1)
 
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler."""
+    """Workers of a Dask scheduler."""
     from distributed import Client
 
     try:

@@ -1,4 +1,4 @@
-"""The folder of a report: its page, each table and figure beside it, and the calls that made it."""
+"""Folder of a report: its page, each table and figure, and the commands that made it."""
 
 import contextlib
 import json
@@ -27,32 +27,32 @@ from skytether.shell import command
 PAGE = "report.html"
 """File of the page."""
 CALLS = "calls.jsonl"
-"""File with a line for each call that has added to the folder, or drawn it anew."""
+"""File with a line for each command that added to the folder, or drew it again."""
 PACKAGES = ("skytether", "numpy", "scipy", "numba", "daqp", "msgpack", "matplotlib")
-"""Packages whose versions the page names."""
+"""Packages whose versions are on the page."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandCall:
-    """A command under way."""
+    """Command that is running."""
 
     command: str
     """Command line."""
     began: datetime
     """Time of day at which the command began."""
     began_s: float
-    """Time at which the command began, on a clock that nobody sets [s]."""
+    """Time at which the command began, on a monotonic clock [s]."""
 
     @classmethod
     def now(cls, name: str, argv: Sequence[str]) -> "CommandCall":
-        """A call of the command of this name, which begins now."""
+        """Call of the command with this name, which begins now."""
         return cls(shlex.join(["skytether", name, *argv]), datetime.now(UTC), time.monotonic())
 
     def facts(self, runs: int) -> dict[str, Any]:
         """Facts about the call for a reader of the report, as plain values.
 
         Args:
-            runs: number of flights that were flown.
+            runs: number of flights flown by the call.
         """
         return {
             "command": self.command,
@@ -71,7 +71,7 @@ def write(out: Path, drawn: Drawn, scenario: Scenario, call: CommandCall, runs: 
     """Write all files of a report.
 
     Args:
-        scenario: what the report is about.
+        scenario: scenario of the report.
         runs: number of flights flown by this call.
 
     Raises:
@@ -110,7 +110,7 @@ def _processor() -> str:
 
 
 def _commit() -> str | None:
-    """Commit of the checkout that this runs from; None where it is no checkout."""
+    """Commit of the checkout that this code runs from; None without a checkout."""
     with contextlib.suppress(OSError):
         run = subprocess.run(
             ["git", "describe", "--always", "--abbrev=12", "--dirty"],

@@ -1,4 +1,4 @@
-"""`skytether reproduce`: the paper's table and figures, and more, flown and put in a report."""
+"""`skytether reproduce`: fly the paper's table and figures, and more, and write a report."""
 
 import io
 import json
@@ -40,18 +40,18 @@ class ReproduceOptions:
     """Number of flights of each column of Table 1; each point of a curve has half as many, each
     cell of Fig. 5 a quarter."""
     out: Path = Path("results")
-    """Folder for the report; the same command goes on with what it holds."""
+    """Folder for the report; the same command continues there."""
     quick: bool = False
-    """Take a first look, in under a minute: few flights, coarse grids."""
+    """Fly only a first look, in under a minute: few flights, coarse grids."""
     pool: PoolFlags = Flags()
 
 
 def reproduce(argv: Sequence[str]) -> None:
-    """Fly the paper's Table 1 and Figures 2 to 5, and what the literature asks for besides.
+    """Reproduce the paper's Table 1 and Figures 2 to 5, and further studies that are usual.
 
-    OUT/report.html has all of it, and opens anywhere; every figure is in OUT as PNG, PDF and CSV.
-    Flights over real UDP stand beside those in virtual time. Everything flown is kept: after
-    Ctrl-C, or a crash, the same command goes on; once all is flown, it only draws anew.
+    OUT/report.html has all results, and opens offline; every figure is in OUT as PNG, PDF and CSV.
+    Flights over real UDP stand beside those in virtual time. All flights are kept: after Ctrl-C or
+    a crash, the same command continues; after the last flight, it only draws the report again.
     """
     options = read(ReproduceOptions(), argv, "skytether reproduce", reproduce.__doc__)
     command.check_count("--runs", options.runs, 100_000)
@@ -73,7 +73,7 @@ def reproduce(argv: Sequence[str]) -> None:
 def _measure(
     options: ReproduceOptions, scenario: Scenario, scale: ReproductionSize
 ) -> tuple[Reproduction, int]:
-    """All flights, those done before with them, and the number of those flown now."""
+    """All flights, including earlier ones, and the number of those flown now."""
     table = studies.table_study(scenario, scale)
     curves = studies.curve_studies(scenario, scale)
     maps, periods = studies.map_sweep(scenario, scale), studies.period_sweep(scenario, scale)
@@ -81,10 +81,10 @@ def _measure(
     total = points * (len(studies.METHODS.values) + 1)
     total += maps.flights + periods.flights
     sweeps = options.out / "sweeps"
-    # Another reproduction's folder is refused before anything is flown.
+    # A folder of another reproduction is refused before anything is flown.
     Journal(sweeps / table.name, table.first().settings(), Done).close()
     command.prepare(kernel.missing())
-    # First what is measured on the clock, while nobody else needs the cores.
+    # Real-time measurements come first, while the cores are idle.
     delay_ms = _delays(options.out, scenario, scale)
     real = {method: _really(options.out, table, method, scale) for method in (EVERY, EVENT)}
     with crew(options.pool, "reproducing", total) as flyers:
@@ -114,7 +114,7 @@ def _fly_study(flyers: Crew, out: Path, study: Study, title: str) -> Cells:
 
 
 def _delays(out: Path, scenario: Scenario, scale: ReproductionSize) -> Array:
-    """Time that packets take through netem, as `delays.measure` returns it [ms]."""
+    """Delays of packets through netem, as returned by `delays.measure` [ms]."""
     file = out / "delays.npy"
     if not file.exists():
         folder = out / "netem"
@@ -129,7 +129,7 @@ def _delays(out: Path, scenario: Scenario, scale: ReproductionSize) -> Array:
 
 
 def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> report.Real:
-    """A flight over UDP, with the scenario's seed; flown unless it was before."""
+    """Flight over UDP, with the scenario's seed, unless it was flown before."""
     plan = table.first()
     scenario = plan.scenario_of(scale.real_s, method)
     folder = out / "real" / method.replace(" ", "-")
@@ -157,7 +157,7 @@ def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> re
 def _samples(
     out: Path, table: Study, table_cells: Cells, scale: ReproductionSize
 ) -> Mapping[str, tuple[Scenario, Sequence[Record]]]:
-    """Scenario and a few flights in virtual time with their whole records, by method."""
+    """Scenario and some complete records of flights in virtual time, by method."""
     steps = table_cells[table.here, PERIODIC].period
     samples = {}
     for method in (*studies.METHODS.values, PERIODIC):

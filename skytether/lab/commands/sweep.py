@@ -20,7 +20,7 @@ from skytether.shell import command
 from skytether.shell.command import ScenarioFlags, ScenarioName
 
 DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
-"""Figures of which a picture is drawn, and their labels."""
+"""Figures that are drawn, and their labels."""
 SHOWN = {
     "rmse_xy": ("RMSE xy [m]", ".4f"),
     "event_ratio": ("event ratio", ".4f"),
@@ -34,14 +34,14 @@ class SweepOptions:
     """Options of `skytether sweep`."""
 
     out: Path
-    """Folder for the results; the same command goes on with what it holds."""
+    """Folder for the results; the same command continues there."""
     scenario: ScenarioName = "paper"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
     grid: Annotated[
         tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUES")
     ] = ()
-    """A key of the scenario and its values: KEY=START:STOP:COUNT, evenly spaced, or KEY=A,B,C.
-    Several grids make all combinations of their values."""
+    """Key of the scenario and its values: KEY=START:STOP:COUNT, evenly spaced, or KEY=A,B,C.
+    Several grids give all combinations of their values."""
     runs: Annotated[int, tyro.conf.arg(metavar="N")] = 50
     """Number of flights of each combination, with seeds that count up from the scenario's."""
     pool: PoolFlags = Flags()
@@ -52,8 +52,8 @@ def sweep(argv: Sequence[str]) -> None:
     """Fly a scenario many times in virtual time, for every combination of some keys' values.
 
     OUT/runs.csv has a row for each flight, OUT/cells.csv one for each combination, with means and
-    95 % intervals; for one key or two there are pictures as well. Everything flown is kept: after
-    Ctrl-C, or a crash, the same command goes on, and the tables have the same bytes in the end,
+    95 % intervals; for one key or two there are pictures as well. All flights are kept: after
+    Ctrl-C or a crash, the same command continues. The resulting tables are equal, byte for byte,
     for any number of workers.
     """
     options = command.parse(SweepOptions(tyro.MISSING), argv, "skytether sweep", sweep.__doc__)
@@ -72,7 +72,7 @@ def sweep(argv: Sequence[str]) -> None:
 
 
 def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: Spent) -> None:
-    """Write and print the tables and pictures of a sweep that is whole."""
+    """Write and print the tables and pictures of a complete sweep."""
     files = ["runs.csv", "cells.csv"]
     done = results(journal.entries)
     write(options.out / "runs.csv", plan.runs_csv(done).encode())

@@ -1,4 +1,4 @@
-"""`skytether torture`: sealed flights through faults and attacks, and what must hold meanwhile."""
+"""`skytether torture`: encrypted flights through faults and attacks, with checked invariants."""
 
 import math
 import secrets
@@ -34,29 +34,30 @@ class TortureOptions:
     """Options of `skytether torture`."""
 
     seed: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """First seed; another each time unless given."""
+    """First seed; random unless given."""
     count: Annotated[int, tyro.conf.arg(metavar="N")] = 100
     """Number of flights, with seeds that count up."""
     hours: Annotated[float | None, tyro.conf.arg(metavar="H")] = None
-    """Number of hours to be flown instead, in flights of an hour with faults all along."""
+    """Number of hours to fly instead, in flights of an hour with faults throughout."""
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Number of processes that fly; one for each core unless given."""
+    """Number of worker processes; one per core unless given."""
     replay: Path | None = None
-    """File with a schedule in each line, to be flown instead of what is drawn from seeds."""
+    """File with one schedule per line, flown instead of random ones."""
     schedule: str | None = None
-    """Schedule to be flown instead, as a failure prints it."""
+    """Schedule to fly instead of random ones, as printed for a failure."""
     json: Path | None = None
-    """File for what was flown and counted, and for the failures."""
+    """File for the counters, and for the failures."""
 
 
 def torture(argv: Sequence[str]) -> None:
-    """Fly server, netem and clients in virtual time, sealed, and do all that is bad to them.
+    """Fly server, netem and clients in virtual time, encrypted, under random faults and attacks.
 
-    Packets are lost, doubled, held back, changed, recorded and sent again; hosts freeze, restart,
+    Packets are lost, duplicated, delayed, altered, recorded and replayed; hosts freeze, restart,
     and set their clocks; the solver fails, the server is overloaded, strangers flood. At each step
-    of each vehicle it is checked that nothing unsafe is flown, and at the end that all fly again;
-    docs/torture.md has the list. The exit code is 1 where a flight failed: its schedule is then
-    shrunk to the shortest that fails in the same way, and printed; --schedule flies it again.
+    of each vehicle it is checked that nothing unsafe is flown, and at the end that all vehicles fly
+    again; docs/torture.md lists the invariants. If a flight fails, the exit code is 1, and its
+    schedule is shrunk to the shortest that fails in the same way, and printed; --schedule flies it
+    again.
     """
     options = read(TortureOptions(), argv, "skytether torture", torture.__doc__)
     command.check_count("--count", options.count, 10**6)
@@ -90,11 +91,11 @@ def torture(argv: Sequence[str]) -> None:
 
 
 def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
-    """Trials that are asked for, and what they are called.
+    """Trials to fly, and their name for the output.
 
     Raises:
-        CommandError: they cannot be, or not together.
-        ConfigError: a schedule is none.
+        CommandError: the options are impossible, or exclude each other.
+        ConfigError: a text is no schedule.
     """
     asked = ("seed", "hours", "replay", "schedule")
     given = [name for name in asked if getattr(options, name) is not None]
@@ -121,11 +122,11 @@ def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
 
 
 def _read(path: Path) -> list[Trial]:
-    """Trials in a file, one a line; a line that begins with # is none.
+    """Trials in a file, one per line; lines that begin with # are comments.
 
     Raises:
         CommandError: the file cannot be read.
-        ConfigError: a line is no schedule, or there is none.
+        ConfigError: a line is no schedule, or the file has none.
     """
     try:
         lines = path.read_text().splitlines()
@@ -140,7 +141,7 @@ def _read(path: Path) -> list[Trial]:
 def _finish(
     options: TortureOptions, title: str, done: Sequence[Outcome], failed: list[Outcome]
 ) -> None:
-    """Write and print what was flown, and what failed."""
+    """Write and print the counters and the failures."""
     counts: Counter[str] = Counter()
     for outcome in done:
         counts.update(outcome.counts)

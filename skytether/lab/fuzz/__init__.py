@@ -1,6 +1,6 @@
-"""Fuzzing: whatever bytes others send or write, only the documented error comes of it.
+"""Fuzzing: arbitrary bytes from outside may only raise the documented error.
 
-A target (`lab.fuzz.target`) takes bytes and raises where a promise is broken; `lab.fuzz.targets`
-lists all of them, with what each changes in an input that is right. `python -m skytether.lab.fuzz`
-gives them inputs, guided by coverage where atheris is installed.
+A target (`lab.fuzz.target`) takes bytes, and raises if a guarantee is broken; `lab.fuzz.targets`
+lists all targets, each with its own mutations of valid inputs. `python -m skytether.lab.fuzz` feeds
+them inputs, guided by coverage if atheris is installed.
 """

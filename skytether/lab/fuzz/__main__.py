@@ -1,4 +1,4 @@
-"""Fuzzing as a command: guided by coverage with atheris; without it, or by number, random."""
+"""Fuzzing as a command: guided by coverage with atheris; random without it, or with --count."""
 
 import argparse
 import multiprocessing
@@ -20,24 +20,25 @@ except ImportError:
     atheris = None
 
 LOOK_EVERY = 100
-"""Number of inputs from one look at the clock to the next."""
+"""Number of inputs between two checks of the time."""
 GUIDED_SHARE = 0.5
-"""Share of inputs that a target changes itself, by what it knows of them; atheris the others."""
+"""Share of inputs that a target mutates itself, by its knowledge of the format; atheris makes the
+rest."""
 SHM = Path("/dev/shm")
-"""Place for files that are written again and again."""
+"""Folder in memory for files that are rewritten often."""
 
 
 def memory_mb() -> float:
-    """Most memory that this process has had [MB]."""
+    """Peak memory of this process [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> str:
-    """Give random inputs to a target; returns what happened, as a sentence.
+    """Feed random inputs to a target; returns the result, as a sentence.
 
     Args:
         name: name of the target.
-        folder: place for its files.
+        folder: folder for its files.
         seed: seed of the inputs.
         count: most inputs.
         seconds: longest time [s].
@@ -53,21 +54,22 @@ def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> st
                 print(f"{name}, seed {seed}, input {done}: {payload.hex()}", file=sys.stderr)
                 raise
             done += 1
-        before_mb = before_mb or memory_mb()  # whatever is made once is there now
+        before_mb = before_mb or memory_mb()  # allocations made once are complete by now
     took_s, grown_mb = time.monotonic() - begin_s, memory_mb() - before_mb
     return f"{told(name, done, took_s)}, seed {seed}, no fault, {grown_mb:.1f} MB grown"
 
 
 def told(name: str, done: int, took_s: float) -> str:
-    """Number of inputs that a target had, and their rate."""
+    """Number of inputs that a target had, and their rate, in words."""
     return f"{name}: {done} inputs in {took_s:.0f} s, {done / took_s:.0f} per s"
 
 
 def guided(name: str, folder: Path, seconds: float) -> str:
-    """Let atheris search from a target's seeds, in a process of its own; returns what happened.
+    """Let atheris search from a target's seeds, in another process; returns the result, as a
+    sentence.
 
     Raises:
-        SystemExit: with 1, where it has found a fault.
+        SystemExit: with 1, if it has found a fault.
     """
     done = multiprocessing.RawValue(c_longlong, 0)
     child = multiprocessing.get_context("fork").Process(
@@ -110,7 +112,7 @@ def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
 
 
 def main() -> None:
-    """Fuzz for a time, or by number."""
+    """Run targets for a time, or a number of inputs."""
     parser = argparse.ArgumentParser(prog="python -m skytether.lab.fuzz", description=main.__doc__)
     parser.add_argument("--target", choices=TARGETS, help="what is fuzzed; left out: all")
     parser.add_argument(

@@ -1,4 +1,6 @@
-"""Datagrams as targets: the decoder, and a server and a client in flight, with keys or without."""
+"""Targets for datagrams: the decoder, and a server and a client in flight, with and without
+keys.
+"""
 
 from collections.abc import Hashable, Sequence
 from math import isfinite
@@ -36,33 +38,35 @@ SCENARIOS = (
     ),
     reading.check({"control": {"scheme": "trajectory", "trigger": "expected_gap"}}, "fuzz"),
 )
-"""A flight in the plane with committed inputs, one in space with feedback aboard, and one along
-trajectories."""
+"""Scenarios: a flight in the plane with committed inputs, one in 3-D with feedback aboard, and one
+along trajectories."""
 
 KNOWN = (*corpus().values(), *(seed for each in SCENARIOS for seed in seeds(each.terms())))
-"""Odd payloads, and a message of each type."""
+"""Odd payloads, and one message of each type."""
 
 STEP_NS = MILLISECOND_NS
-"""Time that passes in a flight from one payload to the next [ns]."""
+"""Time that passes in a flight between two payloads [ns]."""
 LIFE = 10_000
-"""Number of payloads after which a flight begins anew."""
+"""Number of payloads after which a flight starts again."""
 
 
 class Datagrams(Target):
-    """Something that takes datagrams, or what is sealed in them."""
+    """Target that takes datagrams, or the content of encrypted ones."""
 
     def seeds(self) -> Sequence[bytes]:
-        """Messages of each type, and odd ones."""
+        """Messages of each type, and odd payloads."""
         return KNOWN
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """A payload with another value in its fields, or with other bytes."""
+        """Payload with a changed field, or with changed bytes."""
         change = fields_changed if rng.random() < 0.5 else bytes_changed
         return change(rng, payload)
 
 
 class Decoder(Datagrams):
-    """Decoder with the terms of a scenario: a payload is none of ours, or a message that keeps."""
+    """Decoder with the terms of a scenario: it rejects a payload, or returns a message that
+    re-encodes.
+    """
 
     code = (protocol,)
 
@@ -80,12 +84,12 @@ class Decoder(Datagrams):
 
 
 class EndpointInFlight(Datagrams):
-    """A server and a client that fly a scenario, and hear a payload each beside their own.
+    """Server and client in flight, which each receive a payload besides their own messages.
 
     Args:
-        scenario: what to fly.
-        sealed: whether they have keys; then each payload is sealed by the other end, as a faulty
-            peer would, and stands behind all that keeps strangers out.
+        scenario: scenario to fly.
+        sealed: whether they have keys; then each payload is encrypted by the other end, as by a
+            faulty peer, and so passes all checks against strangers.
     """
 
     code: Sequence[ModuleType] = (
@@ -100,7 +104,7 @@ class EndpointInFlight(Datagrams):
     def __init__(self, scenario: Scenario, *, sealed: bool = False) -> None:
         self._scenario = scenario
         self._keyring = make_keys(1, 2) if sealed else None
-        # Goes on from flight to flight: none has the keys of an earlier one.
+        # Continues from flight to flight, so that no flight has the keys of an earlier one.
         self._entropy = stream(1, "entropy").bytes
         self._begin()
 
@@ -108,9 +112,9 @@ class EndpointInFlight(Datagrams):
         scenario = self._scenario
         self._now_ns = SECOND_NS
         self.heard = 0
-        """Number of payloads heard since the flight began."""
+        """Number of payloads received since the flight began."""
         self.newest: dict[Hashable, bytes] = {}
-        """Newest of their own datagrams of each kind."""
+        """Newest datagram of each kind that the two ends have sent."""
         self._vehicle = simulated(scenario, 1)
         entropy, keyring = self._entropy, self._keyring
         link = client_secure.SecureLink(keyring.of(1), entropy=entropy) if keyring else None
@@ -123,7 +127,7 @@ class EndpointInFlight(Datagrams):
             self._pass()
 
     def _pass(self) -> None:
-        """Let a step of time pass; what they send arrives at once."""
+        """Advance time by a step; datagrams arrive at once."""
         self._now_ns += STEP_NS
         ends = ((self.client, self.server, "client"), (self.server, self.client, "server"))
         for sender, receiver, name in ends:
@@ -137,7 +141,7 @@ class EndpointInFlight(Datagrams):
             assert len(sender.events()) <= EVENTS_MAX + 20
 
     def __call__(self, payload: bytes) -> None:
-        """Let both ends hear a payload."""
+        """Let both ends receive a payload."""
         if self.heard == LIFE or self.client.finished:
             self._begin()
         self.heard += 1
@@ -145,7 +149,9 @@ class EndpointInFlight(Datagrams):
         self._pass()
 
     def seeds(self) -> Sequence[bytes]:
-        """Messages of each type, odd ones, and twice as often the newest that the two have sent."""
+        """Messages of each type, odd payloads, and, twice as often, the newest that both ends have
+        sent.
+        """
         newest = list(self.newest.values())
         return (*KNOWN, *newest * (2 * len(KNOWN) // max(1, len(newest))))
 
@@ -158,7 +164,9 @@ class EndpointInFlight(Datagrams):
             self.newest[kind_of(payload)] = payload
 
     def _seal(self, end: Endpoint, payload: bytes) -> bytes:
-        """Datagram that brings a payload to an end, from the other one where they have keys."""
+        """Datagram that carries a payload to an end, encrypted by the other one if they have
+        keys.
+        """
         session = next(iter(self.server.sessions), None)
         if self._keyring is None or session is None:
             return payload

@@ -1,4 +1,4 @@
-"""Feeds as targets: what a process tells whoever looks on, and what a page makes of it."""
+"""Targets for feeds: decoding a process's feed, and showing it on a page."""
 
 import io
 from collections.abc import Sequence
@@ -18,19 +18,21 @@ from skytether.view.recording import About, Recording
 from skytether.view.state import State
 
 PIECES = 3
-"""Number of pieces in which a feed comes."""
+"""Number of pieces into which a feed is split."""
 EACH = 12
-"""Number of frames of a process and kind among the seeds."""
+"""Number of frames of each process and kind among the seeds."""
 LIFE = 300
-"""Number of feeds after which a page begins anew."""
+"""Number of feeds after which a page starts again."""
 ABOUT = About(scenario="demo", seed=1, version="1", began="", offset_ns=0, secure=False)
-"""What the recording says of itself."""
+"""Facts about the recording that the target writes."""
 POINTS = 50
 """Number of points of a drawn curve."""
 
 
 class FeedTarget(Text):
-    """Feed of a process, in pieces: it is none, as `FeedError` says, or frames that come back."""
+    """Target for a process's feed, in pieces: it raises `FeedError`, or decodes to frames that
+    re-encode.
+    """
 
     code: Sequence[ModuleType] = (feed,)
 
@@ -45,7 +47,7 @@ class FeedTarget(Text):
         super().__init__([*each, b"".join(each[:5])])
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """A feed with other bytes or words, the length of its first frame often made right."""
+        """Feed with changed bytes or words; the length of its first frame is often corrected."""
         if rng.random() < 0.5:
             changed = bytes_changed(rng, payload, self.largest)
         else:
@@ -56,7 +58,7 @@ class FeedTarget(Text):
         return changed
 
     def __call__(self, payload: bytes) -> None:
-        """Read it, whole and in pieces."""
+        """Decode the feed, at once and in pieces."""
         whole, size = read(payload), len(payload) // PIECES + 1
         pieces = [payload[size * i : size * (i + 1)] for i in range(PIECES)]
         assert read(*pieces) == whole, payload.hex()
@@ -68,7 +70,7 @@ class FeedTarget(Text):
 
 
 class PageTarget(FeedTarget):
-    """Page and recording of a flight: what its processes tell is refused, or shown and written."""
+    """Target for page and recording: frames of a feed are refused, or shown and written."""
 
     code = (recording, rows, state)
 
@@ -77,7 +79,7 @@ class PageTarget(FeedTarget):
         self._heard = LIFE
 
     def __call__(self, payload: bytes) -> None:
-        """Take the frames of a feed, as of any process; show what is known, and record it."""
+        """Take a feed's frames, as from any process; show the state, and record it."""
         if self._heard == LIFE:
             self._begin()
         self._heard += 1
@@ -113,7 +115,7 @@ class PageTarget(FeedTarget):
 
 
 def read(*pieces: bytes) -> list[Frame] | None:
-    """Frames of a feed; None where it is none."""
+    """Frames of a feed; None if the bytes are no feed."""
     reader = Reader()
     try:
         return [frame for piece in pieces for frame in reader.read(piece)]

@@ -1,4 +1,4 @@
-"""A short flight, for targets that take what a flight leaves behind."""
+"""Short flight, for targets that read the results of a flight."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from skytether.shared.telemetry.record import Record
 from skytether.sim.flight import fly
 
 SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=1.0, settle=0.0)
-"""What is flown."""
+"""Scenario that is flown."""
 
 
 @cache

@@ -1,8 +1,8 @@
-"""The handshake as a target: strangers without a key, and a peer that has one and errs.
+"""Targets for the handshake: strangers without a key, and a faulty peer with one.
 
-Nobody without a key gets in, whatever he sends to a server, to a client that waits for its first
-session, or to one that flies. Who has a vehicle's key gets in as this vehicle alone. What is kept
-of either of them is bounded, and no answer is longer than its question.
+No sender without a key is accepted, whatever it sends to a server, to a client that waits for its
+first session, or to one that flies. A holder of a vehicle's key is accepted only as this vehicle.
+The state kept for either is bounded, and no answer is longer than its request.
 """
 
 from collections.abc import Sequence
@@ -29,20 +29,22 @@ SERVER: Address = ("server", 0)
 CLIENT: Address = ("client", 0)
 STRANGER: Address = ("stranger", 6)
 NEWCOMER = 2
-"""Number of a vehicle that has a key, and no session yet."""
+"""Vehicle that has a key, and no session yet."""
 NEWCOMER_BOOT_ID = 2**51
 FIRST_BYTES = noise_nnpsk0.MESSAGE_BYTES + handshake.HELLO_BYTES_MAX + 1
 """Size of the first message of a handshake, with a HELLO and its padding [B]."""
 CHANNEL = 9
-"""Number of the channels that a key's holder makes."""
+"""Number of the channels that a key's holder opens."""
 HOLDER_STEP_NS = 250 * MILLISECOND_NS
-"""Time from one packet of a key's holder to the next [ns]: none is one too many."""
+"""Time between two packets of a key's holder [ns], so long that the rate limit never applies."""
 HOLDER_LIFE = 500
-"""Number of payloads after which a key's holder meets other ends."""
+"""Number of payloads after which a key's holder meets new ends."""
 
 
 class Strangers(EndpointInFlight):
-    """Raw datagrams to both ends of a sealed flight, and to a newcomer whom no server answers."""
+    """Target for raw datagrams to both ends of an encrypted flight, and to a vehicle that no server
+    answers.
+    """
 
     code = CODE
 
@@ -64,11 +66,11 @@ class Strangers(EndpointInFlight):
         assert self._session is not None
 
     def seeds(self) -> Sequence[bytes]:
-        """Packets of each type that the three have sent."""
+        """Packets of each type that the three ends have sent."""
         return list(self.newest.values())
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """A packet with another header or other bytes, or at times as it was."""
+        """Packet with another header or other bytes, or sometimes unchanged."""
         draw, head = rng.random(), channel.HEADER.size
         if draw < 0.1:
             return payload
@@ -78,11 +80,11 @@ class Strangers(EndpointInFlight):
         return bytes_changed(rng, payload)
 
     def _note(self, sender: str, payload: bytes) -> None:
-        if sender != "answer":  # a stranger who hands on all that both say is none who gets in
+        if sender != "answer":  # a stranger who forwards all packets of both ends is no intruder
             self.newest[sender, payload[1]] = payload
 
     def _attack(self, payload: bytes) -> None:
-        if self.newcomer.finished:  # it has given up
+        if self.newcomer.finished:  # the client has given up
             self._begin()
         due_ns = self.newcomer.next_wake_ns()
         if due_ns is not None and due_ns <= self._now_ns:
@@ -99,7 +101,9 @@ class Strangers(EndpointInFlight):
         assert self.newcomer._session.number is None, payload.hex()
 
     def _unheard(self, end: Server | Client, payload: bytes, peer: Address) -> None:
-        """Let an end hear what no peer of its own has sealed: it is dropped, or draws a cookie."""
+        """Let an end receive a datagram that its peer has not sealed: it is dropped, or answered by
+        a cookie.
+        """
         dropped = end.dropped.total()
         end.receive(Datagram(payload, peer), now_ns=self._now_ns)
         answers = end.outbox()
@@ -108,10 +112,11 @@ class Strangers(EndpointInFlight):
 
 
 class Holder(Datagrams):
-    """Holder of a vehicle's key, who seals whatever is given in packets of the handshake.
+    """Target for a holder of a vehicle's key, which seals arbitrary content in handshake packets.
 
-    The first byte of a payload chooses the packet: an INITIATION whose first message is noise or
-    carries the rest, a CHALLENGE, or a RESPONSE whose second message is noise or carries the rest.
+    The first byte of a payload chooses the packet: an INITIATION, a CHALLENGE, or a RESPONSE. The
+    rest of the payload is the handshake message of the INITIATION or RESPONSE, or is carried in a
+    valid one.
     """
 
     code = (*CODE, protocol)
@@ -140,19 +145,19 @@ class Holder(Datagrams):
         )
 
     def seeds(self) -> Sequence[bytes]:
-        """Packets of each kind, those that carry the rest with a message that belongs there."""
+        """Packets of each kind, those with content carrying a valid message."""
         terms = self._scenario.terms()
         hello = encode(Hello(NEWCOMER, NEWCOMER_BOOT_ID, terms))
         welcome = encode(Welcome(NEWCOMER, 7, NEWCOMER_BOOT_ID, 3, 10, 0, terms))
         return (b"\0" + hello, b"\1" + hello, b"\2" + bytes(16), b"\3" + welcome, b"\4" + welcome)
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """A payload of the same kind, or another one, with something changed in the rest."""
+        """Payload of the same kind, or another kind, with changed content."""
         kind = payload[:1] if rng.random() < 0.9 else rng.randbytes(1)
         return kind + super().mutated(rng, payload[1:])
 
     def __call__(self, payload: bytes) -> None:
-        """Say it to the end that it is for."""
+        """Send the packet to the end that it is meant for."""
         if self._heard == HOLDER_LIFE or self.client.finished:
             self._begin()
         self._heard += 1
@@ -182,7 +187,7 @@ class Holder(Datagrams):
         assert attempt is None or len(attempt.tried_ns) <= client_secure.COOKIES_MAX
 
     def _initiation(self, rest: bytes, *, carried: bool) -> bytes:
-        """INITIATION with a cookie that is right, and the rest as its message, or carried in it."""
+        """INITIATION with a valid cookie, whose message is the given content, or carries it."""
         key = self._key
         cookie = self._gate._cookie(CLIENT, self._now_ns // server_secure.COOKIE_NS)
         message = rest[:FIRST_BYTES].ljust(FIRST_BYTES)
@@ -193,7 +198,7 @@ class Holder(Datagrams):
         return handshake.write_initiation(key, cookie, message)
 
     def _answer(self, kind: int, rest: bytes) -> bytes | None:
-        """CHALLENGE or RESPONSE to the client's attempt; None where it makes none."""
+        """CHALLENGE or RESPONSE to the client's attempt; None if there is no attempt."""
         key, attempt = self._key, self._link._attempt
         if attempt is None:
             return None

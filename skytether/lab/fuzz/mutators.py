@@ -1,4 +1,4 @@
-"""Bytes that are nearly messages: real ones, odd ones, and both with something changed."""
+"""Mutations: valid messages, odd ones, and both with changes."""
 
 import re
 from collections.abc import Sequence
@@ -24,14 +24,14 @@ from skytether.shared.wire.protocol import (
 )
 
 CORPUS = Path(__file__).with_name("corpus.txt")
-"""Odd payloads: a line each, its name and its bytes in hexadecimal."""
+"""Odd payloads: one per line, its name and its bytes in hexadecimal."""
 
 TOKENS = re.compile(rb'"[^"\n]*"|[\w.+-]+|\s+|.', re.DOTALL)
-"""Tokens of a text: a string, a word or number, space, or any other letter."""
+"""Tokens of a text: a string, a word or number, white space, or any other character."""
 SMALL_TOKENS = re.compile(rb"\w+|\s+|.", re.DOTALL)
-"""Tokens of a text and of its strings and numbers."""
+"""Tokens of a text, also within strings and numbers."""
 DEEP = 20_000
-"""Depth to which lists are nested: deeper than any decoder goes."""
+"""Depth of nested lists, deeper than any decoder accepts."""
 WORDS = (
     *(b"-1 0 1 2 9 1.5 -0.0 1e-320 1e99 1e308 1e400 4096 2147483648 9223372036854775807".split()),
     *(b"18446744073709551616 nan inf -inf true false null [] {} [[]] [0.1,0.2] = , :".split()),
@@ -39,7 +39,7 @@ WORDS = (
     *(b"\n", b"\xff", b"\0", b"` - at `$.model"),
     *(b"[" * DEEP, b'{"a":' * DEEP, b"9" * 5000, b'"' + b"x" * 5000 + b'"', b"a." * 2000 + b"a"),
 )
-"""Words that are rarely right where they stand."""
+"""Words that are invalid in most places."""
 
 NUMBERS = (
     -1,
@@ -59,17 +59,17 @@ NUMBERS = (
     2**63,
     2**64 - 1,
 )
-"""Numbers at which something changes."""
+"""Numbers at which encodings or ranges change."""
 
 
 def corpus() -> dict[str, bytes]:
-    """Odd payloads that are kept, by name."""
+    """Odd payloads, by name."""
     lines = CORPUS.read_text().splitlines()
     return {name: bytes.fromhex(code) for name, _, code in (line.partition(" ") for line in lines)}
 
 
 def seeds(terms: Terms) -> list[bytes]:
-    """A message of each type, as an end with these terms would send it."""
+    """Message of each type, as sent by an end with these terms."""
     axes, n = terms.axes, terms.horizon
     inputs = np.zeros((axes, n), np.float32)
     feedback = np.ones((axes, FEEDBACK), np.float32)
@@ -94,7 +94,7 @@ def seeds(terms: Terms) -> list[bytes]:
 
 
 def fields_changed(rng: Random, payload: bytes) -> bytes:
-    """A message with another value in one or two of its fields; what is none has bytes changed."""
+    """Message with one or two changed fields; other payloads get changed bytes."""
     try:
         fields = msgpack.unpackb(payload)
     except (ValueError, msgpack.UnpackException):
@@ -129,7 +129,7 @@ def _floats(rng: Random, packed: bytes) -> bytes:
 
 
 def bytes_changed(rng: Random, payload: bytes, most: int = 2000) -> bytes:
-    """A payload with bytes changed, cut off, put in or doubled; `most` of them at most."""
+    """Payload with bytes changed, removed, inserted or repeated; at most `most` of them."""
     changed = bytearray(payload)
     for _ in range(rng.randrange(1, 4)):
         at = rng.randrange(len(changed) + 1)
@@ -146,12 +146,12 @@ def bytes_changed(rng: Random, payload: bytes, most: int = 2000) -> bytes:
 
 
 def text_changed(rng: Random, text: bytes, words: Sequence[bytes]) -> bytes:
-    """A text with a few tokens replaced, left out, doubled or exchanged, or with bytes changed.
+    """Text with a few tokens replaced, removed, repeated or swapped, or with changed bytes.
 
     Args:
-        rng: source of chance.
+        rng: random generator.
         text: the text.
-        words: what may stand in place of a token, beside WORDS.
+        words: replacements for tokens, besides WORDS.
     """
     if rng.random() < 0.15:
         return bytes_changed(rng, text, len(text) + 1000)

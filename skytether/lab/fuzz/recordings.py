@@ -1,7 +1,7 @@
-"""Recordings as a target: what somebody has changed with care, and what is made of it.
+"""Target for recordings: carefully altered files, and everything that commands make of them.
 
-Each is read as `export`, `report` and `recover` read it: it is a recording, or `RecordingError`
-says why it is none; and it takes little memory, whatever it says of itself.
+Each is read as `export`, `report` and `recover` read it: it is accepted, or `RecordingError` says
+why not; and reading takes little memory, whatever sizes the file claims.
 """
 
 import io
@@ -35,9 +35,9 @@ from skytether.view.recording import Recorded
 from skytether.view.report import page
 
 REPORTED = 500
-"""One in so many readable recordings is drawn, which takes longer than all else."""
+"""Rate at which readable recordings are also drawn, one in this number, because drawing is slow."""
 MEMORY_MAX_MB = 600
-"""Memory that reading may take beyond the most that the process has had before [MB]."""
+"""Memory that reading may take above the process's earlier peak [MB]."""
 ODD: tuple[Any, ...] = (
     *(
         -(2**63),
@@ -57,9 +57,9 @@ ODD: tuple[Any, ...] = (
     *(2**70, -0.0, 1e-320, 1e12, 1e99, 1e308, -1e308, None, True, "", "x" * 5000, "=1+1", [], {}),
     *([0.5] * 400, ["position_x_m=000000000000f0ff"], [[]] * 50),
 )
-"""Values that are rarely right."""
+"""Values that are rarely valid."""
 DEEP = 100_000
-"""Depth to which lists are nested."""
+"""Depth of nested lists."""
 COLUMNS = (
     *(
         "[]",
@@ -73,7 +73,7 @@ COLUMNS = (
     *('[["vehicle","<u2"],["step","<i8"]]', '[["state","<f8",[2,2]],["x","<f8",[900000]]]'),
     "[" * DEEP,
 )
-"""Columns that no part has."""
+"""Column descriptions that no part has."""
 
 
 def records(content: bytes) -> list[Any]:
@@ -87,7 +87,7 @@ def records(content: bytes) -> list[Any]:
 
 
 def written(found: list[Any]) -> bytes:
-    """A whole file of such records, with the right checksums."""
+    """Complete file of such records, with valid checksums."""
     file = io.BytesIO()
     writer = Writer(file, chunk_size=64 * 1024)
     writer.start()
@@ -113,12 +113,12 @@ def written(found: list[Any]) -> bytes:
 
 
 def deep(rng: Random) -> bytes:
-    """Lists or objects in each other."""
+    """Nested lists or objects."""
     return rng.choice([b"[" * DEEP, b'{"a":' * DEEP, b"[" * DEEP + b"]" * DEEP])
 
 
 def changed_value(rng: Random, found: list[Any]) -> None:
-    """Another value in a message, or none, or all of it nested."""
+    """Message with another value, without one, or deeply nested."""
     at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Message)])
     if rng.random() < 0.1:
         found[at] = replace(found[at], data=deep(rng))
@@ -160,7 +160,7 @@ def changed_channel(rng: Random, found: list[Any]) -> None:
 
 
 def changed_words(rng: Random, found: list[Any]) -> None:
-    """Something else in what the recording says of itself, in its scenario or its summary."""
+    """Changed metadata, scenario or summary of a recording."""
     at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Metadata | Attachment)])
     each = found[at]
     if isinstance(each, Metadata):
@@ -184,20 +184,20 @@ def changed_words(rng: Random, found: list[Any]) -> None:
 
 
 def changed_times(rng: Random, found: list[Any]) -> None:
-    """Another time of a message."""
+    """Message with another time."""
     at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Message)])
     time_ns = rng.choice([0, 1, 2**31, 2**50, 2**62, 2**63, 2**64 - 1])
     found[at] = replace(found[at], log_time=time_ns)
 
 
 def repeated(rng: Random, found: list[Any]) -> None:
-    """A message many times."""
+    """Message repeated many times."""
     message = rng.choice([each for each in found if isinstance(each, Message)])
     found += [message] * rng.choice([100, 2000])
 
 
 def of_columns_alone(rng: Random, found: list[Any]) -> None:
-    """Rows that say nothing, of a part with huge rows."""
+    """Empty rows of a part with huge rows."""
     at = rng.choice(
         [i for i, e in enumerate(found) if isinstance(e, Channel) and "part" in e.metadata]
     )
@@ -209,7 +209,7 @@ def of_columns_alone(rng: Random, found: list[Any]) -> None:
 
 
 def bomb(rng: Random, content: bytes) -> bytes:
-    """A chunk that is far larger inside, with the scenario before it and an index behind it."""
+    """Chunk that decompresses to far more, with the scenario before it and an index after it."""
     with_it = records(content)
     channel = rng.choice([each for each in with_it if isinstance(each, Channel)])
     builder = RecordBuilder()
@@ -220,7 +220,7 @@ def bomb(rng: Random, content: bytes) -> bytes:
     size = len(inside)
     if rng.random() < 0.3:
         size = rng.choice([0, 1, 2**31, 2**40, 2**63])
-    if rng.random() < 0.2:  # a frame that says more than it has
+    if rng.random() < 0.2:  # a zstd frame that claims more than it contains
         data = (
             b"\x28\xb5\x2f\xfd\xe0"
             + struct.pack("<Q", rng.choice([2**33, 2**40, 2**62]))
@@ -233,13 +233,13 @@ def bomb(rng: Random, content: bytes) -> bytes:
     summary = reader.get_summary()
     assert summary is not None
     place = summary.chunk_indexes[0].chunk_start_offset
-    if rng.random() < 0.5:  # at the place of one that the index knows
+    if rng.random() < 0.5:  # at the position of a chunk in the index
         return content[:place] + record + content[place + len(record) :]
     return content[:place] + record + content[place:]
 
 
 def misled(rng: Random, content: bytes) -> bytes:
-    """An index that names what is not there, or the same again and again; or heads that lie."""
+    """Index that points to missing or repeated positions, or headers with false sizes."""
     changed = bytearray(content)
     start = struct.unpack_from("<Q", content, len(content) - 28)[0]
     match rng.randrange(4):
@@ -263,7 +263,7 @@ def misled(rng: Random, content: bytes) -> bytes:
 
 
 def scattered(rng: Random, content: bytes) -> bytes:
-    """Some bytes changed, or cut off."""
+    """Bytes changed, or cut off."""
     changed = bytearray(content)
     for _ in range(rng.randrange(1, 5)):
         changed[rng.randrange(len(changed))] = rng.randrange(256)
@@ -276,16 +276,16 @@ INSIDE = (
     *(changed_value, changed_value, changed_column, changed_column, changed_channel),
     *(changed_words, changed_times, repeated, of_columns_alone),
 )
-"""Changes of records, which are written anew."""
+"""Changes of records, which are written as a valid file again."""
 OUTSIDE = (bomb, misled, scattered)
 """Changes of bytes."""
 
 
 def hostile(rng: Random, content: bytes, known: list[Any]) -> tuple[str, bytes]:
-    """A mutated recording, and how it was made.
+    """Mutated recording, and the name of the mutation.
 
     Args:
-        rng: source of chance.
+        rng: random generator.
         content: a recording.
         known: its records.
     """
@@ -298,7 +298,7 @@ def hostile(rng: Random, content: bytes, known: list[Any]) -> tuple[str, bytes]:
 
 
 class RecordingFile(Target):
-    """Recording in a file: it is none, or all that can be made of it is made."""
+    """Target for a recording's file: it is refused, or all that commands make of it can be made."""
 
     code = (container, export, feed, recording, recovery, rows, summaries)
     largest = 256 * 1024
@@ -317,13 +317,13 @@ class RecordingFile(Target):
         return (self._content,)
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """A recording with records changed, which are written anew, or with bytes changed."""
+        """Recording with changed records, written as a valid file, or with changed bytes."""
         if payload != self._content:
             return scattered(rng, payload or b"\0")
         return hostile(rng, payload, self._records)[1]
 
     def __call__(self, payload: bytes) -> None:
-        """Read it, and mend it."""
+        """Read the recording, and recover it."""
         self._path.write_bytes(payload)
         with suppress(RecordingError), Recorded(self._path) as recorded:
             for columns in export.tables(recorded).values():
@@ -336,5 +336,5 @@ class RecordingFile(Target):
 
 
 def peak_mb() -> float:
-    """Most memory that this process has had [MB]."""
+    """Peak memory of this process [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

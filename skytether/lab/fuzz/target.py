@@ -1,4 +1,4 @@
-"""Target of fuzzing: something that takes bytes of others, and what is promised of it."""
+"""Base of all fuzzing targets: it takes bytes from outside, and checks the guarantees."""
 
 from collections.abc import Sequence
 from inspect import isclass, isfunction
@@ -10,10 +10,10 @@ from skytether.lab.fuzz.mutators import bytes_changed
 
 
 class Target:
-    """Something that takes bytes, and raises where a promise is broken."""
+    """Target that takes bytes, and raises if a guarantee is broken."""
 
     code: Sequence[ModuleType] = ()
-    """Modules by whose branches atheris is guided; kernels are compiled, and are none."""
+    """Modules whose branches guide atheris; kernels are compiled, and are not among them."""
     largest = 1300
     """Size of the largest input [B]."""
 
@@ -21,20 +21,20 @@ class Target:
         """Take an input.
 
         Raises:
-            Exception: whatever is not promised.
+            Exception: a guarantee is broken.
         """
         raise NotImplementedError
 
     def seeds(self) -> Sequence[bytes]:
-        """Inputs to begin with; there may be others of them later."""
+        """Valid inputs to begin with; the list may change later."""
         raise NotImplementedError
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """An input with something changed."""
+        """Mutation of an input."""
         return bytes_changed(rng, payload)
 
     def next(self, rng: Random) -> bytes:
-        """An input: random bytes, or a mutated one of the seeds."""
+        """Input: random bytes, or a mutated seed."""
         if rng.random() < 0.1:
             return rng.randbytes(rng.randrange(1500))
         return self.mutated(rng, rng.choice(self.seeds()))

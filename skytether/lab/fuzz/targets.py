@@ -14,7 +14,7 @@ from skytether.lab.fuzz.texts import ControlTarget, LogLines, ScenarioFile
 
 
 class Both(Target):
-    """A target in the plane and one in space, which take the same inputs."""
+    """Pair of targets, one in the plane and one in 3-D, which take the same inputs."""
 
     def __init__(self, *targets: Target) -> None:
         self._targets = targets
@@ -30,7 +30,7 @@ class Both(Target):
         return self._targets[0].seeds()
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """An input as the first changes it."""
+        """Mutation of an input by the first."""
         return self._targets[0].mutated(rng, payload)
 
 
@@ -49,4 +49,4 @@ TARGETS: Mapping[str, Callable[[Path], Target]] = MappingProxyType(
         "log": lambda _: LogLines(),
     }
 )
-"""What is fuzzed."""
+"""Constructors of all targets, by name."""

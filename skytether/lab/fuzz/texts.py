@@ -1,4 +1,4 @@
-"""Texts as targets: scenarios, requests for changes in flight, and what a process says."""
+"""Targets for texts: scenarios, requests for changes in flight, and output of processes."""
 
 import importlib
 import tomllib
@@ -36,17 +36,17 @@ LIVE = reading.check(
     },
     "fuzz",
 )
-"""A flight in which as much as possible can be changed."""
+"""Scenario in which as many keys as possible can be changed in flight."""
 POLICIES = [name.encode() for name in (*TRIGGERS, *REFERENCES)] + b"( ) & | ! ,".split()
-"""Pieces of policies."""
+"""Fragments of policies."""
 
 
 class Text(Target):
-    """Something that takes text.
+    """Target that takes text.
 
     Args:
         known: texts to begin with.
-        words: what may stand in place of a token, beside the words of these texts.
+        words: replacements for tokens, besides the words of these texts.
     """
 
     largest = 8192
@@ -56,16 +56,16 @@ class Text(Target):
         self._words = [*words_of(known), *words]
 
     def seeds(self) -> Sequence[bytes]:
-        """Texts that are right."""
+        """Valid texts."""
         return self._known
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """A text with other words."""
+        """Text with changed words."""
         return text_changed(rng, payload, self._words)
 
 
 class ScenarioFile(Text):
-    """Scenario in a file: it is refused as `ConfigError`, or it can be agreed upon and flown."""
+    """Target for a scenario file: it raises `ConfigError`, or it can be agreed upon and flown."""
 
     code = (
         reading,
@@ -84,7 +84,7 @@ class ScenarioFile(Text):
         super().__init__([*files, *whole, *made], [*words, *POLICIES])
 
     def __call__(self, payload: bytes) -> None:
-        """Read it."""
+        """Read the scenario."""
         self._path.write_bytes(payload)
         try:
             scenario = reading.load(str(self._path))
@@ -103,7 +103,7 @@ class ScenarioFile(Text):
 
 
 class ControlTarget(Text, EndpointInFlight):
-    """Requests to the processes of a flight: each is answered, and what it changes can be flown."""
+    """Target for control requests: each is answered, and the changed scenario can be flown."""
 
     code = (change, reading, contradictions, policies)
     largest = REQUEST_BYTES_MAX + 1
@@ -134,11 +134,11 @@ class ControlTarget(Text, EndpointInFlight):
             assert bool(said.changed) == (running.scenario != before), payload.hex()
             assert not (said.refused and said.changed), payload.hex()
             reading.check(reading.to_table(running.scenario), known=running.scenario)
-        running._endpoint.events()  # nobody else asks netem
+        running._endpoint.events()  # no other sender asks netem
 
 
 class LogLines(Text):
-    """Lines of a process, and answers at its control socket, which may be none."""
+    """Target for lines of a process, and answers at its control socket."""
 
     code = (log,)
 
@@ -150,7 +150,7 @@ class LogLines(Text):
         super().__init__([msgspec.json.encode(each) for each in (*lines, *answers)])
 
     def __call__(self, payload: bytes) -> None:
-        """Read it as either."""
+        """Read the bytes as both."""
         line = line_of(payload)
         assert line is None or str(line.event).splitlines(), payload.hex()
         with suppress(ControlError):

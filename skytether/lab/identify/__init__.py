@@ -1,5 +1,5 @@
-"""Identification of a vehicle: small steps of velocity, and the model that answers them alike.
+"""Identification of a vehicle's model from small steps of velocity.
 
-steps: what is flown → flight: the endpoint that flies it → responses: what came of each step
-→ fit: gain, time constant and dead time → told: words, table, picture and scenario
+steps: experiment → flight: endpoint that flies it → responses: measurements of each step → fit:
+gain, time constant and dead time → outcome: words, table, picture and scenario
 """

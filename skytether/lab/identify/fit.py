@@ -1,12 +1,12 @@
-"""First order with dead time, fitted to what a vehicle answered to steps of velocity.
+"""First-order model with dead time, fitted to a vehicle's responses to steps of velocity.
 
     v(t) = g Σ Δu (1 - exp(-(t - t_u - θ) / τ)) + w       over the changes Δu at times t_u < t - θ
 
-Gain g, time constant τ and dead time θ are those of the least squares over all steps of an axis; w
-is what wind or a sensor's error adds, for each step its own, and is gone where each step's mean is
-taken off both sides. Errors of a fit belong together within a step, for what is left over is no
-white noise: intervals are those of the steps as clusters (the sandwich estimator; Liang and Zeger,
-Biometrika 73, 1986), and no narrower than those of white noise.
+Gain g, time constant τ and dead time θ are the least-squares solution over all steps of an axis; w
+is a constant offset of each step by wind or sensor error, and is removed by subtracting each step's
+mean from both sides. Residuals are correlated within a step: so the intervals treat steps as
+clusters (the sandwich estimator; Liang and Zeger, Biometrika 73, 1986), and are never narrower than
+those for white noise.
 """
 
 import math
@@ -20,55 +20,55 @@ from scipy import optimize, stats
 from skytether.shared.law.model import Array
 
 STEPS_MIN = 2
-"""Fewest steps that a fit, and its intervals, can be made of."""
+"""Smallest number of steps for a fit with intervals."""
 CONFIDENCE = 0.95
-"""Share of intervals that hold the true number."""
+"""Confidence level of the intervals."""
 DEAD_MAX_S = 2.0
-"""Longest dead time that both ends can reckon with [s]."""
+"""Longest dead time that a scenario allows [s]."""
 TAU_MIN_S = 1e-3
-"""Shortest time constant that they can [s]."""
+"""Shortest time constant that a scenario allows [s]."""
 GAIN_MIN = 1e-3
-"""Smallest gain that they can."""
+"""Smallest gain that a scenario allows."""
 GRID_S = 0.08
-"""Distance of the dead times from which a fit is begun [s]."""
+"""Spacing of the grid of dead times from which fits start [s]."""
 BEGINNINGS = 2
-"""Number of places where a fit is begun."""
+"""Number of starting points of a fit."""
 BIN_S = 0.05
-"""Time over which what steps have left over is averaged [s]."""
+"""Time over which the residuals of steps are averaged [s]."""
 GOOD = 0.1
-"""Largest difference between measured and predicted step that will do, as share of its height."""
+"""Largest acceptable difference between measured and predicted step, as a share of its height."""
 SURE = 4.0
-"""Standard errors by which a difference has to be larger than `GOOD` for a model to be refused."""
+"""Number of standard errors above `GOOD` at which a model is rejected."""
 
 
 class StepResponse(NamedTuple):
-    """What an axis answered to one step of its input."""
+    """Response of an axis to one step of its input."""
 
     before: float
     """Input before the step [m/s]."""
     after: float
-    """Input after it [m/s]."""
+    """Input after the step [m/s]."""
     changes: Array
-    """Changes of the input, as far back as they matter: time from the step [s], and by how much
-    [m/s]; shape (n, 2)."""
+    """Earlier changes of the input that still have an effect: time relative to the step [s], and
+    amount [m/s]; shape (n, 2)."""
     times: Array
-    """Times of the measurements, from a while before the step on [s]; shape (m,)."""
+    """Times of the measurements relative to the step, starting before it [s]; shape (m,)."""
     velocity: Array
-    """Velocity measured then [m/s]; shape (m,)."""
+    """Measured velocity [m/s]; shape (m,)."""
 
     @property
     def height(self) -> float:
-        """Height of the step, with its sign [m/s]."""
+        """Height of the step, signed [m/s]."""
         return self.after - self.before
 
     @property
     def starts(self) -> bool:
-        """Whether the vehicle sets out with the step; else it stops."""
+        """Whether the step starts a motion; otherwise it ends one."""
         return abs(self.after) > abs(self.before)
 
 
 class Numbers(NamedTuple):
-    """Numbers of a model of first order with dead time, or half-widths of their intervals."""
+    """Parameters of a first-order model with dead time, or half-widths of their intervals."""
 
     gain: float
     """Gain."""
@@ -79,31 +79,31 @@ class Numbers(NamedTuple):
 
 
 class Misfit(NamedTuple):
-    """What a model leaves over of measured steps, as shares of their predicted height."""
+    """Residual of a model, as shares of the predicted height of steps."""
 
     rms: float
-    """Root of the mean square over all measurements."""
+    """Root mean square over all measurements."""
     largest: float
-    """Largest difference at any time, of the mean of the steps that set out, or that stop."""
+    """Largest difference at any time, in the mean of all starting or of all ending steps."""
     at_s: float
-    """Time from the step at which it is [s]."""
+    """Time of the largest difference, relative to the step [s]."""
     certain: float
-    """How large it is at least, for noise and wind make the steps differ among themselves."""
+    """Lower confidence bound of the largest difference, from the scatter between steps."""
 
 
 class Fit(NamedTuple):
-    """A model of first order with dead time, fitted to steps."""
+    """First-order model with dead time, fitted to steps."""
 
     numbers: Numbers
-    """Numbers of the model."""
+    """Parameters of the model."""
     within: Numbers
-    """Half-widths of their 95 % intervals; infinite where the steps do not tell."""
+    """Half-widths of their 95 % intervals; infinite if the steps do not determine them."""
     misfit: Misfit
-    """What is left over."""
+    """Residual of the fit."""
 
 
 def fit(responses: Sequence[StepResponse]) -> Fit | None:
-    """The model that fits responses of an axis best; None where there are too few to tell."""
+    """Best model for the responses of an axis; None if there are too few."""
     if len(responses) < STEPS_MIN:
         return None
     numbers = _best(responses)
@@ -111,12 +111,12 @@ def fit(responses: Sequence[StepResponse]) -> Fit | None:
 
 
 def unit_response(times: Array, numbers: Numbers) -> Array:
-    """Velocity after a unit step of the input, over the gain; shape of the times [s]."""
+    """Velocity after a unit step of the input, divided by the gain; shape of the times [s]."""
     return -np.expm1(-np.maximum(times - numbers.dead_time_s, 0.0) / numbers.tau_s)
 
 
 def predicted(response: StepResponse, numbers: Numbers) -> Array:
-    """Velocity that a model predicts for the measurements of a step [m/s]; shape (m,)."""
+    """Velocity predicted by a model at the measurements of a step [m/s]; shape (m,)."""
     since = response.times[:, None] - response.changes[:, 0]
     first = response.before - response.changes[response.changes[:, 0] < 0.0, 1].sum()
     told = first + unit_response(since, numbers) @ response.changes[:, 1]
@@ -125,7 +125,7 @@ def predicted(response: StepResponse, numbers: Numbers) -> Array:
 
 
 def remainder(response: StepResponse, numbers: Numbers) -> Array:
-    """What a model leaves over of a step, but for what is the same all along [m/s]; shape (m,)."""
+    """Residual of a model for a step, without its mean [m/s]; shape (m,)."""
     return _centred(response.velocity - predicted(response, numbers))
 
 
@@ -135,7 +135,7 @@ def _centred(values: Array) -> Array:
 
 
 def _slopes(response: StepResponse, numbers: Numbers) -> Array:
-    """Derivatives of the remainder by gain, time constant and dead time; shape (m, 3)."""
+    """Derivatives of the residual by gain, time constant and dead time; shape (m, 3)."""
     gain, tau, late = numbers
     late_s = response.times[:, None] - response.changes[:, 0] - late
     left = np.where(late_s > 0.0, np.exp(-np.maximum(late_s, 0.0) / tau), 0.0)
@@ -147,10 +147,10 @@ def _slopes(response: StepResponse, numbers: Numbers) -> Array:
 
 
 def _best(responses: Sequence[StepResponse]) -> Numbers:
-    """Numbers of least squares: the best of a grid, each with its best gain, and from there on.
+    """Least-squares parameters: a grid, each point with its best gain, then a local search.
 
-    What is left over has a kink wherever a dead time ends at a measurement, and local minima there:
-    the search compares values alone, and begins at several places.
+    The sum of squares has a kink, and local minima, wherever a dead time ends at a measurement: so
+    the search uses no derivatives, and starts at several points.
     """
     longest_s = max(float(each.times[-1]) for each in responses)
     dead_max_s = min(DEAD_MAX_S, longest_s / 2.0)
@@ -178,8 +178,9 @@ def _best(responses: Sequence[StepResponse]) -> Numbers:
 
 
 def _projection(responses: Sequence[StepResponse]) -> Callable[[float, float], tuple[float, float]]:
-    """What gives, for a time constant and a dead time, the sum of squares that is left over, and
-    the gain with which it is least; all responses at once, for it is asked a thousand times.
+    """Function of time constant and dead time that returns the sum of squares and the best gain.
+
+    It evaluates all responses at once, because it is called a thousand times.
     """
     lengths = [len(each.times) for each in responses]
     edges = np.cumsum([0, *lengths[:-1]])
@@ -206,7 +207,7 @@ def _projection(responses: Sequence[StepResponse]) -> Callable[[float, float], t
 
 
 def _within(responses: Sequence[StepResponse], numbers: Numbers) -> Numbers:
-    """Half-widths of the intervals of numbers that fit responses best."""
+    """Half-widths of the intervals of the best parameters."""
     slopes = [_slopes(each, numbers) for each in responses]
     left = [remainder(each, numbers) for each in responses]
     count, samples = len(responses), sum(map(len, left))
@@ -225,12 +226,12 @@ def _within(responses: Sequence[StepResponse], numbers: Numbers) -> Numbers:
 
 
 def differences(response: StepResponse, numbers: Numbers) -> Array:
-    """What a model leaves over of a step, as share of its predicted height; shape (m,)."""
+    """Residual of a model for a step, as a share of its predicted height; shape (m,)."""
     return remainder(response, numbers) / (numbers.gain * response.height)
 
 
 def misfit(responses: Sequence[StepResponse], numbers: Numbers) -> Misfit:
-    """What a model leaves over of responses, which need not be those that it was fitted to."""
+    """Residual of a model for responses, which need not be those of its fit."""
     shares = [differences(each, numbers) for each in responses]
     rms = float(np.sqrt(np.mean(np.concatenate(shares) ** 2)))
     worst = Misfit(rms, 0.0, 0.0, 0.0)
@@ -248,19 +249,20 @@ def misfit(responses: Sequence[StepResponse], numbers: Numbers) -> Misfit:
 
 
 def binned(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Mean of curves over time, and its standard error, where at least half of them have a value.
+    """Mean of curves over time, and its standard error, at times at which at least half have
+    values.
 
     Args:
         curves: times from the step [s] and values of each.
 
     Returns:
-        times [s], means, and standard errors, which are infinite where there is one curve.
+        times [s], means, and standard errors, which are infinite for a single curve.
     """
     count = max((int(times[-1] / BIN_S) + 2 for times, _ in curves), default=0)
     table = np.full((len(curves), count), np.nan)
     for row, (times, values) in zip(table, curves, strict=True):
         after = times >= 0.0
-        which = (times[after] / BIN_S + 1e-6).astype(int)  # at a border, what comes after it
+        which = (times[after] / BIN_S + 1e-6).astype(int)  # at a bin's border: the later bin
         number = np.bincount(which, minlength=count)
         with np.errstate(invalid="ignore"):
             row[:] = np.bincount(which, values[after], minlength=count) / number
@@ -270,13 +272,14 @@ def binned(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
     mean = np.nansum(table, axis=0) / having
     variance = np.nansum((table - mean) ** 2, axis=0) / np.maximum(having - 1, 1)
     several = having > 1
-    pooled = variance[several].mean() if several.any() else np.inf  # of two curves one tells little
+    # with two curves, the scatter of one degree of freedom says little
+    pooled = variance[several].mean() if several.any() else np.inf
     error = np.sqrt(np.maximum(variance, pooled) / having)
     return BIN_S * (np.flatnonzero(told).astype(np.float64) + 0.5), mean, error
 
 
 def verdict(found: Fit) -> str:
-    """Whether first order with dead time will do, in words."""
+    """Sentence on whether a first-order model with dead time is adequate."""
     off = found.misfit
     where = f"{off.largest:.0%} of the step's height {off.at_s:.2f} s after it"
     if off.largest <= GOOD:

@@ -1,7 +1,7 @@
-"""The flight of an experiment: an endpoint around a vehicle, without a server.
+"""Flight of an experiment: an endpoint around a vehicle, without a server.
 
-It takes off, flies what the experiment says, and lands. What keeps a vehicle from following a plan
-ends the flight at once; one that a pilot has taken is left to him.
+The vehicle takes off, flies the experiment, and lands. Any event that keeps it from following a
+plan ends the flight at once; if a pilot takes over, the pilot keeps the vehicle.
 """
 
 from typing import Any
@@ -19,18 +19,18 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 BLIND_NS = SECOND_NS
-"""Time for which the vehicle's state may be unknown [ns]."""
+"""Longest time for which the vehicle's state may be unknown [ns]."""
 FLOWN_MAX_NS = 3600 * SECOND_NS
-"""Longest flight [ns]: what is kept of it stays bounded."""
+"""Longest flight [ns]; it bounds the memory for measurements."""
 
 
 class Identifying(Endpoint):
-    """One vehicle on an experiment.
+    """Vehicle that flies an experiment.
 
     Args:
-        scenario: the vehicle's own.
-        flies: what flies.
-        experiment: what it flies.
+        scenario: scenario of the vehicle.
+        flies: the vehicle.
+        experiment: the experiment.
     """
 
     def __init__(self, scenario: Scenario, flies: Vehicle, experiment: Experiment) -> None:
@@ -42,27 +42,27 @@ class Identifying(Endpoint):
         self._next_ns = 0
         self._step = -1
         self._known_ns = 0
-        """Time at which its state was known last."""
+        """Time at which the vehicle's state was last known."""
         self._input = np.zeros(scenario.model.axes)
         self._ends: Reason | str | None = None
         self.inputs: list[tuple[int, list[float]]] = []
-        """Times at which an input was flown from, and the input of each axis [m/s]."""
+        """Times of changes of the input, and the input of each axis from then on [m/s]."""
         self.measured: list[Measurement] = []
-        """All that was measured."""
+        """All measurements."""
 
     @property
     def failure(self) -> Failure | None:
-        """Event for which it cannot fly."""
+        """Event that made the flight impossible."""
         return self._flies.failure
 
     @property
     def why(self) -> str:
-        """Why the flight ended before its time; empty where it did not."""
+        """Reason why the flight ended early; empty if it did not."""
         return "" if self.experiment.is_over or self._ends is None else str(self._ends)
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing is flown any more."""
+        """Whether the flight is over."""
         return self._ends is not None
 
     @property
@@ -72,19 +72,19 @@ class Identifying(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether the flight has ended and the vehicle is down, or cannot begin."""
+        """Whether the flight is over and the vehicle has landed, or the flight cannot begin."""
         if self._ends is Reason.TAKEN:
             return True
         return (self._ends is not None or self.failure is not None) and self._flies.is_down
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Hand on what comes from the vehicle's own hardware."""
+        """Pass bytes from the vehicle's hardware on."""
         if self._port is not None and datagram.socket == VEHICLE_SOCKET:
             self._port.receive(datagram, now_ns=now_ns)
             self._attend()
 
     def next_wake_ns(self) -> int | None:
-        """Begin of the next step, or when the vehicle's port wants to be woken."""
+        """Beginning of the next step, or the next wake of the vehicle's port."""
         if self.finished:
             return None
         due_ns = None if self._ends is not None else self._next_ns
@@ -92,7 +92,7 @@ class Identifying(Endpoint):
         return min((each for each in (due_ns, port_ns) if each is not None), default=None)
 
     def wake(self, *, now_ns: int) -> None:
-        """Fly the step that is due."""
+        """Fly the steps that are due."""
         if self._port is not None:
             port_ns = self._port.next_wake_ns()
             if port_ns is not None and port_ns <= now_ns:
@@ -102,7 +102,7 @@ class Identifying(Endpoint):
         self._attend()
 
     def _go_on(self, now_ns: int) -> None:
-        """Fly a step, or see whether the first can be flown."""
+        """Fly a step, or check whether the first one can be flown."""
         if self._epoch_ns is None:
             if not (self._flies.is_ready and self._flies.take_off(now_ns=now_ns)):
                 self._next_ns = now_ns + self._dt_ns
@@ -118,7 +118,7 @@ class Identifying(Endpoint):
         self._fly(now_ns)
 
     def _fly(self, now_ns: int) -> None:
-        """Fly what the experiment says, or end."""
+        """Fly the experiment's input, or end."""
         known, hindrance = self._navigation, self._flies.hindrance(now_ns=now_ns)
         if known.is_known:
             self._known_ns = now_ns
@@ -141,14 +141,14 @@ class Identifying(Endpoint):
             self._end("it takes too long")
 
     def _end(self, why: Reason | str) -> None:
-        """Fly no more; the vehicle lands by itself, unless a pilot has it."""
+        """End the flight; the vehicle lands by itself, unless a pilot has it."""
         self._ends = why
         if why is not Reason.TAKEN:
             self._flies.fly(np.zeros(len(self._input)))
             self._flies.land()
 
     def _attend(self) -> None:
-        """Hand on what the vehicle's port wants sent and said."""
+        """Pass on datagrams and events of the vehicle's port."""
         if self._port is not None:
             self._out += [
                 Datagram(said, peer, VEHICLE_SOCKET) for said, peer, _ in self._port.outbox()
@@ -156,7 +156,7 @@ class Identifying(Endpoint):
             self._events += self._port.events()
 
     def close(self, *, now_ns: int) -> None:
-        """Let the vehicle land by itself, whose process ends."""
+        """Let the vehicle land, because the process ends."""
         if self._port is not None:
             self._port.close(now_ns=now_ns)
             self._attend()

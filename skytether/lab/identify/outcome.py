@@ -1,6 +1,6 @@
-"""What an identification came to: numbers of each axis in words, and a scenario that flies by them.
+"""Results of an identification: each axis in words, and a scenario with the identified model.
 
-Whatever the command line changed in the scenario stands in the one that is written as well.
+Keys changed on the command line are also in the written scenario.
 """
 
 import math
@@ -19,39 +19,39 @@ from skytether.shared.scenario.schema import Scenario
 AXES = "xyz"
 """Names of the axes."""
 BEYOND = 1.5
-"""How much larger than the steps an input may be: nobody has seen how a larger one is answered."""
+"""Largest allowed input over the largest step; the response to larger inputs was not measured."""
 FASTER = 1.25
-"""How much faster than the desired trajectory the vehicle has to be, to catch up."""
+"""Required input over the desired trajectory's speed, so that the vehicle can catch up."""
 DIGITS = 4
-"""Significant digits of what is written."""
+"""Significant digits of written numbers."""
 
 
 class AxisOutcome(NamedTuple):
-    """What came of the steps of an axis."""
+    """Results of one axis."""
 
     speed: float
     """Size of step [m/s]."""
     cut: int
-    """Number of steps that the fence cut, or left no room for."""
+    """Number of steps that the fence cut short or left no room for."""
     responses: Sequence[StepResponse]
-    """Responses to the steps that are used."""
+    """Responses to the usable steps."""
     fit: Fit | None
-    """The model; None where there are too few steps."""
+    """Fitted model; None with too few steps."""
 
     @property
     def steps(self) -> str:
-        """How many of the steps are used."""
+        """Sentence on how many steps are usable."""
         return f"{len(self.responses)}{f', {self.cut} cut' if self.cut else ''}"
 
 
 def with_interval(name: str, numbers: Numbers, within: Numbers) -> str:
-    """A number and its interval."""
+    """Number and its interval, as text."""
     half = getattr(within, name)
     return f"{getattr(numbers, name):.3f} ± {f'{half:.3f}' if math.isfinite(half) else '?'}"
 
 
 def describe(axis: AxisOutcome) -> str:
-    """What came of an axis, in words."""
+    """Results of an axis, in words."""
     fit = axis.fit
     if fit is None:
         return f"too few steps ({axis.steps}), {_remedy(axis)}"
@@ -61,7 +61,7 @@ def describe(axis: AxisOutcome) -> str:
 
 
 def _remedy(axis: AxisOutcome) -> str:
-    """What would give more steps."""
+    """Advice on how to get more steps."""
     if axis.cut < STEPS:
         return "fly it to its end, and measure velocities"
     return "the fence leaves no room: expected a wider one, a smaller --speed, or a shorter --hold"
@@ -70,13 +70,13 @@ def _remedy(axis: AxisOutcome) -> str:
 def scenario_text(
     flown: Scenario, extends: str, base: Scenario, axes: Sequence[AxisOutcome]
 ) -> bytes | None:
-    """The scenario that flies by what was identified; None where an axis has no model.
+    """Scenario with the identified model; None if an axis has no model.
 
     Args:
-        flown: what was flown.
+        flown: scenario that was flown.
         extends: name or file of the scenario that it extends.
         base: that scenario.
-        axes: what came of each axis.
+        axes: results of each axis.
     """
     fits = [each.fit for each in axes if each.fit is not None]
     if len(fits) < len(axes):
@@ -88,7 +88,8 @@ def scenario_text(
     told |= differing(reading.to_table(base), reading.to_table(flown))
     if file := told.get("reference", {}).get("file"):
         told["reference"]["file"] = str(Path(file).absolute())
-    if flown.vehicle.kind == "simulated":  # it flies by its model where nothing else is said
+    # the plant equals the model unless the scenario says otherwise
+    if flown.vehicle.kind == "simulated":
         truth = {
             "tau_s": flown.true_tau_s,
             "gain": flown.true_gain,
@@ -115,7 +116,7 @@ def scenario_text(
 
 
 def differing(base: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
-    """Values of a table that are others in the base, as a table."""
+    """Values of a table that differ from the base, as a table."""
     found: dict[str, Any] = {}
     for key, value in table.items():
         before = base.get(key)
@@ -132,7 +133,7 @@ def _rounded(number: float) -> float:
 
 
 def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbers]) -> list[float]:
-    """Bounds of the input [m/s]: as much as was tried, and enough for the desired trajectory."""
+    """Bounds of the input [m/s]: no more than was tested, and enough for the desired trajectory."""
     wanted = reference_speeds(flown)
     most = flown.u_max.tolist()
     each = zip(axes, numbers, wanted, most, strict=True)
@@ -143,7 +144,7 @@ def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbe
 
 
 class AxisTold(msgspec.Struct, frozen=True):
-    """What came of an axis, for a program; None where nothing is known."""
+    """Results of one axis in identified.json; None for unknown values."""
 
     axis: str
     step_mps: float
@@ -162,7 +163,7 @@ class AxisTold(msgspec.Struct, frozen=True):
 
 
 def told(name: str, axis: AxisOutcome) -> AxisTold:
-    """What came of an axis, for a program."""
+    """Results of an axis, for identified.json."""
     steps, fit = len(axis.responses), axis.fit
     if fit is None:
         return AxisTold(name, axis.speed, steps, axis.cut, describe(axis))

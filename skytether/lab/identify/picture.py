@@ -1,6 +1,4 @@
-"""The picture of an identification: steps over the model that was fitted to them, and what is left
-over.
-"""
+"""Picture of an identification: steps over the fitted model, and residuals."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -14,12 +12,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = {True: "tab:blue", False: "tab:orange"}
-"""Colours of steps that set out, and that stop."""
+"""Colours of steps that start a motion, and of steps that end one."""
 WORDS = {True: "sets out", False: "stops"}
 
 
 def drawn(axes: Sequence[AxisOutcome]) -> "Figure":
-    """Steps of each axis over its model, all of height 1, and below what is left over."""
+    """Steps of each axis over its model, scaled to height 1, and the residuals below."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2 * len(axes), 5.0), layout="constrained")
@@ -43,7 +41,7 @@ def drawn(axes: Sequence[AxisOutcome]) -> "Figure":
 
 
 def _draw(axis: AxisOutcome, fit: Fit, above: Any, below: Any) -> None:
-    """Draw the steps of an axis, each thin, and their means, thick."""
+    """Draw the steps of an axis as thin lines, and their means as thick ones."""
     for starts in (True, False):
         colour, curves = COLOURS[starts], []
         for response in axis.responses:

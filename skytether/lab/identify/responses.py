@@ -1,4 +1,4 @@
-"""What came of each step: velocities by their own stamps, beside all inputs that they answer to."""
+"""Responses to each step: timestamped velocities, with all inputs that affect them."""
 
 from collections.abc import Sequence
 
@@ -10,12 +10,12 @@ from skytether.lab.identify.steps import FlownStep
 from skytether.shared.base.units import SECOND_NS
 
 LOOKBACK = 2.0
-"""How far back inputs are told of, in times of a step."""
+"""Length of the input's history for a step, in step durations."""
 LEAD = 0.25
-"""Time before a step whose measurements count with it, in times of a step: without a dead time
-nothing else tells gain from wind."""
+"""Time before a step whose measurements are included, in step durations: without a dead time,
+nothing else separates gain from wind."""
 SAMPLES_MIN = 10
-"""Fewest measurements of a step that can be used."""
+"""Smallest number of measurements for a step to be usable."""
 
 
 def responses(
@@ -24,12 +24,12 @@ def responses(
     steps: Sequence[FlownStep],
     axis: int,
 ) -> list[StepResponse]:
-    """Responses of an axis to its steps; one that was hardly measured is left out.
+    """Responses of an axis to its steps; steps with too few measurements are left out.
 
     Args:
-        inputs: times from which inputs were flown [ns], and each input of every axis [m/s].
-        measured: what was measured, in any order.
-        steps: steps that were flown, of any axis.
+        inputs: times of changes of the input [ns], and the input of each axis from then on [m/s].
+        measured: measurements, in any order.
+        steps: steps of any axis.
         axis: number of the axis.
     """
     flown_ns = np.array([time_ns for time_ns, _ in inputs], dtype=np.int64)

@@ -1,9 +1,9 @@
-"""The experiment: steps of velocity on one axis after another, out and back.
+"""Experiment: steps of velocity on one axis after another, out and back.
 
     home → rest → 0 to v → v to 0 → 0 to -v → -v to 0 → home …
 
-Everything passes the fence, as in a flight. What it cuts is no step of the size that was asked for:
-it is not used, and the vehicle goes home.
+All inputs pass the fence, as in a flight. A step that the fence cuts short is not used, and the
+vehicle flies home.
 """
 
 import math
@@ -19,27 +19,27 @@ from skytether.shared.scenario.fence import SLOW_STEPS, margins
 from skytether.shared.scenario.schema import Scenario
 
 ALTITUDE = 2
-"""Axis of the altitude, where there is one."""
+"""Index of the altitude axis, if there is one."""
 STEPS = 4
-"""Steps of one repetition."""
+"""Number of steps in one repetition."""
 HOMEWARD = 0.3
-"""Speed towards home over distance [1/s]: slow enough for a second of dead time."""
+"""Gain from distance to speed towards home [1/s], low enough for a second of dead time."""
 NEAR_M, SLOW_MPS = 0.3, 0.2
-"""Distance and speed on an axis at which the vehicle is home."""
+"""Distance and speed on an axis below which the vehicle counts as home."""
 HOMEWARD_S = 15.0
-"""Longest time on the way home [s]: steady wind keeps a vehicle away."""
+"""Longest time for the way home [s]; steady wind may keep a vehicle away."""
 HOLD_MIN_S, HOLD_MAX_S = 3.0, 6.0
-"""Shortest and longest time after a step, unless another is asked for [s]."""
+"""Shortest and longest default time after a step [s]."""
 STEP_MPS = 0.5
-"""Size of step where the desired trajectory stands still [m/s]."""
+"""Size of step if the desired trajectory stands still [m/s]."""
 STEP_MIN_MPS = 0.05
 """Smallest size of step [m/s]."""
 FAST = 1.3
-"""How much further a vehicle may go with a step than its input says."""
+"""Allowance for how much further a step may carry a vehicle than its input says."""
 
 
 class ExperimentPlan(NamedTuple):
-    """Experiment that is asked for."""
+    """Requested experiment."""
 
     speeds: tuple[float, ...]
     """Size of step on each axis [m/s]."""
@@ -50,12 +50,12 @@ class ExperimentPlan(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """About how long it takes [s]."""
+        """Approximate duration of the experiment [s]."""
         return len(self.speeds) * self.repeats * ((STEPS + 1) * self.hold_s + 2.0)
 
 
 class FlownStep(NamedTuple):
-    """A step that was flown."""
+    """Step that was flown."""
 
     axis: int
     """Axis whose input changed."""
@@ -66,7 +66,7 @@ class FlownStep(NamedTuple):
     began_ns: int
     """Time of the change."""
     ended_ns: int
-    """Time up to which the input stayed."""
+    """Time until which the input was constant."""
 
 
 def reference_speeds(scenario: Scenario) -> list[float]:
@@ -78,10 +78,10 @@ def reference_speeds(scenario: Scenario) -> list[float]:
 
 
 def default_speeds(scenario: Scenario) -> tuple[float, ...]:
-    """Size of step on each axis that is like what will be flown [m/s].
+    """Default size of step on each axis, similar to the later flight [m/s].
 
-    It is the largest speed of the desired trajectory on the axis, and at least half of that on any:
-    an axis that it leaves alone is flown by the feedback.
+    It is the largest speed of the desired trajectory on the axis, but at least half of its largest
+    speed on any axis: on an axis at rest, feedback still makes inputs.
     """
     speeds = reference_speeds(scenario)
     least = max(speeds) / 2.0 or STEP_MPS
@@ -91,14 +91,14 @@ def default_speeds(scenario: Scenario) -> tuple[float, ...]:
 
 
 def default_hold_s(scenario: Scenario) -> float:
-    """Time after a step in which a vehicle that is like the model settles [s]."""
+    """Time after a step in which a vehicle similar to the model settles [s]."""
     terms = scenario.terms()
     slowest = max(4.0 * t + late for t, late in zip(terms.tau_s, terms.dead_time_s, strict=True))
     return round(min(max(slowest, HOLD_MIN_S), HOLD_MAX_S), 2)
 
 
 def fenced(scenario: Scenario, plan: ExperimentPlan) -> Scenario:
-    """The scenario with a fence around an experiment, where it has none."""
+    """Scenario with a fence around the experiment, if it has none."""
     if scenario.fence.is_there:
         return scenario
     fastest, brake = max(plan.speeds), scenario.vehicle.brake_mps2
@@ -110,11 +110,11 @@ def fenced(scenario: Scenario, plan: ExperimentPlan) -> Scenario:
 
 
 class Experiment:
-    """An experiment in flight: what the vehicle is told at each step of control.
+    """Experiment in flight, which chooses the input at each step of control.
 
     Args:
-        scenario: the vehicle's own; it has a fence.
-        plan: what is to be flown.
+        scenario: scenario of the vehicle, with a fence.
+        plan: experiment to fly.
     """
 
     def __init__(self, scenario: Scenario, plan: ExperimentPlan) -> None:
@@ -128,24 +128,24 @@ class Experiment:
         self._script: Iterator[list[float]] | None = None
         self._input = [0.0] * len(plan.speeds)
         self.steps: list[FlownStep] = []
-        """Steps that were flown whole."""
+        """Complete steps."""
         self.cut = [0] * len(plan.speeds)
-        """Number of steps of each axis that the fence cut, or left no room for."""
+        """Number of steps of each axis that the fence cut short or left no room for."""
         self.is_over = False
-        """Whether everything was flown."""
+        """Whether the experiment is complete."""
 
     def choose(self, state: Sequence[tuple[float, float]], *, now_ns: int) -> list[float]:
         """Input to fly from now on, of each axis [m/s].
 
         Args:
-            state: state in which the input will meet the vehicle, of each axis [m, m/s]; the first
-                is home.
+            state: state of each axis when the input takes effect [m, m/s]; the first one is home.
             now_ns: time now.
         """
         self._now_ns, self._state = now_ns, state
         if self._script is None:
             self._home = [p for p, _ in state]
-            self._fence.limited([0.0] * len(state), state, self._u_max)  # it knows home from now on
+            # the home position is known from now on
+            self._fence.limited([0.0] * len(state), state, self._u_max)
             self._script = self._flown()
         wanted = next(self._script, None)
         if wanted is None:
@@ -154,7 +154,7 @@ class Experiment:
         return self._input
 
     def _flown(self) -> Iterator[list[float]]:
-        """What is wanted at each step of control, of each axis [m/s]."""
+        """Desired input at each step of control, of each axis [m/s]."""
         for axis, speed in enumerate(self.plan.speeds):
             for _ in range(self.plan.repeats):
                 yield from self._go_home()
@@ -166,7 +166,7 @@ class Experiment:
         yield from self._go_home()
 
     def _repetition(self, axis: int, speed: float) -> Iterator[list[float]]:
-        """Rest, and steps out and back, until the fence cuts one."""
+        """One repetition: rest, then steps out and back, until the fence cuts one short."""
         before = 0.0
         for number, after in enumerate((0.0, speed, 0.0, -speed, 0.0)):
             began_ns = self._now_ns
@@ -181,7 +181,7 @@ class Experiment:
             before = after
 
     def _go_home(self) -> Iterator[list[float]]:
-        """Fly to where it began."""
+        """Fly back home."""
         began_ns = self._now_ns
         while self._now_ns - began_ns < HOMEWARD_S * SECOND_NS:
             away = zip(self._state, self._home, strict=True)
@@ -190,14 +190,14 @@ class Experiment:
             yield self._homeward()
 
     def _homeward(self) -> list[float]:
-        """Input that leads home, of each axis [m/s]."""
+        """Input towards home, of each axis [m/s]."""
         axes = zip(self._state, self._home, self._u_max, strict=True)
         return [min(max(HOMEWARD * (h - p), -most), most) for (p, _), h, most in axes]
 
     def _direction(self, axis: int) -> float:
-        """Direction in which there is room for a step; 0 where there is none.
+        """Direction in which there is room for a step; 0 if there is none.
 
-        Up is tried first, and down only where the fence says how deep it may go.
+        Up is tried first, and down only if the fence has a lower bound.
         """
         speed = self.plan.speeds[axis]
         ways = (1.0, -1.0) if axis != ALTITUDE or self._has_floor else (1.0,)

@@ -1,1 +1,1 @@
-"""Serving pages to browsers: sockets, threads and clocks are in here, and what is shown is not."""
+"""Page server: sockets, threads and clocks are in this room, and the page's content is not."""

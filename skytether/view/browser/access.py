@@ -1,9 +1,9 @@
-"""Who may look at a page, and who may change what flies.
+"""Access rules of a page: which visitors may look, and which may change the flight.
 
-A browser takes websites from anywhere, and lets each of them connect to this machine. So it is not
-enough that somebody connects from here: the website that does must be ours (`Origin`), under a
-name that no stranger can let mean this machine (`Host`), or else a stranger's website could read
-the flight, or fly it. Who gives the token is asked neither.
+Any website that the user's browser loads can make it connect to this machine. So a connection from
+this machine is not enough: the website must be ours (`Origin`), loaded under a name that no
+stranger can point at this machine (`Host`). Otherwise a stranger's website could read the flight,
+or fly it. A visitor with the token is not checked for either.
 """
 
 import hmac
@@ -14,11 +14,11 @@ from enum import Enum
 from urllib.parse import parse_qs, urlsplit
 
 HOST_PORT = "127.0.0.1:8080"
-"""Address of a page unless another is given."""
+"""Default address of a page."""
 
 
 class TurnedAway(Enum):
-    """Why a browser is turned away, or what it has sent is dropped."""
+    """Reason why a browser is refused, or why its message is dropped."""
 
     ORIGIN = "a website of another origin wanted to connect"
     HOST = "a browser came by a name; number, localhost or the address with the token is expected"
@@ -34,18 +34,18 @@ class TurnedAway(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Visitor:
-    """How a browser has connected."""
+    """Browser's connection, as far as access depends on it."""
 
     host: str
-    """Host that it connects from."""
+    """Address that the browser connects from."""
     path: str
-    """Path and query that it asked for."""
+    """Path and query of the request."""
     headers: Mapping[str, str]
-    """Headers of its request; names in any case."""
+    """Headers of the request; names in any case."""
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is this machine, under a name or address that no other machine has."""
+    """Whether a name or address always means this machine."""
     if host == "localhost":
         return True
     address = _number(host)
@@ -61,7 +61,7 @@ def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def knows(token: str, given: str) -> bool:
-    """Whether somebody has given the token; never where there is none."""
+    """Whether the visitor has given the token; False where there is none."""
     return bool(token) and hmac.compare_digest(token.encode(), given.encode())
 
 
@@ -70,7 +70,7 @@ def _has_token(visitor: Visitor, token: str) -> bool:
 
 
 def _named(visitor: Visitor) -> tuple[str, str, str]:
-    """Host that a browser takes this machine for, that with its port, and its website's origin."""
+    """Name of this machine in the request, the same with its port, and the website's origin."""
     headers = {name.lower(): value for name, value in visitor.headers.items()}
     host = headers.get("host", "")
     try:
@@ -81,9 +81,9 @@ def _named(visitor: Visitor) -> tuple[str, str, str]:
 
 
 def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
-    """Why a browser may not even look; None where it may.
+    """Reason why a browser may not even look; None where it may.
 
-    A number cannot be rebound as a name can, whoever's it is.
+    A numeric address is accepted, because it cannot be rebound to this machine as a name can.
     """
     name, host, origin = _named(visitor)
     if _has_token(visitor, token):
@@ -94,7 +94,7 @@ def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
 
 
 def may_play(visitor: Visitor, token: str) -> bool:
-    """Whether a browser may change what flies."""
+    """Whether a browser may change the flight."""
     if _has_token(visitor, token):
         return True
     here = is_loopback(visitor.host) and is_loopback(_named(visitor)[0])

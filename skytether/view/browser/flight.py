@@ -1,4 +1,4 @@
-"""A flight as a page has it: what is known of it, and the way to change it."""
+"""Flight on a page: its state, and requests to change it."""
 
 import contextlib
 import threading
@@ -15,30 +15,30 @@ from skytether.view.state import LED, State
 
 
 class PageFlight:
-    """A flight on a page.
+    """Flight on a page.
 
     Args:
-        title: what it is called; empty where it is alone.
-        folder: where its control sockets are; None where nothing can be changed.
+        title: its title; empty for a single flight.
+        folder: folder of its control sockets; None where nothing can be changed.
     """
 
     def __init__(self, title: str = "", folder: Path | None = None) -> None:
         self.title = title
         self.state = State()
         self.lock = threading.Lock()
-        """Held by whoever uses the state."""
+        """Lock for use of the state."""
         self.values: dict[str, dict[str, Any]] = {}
-        """Keys that may change and their values, by process, as far as they are known."""
+        """Keys that may change and their known values, by process."""
         self.answer = ""
-        """What was said to the newest request, empty before any."""
+        """Answer to the newest request; empty before any."""
         self.refused = False
-        """Whether that was refused."""
+        """Whether the newest request was refused."""
         self._before: dict[str, Any] = {}
-        """Values from before the link was cut."""
+        """Values to restore when the link is healed."""
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:
-        """Take a frame; one that makes no sense is left out."""
+        """Take a frame; a frame that makes no sense is dropped."""
         with self.lock, contextlib.suppress(ValueError):
             self.state.take(process, frame)
         changed = (
@@ -48,7 +48,7 @@ class PageFlight:
             self.ask(process, {})
 
     def lose(self, process: str) -> None:
-        """Note that a process is not heard any more."""
+        """Note that a process's feed has ended."""
         with self.lock:
             self.state.lose(process)
 
@@ -83,11 +83,11 @@ class PageFlight:
             self.ask("netem", changed)
 
     def heal(self) -> None:
-        """Lose as many packets as before the link was cut, none where that is not known."""
+        """Restore the loss from before the link was cut, or none where that is unknown."""
         if self.is_cut:
             self.ask("netem", self._before or controls.healed(self.values["netem"]))
 
     def close(self) -> None:
-        """Ask for nothing more."""
+        """Stop sending requests."""
         if self.operator:
             self.operator.close()

@@ -1,15 +1,15 @@
-"""The page's websocket, guarded: who may open it, what may be sent by it, and how much.
+"""Guard of the page's websocket: it limits connections, messages and their rate.
 
-viser takes whoever connects, and whatever is sent: uploads of any size, requests to put the page on
-the internet, values of any attribute. `Guard.served` has it listen with this guard's rules:
+viser itself accepts any connection and any message: uploads of any size, requests to put the page
+on the internet, values of any attribute. `Guard.served` makes it listen with these rules:
 
-- who opens the websocket may look (`access.refusal`), and there are not too many already;
-- a message is one that our page sends (`MESSAGES`), of at most 64 KiB in at most 64 pieces;
-- a browser says at most `RATE_HZ` messages a second; what is more waits in its own kernel;
-- for a browser that does not read nothing is drawn, and it is cut off: after 40 s, by pings that it
-  does not answer, or at once if it pings itself.
+- a websocket is opened only for browsers that may look (`access.refusal`), up to a number;
+- only messages that our page sends (`MESSAGES`) are taken, of at most 64 KiB in 64 pieces;
+- at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;
+- nothing is drawn for a browser that does not read; it is disconnected after 40 s, because it
+  does not answer pings, or at once if it sends pings itself.
 
-What a browser breaks is its own connection, and no other.
+A misbehaving browser loses its own connection, and affects no other.
 """
 
 import asyncio
@@ -35,18 +35,18 @@ from skytether.view.browser.access import TurnedAway, Visitor, refusal
 BROWSERS_MAX = 16
 """Most browsers at once."""
 CONNECTIONS_MAX = 32
-"""Most connections at once, with those that only load the page or have not said what they want."""
+"""Most connections at once, including those that only load the page or have sent no request yet."""
 MESSAGE_BYTES_MAX = 64 * 1024
 PIECES_MAX = 64
-"""Most frames of a message."""
+"""Most websocket frames of a message."""
 FRAMES_MAX = 1024
-"""Most frames that wait to be looked at."""
+"""Most websocket frames queued for parsing."""
 UNREAD_BYTES = 128 * 1024
-"""Room that the kernel has for what a browser has not read yet [B]; it takes twice as much."""
+"""Size of the kernel's send buffer for a browser that does not read [B]; the kernel doubles it."""
 RATE_HZ = 200.0
-"""Messages a second of one browser that are looked at; a slider that is dragged makes 60."""
+"""Messages per second that are read of one browser; a slider that is dragged makes 60."""
 BURST_S = 2.0
-"""Time for which a browser that has been silent may say twice as much [s]."""
+"""Burst that an idle browser may send at once, in seconds of the full rate [s]."""
 MESSAGES = frozenset(
     {
         "GuiUpdateMessage",
@@ -57,17 +57,17 @@ MESSAGES = frozenset(
         "ViewerCameraMessage",
     }
 )
-"""Messages of viser's that the page's elements send."""
+"""Types of viser's messages that the page's elements send."""
 VALUE = "value"
-"""The one attribute of an element that a browser sets."""
+"""Only attribute of an element that a browser may set."""
 PROTOCOL = f"viser-v{viser.__version__}"
 
 _QUIET = logging.getLogger(__name__)
-_QUIET.disabled = True  # a stranger's bytes are no reason for a traceback
+_QUIET.disabled = True  # a stranger's bytes must not print a traceback
 
 
 class _Outline(msgspec.Struct):
-    """What is looked at of a message."""
+    """Fields of a message that are checked."""
 
     type: str
     updates: dict[str, msgspec.Raw] = {}
@@ -86,34 +86,34 @@ def is_taken(message: bytes) -> bool:
 
 
 class Guard:
-    """Turns browsers away, and counts them.
+    """Gatekeeper that refuses browsers, and counts refusals.
 
     Args:
-        token: who gives it is asked for nothing else; empty where there is none.
+        token: secret that exempts a visitor from the other checks; empty for none.
     """
 
     def __init__(self, token: str) -> None:
         self._token = token
         self.counts: Counter[TurnedAway] = Counter()
-        """How often somebody was turned away, or something dropped."""
+        """Number of refusals and of dropped messages, by reason."""
         self.connections = 0
         """Number of connections."""
         self.browsers = 0
-        """Number of websockets that are open."""
+        """Number of open websockets."""
         self._news: set[TurnedAway] = set()
         self._lock = threading.Lock()
 
     # -- what is counted ---------------------------------------------------------------------
 
     def count(self, why: TurnedAway) -> None:
-        """Count somebody who is turned away, or something that is dropped."""
+        """Count a refusal, or a dropped message."""
         with self._lock:
             self.counts[why] += 1
-            if str(self.counts[why]).strip("0") == "1":  # the first, tenth, hundredth
+            if str(self.counts[why]).strip("0") == "1":  # report the first, tenth, hundredth
                 self._news.add(why)
 
     def events(self) -> list[BrowserRefused]:
-        """What there is to be told since this was called last."""
+        """Events since the last call."""
         with self._lock:
             news, self._news = self._news, set()
             return [BrowserRefused(why=str(why), count=self.counts[why]) for why in news]
@@ -122,10 +122,10 @@ class Guard:
 
     @contextmanager
     def served(self) -> Iterator[None]:
-        """Have a server of viser's that is made in this block listen with this guard.
+        """Make a viser server created in this block listen with this guard.
 
         Raises:
-            RuntimeError: it has listened without.
+            RuntimeError: the server listened without the guard.
         """
         serve, used = sockets.serve, threading.Event()
 
@@ -140,7 +140,7 @@ class Guard:
             }
             return serve(partial(self._handle, handler), *at, **(own | rules))
 
-        # viser has no place for any of this, but it looks this name up when it listens.
+        # viser offers no hook for this, but looks this name up when it starts to listen.
         sockets.serve = guarded  # type: ignore[assignment, misc]
         try:
             yield
@@ -155,7 +155,7 @@ class Guard:
         connection: sockets.ServerConnection,
         request: Request,
     ) -> Response | None:
-        """Answer a request: None opens a websocket, anything else is a file."""
+        """Answer a request: None opens a websocket, any other answer is a file."""
         response = answer(connection, request)
         why = refusal(visitor(connection), self._token)
         if response is None and why:
@@ -163,7 +163,7 @@ class Guard:
             return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
         if (
             why is TurnedAway.HOST and request.path == "/"
-        ):  # it would wait for its websocket for ever
+        ):  # otherwise viser would wait for this client's websocket for ever
             return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
         return response
 
@@ -172,7 +172,7 @@ class Guard:
         handle: Callable[[sockets.ServerConnection], Awaitable[None]],
         connection: sockets.ServerConnection,
     ) -> None:
-        """Let viser talk to a browser."""
+        """Run viser's handler for a browser."""
         if connection.subprotocol != PROTOCOL:
             self.count(TurnedAway.VERSION)
             await connection.close(CloseCode.PROTOCOL_ERROR, f"Version mismatch: {PROTOCOL}")
@@ -189,23 +189,23 @@ class Guard:
                 self.browsers -= 1
 
     def _fault(self, _: asyncio.AbstractEventLoop, __: dict[str, Any]) -> None:
-        """Count a message that a handler of viser's could not make sense of."""
+        """Count a message that made one of viser's handlers fail."""
         self.count(TurnedAway.PANEL)
 
 
 class _Connection(sockets.ServerConnection):
-    """A connection of one browser."""
+    """Connection of one browser."""
 
     def __init__(self, guard: Guard, *protocol: Any, **limits: Any) -> None:
         super().__init__(*protocol, **limits)
         self._guard = guard
         self._due_s = 0.0
-        """Time at which a browser that says RATE_HZ messages a second would have said them all."""
+        """Time at which the messages so far would have been sent at RATE_HZ [s]."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See `asyncio.Protocol`."""
         super().connection_made(transport)
-        # The kernel would keep 4 MB for a browser that does not read.
+        # Otherwise the kernel would buffer 4 MB for a browser that does not read.
         transport.get_extra_info("socket").setsockopt(SOL_SOCKET, SO_SNDBUF, UNREAD_BYTES)
         self._guard.connections += 1
         if self._guard.connections > CONNECTIONS_MAX:
@@ -223,13 +223,13 @@ class _Connection(sockets.ServerConnection):
             self._cut(TurnedAway.ROOM)
 
     def process_event(self, event: Any) -> None:
-        """See `websockets`: a ping is answered whether or not somebody reads the answers."""
+        """See `websockets`: pings are answered even if the answers are not read."""
         if isinstance(event, Frame) and event.opcode is Opcode.PING and self.paused:
             self._cut(TurnedAway.ROOM)
         super().process_event(event)
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ARG002 - viser's are bytes
-        """Next message that the page takes; others are dropped."""
+        """Next message that the page accepts; others are dropped."""
         while True:
             pieces = []
             async for piece in self._pieces():
@@ -256,10 +256,10 @@ class _Connection(sockets.ServerConnection):
 
 
 def visitor(connection: sockets.ServerConnection) -> Visitor:
-    """How a browser has connected.
+    """Access data of a browser's request.
 
     Raises:
-        LookupError: a header stands twice in its request.
+        LookupError: a header occurs twice in the request.
     """
     request, address = connection.request, connection.remote_address
     assert request is not None

@@ -1,6 +1,7 @@
-"""The page: flights in a browser, live, by viser.
+"""Page that shows flights in a browser, live, by viser.
 
-One thread draws for all browsers, as often as an eye needs and only while somebody looks.
+One thread draws for all browsers, at a rate sufficient for the eye, and only while a browser is
+open.
 """
 
 import contextlib
@@ -20,25 +21,26 @@ from skytether.view.browser.panel import More, Panel
 from skytether.view.scene import Scene
 
 MOVES_HZ = 25
-"""How often vehicles move [1/s]."""
+"""Rate at which vehicles' markers move [1/s]."""
 MOVES_TO_A_DRAWING = 5
-"""Number of moves to each drawing of lines, plots and words."""
+"""Number of marker updates per redraw of lines, plots and words."""
 
 
 def _silence() -> contextlib.redirect_stdout[io.StringIO]:
-    """Keep what viser prints, even where it is told not to, off the standard output."""
+    """Keep viser's prints off standard output; it prints even when told not to."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 class Page:
-    """Shows flights to browsers.
+    """Page that shows flights to browsers.
 
     Args:
-        host, port: where it listens.
-        flights: what is shown.
-        now_ns: tells the time of the frames [ns]; the clock of this machine unless given.
-        token: who gives it may look, and change what flies, from anywhere; empty for nobody.
-        more: adds what else the page has to a browser.
+        host, port: address that it listens at.
+        flights: flights that are shown.
+        now_ns: time of the frames [ns]; this machine's clock unless given.
+        token: secret that lets a visitor look and change the flight from any machine; empty for
+            none.
+        more: adds further controls to a browser.
     """
 
     def __init__(
@@ -61,22 +63,22 @@ class Page:
         self._panels: dict[int, Panel] = {}
         self._scene: Scene | None = None
         self._shown: tuple[object, ...] = ()
-        """What the scene was made of."""
+        """State from which the scene was last built."""
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     @property
     def port(self) -> int:
-        """Port that it listens on."""
+        """Port that the page listens on."""
         return self._server.get_port()
 
     def events(self) -> Sequence[BrowserRefused]:
-        """What there is to be told of browsers since this was called last."""
+        """Events about browsers since the last call."""
         return self._guard.events()
 
     def close(self) -> None:
-        """Show nothing more."""
+        """Close the page."""
         self._closed.set()
         self._thread.join()
         with _silence():
@@ -111,7 +113,7 @@ class Page:
                 with self._alone(number):
                     self._panels[number] = self._panel(client)
                 draws = True
-                break  # one at a time: whoever keeps coming back costs no more than that
+                break  # one at a time: a browser that keeps reconnecting costs no more
         with self._server.atomic():
             self._scene.move(states)
             if draws:
@@ -124,13 +126,13 @@ class Page:
                         panel.show(now_ns)
 
     def _reads(self, number: int) -> bool:
-        """Whether a browser has read what it was sent: nothing is drawn for one that has not."""
+        """Whether a browser has read what it was sent; nothing is drawn for one that has not."""
         connection = self._connections.get(number)
         return connection is not None and not connection.paused
 
     @contextlib.contextmanager
     def _alone(self, number: int) -> Iterator[None]:
-        """Let whatever goes wrong with one browser's panel cost its connection, and nobody else's.
+        """Contain errors of one browser's panel: they close its connection, and no other.
 
         viser sets values as browsers send them: texts for numbers, lists of any length.
         """
@@ -143,7 +145,7 @@ class Page:
                 self._server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
 
     def _begin(self, shown: tuple[object, ...]) -> None:
-        """Begin anew: other flights are flown."""
+        """Build the scene again: other flights are flown."""
         self._server.scene.reset()
         for client in self._server.get_clients().values():
             client.gui.reset()
@@ -166,5 +168,5 @@ class Page:
 
     @property
     def _connections(self) -> dict[int, ServerConnection]:
-        """Connections of the browsers, which viser keeps to itself."""
+        """Connections of the browsers, from viser's private attribute."""
         return self._server._websock_server._live_connections

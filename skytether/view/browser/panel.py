@@ -1,6 +1,6 @@
-"""What one browser is shown beside the scene: words, plots and, where it may, what it can change.
+"""Panel of one browser beside the scene: words, plots and, if allowed, controls.
 
-Everything belongs to this browser alone: who may only look has nothing that could be moved.
+Each browser has a panel of its own; one that may only look gets no controls.
 """
 
 import time
@@ -31,39 +31,39 @@ from skytether.view.scene import GROUND_RGB, WIDE, Scene, in_space
 from skytether.view.state import GUIDED, LED, ZONED, VehicleTrack
 
 HELD_S = 1.5
-"""Time for which a slider that was moved is left where it is [s]."""
+"""Time for which a slider stays where the user has put it [s]."""
 IMPAIRMENTS = 'Impairments joined by &, as in "constant(0.05) & loss(0.1)", see docs/network.md'
 ZONES = "Zones joined by &, as in 'box(-1, 1, 2, 3) & cylinder(0, -2, 0.5)', see docs/together.md"
 GUIDES, DRAWS = "sends the vehicle", "draws a zone"
 CLICKS = ("looks", GUIDES, DRAWS)
 CLICKED = "What a click on the map does: the chosen vehicle's goal, or two corners of a box."
 GOAL_S = 60.0
-"""Age up to which a goal is known [s]."""
+"""Age up to which a desired position is shown as known [s]."""
 FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
 )
 WIDE_PLOTS = 760
-"""Width of plots where no flight is shown beside them [pixels]."""
+"""Width of plots where no scene is beside them [pixels]."""
 NARROW = 800
-"""Width up to which panels lie over the scene, and not beside it [pixels]."""
+"""Window width up to which panels lie over the scene, not beside it [pixels]."""
 MOVED_M = 0.05
-"""Distance from which on the handle of the target follows it [m]."""
+"""Distance of the target from its handle above which the handle follows [m]."""
 
 More = Callable[[viser.GuiApi], Callable[[], None]]
 
 
 class Panel:
-    """What one browser is shown.
+    """Panel of one browser.
 
     Args:
         client: the browser.
-        flights: what is flown, all of it known.
+        flights: flights on the page, all of them with known scenarios.
         scene: the scene.
-        may_play: whether it may change what flies.
-        unlock: takes a token; whether it is the right one. None where there is no token.
-        more: adds what else a page has to a browser that may play; what it returns is called
-            whenever the panel is shown.
+        may_play: whether the browser may change the flight.
+        unlock: checks a token and returns whether it is right; None where there is no token.
+        more: adds further controls for a browser that may change the flight; the function that it
+            returns is called at each redraw.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Panel:
             self._let_play()
         light = gui.add_checkbox("Light page", initial_value=False)
 
-        # viser's own grid costs a computer without a GPU a second to draw, lines nearly nothing.
+        # viser's own grid takes a computer without a GPU 1 s to draw, lines nearly nothing.
         ground = client.scene.add_line_segments(
             "/ground", scene.ground, GROUND_RGB[False], thickness=1.0, thickness_units="screen"
         )
@@ -115,7 +115,7 @@ class Panel:
         self._plots = []
         flies = any(each.state.flies for each in flights)
         self._nobody = None if flies else VehicleTrack(0, scenarios[0])
-        """Stands for a vehicle where netem is alone."""
+        """Placeholder for a vehicle where only netem is known."""
         if flies:
             with panel.add_tab("Flight"):
                 self._plots.append(
@@ -131,7 +131,7 @@ class Panel:
         panel.set_width(400 if flies else WIDE_PLOTS)
         self._scene = scene
         self._aimed = scene.camera(WIDE)[0]
-        """Where the camera was put."""
+        """Position at which the panel has put the camera."""
 
     def _dress(self, *, light: bool) -> None:
         self._client.gui.configure_theme(
@@ -139,7 +139,7 @@ class Panel:
         )
 
     def _let_look(self) -> None:
-        """Say why nothing can be changed here, and what would help."""
+        """Explain why this browser cannot change anything, and how it could."""
         with self._play:
             said = "This page can only be looked at: it may be played with on the machine itself"
             self._client.gui.add_html(
@@ -162,7 +162,7 @@ class Panel:
             ]
 
     def _aim(self) -> None:
-        """Show all there is in a window that changes, unless somebody has moved the camera."""
+        """Point the camera at all flights after a resize, unless the user has moved it."""
         camera = self._client.camera
         aim, target = self._scene.camera(camera.aspect)
         is_ours = np.abs(camera.position - self._aimed).max() < 0.05 * self._scene.reach_m
@@ -171,7 +171,7 @@ class Panel:
             camera.position, camera.look_at = aim, target
 
     def show(self, now_ns: int) -> None:
-        """Show flights as they are now."""
+        """Update the panel."""
         self._aim()
         numbers = sorted({number for each in self._flights for number in each.state.vehicles})
         if numbers and tuple(map(str, numbers)) != tuple(self._vehicle.options):
@@ -198,15 +198,15 @@ class Panel:
 
 
 def assign(handle: Any, value: Any) -> None:
-    """Set the value of a handle; mypy takes viser's property for one that cannot be."""
+    """Set a handle's value; mypy takes viser's property for a read-only one."""
     handle.value = value
 
 
 class _Slider:
-    """A number that this browser can change.
+    """Slider for a number that the browser can change.
 
-    What it calls back is a coroutine, here and below: viser calls these in their order, and others
-    in any.
+    Callbacks are coroutines, here and below: viser runs coroutines in order, and plain functions in
+    any order.
     """
 
     def __init__(self, gui: viser.GuiApi, knob: Knob, ask: Callable[[Knob, float], None]) -> None:
@@ -218,12 +218,12 @@ class _Slider:
 
         @self._slider.on_update
         async def _(event: Any) -> None:
-            if event.client is not None:  # else it was we who moved it
+            if event.client is not None:  # ignore changes made by the program itself
                 self._moved_s = time.monotonic()
                 ask(knob, float(self._slider.value))
 
     def show(self, values: Values, *, visible: bool) -> None:
-        """Put it where the value is, unless it is being moved."""
+        """Set the slider to the value, unless the user is moving it."""
         self._slider.visible = visible and self.knob.key in values
         if not self._slider.visible or time.monotonic() - self._moved_s < HELD_S:
             return
@@ -235,7 +235,7 @@ class _Slider:
 
 
 class _Network:
-    """Both directions of the network as texts, which this browser can change together."""
+    """Text fields of both network directions, which the browser changes together."""
 
     def __init__(
         self, gui: viser.GuiApi, ask: Callable[[dict[str, Any]], None], *, flies: bool
@@ -255,7 +255,7 @@ class _Network:
             ask({way: text.value for way, text in self._texts.items()})
 
     def show(self, values: Values) -> None:
-        """Show the directions once they are others than before."""
+        """Show the directions after they have changed."""
         known = texts(values)
         self._folder.visible = bool(known)
         if known != self._known:
@@ -265,12 +265,12 @@ class _Network:
 
 
 class Controls:
-    """What one browser can change: the same of all flights on the page.
+    """Controls of one browser; a change applies to all flights on the page.
 
     Args:
         client: the browser.
-        flights: what is flown.
-        vehicle: tells the number of the vehicle that is chosen.
+        flights: flights on the page.
+        vehicle: returns the number of the chosen vehicle.
     """
 
     def __init__(
@@ -306,7 +306,7 @@ class Controls:
                 flight.heal()
 
     def _let_fly(self) -> None:
-        """Add what only a flight has."""
+        """Add controls that only flights have, and not netem alone."""
         gui, scenario = self._client.gui, self._flights[0].state.scenario
         self._trigger = gui.add_dropdown(
             "Trigger",
@@ -344,7 +344,7 @@ class Controls:
                 flight.ask(knob.process, knob.write(values, number))
 
     def show(self) -> None:
-        """Show what flies, and what was answered."""
+        """Update the controls and the newest answer."""
         flight = self._flights[0]
         if self._flights[0].state.flies:
             self._show_flight(flight)
@@ -380,7 +380,7 @@ class Controls:
 
 
 class _Mission:
-    """What can be changed of a mission: zones as a text or drawn, and the chosen vehicle's goal."""
+    """Controls of a mission: zones, as a text or drawn, and the chosen vehicle's goal."""
 
     def __init__(
         self,
@@ -392,7 +392,7 @@ class _Mission:
         self._flight, self._state, self._ask = flights[0], flights[0].state, ask
         self._known, self._vehicle = self._state.zones, vehicle
         self._corners: list[NDArray[Any]] = []
-        """Corners of a box that were clicked."""
+        """Clicked corners of a box."""
         gui = client.gui
         with gui.add_folder("Mission"):
             self._text = gui.add_text("Zones", self._known, hint=ZONES)
@@ -410,7 +410,7 @@ class _Mission:
         @client.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            if direction[2] * origin[2] < 0:  # else it is the sky that was clicked
+            if direction[2] * origin[2] < 0:  # otherwise the sky was clicked
                 at = (origin - direction * origin[2] / direction[2])[:2]
                 if self._clicks.value == GUIDES:
                     self._guide(at)
@@ -418,7 +418,7 @@ class _Mission:
                     self._draw(at)
 
     def _guide(self, at: NDArray[Any]) -> None:
-        """Send the chosen vehicle to a place, in space at the height of its goal."""
+        """Send the chosen vehicle to a point; in 3-D at its goal's height."""
         number, axes = self._vehicle(), self._state.scenario.model.axes
         track = self._state.vehicles.get(number)
         here = track.goal(GOAL_S) if track else None
@@ -428,7 +428,7 @@ class _Mission:
         self._ask({GUIDED: written(goals)})
 
     def _draw(self, at: NDArray[Any]) -> None:
-        """Take a corner of a box; the second one makes it."""
+        """Take a corner of a box; the second corner completes it."""
         self._corners.append(at)
         if len(self._corners) == 2:
             (x0, y0), (x1, y1) = np.sort(np.round(self._corners, 2), axis=0)
@@ -437,14 +437,14 @@ class _Mission:
             self._ask({ZONED: " & ".join(filter(None, (self._state.zones, box)))})
 
     def show(self) -> None:
-        """Show the zones once they are others than before."""
+        """Show the zones after they have changed."""
         if self._state.zones != self._known:
             self._known = self._state.zones
             assign(self._text, self._known)
 
 
 class _Lead:
-    """The target, which this browser can drag, or put where it clicks."""
+    """Target that this browser can drag, or place by a click."""
 
     def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
         self._flights = flights
@@ -469,7 +469,7 @@ class _Lead:
         def _(event: viser.SceneClickEvent) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             height = self._handle.position[2] - origin[2]
-            if direction[2] * height > 0:  # else it is the sky that was clicked
+            if direction[2] * height > 0:  # otherwise the sky was clicked
                 point = origin + direction * height / direction[2]
                 self._handle.position = point
                 self._move(point)
@@ -480,7 +480,7 @@ class _Lead:
             flight.ask("server", {LED: [np.round(point[: self._axes], 3).tolist()]})
 
     def show(self) -> None:
-        """Put it where the target is, unless it is being dragged."""
+        """Move the handle to the target, unless it is being dragged."""
         if time.monotonic() - self._held_s < HELD_S:
             return
         for track in list(self._flights[0].state.vehicles.values())[:1]:

@@ -1,7 +1,7 @@
-"""Changes that somebody asks for on the page, on their way to the processes that make them.
+"""Changes requested on the page, on their way to the processes.
 
-A slider that is dragged asks many times a second, and a process answers in its own time: of what
-waits for a key only the newest is asked for. All of it goes through the control sockets
+A dragged slider makes many requests per second, and a process answers in its own time: of the
+requests waiting for a key only the newest is sent. All go through the control sockets
 (`shell.control`), and so through the checks of a scenario.
 """
 
@@ -20,12 +20,12 @@ Answered = Callable[[str, Mapping[str, Any], Answer | None], None]
 
 
 class Operator:
-    """Asks the processes of a flight for changes, in a thread of its own.
+    """Sender of changes to a flight's processes, in a thread of its own.
 
     Args:
-        folder: where their sockets are.
-        answered: called in the thread with the name of a process, what it was asked for, and its
-            answer, or None where there is none.
+        folder: folder of their sockets.
+        answered: called in the thread with the name of a process, the requested values, and its
+            answer, or None for no answer.
     """
 
     def __init__(self, folder: Path, answered: Answered) -> None:
@@ -39,13 +39,13 @@ class Operator:
         self._thread.start()
 
     def ask(self, process: str, values: Mapping[str, Any]) -> None:
-        """Ask a process for other values, soon; without any, for those that it has."""
+        """Queue a request for other values; without values, for the present ones."""
         with self._changed:
             self._wanted.setdefault(process, {}).update(values)
             self._changed.notify()
 
     def close(self) -> None:
-        """Ask for nothing more."""
+        """Stop sending requests."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -67,7 +67,7 @@ class Operator:
             try:
                 answer = caller.ask(values)
             except ControlError:
-                caller.close()  # an answer that comes yet is not that to the next request
+                caller.close()  # a late answer must not be taken for the next request's
                 raise
         except ControlError:
             return None

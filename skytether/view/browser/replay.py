@@ -1,4 +1,4 @@
-"""Flights that are over, shown again: forwards, at any speed, from any time."""
+"""Playback of recorded flights: forwards, at any speed, from any time."""
 
 import threading
 import time
@@ -20,17 +20,17 @@ from skytether.view.state import State
 TICK_S = 0.04
 """Time from one batch of frames to the next [s]."""
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8", "16")
-"""Speeds that are offered, over that of the flight."""
+"""Speeds offered to the user, relative to real time."""
 Placed = tuple[int, int, str, Frame]
-"""Time of a frame since its flight's first [ns], place of its flight, process, and the frame."""
+"""Time of a frame since its flight's first [ns], index of its flight, process, and the frame."""
 
 
 class Player:
-    """Plays frames of flights.
+    """Player of recorded frames.
 
     Args:
-        flights: what is shown.
-        frames: frames of each, in their order.
+        flights: flights on the page.
+        frames: frames of each flight, in order.
     """
 
     def __init__(self, flights: Sequence[PageFlight], frames: Sequence[Sequence[Timed]]) -> None:
@@ -54,13 +54,13 @@ class Player:
         self._lock = threading.Lock()
         self._at_ns = 0
         self._next = 0
-        """Frame that comes next."""
+        """Index of the next frame."""
         self.speed = 1.0
-        """Speed over that of the flight."""
+        """Playback speed relative to real time."""
         self.plays = True
-        """Whether time goes on."""
+        """Whether playback is running."""
         self._wanted_ns: int | None = None
-        """Time that somebody wants to see; None where it is shown already."""
+        """Requested time [ns]; None where it is shown already."""
         self.seek(0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -68,15 +68,15 @@ class Player:
 
     @property
     def at_ns(self) -> int:
-        """Time that is shown since the first frame [ns]."""
+        """Time shown, since the first frame [ns]."""
         return self._at_ns
 
     def now_ns(self) -> int:
-        """Time that is shown, on the clock of the first flight [ns]."""
+        """Time shown, on the clock of the first flight [ns]."""
         return self._begin_ns + self._at_ns
 
     def seek(self, at_ns: int) -> None:
-        """Show another time."""
+        """Jump to another time."""
         with self._lock:
             for flight in self._flights:
                 with flight.lock:
@@ -87,7 +87,7 @@ class Player:
             self._go(at_ns)
 
     def advance(self, passed_ns: int) -> None:
-        """Show what came in some more time."""
+        """Play the frames of some more time."""
         with self._lock:
             self._go(min(self._at_ns + passed_ns, self.end_ns))
 
@@ -110,12 +110,12 @@ class Player:
             before_s = now_s
 
     def close(self) -> None:
-        """Play no more."""
+        """Stop playback."""
         self._closed.set()
         self._thread.join()
 
     def controls(self, gui: viser.GuiApi) -> Callable[[], None]:
-        """Add slider, speed and pause to a browser; what is returned keeps them up to date."""
+        """Add slider, speed and pause to a browser; the returned function updates them."""
         end_s = max(self.end_ns / SECOND_NS, 1.0)
         with gui.add_folder("Replay"):
             at = gui.add_slider("Time [s]", 0.0, end_s, 0.1, 0.0)

@@ -1,4 +1,4 @@
-"""Serving a page: where it listens, who may change what, and how it ends."""
+"""Page server: its address, who may change the flight, and how it ends."""
 
 import errno
 import secrets
@@ -21,11 +21,11 @@ from skytether.view.browser.play import PROCESSES
 
 TOKEN_BYTES = 16
 POLL_S = 0.1
-"""Time after which Ctrl-C is noticed [s]."""
+"""Interval at which Ctrl-C is checked [s]."""
 PORTS, PORTS_TRIED = 65536, 100
-"""Number of ports there are, and most that are tried from the one that is asked for on."""
+"""Number of ports, and most that are tried from the requested one on."""
 ANYWHERE = ("0.0.0.0", "::")
-"""Hosts that are none to connect to."""
+"""Addresses that mean every interface, and cannot be connected to."""
 
 
 @contextmanager
@@ -46,15 +46,15 @@ def page(
     now_ns: Callable[[], int] | None = None,
     more: More | None = None,
 ) -> Iterator[tuple[Page, PageServed]]:
-    """Serve a page for as long as the block takes; yields it and its address.
+    """Serve a page for as long as the block takes; yields the page and its address.
 
     Args:
-        at: where it listens; where that port is taken, on the next free one.
-        flights: what is shown.
+        at: address to listen at; if its port is taken, the next free one.
+        flights: flights on the page.
         now_ns, more: see `Page`.
 
     Raises:
-        CommandError: it cannot listen there.
+        CommandError: the address cannot be listened at.
     """
     host, port = at
     free = next_free(host, port)
@@ -67,10 +67,10 @@ def page(
 
 
 def next_free(host: str, port: int) -> int:
-    """The first port from one on where nobody listens; 0, which takes any, stays 0.
+    """First free port from the given one on; 0, which takes any free port, stays 0.
 
     Raises:
-        CommandError: there is none, or the host is not this machine's.
+        CommandError: no port is free, or the host is not this machine.
     """
     for candidate in range(port, min(port + PORTS_TRIED, PORTS)):
         try:
@@ -100,14 +100,14 @@ def until_told(
     now_ns: Callable[[], int] | None = None,
     more: More | None = None,
 ) -> None:
-    """Serve a page until SIGINT or SIGTERM, and say where.
+    """Serve a page until SIGINT or SIGTERM, and print its address.
 
     Args:
         at, flights, now_ns, more: see `page`.
         log: form of the log.
 
     Raises:
-        CommandError: it cannot listen there.
+        CommandError: the address cannot be listened at.
     """
     with (
         interruptible() as interrupted,
