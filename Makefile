@@ -26,7 +26,7 @@ LOAD = from skytether.shared.base import kernel; kernel.load()
 KERNELS = $(BIN)/python -c "import skytether.lab.linear, skytether.quadrotor.loops; $(LOAD)" & \
 	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
 
-.PHONY: setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench fuzz clean
+.PHONY: setup demo reproduce test long-test check format lock keys pictures docs docker-test page-test autopilot-test bench fuzz clean
 
 setup: $(STAMP)  ## the environment alone
 
@@ -72,6 +72,10 @@ format: setup  ## as `check` wants it
 keys: setup  ## docs/keys.md, from the keys in shared/scenario/schema.py
 	$(BIN)/python -m skytether.lab.keys_document > docs/keys.md
 
+pictures: setup  ## docs/rooms.svg and docs/packet.svg, from the imports and the calls in the code
+	$(BIN)/python -m skytether.lab.house docs
+
+# Open site/index.html; its search works only through a server, as of `python -m http.server -d site`.
 docs: $(DOCS_STAMP)  ## a site of docs/ in site/, offline; a link that leads nowhere fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 
