@@ -1,4 +1,4 @@
-"""What the site needs done to a page before it is made: see `hooks` in mkdocs.yml."""
+"""Hook of the site: changes a page before it is made, see `hooks` in mkdocs.yml."""
 
 import re
 

@@ -52,7 +52,7 @@ class Room(NamedTuple):
     y: int
     """Middle of its box, from the top."""
     about: str
-    """What is in it, in a few words."""
+    """Contents, in a few words."""
 
 
 ROOMS: Mapping[str, Room] = {
@@ -235,7 +235,7 @@ class Call(NamedTuple):
     where: str
     """File and name, as docs/design.md writes them."""
     about: str
-    """What it does, in a few words."""
+    """Purpose, in a few words."""
     calls: tuple["Call", ...] = ()
     """Functions that it calls, by itself or through others of its class, in their order."""
 
@@ -523,7 +523,7 @@ def _tree(file: Path) -> ast.Module:
 
 
 PICTURES = {"rooms.svg": rooms_svg, "packet.svg": packet_svg}
-"""What draws each file."""
+"""Function that draws each file."""
 
 
 def main(folder: str) -> None:

@@ -29,7 +29,7 @@ def test_a_room_imports_what_it_says() -> None:
 
 
 def test_an_arrow_that_a_longer_way_implies_is_left_out() -> None:
-    """a → b → c stands for a → c as well."""
+    """Arrows a → b → c stand for a → c as well."""
     a, b, c, d = ("a",), ("b",), ("c",), ("d",)
     edges = {a: {b, c, d}, b: {c}, c: set(), d: set()}
     assert house.reduced(edges) == {(a, b), (b, c), (a, d)}

@@ -107,7 +107,7 @@ def test_a_documented_flight_flies(
 
 
 def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
-    """docs/running.md's block with server, netem and client, each line in a process of its own."""
+    """Block of docs/running.md with server, netem and client, each line in a process of its own."""
     on_one, _ = terminals()
     said = fly_together(on_one, tmp_path)
     assert "PLAINTEXT" in said
@@ -115,7 +115,7 @@ def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
 
 
 def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
-    """docs/running.md's block with keys, all of its hosts being this one."""
+    """Block of docs/running.md with keys, all of its hosts being this one."""
     _, on_three = terminals()
     keygen, *processes = on_three
     made = subprocess.run(skytether(keygen), cwd=tmp_path, capture_output=True, check=False)
@@ -251,7 +251,7 @@ def test_documented_targets_exist(line: str) -> None:
 
 
 def test_documented_extras_exist() -> None:
-    """docs/install.md has each that is for users; whatever is installed names one of them."""
+    """Extras for users are all in docs/install.md; every documented `pip install` names one."""
     extras = set(metadata.metadata("skytether").get_all("Provides-Extra", ()))
     page = (ROOT / "docs" / "install.md").read_text()
     told = set(re.findall(r"(?m)^\| `(\w+)` \| .* \| .* \|$", page.partition("| extra |")[2]))

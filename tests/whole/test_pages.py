@@ -90,7 +90,7 @@ def test_a_term_is_linked_where_it_first_stands(page: str) -> None:
     ],
 )
 def test_a_term_without_a_link_is_found(text: str, found: list[str]) -> None:
-    """And what is code, a table or another word is not."""
+    """Code, tables and other words are no uses of a term."""
     assert list(unexplained(text)) == found
 
 
