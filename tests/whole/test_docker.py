@@ -104,7 +104,7 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
 def test_one_command_flies_for_a_gate(
     compose: list[str], tmp_path: Path, seconds: int, code: int
 ) -> None:
-    """As docs/running.md says, after the flight all have ended, and the exit code is the client's."""
+    """By the command of docs/running.md all end after the flight, with the client's exit code."""
     (line,) = (line for line in RUNNING.splitlines() if "--exit-code-from" in line)
     *command, build = shlex.split(line)[:4]
     assert (command, build) == (["docker", "compose", "up"], "--build")
