@@ -7,6 +7,7 @@ FLY := .venv/.ready-to-fly
 STAMP := .venv/.ready
 BENCH_STAMP := .venv/.ready-to-bench
 FUZZ_STAMP := .venv/.ready-to-fuzz
+DOCS_STAMP := .venv/.ready-to-document
 COMPILE := $(BIN)/uv pip compile --quiet --upgrade --universal --fork-strategy fewest \
 	--python-version 3.11 --generate-hashes --no-header --no-annotate --no-emit-index-url
 # From pip's index, where pip is told of another one. Where uv can reach none, pip may know more.
@@ -25,7 +26,7 @@ LOAD = from skytether.shared.base import kernel; kernel.load()
 KERNELS = $(BIN)/python -c "import skytether.lab.linear, skytether.quadrotor.loops; $(LOAD)" & \
 	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
 
-.PHONY: setup demo reproduce test long-test check format lock keys docker-test page-test autopilot-test bench fuzz clean
+.PHONY: setup demo reproduce test long-test check format lock keys pictures docs docker-test page-test autopilot-test bench fuzz clean
 
 setup: $(STAMP)  ## the environment alone
 
@@ -71,6 +72,17 @@ format: setup  ## as `check` wants it
 keys: setup  ## docs/keys.md, from the keys in shared/scenario/schema.py
 	$(BIN)/python -m skytether.lab.keys_document > docs/keys.md
 
+pictures: setup  ## docs/rooms.svg and docs/packet.svg, from the imports and the calls in the code
+	$(BIN)/python -m skytether.lab.house docs
+
+# Open site/index.html; its search works only through a server, as of `python -m http.server -d site`.
+docs: $(DOCS_STAMP)  ## a site of docs/ in site/, offline; a link that leads nowhere fails
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
+
+$(DOCS_STAMP): $(STAMP) requirements-docs.lock
+	$(INSTALL) --require-hashes -r requirements-docs.lock
+	touch $@
+
 docker-test: setup  ## the three containers, and what they survive; needs a Docker engine
 	$(BIN)/pytest -q -rs -m docker
 
@@ -101,7 +113,7 @@ $(FUZZ_STAMP): $(STAMP) requirements-fuzz.lock
 lock: $(UV)  ## pin what pyproject.toml asks for: one version of each package, whoever needs it
 	$(COMPILE) --extra dev pyproject.toml -o requirements-dev.lock
 	$(COMPILE) --group setup -o requirements-setup.lock
-	for need in "" client mavlink page server bench fuzz; do \
+	for need in "" client mavlink page server bench fuzz docs; do \
 		case "$$need" in \
 			"") extras="--extra server --extra page --extra plot";; \
 			client) extras="";; \

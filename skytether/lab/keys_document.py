@@ -18,14 +18,18 @@ from skytether.shared.scenario.schema import Scenario, Section
 
 HEAD = """# Keys of a scenario
 
-Every key that a scenario's file may have, and a flag of every command that flies. This page is
-made from `shared/scenario/schema.py` by `make keys`.
+Every key that a scenario's file may have; each is also a flag of every command that flies. This
+page is for looking up, and made from `shared/scenario/schema.py` by `make keys`.
 
-The **owner** of a key uses its value. A key of *both ends* is a [term](protocol.md#terms): where
-the ends differ in one, there is no flight. Any other key may differ: *each end* has a value of its
-own, or one end alone uses it; flights over UDP do not use those of *virtual time*. Keys with "yes"
-under **in flight** may be [changed in flight](control.md), position and velocity of a point where
-it is a live one. Values are written as in TOML; *list of numbers, 0 to 1* bounds each number.
+- The **owner** of a key is the process that uses its value. A key of *both ends* is a
+  [term](protocol.md#terms): where the ends differ in it, there is no flight. Keys with another
+  owner may differ. With *each end*, both use a value of their own. Keys of *virtual time* are not
+  used over UDP.
+- Keys with "yes" under **in flight** may be [changed in flight](control.md); position and velocity
+  of a point only where `reference.shape = "live"`.
+- **Values** are written as in TOML; *list of numbers, 0 to 1* bounds each number.
+- Meanings use the terms of the [glossary](glossary.md), such as [horizon](glossary.md#horizon),
+  [trigger](glossary.md#trigger) and [scheme](glossary.md#scheme).
 """
 
 

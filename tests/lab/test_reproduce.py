@@ -30,7 +30,7 @@ PAPER = reading.load("paper")
 
 (LINE,) = [
     line
-    for line in (ROOT / "README.md").read_text().splitlines()
+    for line in (ROOT / "docs" / "running.md").read_text().splitlines()
     if line.startswith("skytether reproduce")
 ]
 

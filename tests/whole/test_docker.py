@@ -31,7 +31,7 @@ from skytether.shared.telemetry.summary import Summary
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
+RUNNING = (ROOT / "docs" / "running.md").read_text()
 SERVICES = ("server", "netem", "client")
 IMAGES = ("client", "page", "server")
 STEPS_PER_S = round(1 / reading.load("demo").control.dt)
@@ -104,8 +104,8 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
 def test_one_command_flies_for_a_gate(
     compose: list[str], tmp_path: Path, seconds: int, code: int
 ) -> None:
-    """README's: after the flight all have ended, and the exit code is the client's."""
-    (line,) = (line for line in README.splitlines() if "--exit-code-from" in line)
+    """By the command of docs/running.md all end after the flight, with the client's exit code."""
+    (line,) = (line for line in RUNNING.splitlines() if "--exit-code-from" in line)
     *command, build = shlex.split(line)[:4]
     assert (command, build) == (["docker", "compose", "up"], "--build")
     three = Containers(compose, seconds)

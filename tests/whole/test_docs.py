@@ -107,7 +107,7 @@ def test_a_documented_flight_flies(
 
 
 def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
-    """The block of README with server, netem and client, each line in a process of its own."""
+    """Block of docs/running.md with server, netem and client, each line in a process of its own."""
     on_one, _ = terminals()
     said = fly_together(on_one, tmp_path)
     assert "PLAINTEXT" in said
@@ -115,7 +115,7 @@ def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
 
 
 def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
-    """The block of README with keys, all of its hosts being this one."""
+    """Block of docs/running.md with keys, all of its hosts being this one."""
     _, on_three = terminals()
     keygen, *processes = on_three
     made = subprocess.run(skytether(keygen), cwd=tmp_path, capture_output=True, check=False)
@@ -125,10 +125,10 @@ def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
 
 
 def terminals() -> list[list[str]]:
-    """Blocks of README with a client of their own."""
+    """Blocks of docs/running.md with a client of their own."""
     return [
         block
-        for block in blocks(ROOT / "README.md")
+        for block in blocks(ROOT / "docs" / "running.md")
         if any(line.startswith("skytether client") for line in block)
     ]
 
@@ -202,7 +202,7 @@ def test_the_documented_pages_are_served(
             assert page.wait(60) in (0, command.INTERRUPTED), said
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/recordings.md", "docs/tour.md"])
+@pytest.mark.parametrize("document", ["docs/running.md", "docs/recordings.md", "docs/tour.md"])
 def test_the_documented_recordings_are_made_and_read(
     document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,11 +251,11 @@ def test_documented_targets_exist(line: str) -> None:
 
 
 def test_documented_extras_exist() -> None:
-    """README's table has each that is for users, and whatever is installed names one of them."""
+    """Extras for users are all in docs/install.md; every documented `pip install` names one."""
     extras = set(metadata.metadata("skytether").get_all("Provides-Extra", ()))
-    readme = (ROOT / "README.md").read_text()
-    told = set(re.findall(r"(?m)^\| `(\w+)` \| .* \| .* \|$", readme.partition("| extra |")[2]))
-    assert told == extras - {"bench", "dev", "fuzz"}
+    page = (ROOT / "docs" / "install.md").read_text()
+    told = set(re.findall(r"(?m)^\| `(\w+)` \| .* \| .* \|$", page.partition("| extra |")[2]))
+    assert told == extras - {"bench", "dev", "docs", "fuzz"}
     for document in DOCUMENTS:
         for named in re.findall(r"pip install [^`\n]*\[(\w+)\]", document.read_text()):
             assert named in extras
