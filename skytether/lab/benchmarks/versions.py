@@ -117,7 +117,7 @@ def contests(counts: VersionsCounts) -> list[Contest]:
         paced: tuple[Any, ...] = ("ticks", name, 1, 10, True)
         found += [
             Contest(f"{title}, hot [µs]", hot, counts.hot, 1e3, target_ratio="≤ 0.5"),
-            Contest(f"{title}, paced [µs]", paced, counts.paced, 1e3, target_ratio="≤ 0.6"),
+            Contest(f"{title}, paced [µs]", paced, counts.paced, 1e3, target_ratio="≤ 0.5"),
         ]
     for vehicles in counts.fleets:
         title = f"tick of {vehicles} vehicles, per vehicle [µs]"
