@@ -57,7 +57,7 @@ class ClientOptions:
     """Do without keys even where the server is another machine: anybody on the way can fly the
     vehicle."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Format in which each event is printed: a sentence, or a line of JSON for a program."""
     record: Path | None = None
     """File for the client's part of the record; one that ends in .mcap becomes a recording with
     all that the client says, see `skytether join`."""

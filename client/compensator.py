@@ -75,7 +75,7 @@ class Compensator:
         self._chosen = 0
         """Step chosen for last."""
         self.told = [0.0] * terms.axes
-        """What is flown at the step chosen for last but for the feedback, of each axis [m/s]."""
+        """Input of each axis at the step chosen for last, without the feedback [m/s]."""
         self.in_force = NO_HORIZON
         """Step that the horizon was made for, k_h, or NO_HORIZON."""
         self.newest = NO_HORIZON

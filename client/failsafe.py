@@ -147,7 +147,7 @@ class Failsafe:
         self._land_after_ns = land_after_ns
         self._changed = changed
         self.mode = Mode.INIT
-        """What the vehicle does."""
+        """Present mode."""
         self.reason = Reason.BEGUN
         """Newest cause that it met; what it braked for, while it hovers."""
         self._heard_ns: int | None = None

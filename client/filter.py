@@ -31,7 +31,7 @@ from skytether.shared.law.model import Axis, advance, white_acceleration
 from skytether.shared.scenario.schema import Scenario
 
 DRIFT = 0.3
-"""How fast w walks: that share of q [1], so w moves by DRIFT q √t in the time t."""
+"""Strength of the random walk of w as a share of q [1]: w moves by DRIFT q √t in the time t."""
 BEGIN_MPS = 1.0, 0.5
 """Standard deviation of the velocity at the begin, where it was not measured, and of w [m/s]."""
 LEAST = 1e-6
@@ -50,7 +50,7 @@ class Spread(NamedTuple):
 
 
 Gain = tuple[float, float, float]
-"""What K says for p, v and w."""
+"""Kalman gains K of p, v and w."""
 
 
 def widened(axis: Axis, P: Spread, noise: Spread) -> Spread:
@@ -204,5 +204,5 @@ class Kalman:
         return [(p + late[0] * u, v + late[1] * u) for (p, v), late, u in axes]
 
     def disturbance(self) -> list[float]:
-        """What acts on each axis like an input of its own, w [m/s]."""
+        """Disturbance w that acts on each axis like an input [m/s]."""
         return [w for _, _, w in self.x]

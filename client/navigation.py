@@ -1,4 +1,4 @@
-"""What a vehicle knows of its state: what it measures, and what its filter makes of that.
+"""State of a vehicle as it knows it: its measurements, and its filter's estimate.
 
 What is known is what the vehicle flies by and reports: with a dead time not its state now, but the
 one in which its next input will meet it (`shared.law.dead_time`). With a sensor that measures the
@@ -27,7 +27,7 @@ SIGMAS = 10.0
 
 
 class Sensing(NamedTuple):
-    """What is known of a scenario's sensor."""
+    """Properties of a scenario's sensor."""
 
     delay: int
     """Time from measuring to having the measurement, D [steps]."""
@@ -38,7 +38,7 @@ class Sensing(NamedTuple):
 
 
 def sensing(scenario: Scenario) -> Sensing:
-    """What is known of a scenario's sensor."""
+    """Properties of a scenario's sensor."""
     sensor, dt_ns = scenario.sensor, scenario.dt_ns
     delay = -(-seconds_to_ns(sensor.delay_s) // dt_ns)
     position_ns, velocity_ns = (
@@ -59,13 +59,13 @@ def filters(scenario: Scenario) -> bool:
 
 
 class Navigation:
-    """What a scenario's vehicle makes of its measurements."""
+    """Filter that a scenario's vehicle has for its measurements."""
 
     def __init__(self, scenario: Scenario) -> None:
         known, axes = sensing(scenario), scenario.model.axes
         terms = scenario.terms()
         self.filter = Kalman(scenario, known.delay) if filters(scenario) else Newest(axes)
-        """What makes an estimate of what is measured."""
+        """Filter that makes an estimate of the measurements."""
         late = any(terms.dead_time_s)
         self._inputs = OnTheirWay(terms.model.axes(), terms.dead_times) if late else None
         """Inputs on their way; None where the model has each act at once."""
@@ -74,7 +74,7 @@ class Navigation:
         self._motions = list(zip(terms.tau_s, terms.gain, strict=True))
         self._begun = False
         self.leaps = Leaps(scenario)
-        """What is measured is held against what was measured before."""
+        """Check of each measurement against the one before."""
         self.is_simple = known.exact and self._inputs is None
         """Whether the whole state is measured at each step, and each input acts at once."""
         self.leapt = False

@@ -78,7 +78,7 @@ class Pilot:
         self._recorder = recorder
         gain = feedback_gain(scenario) if self._terms.splines else None
         self.compensator = Compensator(self._terms, gain)
-        """What chooses the input."""
+        """Compensator, which chooses the input."""
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
         self._fence = Fence(scenario) if scenario.fence.is_there else None
         self._change_max = (

@@ -1,4 +1,4 @@
-"""When the vehicle reports its state: what the server believes of it, and the rule for saying more.
+"""Reports of the vehicle's state: what the server believes, and when an observation is sent.
 
 The server rolls the newest observation on by the rule of flight (`shared.law.rule`). So does the
 vehicle, from the observation that it sent last and by the horizon that it holds. While the two lead
@@ -30,7 +30,7 @@ class BelievedState:
         self._states: States = ()
 
     def off_m(self, states: States) -> float:
-        """How far the vehicle has left it [m].
+        """Distance of the vehicle from it [m].
 
         A velocity that is off by Δv counts for the τ Δv by which it would lead astray.
         """

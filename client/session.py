@@ -55,7 +55,7 @@ class Echo(NamedTuple):
     server_ns: int
     """The server's clock when it was sent [ns]."""
     received_ns: int
-    """When it came [ns; our clock]."""
+    """Time at which it came [ns; our clock]."""
     heard: int
     """Number of packets that have come with it, modulo NUMBERS."""
 
@@ -65,7 +65,7 @@ NEVER = Echo(0, 0, 0)
 
 
 class ServerSession:
-    """What one vehicle and its server have agreed upon, over all sessions of the vehicle's life.
+    """Agreement of one vehicle and its server, over all sessions of the vehicle's life.
 
     Args:
         terms: what the server has to agree to.
@@ -100,9 +100,9 @@ class ServerSession:
         self._server = server
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
-        """How messages become datagrams."""
+        """Link, which turns messages into datagrams."""
         self.hearing = hearing
-        """What silence is asked of the server."""
+        """Longest silence that is asked of the server."""
         self.asked = hearing.silence
         """Longest silence that the server asks of us [half steps]; 0 for none."""
         self.said = 0

@@ -1,4 +1,4 @@
-"""What flies, as far as the pilot knows it: it takes a velocity, and tells what it measures.
+"""Vehicle as the pilot knows it: it takes a velocity, and gives measurements.
 
 A vehicle measures at its own rate, by stamps of its own, and tells it late, or not at all; nobody
 aboard knows more of its state than that. `client.simulated` is one that is computed. One that is

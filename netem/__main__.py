@@ -37,13 +37,13 @@ class NetemOptions:
     server: str = "127.0.0.1:47001"
     """HOST:PORT of the server, of the same family as the clients' addresses or not."""
     uplink: str | None = None
-    """What befalls packets from the server to clients: impairments joined by &, as in
+    """Impairments of packets from the server to clients: impairments joined by &, as in
     "constant(0.05) & loss(0.1)", see `skytether impairments`. In place of the scenario's; where
     only one of uplink and downlink is given, the other passes everything at once."""
     downlink: str | None = None
-    """What befalls packets from clients to the server, written as for uplink."""
+    """Impairments of packets from clients to the server, written as for uplink."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Format in which each event is printed: a sentence, or a line of JSON for a program."""
     record: Path | None = None
     """File for netem's part of the record: the fate of every packet. One that ends in .mcap becomes
     a recording with all that netem says, see `skytether join`."""

@@ -110,7 +110,7 @@ class Bottleneck(Generic[T]):
         self.waiting_bytes = 0
         """Their size on the wire [B]."""
         self.dropped: list[T] = []
-        """What was dropped; whoever counts it takes it out."""
+        """Dropped packets; the caller that counts them takes them out."""
         self._pace: _Rate | _Deliveries = (
             _Deliveries(queue) if isinstance(queue, Deliveries) else _Rate(queue.bytes_per_s)
         )

@@ -45,7 +45,7 @@ class ServerOptions:
     [::1]:47001; its socket hears IPv6 alone, even that of [::]. A name means its IPv4 address, if
     it has one."""
     log: LogFormat = "text"
-    """What is printed for each event: a sentence, or a line of JSON for a program."""
+    """Format in which each event is printed: a sentence, or a line of JSON for a program."""
     record: Path | None = None
     """File for the server's part of the record; one that ends in .mcap becomes a recording with
     all that the server says and its plans, see `skytether join`."""

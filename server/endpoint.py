@@ -98,7 +98,7 @@ class Server(Endpoint):
             seconds_to_ns(scenario.link.timeout_s),
             partial(scenario.link.hearing, terms.dt_ns),
         )
-        """Who flies."""
+        """Sessions of the vehicles that fly."""
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(
             terms,
@@ -125,14 +125,14 @@ class Server(Endpoint):
             plans=plans,
         )
         self._expire_ns = 0
-        """When to look for vehicles that are gone."""
+        """Time of the next search for vehicles that are gone."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Reception.hear`."""
         self._reception.hear(datagram, now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """When the next tick is due, while there is anybody to tick for."""
+        """Time of the next tick, while there is a vehicle to plan for."""
         return self._grid.due_ns
 
     def wake(self, *, now_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""Which observations are believed: one may be well formed, in a session, and still be impossible.
+"""Plausibility of observations: one may be well formed, in a session, and still be impossible.
 
 Each is held against the one of its vehicle that was believed last:
 
@@ -26,7 +26,7 @@ from skytether.shared.wire.protocol import NO_HORIZON, Observation
 REPEATS = 3
 """Observations in a row, each possible after the one before, that are believed in the end."""
 SLACK_NS = 50 * MILLISECOND_NS
-"""What clocks that drift may take from a round trip [ns]."""
+"""Time by which drifting clocks may shorten a measured round trip [ns]."""
 
 
 class Statement:
@@ -51,7 +51,7 @@ position_leaps, velocity_leaps = shared(leap.position_leaps), shared(leap.veloci
 
 
 class Belief(IntEnum):
-    """What becomes of an observation."""
+    """Verdict on an observation."""
 
     ANEW = -1
     """Believed, unlike all that was believed before."""
@@ -66,7 +66,7 @@ LAST, DOUBTED, NEW = 0, 1, 2
 
 
 class HeardNumbers(NamedTuple):
-    """What vehicles have said."""
+    """Newest observations of the vehicles."""
 
     numbers: Annotated[NDArray[np.void], records(STATEMENT, 2)]
     """Observations at their three places; shape (3, capacity)."""
@@ -84,7 +84,7 @@ class Plausibility:
         )
         self._dt_s, self._H = terms.dt_s, terms.horizon
         self._noise_m = NOISE_M + NOISE_MPS * max(terms.dead_time_s)
-        """What noise may add to a change of position, predicted over the dead time [m]."""
+        """Largest change of position by noise, predicted over the dead time [m]."""
         for row in range(capacity):
             self.forget(row)
 
@@ -93,7 +93,7 @@ class Plausibility:
         self._said.numbers["step"][:, row] = -1
 
     def judge(self, row: int, observation: Observation, F: int, G: int) -> int:
-        """What becomes of an observation of a vehicle.
+        """Verdict on an observation of a vehicle.
 
         Args:
             row: the vehicle.

@@ -106,7 +106,7 @@ class Reception:
         self._strangers = 0
         """Number of datagrams that the gate has not let pass."""
         self._tell_ns = 0
-        """When the operator may be told of these again."""
+        """Time from which the operator may be told of these again."""
 
     def hear(self, datagram: Datagram, *, now_ns: int) -> None:
         """HELLO opens a session, OBSERVATION feeds it, CLOSE ends it; all else is only counted."""

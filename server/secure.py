@@ -87,7 +87,7 @@ class _Rate:
 
 
 class _KeyedVehicle:
-    """What is kept of one vehicle."""
+    """Channels and attempts of one vehicle."""
 
     __slots__ = ("attempts", "done", "live", "pending", "previous", "repeats")
 
@@ -182,7 +182,7 @@ class SecureGate:
         self._keyring = keyring
         self.entropy = entropy
         self._secret = entropy(hashlib.blake2s.MAX_KEY_SIZE)
-        """What cookies are made of in this life of the server."""
+        """Secret that cookies are made of in this life of the server."""
         self._vehicles: dict[int, _KeyedVehicle] = {}
         """Vehicles that have a key and have come back with a cookie."""
         self._out: deque[Datagram] = deque(maxlen=OUT_MAX)

@@ -1,4 +1,4 @@
-"""Who flies: sessions of vehicles, each with a row in every array of the server.
+"""Sessions of vehicles, each with a row in every array of the server.
 
 A vehicle is welcomed when it says HELLO, and gets its row with its first observation; until then
 the session of an earlier life of it goes on. For each vehicle that was welcomed and has no row yet,
@@ -41,17 +41,17 @@ class Session:
     home: Address
     """Where its newest HELLO came from, which has heard from us there."""
     address: Address
-    """Where its newest observation came from."""
+    """Address that its newest observation came from."""
     line: WayBack
     """Way to answer it."""
     hearing: Hearing
-    """What silence is asked of it."""
+    """Longest silence that it is asked for."""
     row: int = -1
-    """Where its numbers lie in every array; -1 until its first observation."""
+    """Row of its numbers in every array; -1 until its first observation."""
     heard_ns: int = 0
-    """When something was heard of it last."""
+    """Time of the newest packet from it."""
     sent_ns: int = 0
-    """When something was sent to it last."""
+    """Time of the newest packet to it."""
     doubted: bool = False
     """Whether its newest observation was not believed."""
     stale: int = 0
@@ -182,7 +182,7 @@ class Sessions:
         return int.from_bytes(self._entropy(4)) | 2**31
 
     def _waiting(self, vehicle: int) -> dict[int, Session]:
-        """Where the welcomed session of a vehicle is kept, if it has one."""
+        """Sessions among which the welcomed one of a vehicle is kept, if it has one."""
         return self._again if vehicle in self._live else self.coming
 
     def _is_heard(self, live: Session, now_ns: int) -> bool:

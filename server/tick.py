@@ -45,7 +45,7 @@ TICK_BIN_NS = MILLISECOND_NS // 20
 
 
 class Grid:
-    """When ticks are due.
+    """Times of the ticks.
 
     Args:
         dt_ns: time from one tick to the next [ns].
@@ -56,7 +56,7 @@ class Grid:
         self._dt_ns = dt_ns
         self._events = events
         self.due_ns: int | None = None
-        """When the next tick is due; None while there is nobody to tick for."""
+        """Time of the next tick; None while there is no vehicle to plan for."""
         self.missed = 0
         """Number of ticks that were slept through."""
         self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)
@@ -137,7 +137,7 @@ class Ticker:
         self._columns = [str(each) for each in FIGURES[terms.scheme]]
         """Columns of the record that figures of plans are written to."""
         self.durations = Histogram(TICK_BIN_NS)
-        """How long each tick took, as far as the stopwatch runs."""
+        """Duration of each tick, while the stopwatch runs."""
 
     def tick(self, tick_ns: int, now_ns: int) -> None:
         """One tick.

@@ -1,1 +1,1 @@
-"""What both ends of the link agree on: endpoints, wire, model, reference, scenario, record."""
+"""Agreement of both ends of the link: endpoints, wire, model, reference, scenario, record."""

@@ -30,7 +30,7 @@ BATTERY_BAD = range(
 
 
 class Condition:
-    """What is known of the autopilot and its vehicle.
+    """Condition of the autopilot and its vehicle, as far as it is known.
 
     Args:
         battery_min: share of the battery's charge below which it is low.

@@ -1,4 +1,4 @@
-"""What ArduCopter and PX4 do differently: numbers and names of modes, and the way into the air."""
+"""Differences of ArduCopter and PX4: numbers and names of modes, and the way into the air."""
 
 from dataclasses import dataclass
 from enum import Enum, auto

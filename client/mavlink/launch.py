@@ -54,7 +54,7 @@ NOT_DONE = {
 
 
 class Phase(Enum):
-    """Where a flight stands."""
+    """Stage of a flight."""
 
     GROUND = auto()
     CLIMBING = auto()

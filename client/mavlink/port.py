@@ -70,7 +70,7 @@ RATES = {
 
 
 def _start(scenario: Scenario, vehicle: int) -> Vector:
-    """Where a vehicle takes off, in our axes [m]: on a mission, below where it begins."""
+    """Place of take-off, in our axes [m]: on a mission, below where it begins."""
     if not scenario.is_mission:
         return 0.0, 0.0, 0.0
     x, y = scenario.start_m(vehicle)[:2].tolist()
@@ -98,7 +98,7 @@ class Port(Endpoint):
         self.positions = Positions(
             scenario.model.axes, self._clock, start=_start(scenario, vehicle)
         )
-        """What is measured."""
+        """Measurements."""
         self._texts = Texts()
         self._told_ns: dict[str, int] = {}
         """Texts that were told, and when."""

@@ -101,7 +101,7 @@ class Positions:
         return self._untimely(message.time_boot_ms, now_ns)
 
     def _untimely(self, boot_ms: int, now_ns: int) -> str:
-        """What is wrong with a stamp; empty where nothing is."""
+        """Fault of a stamp; empty where there is none."""
         if not self._clock.is_known:
             return "unsynchronised"
         if boot_ms == self._newest_boot_ms:

@@ -17,11 +17,11 @@ SILENCE_MAX_S = 1.0
 SILENCE_MIN_S = 0.2
 """Shortest time-out with which it flies at all where setpoints come at 10 Hz [s]."""
 TOLERANCE = 1e-6
-"""What a float of 32 bits makes of a decimal number."""
+"""Tolerance for a decimal number stored as a float of 32 bits."""
 
 
 class Rule(NamedTuple):
-    """What is asked of a parameter."""
+    """Requirement on a parameter."""
 
     names: tuple[str, ...]
     """Its names, the newest last: an autopilot has one of them."""

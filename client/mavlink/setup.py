@@ -79,7 +79,7 @@ class Setup:
 
     @property
     def fence(self) -> dict[str, float]:
-        """What is known of the autopilot's own fence: values of parameters by name."""
+        """Parameters of the autopilot's own fence that are known: values by name."""
         return {name: value for name, value in self._values.items() if name[:3] in ("FEN", "GF_")}
 
     # What is heard

@@ -1,4 +1,4 @@
-"""What a vehicle measures of itself: its position and its velocity, now and then, late and wrong.
+"""Sensor of position and velocity, with its rate, delay, noise and bias.
 
     z(k) = x(k - D) + b + σ n          D: delay [steps]   b: bias   σ n: noise, drawn anew each time
 
@@ -36,7 +36,7 @@ class Sensor:
         self._step = 0
 
     def measure(self, state: Sequence[Sequence[float]], *, began_ns: int = 0) -> Measurement:
-        """What is had at the next step, from step 0 on.
+        """Measurements available at the next step, from step 0 on.
 
         Args:
             state: true position [m] and velocity [m/s] at the step, of each axis.

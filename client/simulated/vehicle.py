@@ -20,7 +20,7 @@ WIND = keys_of(InFlight.WIND)
 
 
 class Plant(Protocol):
-    """What flies in simulation, advanced step by step."""
+    """Simulated vehicle, advanced step by step."""
 
     @property
     def x(self) -> list[tuple[float, float]]:

@@ -17,7 +17,7 @@ from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 
 class AirStep(NamedTuple):
-    """What the air does over one step."""
+    """Wind over one step."""
 
     push: list[float]
     """Push w + τ a on each axis, which acts like an input [m/s]."""
@@ -41,7 +41,7 @@ class Weather:
         """Way that the gust blows, of any length; shape (axes,). None between gusts."""
         self._still = np.zeros((len(self._tau), 2))
         self.drawn: Array | None = None
-        """What was drawn for the next step and is not flown in yet."""
+        """Wind drawn for the next step and not used yet."""
         self.change(scenario.vehicle)
 
     def change(self, vehicle: VehicleConfig) -> None:

@@ -1,4 +1,4 @@
-"""Where a vehicle aims: at its goal, at a point of the way around zones, or to the right of it.
+"""Point that a vehicle aims at: its goal, a point on the way around zones, or to the right of it.
 
 One that is stuck finds its way around vehicles at rest as well for a while, and aims ever further
 round, at last in directions that are drawn: so vehicles that meet pass each other.
@@ -16,7 +16,7 @@ from skytether.shared.scenario.zones import Zone, Zones
 AIM_M = 3.0
 """Distance of what is aimed at in place of the goal [m]."""
 AHEAD_M = 1.5
-"""How far ahead on a way around zones a vehicle aims [m]."""
+"""Distance ahead on a way around zones at which a vehicle aims [m]."""
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 """By how much further round a vehicle aims that is stuck, how far at most before directions are
 drawn, and by how much less once it moves [rad]."""
@@ -30,7 +30,7 @@ TRIES = 5
 
 
 class Aims:
-    """Where vehicles of a mission aim.
+    """Points that the vehicles of a mission aim at.
 
     Args:
         zones: where they may not be.
@@ -58,7 +58,7 @@ class Aims:
         goal: Array,
         rests: Callable[[], Sequence[Array]],
     ) -> Iterator[Array]:
-        """What to fly to: a point of the way to the goal, its next corner, or right of that.
+        """Point to fly to: on the way to the goal, its next corner, or to the right of that.
 
         Args:
             known: the vehicle.

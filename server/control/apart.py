@@ -1,4 +1,4 @@
-"""How far motions are apart, at every time, and the half-planes that keep them so.
+"""Distances between motions at every time, and the half-planes that keep motions apart.
 
 Distances along the third axis may count less than those in the plane: all are of coordinates that
 are multiplied by `scale` first. So a sphere of that metric is an ellipsoid, higher than it is wide,
@@ -111,7 +111,7 @@ def pieces_of(begin: int, end: int) -> Array:
 
 
 def bend_m(acceleration_mps2: float, dt_s: float) -> float:
-    """How far a motion of at most this acceleration is from its straight pieces [m]."""
+    """Largest distance of a motion of at most this acceleration from its straight pieces [m]."""
     return acceleration_mps2 * (SPACING / SAMPLES * dt_s) ** 2 / 8.0
 
 

@@ -26,7 +26,7 @@ FURTHER = (1.2, 1.8, 2.7, 4.0)
 
 
 class Aside(NamedTuple):
-    """Where a vehicle is that has stepped aside."""
+    """Place of a vehicle that has stepped aside."""
 
     place: Array
     """Goal in place of its own [m]; shape (axes,)."""

@@ -92,7 +92,7 @@ class Budget:
     def choose(
         self, rows: Indices, event: Flags, owed: Flags, worth: Array, since_s: Array
     ) -> Flags:
-        """Which of some vehicles are sent what they ask for.
+        """Flags of the vehicles whose requests are granted.
 
         Args:
             rows: the vehicles; shape (n,).
@@ -130,7 +130,7 @@ class Budget:
             self._bytes[row] = size
 
     def figures(self) -> dict[str, Any]:
-        """What is told of it."""
+        """Figures of the budget."""
         return {
             "bytes_per_s": self.bytes_per_s,
             "queueing_ms": self._control.queueing_s * 1e3,

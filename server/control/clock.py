@@ -1,4 +1,4 @@
-"""Which step it is aboard each vehicle: the server's clock mapped to the vehicle's.
+"""Clock map: present step of each vehicle, from the server's clock and the vehicle's stamps.
 
 Neither clock is set; the vehicle's is the time since its step 0. Every observation gives
 F = t2 - t1 (sent by the vehicle, received here) and tells G = t4 - t3 (sent here, received aboard)
@@ -57,7 +57,7 @@ VEHICLE_CLOCK = record(VehicleClock)
 
 
 class Seen(NamedTuple):
-    """What was seen of the clocks and delays of up to `capacity` vehicles."""
+    """Clock offsets and delays observed for up to `capacity` vehicles."""
 
     vehicles: Annotated[NDArray[np.void], records(VEHICLE_CLOCK, 1)]
     """Shape (capacity,)."""
@@ -116,7 +116,7 @@ class ClockMap:
         return offsets
 
     def bound_ns(self, row: int) -> int:
-        """How far the offset of a vehicle may be off [ns]."""
+        """Bound of the error of a vehicle's clock offset [ns]."""
         return int(plain(half_trip_ns)(self.seen, row))
 
 

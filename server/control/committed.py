@@ -166,7 +166,7 @@ SENT_HORIZON, LEAD = record(SentHorizon), record(Lead)
 
 
 class ReplaySettings(NamedTuple):
-    """What is the same for all vehicles."""
+    """Constants shared by all vehicles."""
 
     laws: Laws
     """Model, bound and gain of each axis; shape (axes,)."""
@@ -187,7 +187,7 @@ class ReplaySettings(NamedTuple):
 
 
 class ReplayMemory(NamedTuple):
-    """What is known of every vehicle, and what it was sent."""
+    """State of every vehicle, and the horizons sent to it."""
 
     observed: I1
     """Step of the newest observation, or -1; shape (capacity,)."""
@@ -200,7 +200,7 @@ class ReplayMemory(NamedTuple):
     inputs: S4
     """Their inputs [m/s]; shape (capacity, room, axes, most + H), with the largest d."""
     led: Annotated[NDArray[np.void], records(LEAD, 3)]
-    """Where they lead; shape (capacity, room, axes)."""
+    """States that the horizons lead to; shape (capacity, room, axes)."""
 
 
 class Replay:
@@ -295,7 +295,7 @@ class Replay:
 
 
 class HorizonsInForce(NamedTuple):
-    """Which horizon is in force from which step on; room for more than can be in flight."""
+    """Horizons with the step from which each is in force; room for more than can be in flight."""
 
     begins: I1
     """First step of each leg."""
@@ -304,7 +304,7 @@ class HorizonsInForce(NamedTuple):
 
 
 class FlownTrack(NamedTuple):
-    """What was flown on one axis, step by step, and where that led."""
+    """Inputs flown on one axis, step by step, and the states they led to."""
 
     commands: F1
     """Inputs [m/s]."""

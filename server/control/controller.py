@@ -43,26 +43,26 @@ so large (128 KiB) that the C library would ask the kernel for its memory, and f
 
 @dataclass(frozen=True, slots=True)
 class Decisions:
-    """What was decided of n vehicles at a step; valid until the next decisions are made."""
+    """Decisions on n vehicles at a step; valid until the next decisions are made."""
 
     rows: Indices
     """The vehicles; shape (n,)."""
     step: Indices
     """Step k of each; shape (n,)."""
     found: Foresight
-    """What was foreseen, and the horizons; the n vehicles come first."""
+    """Predicted states, and the horizons; the n vehicles come first."""
     figures: Figures
-    """What the plans are worth; shape (n,)."""
+    """Costs of the plans; shape (n,)."""
     planned: Array
     """Planned state x_p(k+d|k-1) [m, m/s]; shape (n, axes, 2)."""
     verdict: Verdict
-    """What the trigger says."""
+    """Verdict of the trigger."""
     event: Flags
-    """Which are sent their horizon; shape (n,)."""
+    """Whether each vehicle is sent its horizon; shape (n,)."""
     sent: Indices
     """Indices of those that are sent theirs."""
     solve_ns: int
-    """How long planning took for all of them, or -1 where nobody measures it."""
+    """Time that planning for all of them took [ns], or -1 where nobody measures it."""
 
 
 class Controller:
@@ -95,13 +95,13 @@ class Controller:
         if not terms.indexed:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
         self.desired = Desired(scenario, terms, room, block, references)
-        """What is known of the desired trajectories."""
+        """Desired trajectories as far as they are known."""
         gain = feedback_gain(scenario)
         self._scheme: Scheme
         self.planner: Planner | Guidance | Together
         """Plans of every vehicle, or what is sent in place of a plan."""
         self._together: Together | None = None
-        """What keeps vehicles of a mission apart."""
+        """Planner that keeps vehicles of a mission apart."""
         if scenario.is_mission and references is not None:
             self._scheme = self.planner = self._together = Together(
                 scenario, terms, room, block, references, self.desired.number
@@ -184,7 +184,7 @@ class Controller:
         return self._together.left if self._together else []
 
     def waits(self, row: int) -> str:
-        """What a vehicle of a mission waits for, in words; empty: for nothing."""
+        """Reason in words why a vehicle of a mission waits; empty if it does not."""
         return self._together.waits(row) if self._together else ""
 
     def forget(self, row: int) -> None:
@@ -206,7 +206,7 @@ class Controller:
         return kept
 
     def able(self, rows: Indices, step: Indices) -> Flags:
-        """Which vehicles can be decided on: their step is new, and `idle` names no reason."""
+        """Flags of the vehicles to decide on: the step is new, and `idle` has no reason."""
         able = np.empty(len(rows), dtype=np.bool_)
         _able(
             rows,

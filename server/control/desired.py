@@ -1,4 +1,4 @@
-"""What the server knows of the desired trajectory: the window that a vehicle is planned along.
+"""Desired trajectory as the server knows it: the window that a vehicle is planned along.
 
 A vehicle at step k is planned for from k + d to k + d + H. How far ahead the server may look is
 `reference.preview`: with "all" it sees the whole window, and otherwise nothing behind the step
@@ -42,7 +42,7 @@ SPREAD = 31
 """Number of places from the first page of a trajectory to that of the next; odd, so that no two
 have the same."""
 TINY = 1e-9
-"""As much as floating point may make of 0.15 / 0.05."""
+"""Rounding tolerance of a quotient such as 0.15 / 0.05."""
 
 reflected = shared(reference.reflected)
 
@@ -59,12 +59,12 @@ class Window(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """How far a page reaches on each axis; shape (axes,)."""
+    """Length of a page on each axis; shape (axes,)."""
 
     reach: I1
     """Steps behind k that are seen."""
     rest_s: F1
-    """How much later the vehicle is planned for than the last of them is [s]."""
+    """Time from the last of them to the time that the vehicle is planned for [s]."""
 
 
 class Desired:
@@ -98,7 +98,7 @@ class Desired:
             self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
         seen_s = self._reach * terms.dt_s
         self._ahead_s = late_s if self._all else np.minimum(late_s, seen_s)
-        """How much later than its step each axis of a page is [s]; shape (axes,)."""
+        """Time from a step to the state kept for it in a page, on each axis [s]; shape (axes,)."""
         left = (seen_s - self._ahead_s) / terms.dt_s + TINY
         self._outlook = Outlook(left.astype(np.int64), late_s - self._ahead_s)
         left_min = H if self._all else int(self._outlook.reach.min())
@@ -123,13 +123,13 @@ class Desired:
         self._found = Window(
             self._pages, np.zeros(block, dtype=np.int64), np.zeros(block, dtype=np.int64)
         )
-        """Where the states from a step on are in the pages."""
+        """Place in the pages of the states from a step on."""
         self._foreseen = Window(
             np.zeros((block, axes, H + 1, 2)),
             np.arange(block),
             np.zeros(block, dtype=np.int64),
         )
-        """What is predicted; not used where all is seen."""
+        """Predicted states; not used where everything is seen."""
 
     def assign(self, row: int, vehicle: int) -> None:
         """Let a vehicle begin in this row."""
@@ -229,7 +229,7 @@ def _live(scenario: Scenario) -> LivePoint:
 
 @inline
 def _place(held: I1, number: int, page: int) -> int:
-    """Where a page is held, or where there is room for it; one place at least must be EMPTY."""
+    """Place of a page, or a free place for it; one place at least must be EMPTY."""
     at, key = (page + SPREAD * number) % PAGES, number * TRAJECTORY + page
     while held[at] != key and held[at] != EMPTY:
         at = (at + 1) % PAGES

@@ -16,7 +16,7 @@ from skytether.shared.base.kernel import F1, F2, I1, R2, making_kernel, making_p
 from skytether.shared.law.model import Array
 
 SOLVED, INFEASIBLE, ENDLESS = 0, 1, 2
-"""What came of it."""
+"""Outcome of the solve."""
 VIOLATED = 1e-9
 """Violation from which on a constraint counts."""
 DEPENDENT = 1e-12

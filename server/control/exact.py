@@ -30,7 +30,7 @@ ROUNDS_MAX = 8
 PIVOTS_MAX = 200
 """Rounds after that, in which one input enters the set or leaves it."""
 SNAP = 1e-12
-"""How far inside its bound DAQP may leave an input that is at it [m/s]."""
+"""Distance from its bound at which DAQP may leave an input that belongs on it [m/s]."""
 RESIDUAL_MAX = 1e-7
 """Largest residual of the optimality conditions, relative to the gradient, of an answer of DAQP."""
 CYCLED, NOT_FINITE = -1, -2
@@ -45,7 +45,7 @@ S0, S1, K0, K1, INVERSE, F00, F01, F10, F11, P00, P01, P11 = range(12)
 
 
 class Workspace(NamedTuple):
-    """What solving keeps from one round, and from one problem, to the next."""
+    """Scratch memory that a solve reuses from round to round and from problem to problem."""
 
     stages: F5
     """Backward passes for FIRST and LATER weights, each axis, FREE and OWN; shape
@@ -53,7 +53,7 @@ class Workspace(NamedTuple):
     side: F1
     """-1 or 1 where the input is at that bound, 0 where it is free; shape (H,)."""
     own: F1
-    """What each stage would choose for itself at x = 0 [m/s]; shape (H,)."""
+    """Input that each stage would choose for itself at x = 0 [m/s]; shape (H,)."""
 
 
 Three = tuple[float, float, float]

@@ -1,4 +1,4 @@
-"""What the server knows of one vehicle on a mission: the motions that it may fly.
+"""Motions that one vehicle on a mission may fly, as far as the server knows.
 
 A motion that is not acknowledged is sent again, the very same one, while it may still be taken. One
 or its acknowledgement that is lost costs the time until an observation says so, in which nothing
@@ -34,7 +34,7 @@ class Sent(NamedTuple):
 
 
 class Known:
-    """What is known of one vehicle."""
+    """State of one vehicle as the server knows it."""
 
     def __init__(self) -> None:
         self.in_force: Sent | None = None
@@ -50,9 +50,9 @@ class Known:
         self.unknown_until = -1
         """Step from which on a motion is over that another server has sent."""
         self.off_m = 0.0
-        """How far outside its tube it may be, as it was seen last [m]."""
+        """Distance by which it was outside its tube when it was last observed [m]."""
         self.speed_mps = 0.0
-        """How fast it was then [m/s]."""
+        """Speed when it was last observed [m/s]."""
         self.detour: Routes | None = None
         """Ways around others that rest where it was stuck; None before it ever was."""
         self.detour_until = 0
@@ -64,9 +64,9 @@ class Known:
         self.nearer_at = 0
         """Step at which it was that near first, or asked another to step aside last."""
         self.aside: Aside | None = None
-        """Where it has stepped aside to; None of one that flies to its own goal."""
+        """Place it has stepped aside to; None if it flies to its own goal."""
         self.waits = ""
-        """What it waits for, as the operator is told; empty: for nothing."""
+        """Reason why it waits, in words for the operator; empty if it does not."""
 
         self.copies = 1
         """Largest number of times that a motion is sent to it."""

@@ -55,7 +55,7 @@ def axes_of(model: Model) -> Axes:
 
 
 def laws_of(terms: Terms, gain: Array) -> Laws:
-    """What a vehicle flies by, with K as the vehicle will be told it.
+    """Horizon as the vehicle flies it, with K as it will be sent.
 
     Args:
         terms: the rule of flight.

@@ -69,7 +69,7 @@ class MotionPlan:
         passed_s = self.times * T
         along_m = np.minimum(acceleration_mps2 * passed_s**2, 2.0 * most.max() * passed_s)
         self.reach_m = np.sqrt(axes) * along_m
-        """How far apart two motions from one state may be at those times [m]."""
+        """Largest distance between two motions from one state at those times [m]."""
 
     def solve(
         self,

@@ -40,7 +40,7 @@ class Weights(NamedTuple):
     input: float
     """R."""
     target: F1
-    """What weighs the desired velocity: R / g where the input has a target of its own (E7), for it
+    """Weight of the desired velocity: R / g where the input has a target of its own (E7), for it
     takes the input v / g to fly at v, else 0; shape (axes,)."""
 
 

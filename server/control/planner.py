@@ -90,7 +90,7 @@ Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
 
 
 class PlanMemory(NamedTuple):
-    """What both MPCs remember of every vehicle."""
+    """Memory of both MPCs for every vehicle."""
 
     inputs: F4
     """U(k-1), the horizon computed last [m/s]; shape (2, capacity, axes, H)."""
@@ -130,15 +130,15 @@ class Batch(NamedTuple):
     compares: bool
     """Whether what was sent before is known, so that a plan can be compared with it."""
     memory: PlanMemory
-    """What is remembered of all vehicles."""
+    """Memory of all vehicles."""
     draft: Draft
     """The plans in the making."""
     desired: Window
     """The desired trajectory, as far as plans go."""
     found: Foresight
-    """What is foreseen of the vehicles."""
+    """Predicted states of the vehicles."""
     figures: Figures
-    """What their plans are worth."""
+    """Costs of their plans."""
     room: F3
     """Scratch of vehicles side by side, see `lanes.make_room`."""
     picked: I1
@@ -193,13 +193,13 @@ class Planner:
         self._picked = np.zeros(LANES, dtype=np.int64)
         self._settled = np.zeros(LANES, dtype=np.bool_)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
-        """What the last plans are worth; those of a block come first."""
+        """Costs of the last plans; those of a block come first."""
         self.planned = self._draft.planned
         """Planned states x_p(k+d|k-1) of the last plans [m, m/s]; shape (block, axes, 2)."""
         self.inputs = self._memory.inputs[TRACKER]
         """U of the last plan of each vehicle [m/s]; shape (capacity, axes, H)."""
         self.solve_ns = -1
-        """How long planning for the last block took, or -1 where nobody measures it."""
+        """Time that planning for the last block took [ns], or -1 where nobody measures it."""
 
     def forget(self, row: int) -> None:
         """Make the next plan of this vehicle its first."""

@@ -40,7 +40,7 @@ in between are reckoned from those at both ends."""
 
 
 class EstimatorSettings(NamedTuple):
-    """What is the same for all vehicles."""
+    """Constants shared by all vehicles."""
 
     laws: Laws
     """Model, bound and gain of each axis; shape (axes,)."""
@@ -55,7 +55,7 @@ class EstimatorSettings(NamedTuple):
 
 
 class EstimatorMemory(NamedTuple):
-    """What is known of every vehicle."""
+    """State of every vehicle as the server knows it."""
 
     observed: I1
     """Step of the newest observation, or -1; shape (capacity,)."""

@@ -54,7 +54,7 @@ class Routes:
         return bool(graph.sees(place[None, :2], self.way(place, goal)[:1, :2])[0])
 
     def _heights(self, place: Array, goal: Array) -> tuple[bool, ...]:
-        """Which zones are at heights between those of two places."""
+        """Flags of the zones at heights between those of two places."""
         if len(place) < 3:
             return (True,) * len(self._zones.zones)
         low, high = sorted((float(place[2]), float(goal[2])))

@@ -1,4 +1,4 @@
-"""What the schemes of delay compensation have in common: what is foreseen, and asked of each.
+"""Interface of the schemes of delay compensation, and the predictions that they share.
 
 `server.control.committed` is "committed", `server.control.predictive` "predictive" and "none",
 `server.control.trajectory` "trajectory".
@@ -30,7 +30,7 @@ class Splines(NamedTuple):
 
 
 class Foresight(NamedTuple):
-    """What is known of vehicles at their steps k before anything is planned, and what is then sent.
+    """Predictions for vehicles at their steps k before planning, and the horizons sent after it.
 
     It is written anew for every block of vehicles; those of a block come first in each array.
     """
@@ -123,7 +123,7 @@ def _pack(horizons: S3, ahead: I1, sent: I1, H: int, packed: S1) -> None:
 
 
 class Scheme(Protocol):
-    """What becomes of observations and of horizons that were sent."""
+    """Counts of observations and of horizons sent, by what became of them."""
 
     observed_step: Indices
     """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""

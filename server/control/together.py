@@ -99,7 +99,7 @@ class Together:
         self.planned = np.zeros((block, terms.axes, 2))
         self._state = np.zeros((capacity, terms.axes, 2))
         self._rows: dict[int, Known] = {}
-        """What is known of vehicles, by row."""
+        """State of the vehicles, by row."""
         self._references, self._number_of = references, number_of
         goals = scenario.make_reference()
         self._absent = set(goals.vehicles) if isinstance(goals, Mission) else set[int]()
@@ -117,7 +117,7 @@ class Together:
         self._again = terms.age_max // 3
         """Steps after which a motion is sent again, before it is too old to be flown."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
-        """How fast it comes to rest without a motion [s, m/s²]."""
+        """Time constant and deceleration with which it comes to rest without a motion [s, m/s²]."""
         self._plan = MotionPlan(terms, mission.acceleration_mps2, mission.speed_mps)
         self._zones = scenario.zones
         self._aims = Aims(
@@ -261,7 +261,7 @@ class Together:
         return ""
 
     def waits(self, row: int) -> str:
-        """What a vehicle waits for; empty: for nothing."""
+        """Reason why a vehicle waits; empty if it does not."""
         return self._rows[row].waits if row in self._rows else ""
 
     # -- what is decided ---------------------------------------------------------------------------
@@ -332,7 +332,7 @@ class Together:
             self._flown.add(known.next, self._ahead[row], row, known.off_m)
 
     def _goal(self, row: int) -> Array:
-        """Where a vehicle wants to be now [m]; shape (axes,)."""
+        """Goal of a vehicle at the present step [m]; shape (axes,)."""
         k = self._now + self._ahead[row]
         wanted: Array = self._references(self._number_of(row))(np.array(k * self._dt_s))[:, 0]
         return wanted
@@ -416,7 +416,7 @@ class Together:
         return None
 
     def _rests(self, row: int) -> list[Array]:
-        """Where vehicles other than one rest [m]."""
+        """Resting places of all vehicles but one [m]."""
         found = []
         for other, each in self._rows.items():
             motions, now = each.motions(), self._now + self._ahead.get(other, 0)
@@ -452,7 +452,7 @@ class Together:
         )
 
     def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
-        """What holds a motion back most, in words."""
+        """Constraint that holds a motion back most, in words."""
         position = self._plan.at_times(*solved)
         room = np.einsum("ij,ij->i", planes.normal, position[planes.at]) - planes.least
         binding = planes.of[room < BINDS_M]

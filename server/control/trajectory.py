@@ -116,7 +116,7 @@ VEHICLE, SENT = record(Followed), record(Sent)
 
 
 class Settings(NamedTuple):
-    """What is the same for all vehicles."""
+    """Constants shared by all vehicles."""
 
     dt_ns: int
     """Length of a step [ns]."""
@@ -137,7 +137,7 @@ class Settings(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What is known of every vehicle, and what it was sent."""
+    """State of every vehicle, and the horizons sent to it."""
 
     observed: I1
     """Step of the newest observation, or -1; shape (capacity,)."""
@@ -202,7 +202,7 @@ class Guidance:
         self.observed_step: Indices = self._memory.observed
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
-        """What flying on would cost; those of a block come first."""
+        """Costs of flying on; those of a block come first."""
         self.planned = np.zeros((block, axes, 2))
         """States at k of the trajectories sent last [m, m/s]; shape (block, axes, 2)."""
         self._nominal = make_nominal(terms, control, capacity if desired.seen else 0)

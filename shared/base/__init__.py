@@ -1,1 +1,1 @@
-"""What everything else stands on: units of time, named chance, files, hints, errors for users."""
+"""Foundations: units of time, named chance, files, hints, errors for users."""

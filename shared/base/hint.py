@@ -1,4 +1,4 @@
-"""What a user may have meant by a name that nobody knows."""
+"""Suggestion of the name that a user may have meant."""
 
 from collections.abc import Iterable
 

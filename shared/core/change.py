@@ -29,12 +29,12 @@ KEY_SHOWN_MAX = 60
 
 
 class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What is answered to a request."""
+    """Answer to a request."""
 
     refused: str = ""
     """Why nothing was changed, in a line; empty where the request was heeded."""
     changed: tuple[Changed, ...] = ()
-    """What has got another value."""
+    """Keys that have another value now."""
     values: dict[str, Any] = {}
     """Keys that may change and their present values, where the request has none."""
 
@@ -156,7 +156,7 @@ _DECODER = msgspec.json.Decoder(dict[str, Any])
 
 
 def _at(table: Any, key: str) -> Any:
-    """What a table has under a key with dots.
+    """Value that a table has under a key with dots.
 
     Raises:
         KeyError: nothing, at some point of the way.

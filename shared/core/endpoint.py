@@ -37,7 +37,7 @@ class Datagram(NamedTuple):
 
 
 class Form(NamedTuple):
-    """What the packets of one kind have in common, as far as anybody can see it."""
+    """Form of the packets of one kind: their first bytes, and bounds of their length."""
 
     head: bytes
     """Bytes that they begin with."""

@@ -52,7 +52,7 @@ class BrowserRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     why: str
     count: int
-    """How often that has happened so far."""
+    """Number of times that this has happened so far."""
 
     def __str__(self) -> str:
         return f"refused, {self.count} so far: {self.why}"
@@ -117,7 +117,7 @@ class RecordIncomplete(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     file: str
     reason: str
-    """What the system says of it, such as "No space left on device"."""
+    """Message of the system, such as "No space left on device"."""
 
     def __str__(self) -> str:
         return f"{self.file}: {self.reason}: the record is incomplete, the flight goes on"
@@ -165,7 +165,7 @@ class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Host that the newest came from."""
     port: int
     reason: Drop
-    """What is wrong with the newest."""
+    """Fault of the newest one."""
 
     def __str__(self) -> str:
         newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"
@@ -362,7 +362,7 @@ class LeftTube(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle of a mission is further from its motion than the others reckon with."""
 
     off_m: float
-    """How far it is outside its tube [m]."""
+    """Distance by which it is outside its tube [m]."""
 
     def __str__(self) -> str:
         off = f"{self.off_m:.2g} m outside its tube (mission.tube_m)"

@@ -24,7 +24,7 @@ FORMS = "udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
 
 
 class Line(NamedTuple):
-    """Where a vehicle's own hardware is reached."""
+    """Address of a vehicle's own hardware."""
 
     kind: Literal["udp", "udpout", "tcp", "serial"]
     host: str

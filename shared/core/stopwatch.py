@@ -1,4 +1,4 @@
-"""What each part of the work costs: laps of a clock that the driver lends to a core."""
+"""Stopwatch: cost of each part of the work, by a clock that the driver lends to a core."""
 
 from collections import Counter
 from collections.abc import Callable

@@ -85,11 +85,11 @@ class Hearing:
         table = silences(timeout_ns, step_ns)
         self._losses, self._silences = [loss for loss, _ in table], [ns for _, ns in table]
         self._came = 0
-        """Which of the newest WINDOW packets came, the newest in the lowest bit."""
+        """Bits of the newest WINDOW packets, set for those that came; the newest is lowest."""
         self.newest = -1
         """Largest number of a packet that came; -1 before the first."""
         self._newest_at = BEFORE
-        """What tells when that packet was sent."""
+        """Step or time at which that packet was sent."""
         self._told = 0
         """`silence`, once it has been asked for; 0 where it may be another by now."""
 

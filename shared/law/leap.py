@@ -1,4 +1,4 @@
-"""What no vehicle can do: come from one state to another within a time.
+"""Leaps: changes from one state to another that no vehicle can make in the time between.
 
 The vehicle holds what it measures of itself against what it measured before, the server what it is
 told against what it was told; both by this, which is compiled into the server's kernel.
@@ -7,7 +7,7 @@ told against what it was told; both by this, which is compiled into the server's
 ACCELERATION_MPS2 = 50.0
 """Acceleration that no vehicle exceeds [m/s²]."""
 NOISE_M, NOISE_MPS = 1.0, 2.0
-"""What noise may add to a change of position [m] and of velocity [m/s]."""
+"""Largest change of position [m] and of velocity [m/s] by noise."""
 
 
 def velocity_leaps(v: float, after_v: float, time: float, noise: float) -> bool:

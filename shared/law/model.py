@@ -29,11 +29,11 @@ class Axis(NamedTuple):
     """Eq. (4) on one axis."""
 
     a01: float
-    """How far the velocity carries the position within a step [s]."""
+    """Change of position in a step for each m/s of velocity [s]."""
     a11: float
     """Share of the velocity that is left after a step."""
     b0: float
-    """How far the input carries the position within a step [s]."""
+    """Change of position in a step for each m/s of input [s]."""
     b1: float
     """Share of the input that the velocity has taken on after a step."""
 
@@ -42,11 +42,11 @@ class Model(NamedTuple):
     """Eq. (4) on every axis; each field has the shape (axes,)."""
 
     a01: Array
-    """How far the velocity carries the position within a step [s]."""
+    """Change of position in a step for each m/s of velocity [s]."""
     a11: Array
     """Share of the velocity that is left after a step."""
     b0: Array
-    """How far the input carries the position within a step [s]."""
+    """Change of position in a step for each m/s of input [s]."""
     b1: Array
     """Share of the input that the velocity has taken on after a step."""
 

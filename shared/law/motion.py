@@ -20,7 +20,7 @@ JOIN_MAX = 3
 
 
 class Motion(NamedTuple):
-    """Where a vehicle is at every time, by its own steps."""
+    """Motion: position of a vehicle at every time, by its own steps."""
 
     first: int
     """Step of the first knot, a multiple of SPACING."""

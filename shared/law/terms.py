@@ -47,9 +47,9 @@ class Terms(NamedTuple):
     feedback: bool
     """Whether horizons bring feedback."""
     exhausted: str
-    """What the vehicle does after a horizon's last input, "hold" or "brake"."""
+    """Behaviour after a horizon's last input: "hold" or "brake"."""
     brake_mps2: float
-    """How fast braking takes the desired velocity to zero [m/s²]."""
+    """Deceleration with which braking takes the desired velocity to zero [m/s²]."""
     age_max_s: float
     """Largest age of the observation behind an input [s]."""
     join_s: float

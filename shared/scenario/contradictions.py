@@ -28,7 +28,7 @@ Contradiction = tuple[str, object, str]
 """A key, the value that it was given, and what was expected."""
 
 TINY = 1e-9
-"""As much as floating point may make of 40 · 0.011."""
+"""Rounding tolerance of a product such as 40 · 0.011."""
 
 FENCED_STEPS_MAX = 100_000
 """Most steps of a trajectory that are held against the fence."""
@@ -354,7 +354,7 @@ def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _outside(scenario: Scenario) -> Iterator[Contradiction]:
-    """Where the desired trajectory leads over the fence, or faster than it allows."""
+    """Contradictions of a desired trajectory that leads over the fence, or is too fast."""
     steps = min(scenario.steps, FENCED_STEPS_MAX)
     given, times_s = scenario.given_reference(), np.arange(steps + 1) * scenario.control.dt
     for vehicle in given.vehicles if isinstance(given, Mission) else (1,):

@@ -13,7 +13,7 @@ SLOW_STEPS = 2
 ERROR_S = 0.06
 """Time by which the model's errors together may lead the vehicle on at its largest speed [s]."""
 WEAK = 1.25
-"""How much further wind leads a vehicle whose gain is a fifth less than the model's."""
+"""Factor by which wind leads a vehicle further if its gain is a fifth less than the model's."""
 LATER_S = 0.1
 """Time by which the vehicle's dead time may be longer than the model's [s]."""
 

@@ -1,4 +1,4 @@
-"""When an observation is worth a packet: the policies of `vehicle.report`.
+"""Policies of `vehicle.report`: when an observation is sent.
 
 They combine with & and | like those of a trigger (`shared.scenario.policies`), and are asked once a
 step, aboard, by `client.reporting`. The first observation of a session is sent whatever they say,
@@ -15,7 +15,7 @@ from skytether.shared.scenario.registry import REPORTS
 
 
 class Unreported(NamedTuple):
-    """What the server does not know yet, at one step of one vehicle."""
+    """Knowledge that the server lacks, at one step of one vehicle."""
 
     off_m: float
     """How far the vehicle has left where the server must believe it, see

@@ -177,7 +177,7 @@ def _with_directions(raw: Mapping[str, Any], folder: Path | None = None) -> dict
 
 
 def _path(file: str) -> Path:
-    """Where a file is, by its path or by the name of one that comes with Skytether."""
+    """Path of a file, given by its path or by the name of one that comes with Skytether."""
     if not file.endswith(".toml"):
         return SCENARIOS / f"{file}.toml"
     try:
@@ -268,7 +268,7 @@ def _written(given: object) -> str:
 
 
 def _short(given: str) -> str:
-    """What was given, as far as a line has room for it."""
+    """Given value, cut to what a line has room for."""
     return given if len(given) <= GIVEN_MAX else f"{given[:GIVEN_MAX]}…"
 
 

@@ -116,7 +116,7 @@ class Entry:
         return all(parameter.may_miss for parameter in self.parameters)
 
     def form(self, name: str) -> str:
-        """What may be written of an entry with this name."""
+        """Grammar of an entry with this name."""
         if not self.parameters:
             return name
         called = f"{name}({', '.join(parameter.name for parameter in self.parameters)})"
@@ -155,7 +155,7 @@ class PluginTable(dict[str, Entry]):
         self._given, self._class, self._texts = given, class_, texts
 
     def written(self, name: str) -> str:
-        """What may be written of the entry with this name."""
+        """Grammar of the entry with this name."""
         entry = self[name]
         if not (self._texts and entry.parameters):
             return entry.form(name)

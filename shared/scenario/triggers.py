@@ -1,4 +1,4 @@
-"""When a horizon is worth a packet: small policies that combine with & and |.
+"""Triggers: when a horizon is sent, by small policies that combine with & and |.
 
 A scenario writes `cost_gap & budget(5, 2) | silence(1)`; `shared.scenario.policies` has the
 grammar, docs/triggers.md says what each policy is good for, and how to write one. Those below are
@@ -145,7 +145,7 @@ class Compared(IntEnum):
 
 
 class Verdict(NamedTuple):
-    """What a trigger says of n vehicles."""
+    """Verdict of a trigger on n vehicles."""
 
     event: Flags
     """Whether it fires; shape (n,)."""
@@ -155,7 +155,7 @@ class Verdict(NamedTuple):
     threshold: Array
     """What it compares that with; 0 where nothing is compared; shape (n,)."""
     compared: Compared = Compared.OWN
-    """Which figure is compared with the threshold."""
+    """Name of the figure that is compared with the threshold."""
 
     @property
     def compares(self) -> bool:

@@ -74,7 +74,7 @@ class Zones:
         self._starts = np.concatenate([[0], np.cumsum(sizes)])[:-1].astype(np.int64)
         nothing = np.zeros((0, 2))
         self._begin = np.concatenate([nothing, *(zone.corners for zone in zones)])
-        """Where each edge begins; shape (edges, 2)."""
+        """Begin of each edge [m]; shape (edges, 2)."""
         ends = [np.roll(zone.corners, -1, axis=0) for zone in zones]
         self._along = np.concatenate([nothing, *ends]) - self._begin
         self._square = np.maximum((self._along**2).sum(axis=1), 1e-18)

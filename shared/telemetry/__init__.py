@@ -1,1 +1,1 @@
-"""What is known of a flight: records, their summaries, feeds for those who look on."""
+"""Telemetry of a flight: records, their summaries, feeds for those who look on."""

@@ -1,4 +1,4 @@
-"""What a process writes down about a flight: rows of one numpy structured type.
+"""Records of a flight that a process writes: rows of one numpy structured type.
 
 Each process keeps its own part: the client what flew, the server what it thought, netem the fate of
 every packet. A part is a line of JSON that names the columns, then the rows as they are in memory.
@@ -233,7 +233,7 @@ TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
 
 
 class Sink(Protocol):
-    """What takes a part of the record, as a binary file does."""
+    """Writer of a part of the record, such as a binary file."""
 
     def write(self, piece: bytes, /) -> object:
         """Take the header, or whole rows."""
@@ -362,7 +362,7 @@ class Record:
     """Events of the run's own endpoints, and those of the server about its vehicles, in their
     order."""
     incomplete: tuple[RecordIncomplete, ...] = ()
-    """What is missing in the record of a flight over real UDP, one for a part."""
+    """Gaps in the record of a flight over real UDP, one for each part."""
     plan: Rows = field(default_factory=lambda: np.empty(0, plan_columns(2, 1)))
     """Plans that the server has sent; none of a flight in a batch, or over real UDP."""
 

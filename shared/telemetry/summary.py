@@ -209,7 +209,7 @@ def position_error(scenario: Scenario, client: Rows, server: Rows | None = None)
 
 
 def _estimate_error(scenario: Scenario, client: Rows) -> Array:
-    """How far the position that was flown by is from the true one [m]; shape (steps, axes).
+    """Difference of the position that was flown by from the true one [m]; shape (steps, axes).
 
     With a dead time it is that of a dead time later; NaN where the flight has ended by then.
     """

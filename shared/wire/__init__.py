@@ -1,1 +1,1 @@
-"""What travels: messages, sealed channels, the handshake that opens them, and vehicles' keys."""
+"""Wire: messages, sealed channels, the handshake that opens them, and vehicles' keys."""

@@ -27,7 +27,7 @@ DATA = 4
 HEADER = struct.Struct("<BBHIQ")
 """Version, type, vehicle, channel and counter."""
 OVERHEAD_BYTES = HEADER.size + 16
-"""What a packet has beside the message [B]."""
+"""Length of header and tag of a packet [B]."""
 
 WINDOW = 2048
 """Number of newest counters that are told apart; an older one is not opened."""
@@ -68,7 +68,7 @@ def address(packet: bytes) -> tuple[int, int]:
 
 
 class OpenedPacket(NamedTuple):
-    """What was in a packet."""
+    """Content of a packet."""
 
     payload: bytes
     """The message."""

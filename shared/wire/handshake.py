@@ -83,7 +83,7 @@ def check_place(message: bytes, *, in_handshake: bool) -> None:
 
 
 def prologue(key: VehicleKey) -> bytes:
-    """What both ends of a handshake have in common: this protocol, the vehicle and its key."""
+    """Prologue, common to both ends of a handshake: this protocol, the vehicle and its key."""
     return _PROLOGUE + _header(key, INITIATION)
 
 

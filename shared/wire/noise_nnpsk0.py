@@ -22,9 +22,9 @@ NAME = b"Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s"
 KEY_BYTES = 32
 """Size of every key, secret or public [B]."""
 TAG_BYTES = 16
-"""What sealing adds to a payload [B]."""
+"""Length that sealing adds to a payload [B]."""
 MESSAGE_BYTES = KEY_BYTES + TAG_BYTES
-"""What a message of the handshake adds to its payload [B]."""
+"""Length that a message of the handshake adds to its payload [B]."""
 
 _NONCE = bytes(12)
 

@@ -45,7 +45,7 @@ from skytether.shared.law.terms import Terms
 
 VERSION = 7
 PAYLOAD_BYTES_MAX = 1200
-"""So that no datagram is ever fragmented: two fragments turn 10 % loss into 19 %."""
+"""Limit below which no datagram is fragmented: two fragments turn 10 % loss into 19 %."""
 
 AXES_MAX = 3
 TEXT_MAX = 32
@@ -79,7 +79,7 @@ NO_INPUT = np.empty(0)
 """`Observation.input` with the scheme "trajectory", where nobody reads it."""
 
 INPUT_TOLERANCE = 1.001
-"""How far over its bound an input may be (float32 rounds) before the packet is refused."""
+"""Factor by which an input may exceed its bound (float32 rounds) before the packet is refused."""
 
 
 class Refusal(IntEnum):
@@ -187,7 +187,7 @@ class Welcome(NamedTuple):
 
 
 class Mode(IntEnum):
-    """What a vehicle does, see `client.failsafe`."""
+    """Mode of a vehicle, see `client.failsafe`."""
 
     INIT = 0
     """It has no session yet."""
@@ -231,7 +231,7 @@ class Observation(NamedTuple):
     heard: int
     """Number of packets of the server that have come, modulo NUMBERS."""
     mode: int
-    """What the vehicle does, one of `Mode`."""
+    """Mode of the vehicle, one of `Mode`."""
     takes: int
     """1 if a horizon that comes now would be flown, else 0."""
     state: Array

@@ -26,7 +26,7 @@ _DRAWN = Struct("<QQ")
 
 @dataclass(slots=True)
 class Fate:
-    """What becomes of one packet; impairments write into it, one after the other."""
+    """Fate of one packet; impairments write into it, one after the other."""
 
     slot: int = 0
     """Slot in which it enters, counted from when its flow began."""

@@ -1,4 +1,4 @@
-"""What an impairment is, and what they are written with in annotations.
+"""Impairments: their type, and the annotations of their arguments.
 
 @impairment
 class Fading(Impairment):

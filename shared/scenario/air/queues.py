@@ -13,7 +13,7 @@ QUEUE_BYTES = 64_000
 
 Bytes = Annotated[int, Meta(ge=1, le=67_108_864)]
 Drop = Literal["tail", "codel"]
-"""What a queue drops: what does not fit, or what keeps it from ever being empty (RFC 8289)."""
+"""Drop policy of a queue: tail drop, or CoDel, which keeps queues short (RFC 8289)."""
 Served = Literal["first", "fair"]
 """Whose packet goes next: who came first, or each flow in turn by as many bytes."""
 
