@@ -223,7 +223,7 @@ class Piqp:
 
 
 class QpOases:
-    """qpOASES, condensed, as it comes with CasADi: a workspace an axis, its active set kept."""
+    """The solver qpOASES, condensed, by CasADi: a workspace an axis, its active set kept."""
 
     def __init__(self, problem: Problem) -> None:
         import casadi

@@ -1,4 +1,4 @@
-"""How the cost of a tick grows with the horizon and the number of axes, for one vehicle and many.
+"""Growth of the cost of a tick with the horizon and the axes, for one vehicle and many.
 
 The number of vehicles is varied in `lab.benchmarks.tick`. Here it is fixed, and each column of the
 table is fitted by a line over the horizon, cost = a + b H: planning makes a fixed number of passes
