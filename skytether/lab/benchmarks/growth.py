@@ -28,7 +28,7 @@ from skytether.shared.scenario.schema import Scenario
 
 @dataclass(frozen=True)
 class GrowthCounts:
-    """How much to measure."""
+    """Horizons, axes, vehicles and number of ticks to measure."""
 
     horizons: tuple[int, ...] = (10, 20, 40, 80, 160)
     axes: tuple[int, ...] = (2, 3)
