@@ -221,8 +221,13 @@ class Ticker:
 
     def _send_trajectories(self, decisions: Decisions, now_ns: int) -> None:
         sent, told, axes = decisions.sent, decisions.found.told, self._terms.axes
-        rows, step = decisions.rows[sent], decisions.step[sent] - told.back[sent]
-        age = np.maximum(step - self._controller.observed_step[rows], 0)
+        rows, back = decisions.rows[sent], told.back[sent]
+        step = decisions.step[sent] - back
+        age = step - self._controller.observed_step[rows]
+        # A motion that is sent again is older than the newest observation, which it was not made
+        # from. Any other may be too, where the server's clock was set and the clock map lags: then
+        # the age is below 0, as a horizon's is, for it has to name an observation that was made.
+        age = np.where(back > 0, np.maximum(age, 0), age)
         columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
         server_us = stamp_us(now_ns)
         for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
