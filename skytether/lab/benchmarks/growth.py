@@ -30,7 +30,8 @@ from skytether.shared.scenario.schema import Scenario
 class GrowthCounts:
     """Horizons, axes, vehicles and number of ticks to measure."""
 
-    horizons: tuple[int, ...] = (10, 20, 40, 80, 160)
+    horizons: tuple[int, ...] = (10, 20, 40, 60, 90)
+    """Horizons; 90 inputs are as many as one datagram holds for three axes."""
     axes: tuple[int, ...] = (2, 3)
     vehicles: tuple[int, ...] = (1, 200)
     ticks: int = 100
