@@ -229,18 +229,18 @@ def _across(one: str, other: str, y: int) -> str:
 # -- a packet's way --------------------------------------------------------------------------------
 
 
-class Call(NamedTuple):
+class DrawnCall(NamedTuple):
     """A function on a packet's way, and those that it calls there."""
 
     where: str
     """File and name, as docs/design.md writes them."""
     about: str
     """Purpose, in a few words."""
-    calls: tuple["Call", ...] = ()
+    calls: tuple["DrawnCall", ...] = ()
     """Functions that it calls, by itself or through others of its class, in their order."""
 
 
-class Part(NamedTuple):
+class DrawnPart(NamedTuple):
     """One frame of the picture: what one process does at one time."""
 
     title: str
@@ -248,137 +248,145 @@ class Part(NamedTuple):
     """Left edge."""
     y: int
     """Upper edge."""
-    calls: tuple[Call, ...]
+    calls: tuple[DrawnCall, ...]
 
 
 LINE, INDENT, FRAME = 36, 16, 320
 """Height of a function, indentation of one that is called, and width of a part."""
 NETEM = (
-    Call("netem/proxy.py: Proxy.receive", "", (Call("netem/link.py: Link.take", "fate drawn"),)),
-    Call("netem/proxy.py: Proxy.wake", "", (Call("netem/link.py: Link.give", "let out when due"),)),
+    DrawnCall(
+        "netem/proxy.py: Proxy.receive", "", (DrawnCall("netem/link.py: Link.take", "fate drawn"),)
+    ),
+    DrawnCall(
+        "netem/proxy.py: Proxy.wake",
+        "",
+        (DrawnCall("netem/link.py: Link.give", "let out when due"),),
+    ),
 )
 SCHEME = "server/control/scheme.py: Scheme"
-WAY: tuple[Part, ...] = (
-    Part(
+WAY: tuple[DrawnPart, ...] = (
+    DrawnPart(
         "1 vehicle: a step begins",
         10,
         40,
         (
-            Call(
+            DrawnCall(
                 "client/endpoint.py: Client.wake",
                 "",
                 (
-                    Call(
+                    DrawnCall(
                         "client/pilot.py: Pilot.fly",
                         "",
                         (
-                            Call("client/vehicle.py: Vehicle.measurements", "what was measured"),
-                            Call("client/navigation.py: Navigation.advance", "filtered"),
+                            DrawnCall(
+                                "client/vehicle.py: Vehicle.measurements", "what was measured"
+                            ),
+                            DrawnCall("client/navigation.py: Navigation.advance", "filtered"),
                         ),
                     ),
-                    Call("client/pilot.py: Pilot.observation", "OBSERVATION, if one is due"),
-                    Call(
+                    DrawnCall("client/pilot.py: Pilot.observation", "OBSERVATION, if one is due"),
+                    DrawnCall(
                         "client/session.py: ServerSession.send",
                         "",
-                        (Call("client/secure.py: SecureLink.seal", "with keys"),),
+                        (DrawnCall("client/secure.py: SecureLink.seal", "with keys"),),
                     ),
                 ),
             ),
         ),
     ),
-    Part("2 netem: downlink", 370, 40, NETEM),
-    Part(
+    DrawnPart("2 netem: downlink", 370, 40, NETEM),
+    DrawnPart(
         "3 server: a datagram arrives",
         730,
         40,
         (
-            Call(
+            DrawnCall(
                 "server/reception.py: Reception.hear",
                 "",
                 (
-                    Call("server/secure.py: SecureGate.open", "with keys"),
-                    Call("shared/wire/protocol.py: decode", "checked"),
-                    Call("server/plausibility.py: Plausibility.judge", "believed?"),
-                    Call("server/control/clock.py: ClockMap.observe", "clocks compared"),
-                    Call(
+                    DrawnCall("server/secure.py: SecureGate.open", "with keys"),
+                    DrawnCall("shared/wire/protocol.py: decode", "checked"),
+                    DrawnCall("server/plausibility.py: Plausibility.judge", "believed?"),
+                    DrawnCall("server/control/clock.py: ClockMap.observe", "clocks compared"),
+                    DrawnCall(
                         "server/control/controller.py: Controller.observe",
                         "",
-                        (Call(f"{SCHEME}.observe", "kept if it is the newest"),),
+                        (DrawnCall(f"{SCHEME}.observe", "kept if it is the newest"),),
                     ),
                 ),
             ),
         ),
     ),
-    Part(
+    DrawnPart(
         "4 server: a tick is due",
         730,
         370,
         (
-            Call(
+            DrawnCall(
                 "server/tick.py: Ticker.tick",
                 "",
                 (
-                    Call("server/control/clock.py: ClockMap.steps", "step aboard"),
-                    Call(
+                    DrawnCall("server/control/clock.py: ClockMap.steps", "step aboard"),
+                    DrawnCall(
                         "server/control/controller.py: Controller.decide",
                         "",
                         (
-                            Call(f"{SCHEME}.foresee", "x̂(k), x̂(k+d), eq. (13)"),
-                            Call("server/control/planner.py: Planner.plan", "(14), (15)"),
-                            Call("shared/scenario/triggers.py: Trigger.test", "event? (16)"),
-                            Call(f"{SCHEME}.remember", "(12)"),
+                            DrawnCall(f"{SCHEME}.foresee", "x̂(k), x̂(k+d), eq. (13)"),
+                            DrawnCall("server/control/planner.py: Planner.plan", "(14), (15)"),
+                            DrawnCall("shared/scenario/triggers.py: Trigger.test", "event? (16)"),
+                            DrawnCall(f"{SCHEME}.remember", "(12)"),
                         ),
                     ),
-                    Call("shared/wire/protocol.py: encode_horizon", "HORIZON"),
-                    Call("server/sessions.py: Session.sealed", "with keys"),
+                    DrawnCall("shared/wire/protocol.py: encode_horizon", "HORIZON"),
+                    DrawnCall("server/sessions.py: Session.sealed", "with keys"),
                 ),
             ),
         ),
     ),
-    Part("5 netem: uplink", 370, 480, NETEM),
-    Part(
+    DrawnPart("5 netem: uplink", 370, 480, NETEM),
+    DrawnPart(
         "6 vehicle: a datagram arrives",
         10,
         370,
         (
-            Call(
+            DrawnCall(
                 "client/endpoint.py: Client.receive",
                 "",
                 (
-                    Call(
+                    DrawnCall(
                         "client/session.py: ServerSession.hear",
                         "",
-                        (Call("client/link.py: ClientLink.open", "with keys"),),
+                        (DrawnCall("client/link.py: ClientLink.open", "with keys"),),
                     ),
-                    Call(
+                    DrawnCall(
                         "client/pilot.py: Pilot.offer",
                         "",
                         (
-                            Call("client/failsafe.py: Failsafe.horizon_arrived", "too late?"),
-                            Call("client/compensator.py: Compensator.offer", "newest is kept"),
+                            DrawnCall("client/failsafe.py: Failsafe.horizon_arrived", "too late?"),
+                            DrawnCall("client/compensator.py: Compensator.offer", "newest is kept"),
                         ),
                     ),
                 ),
             ),
         ),
     ),
-    Part(
+    DrawnPart(
         "7 vehicle: the next step begins",
         10,
         690,
         (
-            Call(
+            DrawnCall(
                 "client/pilot.py: Pilot.fly",
                 "",
                 (
-                    Call("client/failsafe.py: Failsafe.step", "what is flown at all"),
-                    Call(
+                    DrawnCall("client/failsafe.py: Failsafe.step", "what is flown at all"),
+                    DrawnCall(
                         "client/compensator.py: Compensator.choose",
                         "input, (11)",
-                        (Call("shared/law/rule.py: step", "rule of flight"),),
+                        (DrawnCall("shared/law/rule.py: step", "rule of flight"),),
                     ),
-                    Call("client/clamp.py: clamped", "last bounds"),
-                    Call("client/vehicle.py: Vehicle.fly", "flown for a step"),
+                    DrawnCall("client/clamp.py: clamped", "last bounds"),
+                    DrawnCall("client/vehicle.py: Vehicle.fly", "flown for a step"),
                 ),
             ),
         ),
@@ -392,7 +400,7 @@ AFTER = ((2, 3), (5, 6))
 PACKET_SIZE = 1060, 960
 
 
-def functions(calls: tuple[Call, ...] | None = None) -> Iterator[Call]:
+def functions(calls: tuple[DrawnCall, ...] | None = None) -> Iterator[DrawnCall]:
     """Every function of the way, or those of some calls and below."""
     if calls is None:
         for part in WAY:
@@ -499,7 +507,7 @@ def packet_svg() -> str:
     return "\n".join([*lines, "</svg>", ""])
 
 
-def _deep(calls: tuple[Call, ...], depth: int = 0) -> Iterator[tuple[int, Call]]:
+def _deep(calls: tuple[DrawnCall, ...], depth: int = 0) -> Iterator[tuple[int, DrawnCall]]:
     """Functions with their depth, in the order in which they are drawn."""
     for call in calls:
         yield depth, call

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from skytether.lab import house
-from skytether.lab.house import Call, Part
+from skytether.lab.house import DrawnCall, DrawnPart
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -46,19 +46,21 @@ def test_a_room_without_a_place_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (Call("client/nowhere.py: fly", ""), "client/nowhere.py is no file"),
-        (Call("client/pilot.py: Pilot.swim", ""), "client/pilot.py has no Pilot.swim"),
+        (DrawnCall("client/nowhere.py: fly", ""), "client/nowhere.py is no file"),
+        (DrawnCall("client/pilot.py: Pilot.swim", ""), "client/pilot.py has no Pilot.swim"),
         (
-            Call("netem/link.py: Link.take", "", (Call("netem/proxy.py: Proxy.wake", ""),)),
+            DrawnCall(
+                "netem/link.py: Link.take", "", (DrawnCall("netem/proxy.py: Proxy.wake", ""),)
+            ),
             "netem/link.py: Link.take does not call wake",
         ),
     ],
 )
 def test_a_way_that_the_code_does_not_go_is_refused(
-    call: Call, told: str, monkeypatch: pytest.MonkeyPatch
+    call: DrawnCall, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A function that is gone, and one that calls another no more."""
-    monkeypatch.setattr(house, "WAY", (Part("wrong", 0, 0, (call,)),))
+    monkeypatch.setattr(house, "WAY", (DrawnPart("wrong", 0, 0, (call,)),))
     with pytest.raises(LookupError, match=told):
         house.packet_svg()
 

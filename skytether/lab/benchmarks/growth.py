@@ -23,6 +23,7 @@ from skytether.lab.benchmarks.harness import (
     us,
 )
 from skytether.lab.benchmarks.problems import derive
+from skytether.lab.benchmarks.tick import waker
 from skytether.shared.scenario.schema import Scenario
 
 
@@ -41,7 +42,7 @@ FULL = GrowthCounts()
 QUICK = GrowthCounts((10, 40), (2,), (1, 50), 20)
 
 
-class Line(NamedTuple):
+class CostLine(NamedTuple):
     """Least-squares line through the costs of a tick over the horizon."""
 
     fixed_us: float
@@ -58,7 +59,7 @@ def scenario(horizon: int, axes: int) -> Scenario:
     return derive("paper-every-step", control=control, model={"axes": axes})
 
 
-def fit(horizons: list[int], costs_us: list[float]) -> Line:
+def fit(horizons: list[int], costs_us: list[float]) -> CostLine:
     """Fit the costs of a tick [µs] over the horizon.
 
     Each cost counts by its relative distance from the line, so that the long horizons do not decide
@@ -68,7 +69,7 @@ def fit(horizons: list[int], costs_us: list[float]) -> Line:
     rows = np.stack([np.ones_like(H), H], axis=1) / cost[:, None]
     (fixed, stage), *_ = np.linalg.lstsq(rows, np.ones_like(H), rcond=None)
     off = np.abs(rows @ [fixed, stage] - 1.0).max()
-    return Line(float(fixed), float(stage), float(off))
+    return CostLine(float(fixed), float(stage), float(off))
 
 
 def measure(counts: GrowthCounts) -> dict[str, Any]:
@@ -77,7 +78,7 @@ def measure(counts: GrowthCounts) -> dict[str, Any]:
     for vehicles, axes in product(counts.vehicles, counts.axes):
         spaces = {str(H): Airspace(scenario(H, axes), vehicles) for H in counts.horizons}
         spent = interleave(
-            {H: lambda _, space=space: space.wake() for H, space in spaces.items()},  # type: ignore[misc]
+            {H: waker(space) for H, space in spaces.items()},
             counts.ticks,
             Pace(turn=10, pause_s=HOT.pause_s),
             lateness,

@@ -133,7 +133,7 @@ def _single(
         figures = {
             key: figures_us(durations)
             for key, durations in interleave(
-                {key: _waker(space) for key, space in spaces.items()},
+                {key: waker(space) for key, space in spaces.items()},
                 count,
                 pace,
                 lateness,
@@ -237,7 +237,7 @@ def _crowd(scenario: Scenario, counts: TickCounts, lateness: Lateness) -> dict[s
     }
 
 
-def _waker(space: Airspace) -> Callable[[int], None]:
+def waker(space: Airspace) -> Callable[[int], None]:
     """Contestant whose every problem is a tick of these vehicles."""
     return lambda _: space.wake()
 
@@ -246,7 +246,7 @@ def _scaling(scenario: Scenario, counts: TickCounts, lateness: Lateness) -> dict
     """Median CPU time of a tick [ms], by the number of vehicles."""
     spaces = {count: Airspace(scenario, count) for count in counts.scale}
     spent = interleave(
-        {str(count): _waker(space) for count, space in spaces.items()},
+        {str(count): waker(space) for count, space in spaces.items()},
         counts.scale_ticks,
         Pace(turn=10, pause_s=HOT.pause_s),
         lateness,
