@@ -123,7 +123,8 @@ def put(page: "Page", label: str, value: float | str) -> None:
     nearest = f"xpath=//*[text()='{label}']/ancestor::*[.//input][1]//input"
     field = page.locator(nearest).last
     field.fill(value if isinstance(value, str) else f"{value:g}")
-    field.press("Enter")
+    # Not on the field: the page takes it away as soon as the token in it is right.
+    page.keyboard.press("Enter")
 
 
 def picture(page: "Page", file: Path) -> None:
