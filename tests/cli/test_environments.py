@@ -241,17 +241,24 @@ def until(found: Callable[[], object]) -> None:
         time.sleep(0.01)
 
 
+def about(pid: int, path: str) -> str:
+    """File `path` of a process in /proc; empty once the process has ended, which it may do while
+    it is read."""
+    try:
+        return Path(f"/proc/{pid}/{path}").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+
+
 def ignores_usr1(pid: int) -> bool:
-    """Whether a process has come so far as to ignore SIGUSR1."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    found = re.search(r"SigIgn:\s*(\w+)", status)
-    assert found is not None
-    return bool(int(found[1], 16) & SIGUSR1_IGNORED)
+    """Whether a process has come so far as to ignore SIGUSR1; False for one that has ended."""
+    found = re.search(r"SigIgn:\s*(\w+)", about(pid, "status"))
+    return found is not None and bool(int(found[1], 16) & SIGUSR1_IGNORED)
 
 
 def children(pid: int) -> list[int]:
     """Processes that a process has started."""
-    return [int(pid) for pid in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [int(pid) for pid in about(pid, f"task/{pid}/children").split()]
 
 
 @pytest.mark.parametrize(
@@ -289,7 +296,9 @@ def test_a_flight_and_its_processes_outlive_sigusr1() -> None:
         while fly.poll() is None:
             for pid in (fly.pid, *children(fly.pid)):
                 if ignores_usr1(pid):
-                    os.kill(pid, signal.SIGUSR1)
+                    # Ended between the two lines: nobody is left to be told.
+                    with suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGUSR1)
             time.sleep(0.02)
         out, err = fly.communicate()
     assert (fly.returncode, err) == (0, "")
