@@ -243,7 +243,8 @@ def until(found: Callable[[], object]) -> None:
 
 def about(pid: int, path: str) -> str:
     """File `path` of a process in /proc; empty once the process has ended, which it may do while
-    it is read."""
+    it is read.
+    """
     try:
         return Path(f"/proc/{pid}/{path}").read_text()
     except (FileNotFoundError, ProcessLookupError):
