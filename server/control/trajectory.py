@@ -1,8 +1,8 @@
 """Trajectories: the vehicle is told the desired trajectory, and which one it holds is estimated.
 
 What is sent at step k is the trajectory to be followed from there on: where the server sees ahead,
-the nominal motion of the vehicle along what it sees (`server.control.nominal`), and else the state
-of the target at k. It is sent as a spline with as few uniform knots as keep within
+the nominal motion of the vehicle along what it sees (`server.control.nominal`), or what it sees
+itself where the horizon is shorter than the time h below; and else the state of the target at k. It is sent as a spline with as few uniform knots as keep within
 `control.spline_error_m` of it (`shared.law.spline`); of a state that is one. The vehicle regulates
 itself along the spline, so all that is known of the vehicle is its newest observation.
 
@@ -134,6 +134,8 @@ class Settings(NamedTuple):
     """Time h of each axis [s]; shape (axes,)."""
     error_m: float
     """Largest distance of a spline from what is seen on an axis, if its knots suffice [m]."""
+    plans: bool
+    """Whether what is seen is planned along, and not told as it is."""
 
 
 class Memory(NamedTuple):
@@ -177,6 +179,10 @@ class Guidance:
         block: int,
     ) -> None:
         axes, given = terms.axes, control.delay_bound
+        lead_s = (1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY)
+        # A plan shorter than h ends before the vehicle is near what it follows, and beyond its end
+        # the spline goes straight on: measured, such plans led up to 12 m away (docs/envelope.md).
+        plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
         self.counts: Counter[str] = Counter()
         self._desired, self._clock = desired, clock
         self._loop_gain = np.array(terms.gain)
@@ -187,8 +193,9 @@ class Guidance:
             seen=desired.seen,
             bounds=self._loop_gain * terms.u_max,
             weight=control.state_weight[0],
-            lead_s=(1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY),
+            lead_s=lead_s,
             error_m=control.spline_error_m,
+            plans=bool(plans),
         )
         self._memory = Memory(
             observed=np.full(capacity, -1, dtype=np.int64),
@@ -205,7 +212,7 @@ class Guidance:
         """Costs of flying on; those of a block come first."""
         self.planned = np.zeros((block, axes, 2))
         """States at k of the trajectories sent last [m, m/s]; shape (block, axes, 2)."""
-        self._nominal = make_nominal(terms, control, capacity if desired.seen else 0)
+        self._nominal = make_nominal(terms, control, capacity if plans else 0)
         self._intended = np.zeros((block, axes, desired.seen + 1, 2))
         """Trajectories that would be sent now, from k on [m, m/s]; shape (block, axes, seen + 1,
         2)."""
@@ -381,7 +388,7 @@ def _intend(
         intended: what is filled in; where the server sees ahead, its first stage is where the
             vehicle is led at k [m, m/s]; shape (axes, seen + 1, 2).
     """
-    if settings.seen > 0 and plan_nominal(nominal, row, k, desired, intended):
+    if settings.plans and plan_nominal(nominal, row, k, desired, intended):
         return True
     for axis in range(len(intended)):
         bound = settings.bounds[axis]
@@ -389,7 +396,7 @@ def _intend(
             v = desired[axis, stage, 1]
             intended[axis, stage, 0] = desired[axis, stage, 0]
             intended[axis, stage, 1] = max(-bound, min(v, bound))
-    return settings.seen == 0
+    return not settings.plans
 
 
 @kernel

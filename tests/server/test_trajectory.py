@@ -472,6 +472,13 @@ def test_bounds_shape_what_is_told() -> None:
     assert sum(run.uplink_packets for run in told) < sum(run.uplink_packets for run in plans)
 
 
+@pytest.mark.parametrize("horizon", [1, 3, 8])
+def test_a_horizon_too_short_for_a_plan_still_leads_along_the_trajectory(horizon: int) -> None:
+    """What is seen is told as it is: planned along it, the vehicle would be 0.3 to 2.7 m off."""
+    flown = skytether.fly("demo", **{"control.horizon": horizon, "duration": 30.0})
+    assert flown.summary.error_max < 0.28
+
+
 # -- the wire --------------------------------------------------------------------------------
 
 
