@@ -2,9 +2,10 @@
 
 What is sent at step k is the trajectory to be followed from there on: where the server sees ahead,
 the nominal motion of the vehicle along what it sees (`server.control.nominal`), or what it sees
-itself where the horizon is shorter than the time h below; and else the state of the target at k. It is sent as a spline with as few uniform knots as keep within
-`control.spline_error_m` of it (`shared.law.spline`); of a state that is one. The vehicle regulates
-itself along the spline, so all that is known of the vehicle is its newest observation.
+itself where the horizon is shorter than the time h below; and else the state of the target at k. It
+is sent as a spline with as few uniform knots as keep within `control.spline_error_m` of it
+(`shared.law.spline`); of a state that is one. The vehicle regulates itself along the spline, so all
+that is known of the vehicle is its newest observation.
 
 Which trajectory it follows is not certain: every observation acknowledges the one in force, and
 those sent since may be on their way, or lost. With the share ℓ of losses and the share S(t) of
