@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers import packaged
 from skytether.__main__ import main
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import parse as fault
@@ -49,10 +50,7 @@ NONE = {"delay": "none", "loss": 0.0}
 
 def scenario(**table: Any) -> Scenario:
     """The scenario `autopilot`, flown for 4 s, with some keys changed."""
-    default = reading.to_table(reading.load("autopilot")) | {"duration": 4.0, "settle": 0.0}
-    for key, value in table.items():
-        default[key] = default[key] | value if isinstance(value, dict) else value
-    return reading.check(default, "test")
+    return packaged("autopilot", {"duration": 4.0, "settle": 0.0}, table)
 
 
 def flown(law: str = "led", flavour: FlavourName = "ardupilot", **table: Any) -> Record:
