@@ -76,7 +76,7 @@ def kept(problems: list[MotionProblem]) -> Iterator[None]:
         DualSolver.solve = real  # type: ignore[method-assign]
 
 
-class Osqp:
+class MotionOsqp:
     """OSQP for problems with one Hessian."""
 
     def __init__(self, hessian: Array) -> None:
@@ -114,7 +114,7 @@ class Osqp:
 
 def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
     """Solvers by name, each of problems with this Hessian."""
-    found: dict[str, Callable[[MotionProblem], Array]] = {"OSQP": Osqp(hessian).solve}
+    found: dict[str, Callable[[MotionProblem], Array]] = {"OSQP": MotionOsqp(hessian).solve}
 
     def of_daqp(problem: MotionProblem) -> Array:
         least, free = problem.least, np.full(len(problem.least), 1e30)
