@@ -20,8 +20,8 @@ from skytether.probe.wire import (
     NO_NUMBER,
     NONCE_BYTES,
     Answer,
-    Hello,
     Probe,
+    ProbeHello,
     Welcome,
     decode,
     encode,
@@ -100,7 +100,7 @@ class Listener(Endpoint):
 
     def _hear(self, call: Call, datagram: Datagram, now_ns: int) -> None:
         message = decode(call.payload)
-        if isinstance(message, Hello):
+        if isinstance(message, ProbeHello):
             room = len(self._sessions) < SESSIONS_MAX or self._oldest_idle(now_ns) is not None
             welcome = Welcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
             packet = call.line.seal(encode(welcome))

@@ -22,8 +22,8 @@ from skytether.probe.wire import (
     NO_NUMBER,
     NONCE_BYTES,
     Answer,
-    Hello,
     Probe,
+    ProbeHello,
     Welcome,
     decode,
     encode,
@@ -122,7 +122,7 @@ class Prober(Endpoint):
         self._slots, self._period_ns, self._size = probes, period_ns, size
         self._train_every = max(TRAIN_EVERY_SLOTS, TRAIN_EVERY_NS // period_ns)
         self._session = b""
-        self._hello = encode(Hello(nonce), 0 if link.secure else HELLO_BYTES)
+        self._hello = encode(ProbeHello(nonce), 0 if link.secure else HELLO_BYTES)
         self._due_ns: int | None = 0
         """Time of the next wake; 0 before the first."""
         self._hello_ns = 0

@@ -37,7 +37,7 @@ _ARRIVAL = Struct("<IQ")
 _PADDING = bytes(PAYLOAD_BYTES_MAX)
 
 
-class Hello(NamedTuple):
+class ProbeHello(NamedTuple):
     """HELLO: the prober asks for a session."""
 
     nonce: bytes
@@ -81,8 +81,8 @@ class Answer(NamedTuple):
     """Reported arrivals: number of the PROBE and the listener's time [ns]."""
 
 
-Message = Hello | Welcome | Probe | Answer
-_TYPES: tuple[type[Message], ...] = (Hello, Welcome, Probe, Answer)
+Message = ProbeHello | Welcome | Probe | Answer
+_TYPES: tuple[type[Message], ...] = (ProbeHello, Welcome, Probe, Answer)
 
 
 def encode(message: Message, size: int = 0) -> bytes:
@@ -129,7 +129,7 @@ def decode(payload: bytes) -> Message:
         raise ProtocolError(Drop.VERSION)
     match number, body:
         case 1, [bytes(nonce), bytes()] if len(nonce) == NONCE_BYTES:
-            return Hello(nonce)
+            return ProbeHello(nonce)
         case 2, [bytes(nonce), bytes(cookie), bool(room)] if (
             len(nonce) == NONCE_BYTES and len(cookie) == COOKIE_BYTES
         ):

@@ -28,8 +28,8 @@ from skytether.probe.wire import (
     SESSION_BYTES,
     TRAIN_MAX,
     Answer,
-    Hello,
     Probe,
+    ProbeHello,
     Welcome,
     decode,
     encode,
@@ -98,7 +98,7 @@ def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> Non
     """Every byte is changed in turn."""
     session = bytes(range(SESSION_BYTES))
     messages = (
-        Hello(b"12345678"),
+        ProbeHello(b"12345678"),
         Welcome(b"12345678", b"87654321", True),
         Probe(session, 3, 16, 2),
         Answer(session, 3, 99, 1, 3, ((5, 77), (6, 88))),
@@ -107,7 +107,7 @@ def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> Non
     place = data.draw(st.integers(0, len(payload) - 1))
     payload[place] = data.draw(st.integers(0, 255))
     with suppress(ProtocolError):
-        assert type(decode(bytes(payload))) in (Hello, Welcome, Probe, Answer)
+        assert type(decode(bytes(payload))) in (ProbeHello, Welcome, Probe, Answer)
 
 
 # -- the listener ---------------------------------------------------------------------------------
@@ -120,7 +120,7 @@ def listener() -> Listener:
 
 def session_of(far: Listener, peer: tuple[str, int], now_ns: int) -> bytes:
     """Session that a listener gives."""
-    far.receive(Datagram(encode(Hello(b"12345678"), 64), peer), now_ns=now_ns)
+    far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), peer), now_ns=now_ns)
     (packet,) = far.outbox()
     welcome = decode(packet.payload)
     assert isinstance(welcome, Welcome)
@@ -134,7 +134,7 @@ def test_a_listener_answers_with_no_more_than_it_got(payloads: list[bytes]) -> N
     far, peer = listener(), ("prober", 1)
     session = session_of(far, peer, 0)
     probes = [encode(Probe(session, n, n % 3, 0), 96 + n) for n in range(5)]
-    for payload in [*payloads, *probes, encode(Hello(b"abcdefgh"), 20)]:
+    for payload in [*payloads, *probes, encode(ProbeHello(b"abcdefgh"), 20)]:
         far.receive(Datagram(payload, peer), now_ns=0)
         assert sum(len(each.payload) for each in far.outbox()) <= len(payload) or payload in probes
     assert far.figures()["sessions"] == 1
@@ -166,7 +166,7 @@ def test_a_listener_has_room_for_so_many_measurements() -> None:
         far.receive(Datagram(encode(Probe(session, 0, 0, 0), 96), ("prober", port)), now_ns=0)
         assert len(far.outbox()) == 1
     for now_ns, room in ((1, False), (IDLE_NS + 2, True)):
-        far.receive(Datagram(encode(Hello(b"12345678"), 64), ("new", 1)), now_ns=now_ns)
+        far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), ("new", 1)), now_ns=now_ns)
         (packet,) = far.outbox()
         welcome = decode(packet.payload)
         assert isinstance(welcome, Welcome)
