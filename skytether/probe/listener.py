@@ -22,7 +22,7 @@ from skytether.probe.wire import (
     Answer,
     Probe,
     ProbeHello,
-    Welcome,
+    ProbeWelcome,
     decode,
     encode,
 )
@@ -102,7 +102,7 @@ class Listener(Endpoint):
         message = decode(call.payload)
         if isinstance(message, ProbeHello):
             room = len(self._sessions) < SESSIONS_MAX or self._oldest_idle(now_ns) is not None
-            welcome = Welcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
+            welcome = ProbeWelcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
             packet = call.line.seal(encode(welcome))
             if len(packet) > len(datagram.payload):
                 raise ProtocolError(Drop.LENGTH)

@@ -24,7 +24,7 @@ from skytether.probe.wire import (
     Answer,
     Probe,
     ProbeHello,
-    Welcome,
+    ProbeWelcome,
     decode,
     encode,
 )
@@ -174,7 +174,7 @@ class Prober(Endpoint):
 
     def _hear(self, payload: bytes, now_ns: int) -> None:
         message = decode(payload)
-        if isinstance(message, Welcome):
+        if isinstance(message, ProbeWelcome):
             if message.nonce != self._nonce:
                 raise ProtocolError(Drop.UNASKED)
             self._link.adopt(now_ns=now_ns)

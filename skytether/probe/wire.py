@@ -43,7 +43,7 @@ class ProbeHello(NamedTuple):
     nonce: bytes
 
 
-class Welcome(NamedTuple):
+class ProbeWelcome(NamedTuple):
     """WELCOME: the listener grants or refuses a session."""
 
     nonce: bytes
@@ -81,8 +81,8 @@ class Answer(NamedTuple):
     """Reported arrivals: number of the PROBE and the listener's time [ns]."""
 
 
-Message = ProbeHello | Welcome | Probe | Answer
-_TYPES: tuple[type[Message], ...] = (ProbeHello, Welcome, Probe, Answer)
+Message = ProbeHello | ProbeWelcome | Probe | Answer
+_TYPES: tuple[type[Message], ...] = (ProbeHello, ProbeWelcome, Probe, Answer)
 
 
 def encode(message: Message, size: int = 0) -> bytes:
@@ -97,7 +97,7 @@ def encode(message: Message, size: int = 0) -> bytes:
         room = size - len(_packed(Answer, (*message[:-1], b""), b"")) - 1
         told = message.arrivals[: max(0, room // _ARRIVAL.size)]
         fields = *message[:-1], b"".join(_ARRIVAL.pack(*each) for each in told)
-    if isinstance(message, Welcome):
+    if isinstance(message, ProbeWelcome):
         return msgpack.packb((VERSION, 2, *message))
     bare = _packed(type(message), fields, b"")
     room = size - len(bare)
@@ -133,7 +133,7 @@ def decode(payload: bytes) -> Message:
         case 2, [bytes(nonce), bytes(cookie), bool(room)] if (
             len(nonce) == NONCE_BYTES and len(cookie) == COOKIE_BYTES
         ):
-            return Welcome(nonce, cookie, room)
+            return ProbeWelcome(nonce, cookie, room)
         case 3, [bytes(session), int(probe), int(train), int(held), bytes()]:
             _check(session, (probe, held))
             if not 0 <= train <= TRAIN_MAX or isinstance(train, bool):

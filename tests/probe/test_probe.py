@@ -30,7 +30,7 @@ from skytether.probe.wire import (
     Answer,
     Probe,
     ProbeHello,
-    Welcome,
+    ProbeWelcome,
     decode,
     encode,
 )
@@ -99,7 +99,7 @@ def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> Non
     session = bytes(range(SESSION_BYTES))
     messages = (
         ProbeHello(b"12345678"),
-        Welcome(b"12345678", b"87654321", True),
+        ProbeWelcome(b"12345678", b"87654321", True),
         Probe(session, 3, 16, 2),
         Answer(session, 3, 99, 1, 3, ((5, 77), (6, 88))),
     )
@@ -107,7 +107,7 @@ def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> Non
     place = data.draw(st.integers(0, len(payload) - 1))
     payload[place] = data.draw(st.integers(0, 255))
     with suppress(ProtocolError):
-        assert type(decode(bytes(payload))) in (ProbeHello, Welcome, Probe, Answer)
+        assert type(decode(bytes(payload))) in (ProbeHello, ProbeWelcome, Probe, Answer)
 
 
 # -- the listener ---------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ def session_of(far: Listener, peer: tuple[str, int], now_ns: int) -> bytes:
     far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), peer), now_ns=now_ns)
     (packet,) = far.outbox()
     welcome = decode(packet.payload)
-    assert isinstance(welcome, Welcome)
+    assert isinstance(welcome, ProbeWelcome)
     assert len(packet.payload) <= 64
     return welcome.nonce + welcome.cookie
 
@@ -169,7 +169,7 @@ def test_a_listener_has_room_for_so_many_measurements() -> None:
         far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), ("new", 1)), now_ns=now_ns)
         (packet,) = far.outbox()
         welcome = decode(packet.payload)
-        assert isinstance(welcome, Welcome)
+        assert isinstance(welcome, ProbeWelcome)
         assert welcome.room == room
         session = welcome.nonce + welcome.cookie
         probe = encode(Probe(session, 0, 0, 0), 96)
@@ -390,9 +390,9 @@ def test_strangers_and_forgers_change_nothing() -> None:
     near.outbox()
     far = listener()
     session = session_of(far, ("prober", 1), 0)
-    welcome = encode(Welcome(bytes(NONCE_BYTES), b"12345678", True))
+    welcome = encode(ProbeWelcome(bytes(NONCE_BYTES), b"12345678", True))
     near.receive(Datagram(welcome, ("stranger", 1)), now_ns=1)
-    near.receive(Datagram(encode(Welcome(b"87654321", b"12345678", True)), LISTENER), now_ns=1)
+    near.receive(Datagram(encode(ProbeWelcome(b"87654321", b"12345678", True)), LISTENER), now_ns=1)
     assert near.next_wake_ns() is not None
     near.receive(Datagram(welcome, LISTENER), now_ns=1)
     mine = bytes(NONCE_BYTES) + b"12345678"
