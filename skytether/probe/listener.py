@@ -19,8 +19,8 @@ from skytether.probe.wire import (
     COOKIE_BYTES,
     NO_NUMBER,
     NONCE_BYTES,
-    Answer,
     Probe,
+    ProbeAnswer,
     ProbeHello,
     ProbeWelcome,
     decode,
@@ -171,7 +171,7 @@ class Listener(Endpoint):
         log, line = session.log, held.call.line
         first = session.logged - len(log)
         arrivals = tuple(islice(log, _TOLD_MAX))
-        answer = Answer(name, held.number, now_ns, first, session.logged, arrivals)
+        answer = ProbeAnswer(name, held.number, now_ns, first, session.logged, arrivals)
         size = held.size - (OVERHEAD_BYTES if self._gate.secure else 0)
         packet = line.seal(encode(answer, size))
         if len(packet) <= held.size:  # a probe shorter than any prober's cannot be answered

@@ -21,8 +21,8 @@ from skytether.probe.wire import (
     MESSAGE_BYTES_MIN,
     NO_NUMBER,
     NONCE_BYTES,
-    Answer,
     Probe,
+    ProbeAnswer,
     ProbeHello,
     ProbeWelcome,
     decode,
@@ -182,14 +182,14 @@ class Prober(Endpoint):
                 self._session = message.nonce + message.cookie
                 self.refused = self._done = not message.room
                 self._zero_ns = self._due_ns = now_ns
-        elif isinstance(message, Answer):
+        elif isinstance(message, ProbeAnswer):
             if message.session != self._session:
                 raise ProtocolError(Drop.UNKNOWN_SESSION)
             self._learn(message, now_ns)
         else:
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
-    def _learn(self, answer: Answer, now_ns: int) -> None:
+    def _learn(self, answer: ProbeAnswer, now_ns: int) -> None:
         """Keep the arrivals in an answer."""
         # Without keys, an attacker may claim anything: more than twice the probes is impossible.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:

@@ -65,7 +65,7 @@ class Probe(NamedTuple):
     """Number of arrivals that the prober has received reports of."""
 
 
-class Answer(NamedTuple):
+class ProbeAnswer(NamedTuple):
     """ANSWER: packet from the listener to the prober."""
 
     session: bytes
@@ -81,8 +81,8 @@ class Answer(NamedTuple):
     """Reported arrivals: number of the PROBE and the listener's time [ns]."""
 
 
-Message = ProbeHello | ProbeWelcome | Probe | Answer
-_TYPES: tuple[type[Message], ...] = (ProbeHello, ProbeWelcome, Probe, Answer)
+Message = ProbeHello | ProbeWelcome | Probe | ProbeAnswer
+_TYPES: tuple[type[Message], ...] = (ProbeHello, ProbeWelcome, Probe, ProbeAnswer)
 
 
 def encode(message: Message, size: int = 0) -> bytes:
@@ -93,8 +93,8 @@ def encode(message: Message, size: int = 0) -> bytes:
             do not fit.
     """
     fields: tuple[Any, ...] = message
-    if isinstance(message, Answer):
-        room = size - len(_packed(Answer, (*message[:-1], b""), b"")) - 1
+    if isinstance(message, ProbeAnswer):
+        room = size - len(_packed(ProbeAnswer, (*message[:-1], b""), b"")) - 1
         told = message.arrivals[: max(0, room // _ARRIVAL.size)]
         fields = *message[:-1], b"".join(_ARRIVAL.pack(*each) for each in told)
     if isinstance(message, ProbeWelcome):
@@ -154,7 +154,7 @@ def decode(payload: bytes) -> Message:
             arrivals = tuple(_ARRIVAL.iter_unpack(told))
             if first + len(arrivals) > logged or any(at_ns >= 2**63 for _, at_ns in arrivals):
                 raise ProtocolError(Drop.FIELD)
-            return Answer(session, answer, sent_ns, first, logged, arrivals)
+            return ProbeAnswer(session, answer, sent_ns, first, logged, arrivals)
     raise ProtocolError(Drop.TYPE if number not in (1, 2, 3, 4) else Drop.FIELD)
 
 

@@ -27,8 +27,8 @@ from skytether.probe.wire import (
     NONCE_BYTES,
     SESSION_BYTES,
     TRAIN_MAX,
-    Answer,
     Probe,
+    ProbeAnswer,
     ProbeHello,
     ProbeWelcome,
     decode,
@@ -77,11 +77,11 @@ def test_an_answer_tells_of_as_many_arrivals_as_have_room(
     arrivals: list[tuple[int, int]], sent_ns: int, size: int
 ) -> None:
     """It is no longer than its probe, and tells of two at least where there are two."""
-    answer = Answer(bytes(SESSION_BYTES), 3, sent_ns, 7, 7 + len(arrivals), tuple(arrivals))
+    answer = ProbeAnswer(bytes(SESSION_BYTES), 3, sent_ns, 7, 7 + len(arrivals), tuple(arrivals))
     payload = encode(answer, size)
     assert len(payload) <= size
     told = decode(payload)
-    assert isinstance(told, Answer)
+    assert isinstance(told, ProbeAnswer)
     assert len(told.arrivals) >= min(2, len(arrivals))
     assert told == answer._replace(arrivals=answer.arrivals[: len(told.arrivals)])
 
@@ -101,13 +101,13 @@ def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> Non
         ProbeHello(b"12345678"),
         ProbeWelcome(b"12345678", b"87654321", True),
         Probe(session, 3, 16, 2),
-        Answer(session, 3, 99, 1, 3, ((5, 77), (6, 88))),
+        ProbeAnswer(session, 3, 99, 1, 3, ((5, 77), (6, 88))),
     )
     payload = bytearray(encode(messages[kind], 96))
     place = data.draw(st.integers(0, len(payload) - 1))
     payload[place] = data.draw(st.integers(0, 255))
     with suppress(ProtocolError):
-        assert type(decode(bytes(payload))) in (ProbeHello, ProbeWelcome, Probe, Answer)
+        assert type(decode(bytes(payload))) in (ProbeHello, ProbeWelcome, Probe, ProbeAnswer)
 
 
 # -- the listener ---------------------------------------------------------------------------------
@@ -397,9 +397,9 @@ def test_strangers_and_forgers_change_nothing() -> None:
     near.receive(Datagram(welcome, LISTENER), now_ns=1)
     mine = bytes(NONCE_BYTES) + b"12345678"
     for answer in (
-        Answer(session, 0, 1, 0, 1, ((0, 1),)),
-        Answer(mine, 0, 1, 0, 1, ((500, 1),)),
-        Answer(mine, 0, 1, 0, 4_000_000, ()),
+        ProbeAnswer(session, 0, 1, 0, 1, ((0, 1),)),
+        ProbeAnswer(mine, 0, 1, 0, 1, ((500, 1),)),
+        ProbeAnswer(mine, 0, 1, 0, 4_000_000, ()),
     ):
         near.receive(Datagram(encode(answer, 200), LISTENER), now_ns=2)
     near.receive(Datagram(b"garbage", LISTENER), now_ns=2)
