@@ -45,7 +45,7 @@ _TOLD_MAX = PAYLOAD_BYTES_MAX // 12
 
 
 @dataclass(slots=True)
-class Held:
+class HeldPacket:
     """Packet of a train whose answer waits for the rest of the train."""
 
     number: int
@@ -66,7 +66,7 @@ class Session:
     """Number of arrivals so far."""
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     """Newest arrivals not yet acknowledged by the prober: number and time [ns]."""
-    train: list[Held] = field(default_factory=list)
+    train: list[HeldPacket] = field(default_factory=list)
     """Packets of a train that wait for the rest."""
     train_ns: int = 0
     """Time of the newest packet in `train` [ns]."""
@@ -152,7 +152,7 @@ class Listener(Endpoint):
             number = session.logged
             log.append((probe.number, now_ns))
             session.logged += 1
-        waits = Held(number, call, datagram.peer, len(datagram.payload))
+        waits = HeldPacket(number, call, datagram.peer, len(datagram.payload))
         if probe.train > 1 and number != NO_NUMBER:
             session.train.append(waits)
             session.train_ns = now_ns
@@ -167,7 +167,7 @@ class Listener(Endpoint):
             self._answer(session, name, each, now_ns)
         session.train.clear()
 
-    def _answer(self, session: Session, name: bytes, held: Held, now_ns: int) -> None:
+    def _answer(self, session: Session, name: bytes, held: HeldPacket, now_ns: int) -> None:
         log, line = session.log, held.call.line
         first = session.logged - len(log)
         arrivals = tuple(islice(log, _TOLD_MAX))
