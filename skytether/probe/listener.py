@@ -57,7 +57,7 @@ class HeldPacket:
 
 
 @dataclass(slots=True)
-class Session:
+class ProbeSession:
     """Measurement by one prober."""
 
     heard_ns: int
@@ -83,7 +83,7 @@ class Listener(Endpoint):
     def __init__(self, gate: Gate, secret: bytes) -> None:
         super().__init__()
         self._gate, self._secret = gate, secret
-        self._sessions: OrderedDict[bytes, Session] = OrderedDict()
+        self._sessions: OrderedDict[bytes, ProbeSession] = OrderedDict()
         """Measurements by session id, in order of their newest probe, oldest first."""
         self._dropped: Counter[Drop] = Counter()
         self._answered = 0
@@ -114,7 +114,7 @@ class Listener(Endpoint):
         else:
             raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
-    def _session(self, name: bytes, peer: Address, now_ns: int) -> Session:
+    def _session(self, name: bytes, peer: Address, now_ns: int) -> ProbeSession:
         """Measurement of a session, begun if it is new.
 
         Raises:
@@ -130,7 +130,7 @@ class Listener(Endpoint):
                 if idle is None:
                     raise ProtocolError(Drop.FULL)
                 del self._sessions[idle]
-            session = self._sessions[name] = Session(now_ns)
+            session = self._sessions[name] = ProbeSession(now_ns)
         session.heard_ns = now_ns
         self._sessions.move_to_end(name)
         return session
@@ -141,7 +141,7 @@ class Listener(Endpoint):
         return name if session and now_ns - session.heard_ns > IDLE_NS else None
 
     def _probe(
-        self, session: Session, probe: Probe, call: Call, datagram: Datagram, now_ns: int
+        self, session: ProbeSession, probe: Probe, call: Call, datagram: Datagram, now_ns: int
     ) -> None:
         log = session.log
         while log and session.logged - len(log) < probe.held:
@@ -161,13 +161,13 @@ class Listener(Endpoint):
         else:
             self._answer(session, probe.session, waits, now_ns)
 
-    def _release(self, session: Session, name: bytes, now_ns: int) -> None:
+    def _release(self, session: ProbeSession, name: bytes, now_ns: int) -> None:
         """Answer all packets of a train."""
         for each in session.train:
             self._answer(session, name, each, now_ns)
         session.train.clear()
 
-    def _answer(self, session: Session, name: bytes, held: HeldPacket, now_ns: int) -> None:
+    def _answer(self, session: ProbeSession, name: bytes, held: HeldPacket, now_ns: int) -> None:
         log, line = session.log, held.call.line
         first = session.logged - len(log)
         arrivals = tuple(islice(log, _TOLD_MAX))
