@@ -27,7 +27,7 @@ from math import pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.probe.prober import Longs, Measured, Way
+from skytether.probe.prober import Longs, MeasuredPath, Way
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
 
@@ -110,7 +110,7 @@ class Delays:
 # -- clocks and delays --------------------------------------------------------------------------
 
 
-def delays(measured: Measured) -> tuple[Clocks, Delays, Delays]:
+def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     """Clocks, and delays of the downlink and of the uplink.
 
     Raises:

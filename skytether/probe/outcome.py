@@ -9,7 +9,7 @@ import numpy as np
 
 from skytether.probe import analysis, fits
 from skytether.probe.analysis import QUANTILES, Clocks, Delays
-from skytether.probe.prober import TRAIN, Longs, Measured, Way
+from skytether.probe.prober import TRAIN, Longs, MeasuredPath, Way
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
@@ -117,7 +117,7 @@ class Outcome:
     told: PathTold
 
 
-def outcome(measured: Measured, listener: str, *, secure: bool) -> Outcome:
+def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> Outcome:
     """Result of a measurement.
 
     Args:
@@ -223,7 +223,7 @@ def trace(delays: Delays) -> str:
     return "\n".join(lines) + "\n"
 
 
-def rows(measured: Measured, clocks: Clocks) -> Rows:
+def rows(measured: MeasuredPath, clocks: Clocks) -> Rows:
     """Packets in netem's format, one row each, those of trains included.
 
     Times are on the prober's clock; `delay_ns` of a lost packet is 0.
@@ -246,7 +246,7 @@ def rows(measured: Measured, clocks: Clocks) -> Rows:
     return np.concatenate(parts)
 
 
-def _ahead_ns(way: Way, measured: Measured, clocks: Clocks) -> Longs:
+def _ahead_ns(way: Way, measured: MeasuredPath, clocks: Clocks) -> Longs:
     """Offset of the listener's clock when each packet is sent [ns]; shape (n,)."""
     near_ns = measured.downlink.sent_ns[0]
     base_ns = round(clocks.offset_s * SECOND_NS)

@@ -77,7 +77,7 @@ class Way:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredPath:
     """Packets of both directions."""
 
     downlink: Way
@@ -311,7 +311,7 @@ class Prober(Endpoint):
             "dropped": by_name(self._dropped),
         }
 
-    def measured(self) -> Measured:
+    def measured(self) -> MeasuredPath:
         """Packets so far.
 
         If the measurement was ended early, packets that may still be under way are left out: those
@@ -320,7 +320,7 @@ class Prober(Endpoint):
         number = np.array(self._logged_number, np.int64)
         logged_ns = np.array(self._logged_ns, np.int64)
         downlink = self._downlink(number, logged_ns)
-        return Measured(
+        return MeasuredPath(
             downlink,
             self._uplink(number, logged_ns),
             self._size,
