@@ -22,7 +22,7 @@ ORDERED_SHARE = 0.01
 is called ordered."""
 
 
-class Model(msgspec.Struct, frozen=True):
+class ModelTold(msgspec.Struct, frozen=True):
     """Fitted model, for the output."""
 
     text: str
@@ -68,9 +68,9 @@ class WayTold(msgspec.Struct, frozen=True, kw_only=True):
     """Number of trains of which enough packets arrived."""
     train_wait_s: float
     """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
-    delay_models: list[Model]
+    delay_models: list[ModelTold]
     """Models of the delay, without the transmission time at the rate, the best first."""
-    loss_models: list[Model]
+    loss_models: list[ModelTold]
     """Models of the losses, the best first."""
     text: str
     """Text of the best models, for `network.uplink` or `network.downlink`."""
@@ -167,8 +167,8 @@ def _way_told(way: Way, delays: Delays, size: int) -> WayTold:
     reordered = analysis.reordered(way)
     spacing_s = float(apart_s[0]) if len(apart_s) else np.inf
     lasting_s = correlation_s if correlation_s > TEXT_CORRELATION_MIN * spacing_s else 0.0
-    models = [Model(fit.text(lasting_s), fit.bic) for fit in delay_models]
-    losses = [Model(fit.text(), fit.bic) for fit in loss_models]
+    models = [ModelTold(fit.text(lasting_s), fit.bic) for fit in delay_models]
+    losses = [ModelTold(fit.text(), fit.bic) for fit in loss_models]
     parts = [each[0].text for each in (models, losses) if each]
     if rate:
         parts.append(f"rate({rate.bytes_per_s:.4g})")
