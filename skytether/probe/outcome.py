@@ -108,7 +108,7 @@ class PathTold(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ProbeOutcome:
     """Result of a measurement."""
 
     clocks: Clocks
@@ -117,7 +117,7 @@ class Outcome:
     told: PathTold
 
 
-def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> Outcome:
+def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> ProbeOutcome:
     """Result of a measurement.
 
     Args:
@@ -147,7 +147,7 @@ def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> Outcome:
         unreported=measured.unreported,
         **told,
     )
-    return Outcome(clocks, delays, path)
+    return ProbeOutcome(clocks, delays, path)
 
 
 def _way_told(way: Way, delays: Delays, size: int) -> WayTold:
