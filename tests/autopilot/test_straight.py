@@ -306,13 +306,13 @@ def test_the_autopilot_records_where_it_truly_is_at_every_tick() -> None:
 # -- the benchmark, and real UDP -----------------------------------------------------------------
 
 
-def flight(contender: str, air: autopilots.Air, seed: int, **whole: float) -> autopilots.Flown:
+def flight(contender: str, air: autopilots.Air, seed: int, **whole: float) -> autopilots.FlownCell:
     """Figures of flights of PX4 in which nothing was flown, but for those that are given."""
     nothing = [np.zeros(80, columns) for columns in (station_columns(3), TRUTH_COLUMNS)]
     record = joined(scenario(), *nothing, np.zeros(0, PACKET_COLUMNS))
     summary = summary_of(scenario(), "autopilot", record)
     summary = msgspec.structs.replace(summary, error_max=1.0, duration_s=4.0)
-    return autopilots.Flown(
+    return autopilots.FlownCell(
         contender=contender,
         flavour="px4",
         air=air,
