@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skytether.server.control.budget import Budget
+from skytether.server.control.budget import SharedBudget
 from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.control.committed import Replay
 from skytether.server.control.desired import Desired
@@ -136,7 +136,7 @@ class Controller:
         """Whether each vehicle flies horizons, as it said last; shape (room,)."""
         self._counts: Counter[str] = Counter()
         shared = control.shared_bytes_per_s
-        self.budget = Budget(shared, clock, room) if shared else None
+        self.budget = SharedBudget(shared, clock, room) if shared else None
         """Bytes that all vehicles share, where there is a bound."""
 
     @property
