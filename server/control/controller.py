@@ -30,7 +30,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
-from skytether.shared.scenario.triggers import Known, Situation, Verdict, make_trigger
+from skytether.shared.scenario.triggers import KnownArrays, Situation, Verdict, make_trigger
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
@@ -157,7 +157,7 @@ class Controller:
             doubts,
             splines=terms.splines,
         )
-        self._known = Known(
+        self._known = KnownArrays(
             model=terms.model,
             dt_s=terms.dt_s,
             planned=terms.planned,
