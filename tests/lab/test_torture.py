@@ -29,7 +29,7 @@ from skytether.lab.faults import RANGES, Kind, ScheduledFault, Trial, dumps, loa
 from skytether.lab.invariants import Violation, check_bounds
 from skytether.lab.torture import (
     CLOCK_NS,
-    Outcome,
+    TrialOutcome,
     fly,
     long_trial,
     make_scenario,
@@ -147,7 +147,7 @@ EFFECTS = [
 
 
 @cache
-def undisturbed() -> Outcome:
+def undisturbed() -> TrialOutcome:
     """A trial without faults."""
     return fly(Trial(1, ()))
 
