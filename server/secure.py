@@ -64,7 +64,7 @@ FORMS = (
 array of msgpack) is dropped as well, but the operator is to be told of it."""
 
 
-class _Rate:
+class _HandshakeRate:
     """Number of handshakes in a second.
 
     Args:
@@ -92,9 +92,9 @@ class _KeyedVehicle:
     __slots__ = ("attempts", "done", "live", "pending", "previous", "repeats")
 
     def __init__(self, now_ns: int) -> None:
-        self.attempts = _Rate(now_ns)
+        self.attempts = _HandshakeRate(now_ns)
         """Attempts, which nobody else can make: repeats, which anybody can, take none of them."""
-        self.repeats = _Rate(now_ns)
+        self.repeats = _HandshakeRate(now_ns)
         """Other answers to an attempt that has been answered."""
         self.live: Channel | None = None
         """Channel that the vehicle sends in."""
