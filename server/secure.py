@@ -17,6 +17,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Form
 from skytether.shared.wire import channel, handshake
 from skytether.shared.wire.channel import OVERHEAD_BYTES, VERSION, Channel, kind
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.handshake import (
     CHANNEL,
     COOKIE_BYTES,
@@ -30,7 +31,7 @@ from skytether.shared.wire.handshake import (
 )
 from skytether.shared.wire.keys import Keyring, VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, NoiseError, Responder
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, Hello, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello
 
 COOKIE_NS = 60 * SECOND_NS
 """Time for which cookies are alike; each is good for this time and the next [ns]."""

@@ -30,7 +30,8 @@ from skytether.server.gate import Call, Gate
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.wire.channel import OVERHEAD_BYTES
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
 """Most measurements at once; one without a probe for IDLE_NS may be replaced."""

@@ -31,7 +31,8 @@ from skytether.probe.wire import (
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.wire.channel import OVERHEAD_BYTES
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 BYTES_MIN = MESSAGE_BYTES_MIN + OVERHEAD_BYTES
 """Smallest size of a probe, encrypted or not [B]."""

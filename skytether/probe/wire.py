@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 VERSION = 64
 """Protocol version; endpoints of a flight reject it, so that none takes a probe for its own."""

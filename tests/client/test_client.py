@@ -23,9 +23,9 @@ from skytether.shared.core.events import (
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
-    Drop,
     Heartbeat,
     Hello,
     Horizon,

@@ -39,7 +39,8 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.path import path
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 from skytether.sim.world import Clock
 
 LISTENER = ("listener", 0)
