@@ -18,6 +18,7 @@ from skytether.shared.law.model import Array, advance
 from skytether.shared.law.rule import Held, bounded, lasting, late_max
 from skytether.shared.law.spline import Guide, along
 from skytether.shared.law.terms import Terms
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import (
     AXES_MAX,
     DISTURBANCE,
@@ -27,9 +28,7 @@ from skytether.shared.wire.protocol import (
     LED_P,
     LED_V,
     NO_HORIZON,
-    Drop,
     Horizon,
-    ProtocolError,
     Trajectory,
 )
 

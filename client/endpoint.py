@@ -28,7 +28,8 @@ from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
-from skytether.shared.wire.protocol import CLOSES, Close, Drop, Mode, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import CLOSES, Close, Mode
 
 VEHICLE_SOCKET = 1
 """Number of the socket through which the vehicle's own port talks; the server's is 0."""

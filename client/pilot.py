@@ -25,14 +25,13 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     NO_INPUT,
-    Drop,
     Horizon,
     Mode,
     Observation,
-    ProtocolError,
     Trajectory,
     stamp_us,
 )

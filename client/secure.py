@@ -15,6 +15,7 @@ from skytether.client.link import AGAIN_NS
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.wire import channel, handshake
 from skytether.shared.wire.channel import Channel, kind
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.handshake import (
     NO_COOKIE,
     check_place,
@@ -26,7 +27,6 @@ from skytether.shared.wire.handshake import (
 )
 from skytether.shared.wire.keys import VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, Initiator, NoiseError
-from skytether.shared.wire.protocol import Drop, ProtocolError
 
 ATTEMPT_NS = 60 * SECOND_NS
 """Time for which an attempt is said again before another one is begun [ns]."""

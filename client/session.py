@@ -18,16 +18,15 @@ from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import (
     Close,
-    Drop,
     Heartbeat,
     Hello,
     Horizon,
     Idle,
     Message,
     Observation,
-    ProtocolError,
     Refusal,
     Trajectory,
     Welcome,

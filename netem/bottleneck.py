@@ -79,7 +79,7 @@ class Codel:
 
 
 @dataclass(slots=True)
-class Line(Generic[T]):
+class WaitingLine(Generic[T]):
     """Packets that wait in one line: all of a direction, or those of a flow."""
 
     packets: "deque[Waiting[T]]" = field(default_factory=deque)
@@ -99,7 +99,7 @@ class Bottleneck(Generic[T]):
     def __init__(self, queue: Queued) -> None:
         self._queue = queue
         self._is_fair = queue.serve == "fair"
-        self._lines: OrderedDict[int, Line[T]] = OrderedDict()
+        self._lines: OrderedDict[int, WaitingLine[T]] = OrderedDict()
         """Lines in which packets wait, that whose turn it is first."""
         self._served: Waiting[T] | None = None
         self._done_ns = 0
@@ -129,7 +129,7 @@ class Bottleneck(Generic[T]):
         key = flow if self._is_fair else 0
         line = self._lines.get(key)
         if line is None:
-            line = self._lines[key] = Line(credit=QUANTUM_BYTES)
+            line = self._lines[key] = WaitingLine(credit=QUANTUM_BYTES)
         line.packets.append(packet)
         self._count(key, packet, 1)
         while self.waiting_bytes > self._queue.room_bytes:
@@ -180,7 +180,7 @@ class Bottleneck(Generic[T]):
             self.dropped.append(packet.item)
         return None
 
-    def _is_late(self, line: Line[T], packet: Waiting[T], now_ns: int) -> bool:
+    def _is_late(self, line: WaitingLine[T], packet: Waiting[T], now_ns: int) -> bool:
         """Whether CoDel drops a packet that was next in its line."""
         waited_ns = now_ns - packet.entered_ns
         target_ns = max(TARGET_NS, round(self._largest / self._queue.bytes_per_s * SECOND_NS))

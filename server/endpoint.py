@@ -27,7 +27,8 @@ from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
-from skytether.shared.wire.protocol import CLOSES, Close, Drop, Refusal, encode
+from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64
 """Vehicles at once, unless room is made for more."""

@@ -28,13 +28,12 @@ from skytether.shared.core.events import (
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import (
     Close,
-    Drop,
     Hello,
     Idle,
     Observation,
-    ProtocolError,
     Refusal,
     Welcome,
     decode,

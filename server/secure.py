@@ -17,6 +17,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Form
 from skytether.shared.wire import channel, handshake
 from skytether.shared.wire.channel import OVERHEAD_BYTES, VERSION, Channel, kind
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.handshake import (
     CHANNEL,
     COOKIE_BYTES,
@@ -30,7 +31,7 @@ from skytether.shared.wire.handshake import (
 )
 from skytether.shared.wire.keys import Keyring, VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, NoiseError, Responder
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, Hello, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello
 
 COOKIE_NS = 60 * SECOND_NS
 """Time for which cookies are alike; each is good for this time and the next [ns]."""
@@ -64,7 +65,7 @@ FORMS = (
 array of msgpack) is dropped as well, but the operator is to be told of it."""
 
 
-class _Rate:
+class _HandshakeRate:
     """Number of handshakes in a second.
 
     Args:
@@ -92,9 +93,9 @@ class _KeyedVehicle:
     __slots__ = ("attempts", "done", "live", "pending", "previous", "repeats")
 
     def __init__(self, now_ns: int) -> None:
-        self.attempts = _Rate(now_ns)
+        self.attempts = _HandshakeRate(now_ns)
         """Attempts, which nobody else can make: repeats, which anybody can, take none of them."""
-        self.repeats = _Rate(now_ns)
+        self.repeats = _HandshakeRate(now_ns)
         """Other answers to an attempt that has been answered."""
         self.live: Channel | None = None
         """Channel that the vehicle sends in."""

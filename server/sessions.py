@@ -20,7 +20,8 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.law.model import Indices
-from skytether.shared.wire.protocol import Drop, Hello, Observation, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import Hello, Observation
 
 SESSION_NS = 30 * SECOND_NS
 """A vehicle unheard for so long is forgotten [ns]."""

@@ -1,15 +1,20 @@
 """Scenarios and shells that tests of several rooms need."""
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from skytether.__main__ import main
 from skytether.client.pilot import Pilot
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import lay
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell.driver import Shell
 from skytether.sim import flight
@@ -34,6 +39,40 @@ def packaged(name: str, *layers: Mapping[str, Any], **changes: Any) -> Scenario:
         for key, value in layer.items():
             table[key] = table[key] | value if isinstance(value, dict) else value
     return reading.check(table, "test")
+
+
+def demo_with(**keys: Any) -> Scenario:
+    """The scenario `demo-committed` with some keys changed: `control__dt=0.1` is `control.dt`."""
+    table = reading.to_table(reading.load("demo-committed"))
+    lay({key.replace("__", "."): value for key, value in keys.items()}, table)
+    return reading.check(table, "test")
+
+
+def refusal(run: Callable[[], object]) -> str:
+    """Message of the ConfigError that a call raises."""
+    with pytest.raises(ConfigError) as caught:
+        run()
+    return str(caught.value)
+
+
+def refused_before_writing(
+    argv: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> str:
+    """Message of a command that is refused in one line, before it writes into `folder`."""
+    out = folder / "out"
+    assert main([*argv, "--out", str(out)]) == 2
+    assert not out.exists()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    return said.rstrip("\n")
+
+
+def until(holds: Callable[[], object], within_s: float = 60.0) -> None:
+    """Wait until a condition holds; it fails after `within_s` [s]."""
+    deadline_s = time.monotonic() + within_s
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
 
 
 def uncompile(patch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ SAMPLES = 4
 """Number of straight pieces that an interval of a motion is taken for."""
 
 
-class Flown:
+class FlownMotions:
     """Motions that may be flown, side by side, by steps that all vehicles have in common.
 
     Args:
@@ -81,7 +81,7 @@ class Flown:
 
 
 def least_apart(
-    motion: Motion, begin: int, row: int, flown: Flown, scale: Array, dt_s: float
+    motion: Motion, begin: int, row: int, flown: FlownMotions, scale: Array, dt_s: float
 ) -> Array:
     """Least distance of a motion from each that may be flown, from a step on for ever [m].
 
@@ -138,7 +138,7 @@ def half_planes(
     held: Array,
     reach_m: Array,
     row: int,
-    flown: Flown,
+    flown: FlownMotions,
     scale: Array,
     apart_m: float,
     dt_s: float,

@@ -35,7 +35,7 @@ GUESS_BYTES = 100
 """Size of a packet on the line before one was sent [B]."""
 
 
-class Budget:
+class SharedBudget:
     """Shares one rate among up to `capacity` vehicles.
 
     Args:

@@ -113,7 +113,7 @@ class Latest:
     """Share of horizons that were lost lately."""
 
 
-class AxisState:
+class ObservedAxis:
     """Record: the two newest observations of a vehicle on one axis."""
 
     p: float
@@ -161,7 +161,7 @@ class Lead:
     """Disturbance ŵ that the horizon reckons with [m/s]."""
 
 
-LATEST, AXIS_STATE = record(Latest), record(AxisState)
+LATEST, AXIS_STATE = record(Latest), record(ObservedAxis)
 SENT_HORIZON, LEAD = record(SentHorizon), record(Lead)
 
 

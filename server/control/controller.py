@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skytether.server.control.budget import Budget
+from skytether.server.control.budget import SharedBudget
 from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.control.committed import Replay
 from skytether.server.control.desired import Desired
@@ -30,7 +30,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
-from skytether.shared.scenario.triggers import Known, Situation, Verdict, make_trigger
+from skytether.shared.scenario.triggers import KnownArrays, Situation, Verdict, make_trigger
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
@@ -136,7 +136,7 @@ class Controller:
         """Whether each vehicle flies horizons, as it said last; shape (room,)."""
         self._counts: Counter[str] = Counter()
         shared = control.shared_bytes_per_s
-        self.budget = Budget(shared, clock, room) if shared else None
+        self.budget = SharedBudget(shared, clock, room) if shared else None
         """Bytes that all vehicles share, where there is a bound."""
 
     @property
@@ -157,7 +157,7 @@ class Controller:
             doubts,
             splines=terms.splines,
         )
-        self._known = Known(
+        self._known = KnownArrays(
             model=terms.model,
             dt_s=terms.dt_s,
             planned=terms.planned,

@@ -32,7 +32,7 @@ import numpy as np
 
 from skytether.server.control import apart, aside
 from skytether.server.control.aims import DETOUR_S, TURN_BACK, Aims
-from skytether.server.control.apart import Flown, HalfPlanes
+from skytether.server.control.apart import FlownMotions, HalfPlanes
 from skytether.server.control.aside import ASIDE_S, Aside
 from skytether.server.control.known import Known, Sent
 from skytether.server.control.motionplan import MotionPlan
@@ -129,7 +129,7 @@ class Together:
         )
         self._now, self._ahead = 0, dict[int, int]()
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
-        self._flown = Flown(terms.axes)
+        self._flown = FlownMotions(terms.axes)
         """All motions that may be flown at this tick."""
 
     def forget(self, row: int) -> None:

@@ -98,7 +98,7 @@ class Followed:
     """Share of trajectories that were lost lately, ℓ."""
 
 
-class Sent:
+class SentTrajectory:
     """Record: a trajectory that was sent."""
 
     step: int
@@ -113,7 +113,7 @@ class Sent:
     """Number of its knots."""
 
 
-VEHICLE, SENT = record(Followed), record(Sent)
+VEHICLE, SENT = record(Followed), record(SentTrajectory)
 
 
 class Settings(NamedTuple):

@@ -11,7 +11,7 @@ import msgspec
 
 from skytether.shared.core.aboard import AboardEvent, AboardFailure, VehicleEvent
 from skytether.shared.law.terms import Difference
-from skytether.shared.wire.protocol import Drop
+from skytether.shared.wire.drop import Drop
 
 
 def address_text(host: str, port: int) -> str:

@@ -30,7 +30,7 @@ Figures = NDArray[np.void]
 (n,)."""
 
 
-class Known(NamedTuple):
+class KnownArrays(NamedTuple):
     """Arrays that situations are cut from, with room for a whole block of vehicles.
 
     Those of the situation come first; `sent_step` has a row for each vehicle there may be.
@@ -72,7 +72,7 @@ class Situation(NamedTuple):
     """Estimate x̂(k+d): position and velocity where planning starts [m, m/s]; shape (n, axes, 2)."""
     planned: Array
     """State x_p there according to the plan before [m, m/s]; shape (n, axes, 2)."""
-    known: Known
+    known: KnownArrays
     """What the rest is cut from once it is asked for."""
 
     @property

@@ -18,7 +18,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.wire.protocol import Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
 
 VERSION = 1
 """First byte of every sealed packet; no message in plaintext begins with it."""

@@ -19,9 +19,10 @@ import struct
 from typing import NamedTuple
 
 from skytether.shared.wire.channel import VERSION
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.keys import VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import MESSAGE_BYTES
-from skytether.shared.wire.protocol import Drop, ProtocolError, kind_of
+from skytether.shared.wire.protocol import kind_of
 
 INITIATION, CHALLENGE, RESPONSE = 1, 2, 3
 """Types of the packets."""

@@ -28,7 +28,7 @@ dropped and counted by its reason, never answered.
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from enum import IntEnum, StrEnum
+from enum import IntEnum
 from struct import Struct
 from typing import Annotated, Any, NamedTuple
 
@@ -42,6 +42,7 @@ from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
+from skytether.shared.wire.drop import Drop, ProtocolError
 
 VERSION = 7
 PAYLOAD_BYTES_MAX = 1200
@@ -100,67 +101,6 @@ class Refusal(IntEnum):
 
 NO_HORIZON = -1
 """`Observation.in_force` while no horizon has arrived yet."""
-
-
-class Drop(StrEnum):
-    """Why a datagram is dropped; the value is how people read it, and what metrics call it."""
-
-    # It is no message.
-    TOO_LONG = "too long"
-    NOT_MSGPACK = "not msgpack"
-    NOT_A_MESSAGE = "not a message"
-    VERSION = "version"
-    TYPE = "type"
-    FIELD = "field"
-    SHAPE = "shape"
-    NOT_FINITE = "not finite"
-    INPUT_OUT_OF_RANGE = "input out of range"
-
-    # It is not for this end, or not in this session.
-    ELSEWHERE = "not from the server's address"
-    NOT_FOR_A_SERVER = "not for a server"
-    NOT_FOR_A_CLIENT = "not for a client"
-    OF_ANOTHER_VEHICLE = "of another vehicle"
-    """It names another vehicle than the one whose key it is sealed with."""
-    FOR_ANOTHER_LIFE = "for another life"
-    """It answers a client that has ended."""
-    UNKNOWN_SESSION = "unknown session"
-    OTHER_TERMS = "other terms"
-    FULL = "full"
-    TAKEN = "taken"
-
-    # It is not sealed as it should be, see `wire.channel` and `wire.handshake`.
-    NOT_SEALED = "not sealed"
-    LENGTH = "length"
-    UNKNOWN_KEY = "unknown key"
-    UNKNOWN_CHANNEL = "unknown channel"
-    FORGED = "forged"
-    REPLAYED = "replayed"
-    EXPIRED = "expired"
-    UNASKED = "unasked"
-    OUT_OF_PLACE = "out of place"
-    TOO_MANY_HANDSHAKES = "too many handshakes"
-
-    # It is an observation that is impossible, see `server.plausibility`.
-    IMPLAUSIBLE_CLOCK = "implausible: clock"
-    IMPLAUSIBLE_HORIZON = "implausible: horizon"
-    IMPLAUSIBLE_JUMP = "implausible: jump"
-
-    # It is a horizon that is not flown, see `client.compensator`.
-    FROM_THE_FUTURE = "from the future"
-    OBSERVATION = "observation"
-    """It was planned from an observation that there cannot be."""
-    TOO_OLD = "too old"
-    TOO_LATE = "too late"
-    NOT_TAKEN = "not taken"
-
-
-class ProtocolError(Exception):
-    """Error of the peer: what it has sent is to be dropped."""
-
-    def __init__(self, reason: Drop) -> None:
-        super().__init__(reason)
-        self.reason = reason
 
 
 class Hello(NamedTuple):

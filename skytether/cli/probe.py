@@ -13,7 +13,7 @@ import msgspec
 
 from skytether.client.link import ClientLink, PlainLink
 from skytether.probe.listener import Listener
-from skytether.probe.outcome import Outcome, WayTold, outcome, rows, trace
+from skytether.probe.outcome import ProbeOutcome, WayTold, outcome, rows, trace
 from skytether.probe.prober import BYTES_MIN, PROBES_MAX, Prober
 from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import Gate, PlainGate
@@ -222,7 +222,7 @@ def _check(options: ProbeOptions) -> None:
         options.out.mkdir(parents=True, exist_ok=True)
 
 
-def _write(options: ProbeOptions, found: Outcome) -> None:
+def _write(options: ProbeOptions, found: ProbeOutcome) -> None:
     """Write the traces, the figures and the picture.
 
     Raises:
@@ -253,7 +253,7 @@ def _record(path: Path, packets: Rows) -> None:
         files.write(path, content.getvalue())
 
 
-def _tell(options: ProbeOptions, found: Outcome) -> None:
+def _tell(options: ProbeOptions, found: ProbeOutcome) -> None:
     """Print tables of both directions, doubts about them, and the network text to fly."""
     told = found.told
     ways = {"downlink": told.downlink, "uplink": told.uplink}

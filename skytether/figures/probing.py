@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from skytether.probe.outcome import Outcome
+from skytether.probe.outcome import ProbeOutcome
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.scenario.air.delays import Delay
 from skytether.shared.scenario.air.path import path
@@ -16,7 +16,7 @@ DOTS_MAX = 20_000
 """Largest number of packets that are drawn one by one."""
 
 
-def drawn(outcome: Outcome) -> "Figure":
+def drawn(outcome: ProbeOutcome) -> "Figure":
     """Delays of both directions over time, lost packets marked, and their distributions.
 
     The best model is drawn over each distribution.

@@ -149,7 +149,7 @@ def judge(
 
 
 @dataclass(frozen=True, slots=True)
-class Flown:
+class FlownScheme:
     """Points of one scheme, in order of the number of vehicles."""
 
     points: tuple[CrowdPoint, ...]

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from skytether.figures.flights import save
-from skytether.lab.crowd import TITLES, CrowdPoint, Flown, Scheme
+from skytether.lab.crowd import TITLES, CrowdPoint, FlownScheme, Scheme
 from skytether.lab.envelope import WRONG, Envelope, EnvelopePoint, Outcome
 from skytether.lab.sweep import GridAxis
 from skytether.shared.law.model import Array, Flags
@@ -209,7 +209,7 @@ SCHEME_COLOURS: Mapping[Scheme, str] = {
 }
 
 
-def crowd(path: Path, title: str, flown: Mapping[Scheme, Flown], limit_m: float) -> None:
+def crowd(path: Path, title: str, flown: Mapping[Scheme, FlownScheme], limit_m: float) -> None:
     """Draw error, queueing delay and loss over the number of vehicles, for each scheme.
 
     Args:
@@ -257,7 +257,7 @@ def crowd(path: Path, title: str, flown: Mapping[Scheme, Flown], limit_m: float)
     save(figure, path, dpi=110)
 
 
-def _most(flown: Mapping[Scheme, Flown]) -> int:
+def _most(flown: Mapping[Scheme, FlownScheme]) -> int:
     """Largest number of vehicles that was flown."""
     return max(point.vehicles for each in flown.values() for point in each.points)
 

@@ -17,7 +17,16 @@ from scipy import stats
 from skytether.figures.flights import draw_reference
 from skytether.figures.page import Picture
 from skytether.figures.tables import rows_csv, to_csv
-from skytether.lab.studies import EVENT, EVERY, NONE, PERIODIC, Cells, Flown, Study, periodic_wins
+from skytether.lab.studies import (
+    EVENT,
+    EVERY,
+    NONE,
+    PERIODIC,
+    Cells,
+    CellSummaries,
+    Study,
+    periodic_wins,
+)
 from skytether.lab.sweep import by_name, estimate
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario.schema import ControlConfig, DirectionConfig, Scenario
@@ -193,7 +202,7 @@ def _draw_path(plane: Any, scenario: Scenario, flight: Record) -> None:
 DECAY, EPSILON = "decay rate λ [1/s]", "tolerance ε"
 
 
-def maps(flown: Flown, here: ControlConfig) -> Plate:
+def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
     """Fig. 5: RMSE and event ratio over the decay rate λ and the tolerance ε.
 
     Args:
@@ -230,7 +239,7 @@ DRAWN = ("rmse_xy", "event_ratio")
 """Figures in the maps, and in the curves beside them."""
 
 
-def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
+def _grid(flown: CellSummaries) -> tuple[Array, Array, Array, Array]:
     """Values of λ and ε; over both, mean RMSE xy [m] and event ratio; shapes (λ,), (ε,), (λ, ε)."""
     decay, epsilon = (np.unique([values[axis] for values in flown]) for axis in (0, 1))
     shape = (len(decay), len(epsilon))
@@ -241,7 +250,7 @@ def _grid(flown: Flown) -> tuple[Array, Array, Array, Array]:
     return decay, epsilon, rmse.reshape(shape), ratio.reshape(shape)
 
 
-def pareto(flown: Flown, periodic: Flown) -> Plate:
+def pareto(flown: CellSummaries, periodic: CellSummaries) -> Plate:
     """Fig. 5 as curves: RMSE against event ratio, with periodic sending for comparison."""
     decay, _, rmse, ratio = _grid(flown)
     rates, errors = (

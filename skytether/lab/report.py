@@ -17,7 +17,7 @@ from skytether.lab.studies import (
     PERIODIC,
     TRAFFIC,
     Cells,
-    Flown,
+    CellSummaries,
     MethodFlights,
     Study,
     TableEntry,
@@ -57,9 +57,9 @@ class Reproduction:
     """Study of Table 1, and its cells."""
     curves: Sequence[tuple[Study, Cells]]
     """Study of each curve, and its cells."""
-    maps: Flown
+    maps: CellSummaries
     """Summaries of Fig. 5, by λ and ε."""
-    periods: Flown
+    periods: CellSummaries
     """Summaries of periodic sending beside Fig. 5, by period."""
     delay_ms: Array
     """Measured delay of each packet over UDP, and drawn delay [ms]; shape (packets, 2)."""

@@ -112,7 +112,7 @@ class Study:
         """Sweep of the methods of Table 1."""
         return Sweep(SCENARIO, self.scenario, [self.axis, METHODS], self.runs)
 
-    def second(self, flown: "Flown") -> Sweep:
+    def second(self, flown: "CellSummaries") -> Sweep:
         """Sweep of periodic sending, at the rate of the event trigger in the first sweep."""
         changes = tuple(
             {**keys, **periodic(period(flown[value, EVENT]))} for value, keys in self.axis.points()
@@ -227,11 +227,11 @@ def period_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
     return Sweep(SCENARIO, scenario, [axis], scale.map_runs)
 
 
-Flown = Mapping[tuple[Any, ...], Sequence[Summary]]
+CellSummaries = Mapping[tuple[Any, ...], Sequence[Summary]]
 """Summaries of each cell of a sweep, by its values."""
 
 
-def flown(plan: Sweep, done: Results) -> Flown:
+def flown(plan: Sweep, done: Results) -> CellSummaries:
     """Summaries of each cell of a sweep, by its values."""
     return {values: plan.of_cell(done, cell) for cell, values in enumerate(plan.cells)}
 

@@ -175,7 +175,7 @@ def long_trial(seed: int, hours: float = 1.0) -> Trial:
     return Trial(seed, schedule(stream(seed, "torture", "faults"), seconds_to_ns(3600.0 * hours)))
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
     """Result of a trial."""
 
     trial: Trial
@@ -279,7 +279,7 @@ class Torture:
             self._plan(fault)
         self.end_ns = trial.end_ns + self._recovery_ns + QUIET_NS
 
-    def run(self, stopped: Callable[[], bool] = lambda: False) -> Outcome:
+    def run(self, stopped: Callable[[], bool] = lambda: False) -> TrialOutcome:
         """Run the trial to its end, or to the first violation."""
         failure = invariant = ""
         try:
@@ -295,7 +295,7 @@ class Torture:
         for vehicle in self.vehicles:
             self._count(vehicle.life)
         self.counts += self.saboteur.counts
-        return Outcome(
+        return TrialOutcome(
             trial=self.trial,
             failure=f"{self.world.now_ns / SECOND_NS:.3f} s: {failure}" if failure else "",
             invariant=invariant,
@@ -531,12 +531,12 @@ def act(  # noqa: PLR0912 - a branch for each kind of fault
             torture.saboteur.end(fault)
 
 
-def fly(trial: Trial, stopped: Callable[[], bool] = lambda: False) -> Outcome:
+def fly(trial: Trial, stopped: Callable[[], bool] = lambda: False) -> TrialOutcome:
     """Fly a trial to its end, or to the first violation."""
     return Torture(trial).run(stopped)
 
 
-def shrunk(outcome: Outcome) -> Outcome:
+def shrunk(outcome: TrialOutcome) -> TrialOutcome:
     """Result of the shortest schedule of a failed trial that violates the same invariant."""
 
     def fails(faults: tuple[ScheduledFault, ...]) -> bool:

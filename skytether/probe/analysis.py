@@ -27,7 +27,7 @@ from math import pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.probe.prober import Longs, Measured, Way
+from skytether.probe.prober import Longs, MeasuredPath, Way
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
 
@@ -78,7 +78,7 @@ class Clocks:
 
 
 @dataclass(frozen=True, slots=True)
-class Rate:
+class BottleneckRate:
     """Rate of the narrowest part of a path."""
 
     bytes_per_s: float
@@ -98,7 +98,7 @@ class Delays:
     """Time of sending on the prober's clock, from the first probe [s]; shape (n,)."""
     delay_s: Array
     """One-way delay [s]; NaN of a lost packet; shape (n,)."""
-    rate: Rate | None
+    rate: BottleneckRate | None
     """Rate of the direction; None where trains show no finite one."""
 
     @property
@@ -110,7 +110,7 @@ class Delays:
 # -- clocks and delays --------------------------------------------------------------------------
 
 
-def delays(measured: Measured) -> tuple[Clocks, Delays, Delays]:
+def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     """Clocks, and delays of the downlink and of the uplink.
 
     Raises:
@@ -147,7 +147,7 @@ def _points(sent_ns: Longs, came_ns: Longs) -> tuple[Array, Array]:
     return sent_ns / SECOND_NS, (came_ns - sent_ns) / SECOND_NS
 
 
-def _alone(way: Way, time_s: Array, delay_s: Array, found: Rate | None) -> Delays:
+def _alone(way: Way, time_s: Array, delay_s: Array, found: BottleneckRate | None) -> Delays:
     alone = way.train < 0
     return Delays(time_s[alone], np.where(way.came, delay_s, np.nan)[alone], found)
 
@@ -308,7 +308,7 @@ def reordered(way: Way) -> float:
 # -- rate ---------------------------------------------------------------------------------------
 
 
-def rate(way: Way, delay_s: Array, size: int) -> Rate | None:
+def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
     """Rate of the narrowest part of a path; None where trains show no finite one.
 
     Args:
@@ -335,7 +335,7 @@ def rate(way: Way, delay_s: Array, size: int) -> Rate | None:
         return None
     wire = size + HEADER_BYTES
     low, high = wire / (time_s + Z95 * error), wire / (time_s - Z95 * error)
-    return Rate(wire / time_s, low, high, len(trains))
+    return BottleneckRate(wire / time_s, low, high, len(trains))
 
 
 Trains = list[tuple[Array, Array]]

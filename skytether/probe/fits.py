@@ -32,7 +32,7 @@ BURST_MIN, BURST_MAX_S = 0.1, 3600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class FittedImpairment:
     """Fitted model."""
 
     name: str
@@ -53,7 +53,7 @@ class Fit:
 # -- delays -------------------------------------------------------------------------------------
 
 
-def fit_delays(delay_s: Array, independent: float) -> list[Fit]:
+def fit_delays(delay_s: Array, independent: float) -> list[FittedImpairment]:
     """Models of delays, the best first.
 
     Args:
@@ -63,12 +63,14 @@ def fit_delays(delay_s: Array, independent: float) -> list[Fit]:
     if len(delay_s) < PAIRS_MIN:
         return []
     if float(np.std(delay_s)) <= CONSTANT_S:
-        return [Fit("constant", (float(np.mean(delay_s)),), 0.0)]
+        return [FittedImpairment("constant", (float(np.mean(delay_s)),), 0.0)]
     found = [_uniform(delay_s), _normal(delay_s), _paper(delay_s)]
     found += [_with_least(delay_s, "gamma"), _with_least(delay_s, "lognormal")]
     weight = min(1.0, independent / len(delay_s))
     fits = [
-        Fit(name, numbers, parameters * log(max(independent, 2.0)) - 2.0 * weight * likelihood)
+        FittedImpairment(
+            name, numbers, parameters * log(max(independent, 2.0)) - 2.0 * weight * likelihood
+        )
         for name, numbers, parameters, likelihood in filter(None, found)
     ]
     return sorted(fits, key=lambda fit: fit.bic)
@@ -184,7 +186,7 @@ def _paper(delay_s: Array) -> Found | None:
 # -- losses -------------------------------------------------------------------------------------
 
 
-def fit_losses(time_s: Array, lost: Bools) -> list[Fit]:
+def fit_losses(time_s: Array, lost: Bools) -> list[FittedImpairment]:
     """Models of losses, the best first; none where nothing was lost, or everything.
 
     The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and
@@ -200,7 +202,7 @@ def fit_losses(time_s: Array, lost: Bools) -> list[Fit]:
         return []
     share = gone / count
     bernoulli = gone * log(share) + (count - gone) * log(1.0 - share)
-    fits = [Fit("loss", (share,), log(count) - 2.0 * bernoulli)]
+    fits = [FittedImpairment("loss", (share,), log(count) - 2.0 * bernoulli)]
     between = np.maximum(np.diff(time_s), 0.0)
     before, after = lost[:-1].astype(bool), lost[1:].astype(bool)
     groups = [between[(before == one) & (after == other)] for one, other in _TURNS]
@@ -216,7 +218,7 @@ def fit_losses(time_s: Array, lost: Bools) -> list[Fit]:
     numbers = best_share, cell / (1.0 - best_share)
     if numbers[1] <= BURST_MAX_S:
         bic = 2.0 * log(count) - 2.0 * (likelihood(best_share, cell) + first)
-        fits.append(Fit("gilbert_elliott", numbers, bic))
+        fits.append(FittedImpairment("gilbert_elliott", numbers, bic))
     return sorted(fits, key=lambda fit: fit.bic)
 
 

@@ -19,10 +19,10 @@ from skytether.probe.wire import (
     COOKIE_BYTES,
     NO_NUMBER,
     NONCE_BYTES,
-    Answer,
-    Hello,
     Probe,
-    Welcome,
+    ProbeAnswer,
+    ProbeHello,
+    ProbeWelcome,
     decode,
     encode,
 )
@@ -30,7 +30,8 @@ from skytether.server.gate import Call, Gate
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.wire.channel import OVERHEAD_BYTES
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
 """Most measurements at once; one without a probe for IDLE_NS may be replaced."""
@@ -45,7 +46,7 @@ _TOLD_MAX = PAYLOAD_BYTES_MAX // 12
 
 
 @dataclass(slots=True)
-class Held:
+class HeldPacket:
     """Packet of a train whose answer waits for the rest of the train."""
 
     number: int
@@ -57,7 +58,7 @@ class Held:
 
 
 @dataclass(slots=True)
-class Session:
+class ProbeSession:
     """Measurement by one prober."""
 
     heard_ns: int
@@ -66,7 +67,7 @@ class Session:
     """Number of arrivals so far."""
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     """Newest arrivals not yet acknowledged by the prober: number and time [ns]."""
-    train: list[Held] = field(default_factory=list)
+    train: list[HeldPacket] = field(default_factory=list)
     """Packets of a train that wait for the rest."""
     train_ns: int = 0
     """Time of the newest packet in `train` [ns]."""
@@ -83,7 +84,7 @@ class Listener(Endpoint):
     def __init__(self, gate: Gate, secret: bytes) -> None:
         super().__init__()
         self._gate, self._secret = gate, secret
-        self._sessions: OrderedDict[bytes, Session] = OrderedDict()
+        self._sessions: OrderedDict[bytes, ProbeSession] = OrderedDict()
         """Measurements by session id, in order of their newest probe, oldest first."""
         self._dropped: Counter[Drop] = Counter()
         self._answered = 0
@@ -100,9 +101,9 @@ class Listener(Endpoint):
 
     def _hear(self, call: Call, datagram: Datagram, now_ns: int) -> None:
         message = decode(call.payload)
-        if isinstance(message, Hello):
+        if isinstance(message, ProbeHello):
             room = len(self._sessions) < SESSIONS_MAX or self._oldest_idle(now_ns) is not None
-            welcome = Welcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
+            welcome = ProbeWelcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
             packet = call.line.seal(encode(welcome))
             if len(packet) > len(datagram.payload):
                 raise ProtocolError(Drop.LENGTH)
@@ -114,7 +115,7 @@ class Listener(Endpoint):
         else:
             raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
-    def _session(self, name: bytes, peer: Address, now_ns: int) -> Session:
+    def _session(self, name: bytes, peer: Address, now_ns: int) -> ProbeSession:
         """Measurement of a session, begun if it is new.
 
         Raises:
@@ -130,7 +131,7 @@ class Listener(Endpoint):
                 if idle is None:
                     raise ProtocolError(Drop.FULL)
                 del self._sessions[idle]
-            session = self._sessions[name] = Session(now_ns)
+            session = self._sessions[name] = ProbeSession(now_ns)
         session.heard_ns = now_ns
         self._sessions.move_to_end(name)
         return session
@@ -141,7 +142,7 @@ class Listener(Endpoint):
         return name if session and now_ns - session.heard_ns > IDLE_NS else None
 
     def _probe(
-        self, session: Session, probe: Probe, call: Call, datagram: Datagram, now_ns: int
+        self, session: ProbeSession, probe: Probe, call: Call, datagram: Datagram, now_ns: int
     ) -> None:
         log = session.log
         while log and session.logged - len(log) < probe.held:
@@ -152,7 +153,7 @@ class Listener(Endpoint):
             number = session.logged
             log.append((probe.number, now_ns))
             session.logged += 1
-        waits = Held(number, call, datagram.peer, len(datagram.payload))
+        waits = HeldPacket(number, call, datagram.peer, len(datagram.payload))
         if probe.train > 1 and number != NO_NUMBER:
             session.train.append(waits)
             session.train_ns = now_ns
@@ -161,17 +162,17 @@ class Listener(Endpoint):
         else:
             self._answer(session, probe.session, waits, now_ns)
 
-    def _release(self, session: Session, name: bytes, now_ns: int) -> None:
+    def _release(self, session: ProbeSession, name: bytes, now_ns: int) -> None:
         """Answer all packets of a train."""
         for each in session.train:
             self._answer(session, name, each, now_ns)
         session.train.clear()
 
-    def _answer(self, session: Session, name: bytes, held: Held, now_ns: int) -> None:
+    def _answer(self, session: ProbeSession, name: bytes, held: HeldPacket, now_ns: int) -> None:
         log, line = session.log, held.call.line
         first = session.logged - len(log)
         arrivals = tuple(islice(log, _TOLD_MAX))
-        answer = Answer(name, held.number, now_ns, first, session.logged, arrivals)
+        answer = ProbeAnswer(name, held.number, now_ns, first, session.logged, arrivals)
         size = held.size - (OVERHEAD_BYTES if self._gate.secure else 0)
         packet = line.seal(encode(answer, size))
         if len(packet) <= held.size:  # a probe shorter than any prober's cannot be answered

@@ -9,7 +9,7 @@ import numpy as np
 
 from skytether.probe import analysis, fits
 from skytether.probe.analysis import QUANTILES, Clocks, Delays
-from skytether.probe.prober import TRAIN, Longs, Measured, Way
+from skytether.probe.prober import TRAIN, Longs, MeasuredPath, Way
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
@@ -22,7 +22,7 @@ ORDERED_SHARE = 0.01
 is called ordered."""
 
 
-class Model(msgspec.Struct, frozen=True):
+class ModelTold(msgspec.Struct, frozen=True):
     """Fitted model, for the output."""
 
     text: str
@@ -68,9 +68,9 @@ class WayTold(msgspec.Struct, frozen=True, kw_only=True):
     """Number of trains of which enough packets arrived."""
     train_wait_s: float
     """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
-    delay_models: list[Model]
+    delay_models: list[ModelTold]
     """Models of the delay, without the transmission time at the rate, the best first."""
-    loss_models: list[Model]
+    loss_models: list[ModelTold]
     """Models of the losses, the best first."""
     text: str
     """Text of the best models, for `network.uplink` or `network.downlink`."""
@@ -108,7 +108,7 @@ class PathTold(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ProbeOutcome:
     """Result of a measurement."""
 
     clocks: Clocks
@@ -117,7 +117,7 @@ class Outcome:
     told: PathTold
 
 
-def outcome(measured: Measured, listener: str, *, secure: bool) -> Outcome:
+def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> ProbeOutcome:
     """Result of a measurement.
 
     Args:
@@ -147,7 +147,7 @@ def outcome(measured: Measured, listener: str, *, secure: bool) -> Outcome:
         unreported=measured.unreported,
         **told,
     )
-    return Outcome(clocks, delays, path)
+    return ProbeOutcome(clocks, delays, path)
 
 
 def _way_told(way: Way, delays: Delays, size: int) -> WayTold:
@@ -167,8 +167,8 @@ def _way_told(way: Way, delays: Delays, size: int) -> WayTold:
     reordered = analysis.reordered(way)
     spacing_s = float(apart_s[0]) if len(apart_s) else np.inf
     lasting_s = correlation_s if correlation_s > TEXT_CORRELATION_MIN * spacing_s else 0.0
-    models = [Model(fit.text(lasting_s), fit.bic) for fit in delay_models]
-    losses = [Model(fit.text(), fit.bic) for fit in loss_models]
+    models = [ModelTold(fit.text(lasting_s), fit.bic) for fit in delay_models]
+    losses = [ModelTold(fit.text(), fit.bic) for fit in loss_models]
     parts = [each[0].text for each in (models, losses) if each]
     if rate:
         parts.append(f"rate({rate.bytes_per_s:.4g})")
@@ -223,7 +223,7 @@ def trace(delays: Delays) -> str:
     return "\n".join(lines) + "\n"
 
 
-def rows(measured: Measured, clocks: Clocks) -> Rows:
+def rows(measured: MeasuredPath, clocks: Clocks) -> Rows:
     """Packets in netem's format, one row each, those of trains included.
 
     Times are on the prober's clock; `delay_ns` of a lost packet is 0.
@@ -246,7 +246,7 @@ def rows(measured: Measured, clocks: Clocks) -> Rows:
     return np.concatenate(parts)
 
 
-def _ahead_ns(way: Way, measured: Measured, clocks: Clocks) -> Longs:
+def _ahead_ns(way: Way, measured: MeasuredPath, clocks: Clocks) -> Longs:
     """Offset of the listener's clock when each packet is sent [ns]; shape (n,)."""
     near_ns = measured.downlink.sent_ns[0]
     base_ns = round(clocks.offset_s * SECOND_NS)

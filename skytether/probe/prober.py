@@ -21,17 +21,18 @@ from skytether.probe.wire import (
     MESSAGE_BYTES_MIN,
     NO_NUMBER,
     NONCE_BYTES,
-    Answer,
-    Hello,
     Probe,
-    Welcome,
+    ProbeAnswer,
+    ProbeHello,
+    ProbeWelcome,
     decode,
     encode,
 )
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.wire.channel import OVERHEAD_BYTES
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 BYTES_MIN = MESSAGE_BYTES_MIN + OVERHEAD_BYTES
 """Smallest size of a probe, encrypted or not [B]."""
@@ -77,7 +78,7 @@ class Way:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredPath:
     """Packets of both directions."""
 
     downlink: Way
@@ -122,7 +123,7 @@ class Prober(Endpoint):
         self._slots, self._period_ns, self._size = probes, period_ns, size
         self._train_every = max(TRAIN_EVERY_SLOTS, TRAIN_EVERY_NS // period_ns)
         self._session = b""
-        self._hello = encode(Hello(nonce), 0 if link.secure else HELLO_BYTES)
+        self._hello = encode(ProbeHello(nonce), 0 if link.secure else HELLO_BYTES)
         self._due_ns: int | None = 0
         """Time of the next wake; 0 before the first."""
         self._hello_ns = 0
@@ -174,7 +175,7 @@ class Prober(Endpoint):
 
     def _hear(self, payload: bytes, now_ns: int) -> None:
         message = decode(payload)
-        if isinstance(message, Welcome):
+        if isinstance(message, ProbeWelcome):
             if message.nonce != self._nonce:
                 raise ProtocolError(Drop.UNASKED)
             self._link.adopt(now_ns=now_ns)
@@ -182,14 +183,14 @@ class Prober(Endpoint):
                 self._session = message.nonce + message.cookie
                 self.refused = self._done = not message.room
                 self._zero_ns = self._due_ns = now_ns
-        elif isinstance(message, Answer):
+        elif isinstance(message, ProbeAnswer):
             if message.session != self._session:
                 raise ProtocolError(Drop.UNKNOWN_SESSION)
             self._learn(message, now_ns)
         else:
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
-    def _learn(self, answer: Answer, now_ns: int) -> None:
+    def _learn(self, answer: ProbeAnswer, now_ns: int) -> None:
         """Keep the arrivals in an answer."""
         # Without keys, an attacker may claim anything: more than twice the probes is impossible.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
@@ -311,7 +312,7 @@ class Prober(Endpoint):
             "dropped": by_name(self._dropped),
         }
 
-    def measured(self) -> Measured:
+    def measured(self) -> MeasuredPath:
         """Packets so far.
 
         If the measurement was ended early, packets that may still be under way are left out: those
@@ -320,7 +321,7 @@ class Prober(Endpoint):
         number = np.array(self._logged_number, np.int64)
         logged_ns = np.array(self._logged_ns, np.int64)
         downlink = self._downlink(number, logged_ns)
-        return Measured(
+        return MeasuredPath(
             downlink,
             self._uplink(number, logged_ns),
             self._size,

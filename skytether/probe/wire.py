@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 VERSION = 64
 """Protocol version; endpoints of a flight reject it, so that none takes a probe for its own."""
@@ -37,13 +38,13 @@ _ARRIVAL = Struct("<IQ")
 _PADDING = bytes(PAYLOAD_BYTES_MAX)
 
 
-class Hello(NamedTuple):
+class ProbeHello(NamedTuple):
     """HELLO: the prober asks for a session."""
 
     nonce: bytes
 
 
-class Welcome(NamedTuple):
+class ProbeWelcome(NamedTuple):
     """WELCOME: the listener grants or refuses a session."""
 
     nonce: bytes
@@ -65,7 +66,7 @@ class Probe(NamedTuple):
     """Number of arrivals that the prober has received reports of."""
 
 
-class Answer(NamedTuple):
+class ProbeAnswer(NamedTuple):
     """ANSWER: packet from the listener to the prober."""
 
     session: bytes
@@ -81,8 +82,8 @@ class Answer(NamedTuple):
     """Reported arrivals: number of the PROBE and the listener's time [ns]."""
 
 
-Message = Hello | Welcome | Probe | Answer
-_TYPES: tuple[type[Message], ...] = (Hello, Welcome, Probe, Answer)
+Message = ProbeHello | ProbeWelcome | Probe | ProbeAnswer
+_TYPES: tuple[type[Message], ...] = (ProbeHello, ProbeWelcome, Probe, ProbeAnswer)
 
 
 def encode(message: Message, size: int = 0) -> bytes:
@@ -93,11 +94,11 @@ def encode(message: Message, size: int = 0) -> bytes:
             do not fit.
     """
     fields: tuple[Any, ...] = message
-    if isinstance(message, Answer):
-        room = size - len(_packed(Answer, (*message[:-1], b""), b"")) - 1
+    if isinstance(message, ProbeAnswer):
+        room = size - len(_packed(ProbeAnswer, (*message[:-1], b""), b"")) - 1
         told = message.arrivals[: max(0, room // _ARRIVAL.size)]
         fields = *message[:-1], b"".join(_ARRIVAL.pack(*each) for each in told)
-    if isinstance(message, Welcome):
+    if isinstance(message, ProbeWelcome):
         return msgpack.packb((VERSION, 2, *message))
     bare = _packed(type(message), fields, b"")
     room = size - len(bare)
@@ -129,11 +130,11 @@ def decode(payload: bytes) -> Message:
         raise ProtocolError(Drop.VERSION)
     match number, body:
         case 1, [bytes(nonce), bytes()] if len(nonce) == NONCE_BYTES:
-            return Hello(nonce)
+            return ProbeHello(nonce)
         case 2, [bytes(nonce), bytes(cookie), bool(room)] if (
             len(nonce) == NONCE_BYTES and len(cookie) == COOKIE_BYTES
         ):
-            return Welcome(nonce, cookie, room)
+            return ProbeWelcome(nonce, cookie, room)
         case 3, [bytes(session), int(probe), int(train), int(held), bytes()]:
             _check(session, (probe, held))
             if not 0 <= train <= TRAIN_MAX or isinstance(train, bool):
@@ -154,7 +155,7 @@ def decode(payload: bytes) -> Message:
             arrivals = tuple(_ARRIVAL.iter_unpack(told))
             if first + len(arrivals) > logged or any(at_ns >= 2**63 for _, at_ns in arrivals):
                 raise ProtocolError(Drop.FIELD)
-            return Answer(session, answer, sent_ns, first, logged, arrivals)
+            return ProbeAnswer(session, answer, sent_ns, first, logged, arrivals)
     raise ProtocolError(Drop.TYPE if number not in (1, 2, 3, 4) else Drop.FIELD)
 
 

@@ -22,7 +22,7 @@ from skytether.shared.core.line import LINE, Line
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
-from skytether.shell.stream import Stream
+from skytether.shell.stream import ByteStream
 from skytether.shell.timer import make_timer
 from skytether.shell.udp import (
     Names,
@@ -95,7 +95,7 @@ class Shell:
         if forms:
             admit_only(bound, forms)
         self._sockets = {0: bound}
-        self._stream: Stream | None = None
+        self._stream: ByteStream | None = None
         """What socket 1 is, where it is none."""
         if line is not None:
             with contextlib.ExitStack() as failed:
@@ -115,7 +115,7 @@ class Shell:
     def _add(self, line: Line) -> None:
         """Let a line be socket 1."""
         if line.kind in ("tcp", "serial"):
-            self._stream = Stream(line, self._hear_line)
+            self._stream = ByteStream(line, self._hear_line)
         elif line.kind == "udp":
             self._sockets[1] = open_socket(line.address)
         else:

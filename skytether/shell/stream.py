@@ -21,7 +21,7 @@ PIECE_BYTES = 4096
 """Most bytes that are read at once."""
 
 
-class Stream:
+class ByteStream:
     """Byte stream to an autopilot, over TCP or a serial port.
 
     Args:

@@ -60,22 +60,24 @@ def fitted(times: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
     return float(gain), float(tau_s), float(dead_s)
 
 
-@pytest.fixture(scope="module")
-def ardupilot() -> Companion:
-    """ArduCopter in the air, guided, with its position at 50 Hz."""
-    companion = Companion("ardupilot")
+def climbed(flavour: FlavourName) -> Companion:
+    """An autopilot in the air, guided, with its position at 50 Hz."""
+    companion = Companion(flavour)
     companion.climb()
     companion.stream(50.0)
     return companion
+
+
+@pytest.fixture(scope="module")
+def ardupilot() -> Companion:
+    """ArduCopter in the air."""
+    return climbed("ardupilot")
 
 
 @pytest.fixture(scope="module")
 def px4() -> Companion:
-    """PX4 in the air, guided, with its position at 50 Hz."""
-    companion = Companion("px4")
-    companion.climb()
-    companion.stream(50.0)
-    return companion
+    """PX4 in the air."""
+    return climbed("px4")
 
 
 # Velocities

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers import packaged
 from skytether.__main__ import main
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import parse as fault
@@ -49,10 +50,7 @@ NONE = {"delay": "none", "loss": 0.0}
 
 def scenario(**table: Any) -> Scenario:
     """The scenario `autopilot`, flown for 4 s, with some keys changed."""
-    default = reading.to_table(reading.load("autopilot")) | {"duration": 4.0, "settle": 0.0}
-    for key, value in table.items():
-        default[key] = default[key] | value if isinstance(value, dict) else value
-    return reading.check(default, "test")
+    return packaged("autopilot", {"duration": 4.0, "settle": 0.0}, table)
 
 
 def flown(law: str = "led", flavour: FlavourName = "ardupilot", **table: Any) -> Record:
@@ -308,13 +306,13 @@ def test_the_autopilot_records_where_it_truly_is_at_every_tick() -> None:
 # -- the benchmark, and real UDP -----------------------------------------------------------------
 
 
-def flight(contender: str, air: autopilots.Air, seed: int, **whole: float) -> autopilots.Flown:
+def flight(contender: str, air: autopilots.Air, seed: int, **whole: float) -> autopilots.FlownCell:
     """Figures of flights of PX4 in which nothing was flown, but for those that are given."""
     nothing = [np.zeros(80, columns) for columns in (station_columns(3), TRUTH_COLUMNS)]
     record = joined(scenario(), *nothing, np.zeros(0, PACKET_COLUMNS))
     summary = summary_of(scenario(), "autopilot", record)
     summary = msgspec.structs.replace(summary, error_max=1.0, duration_s=4.0)
-    return autopilots.Flown(
+    return autopilots.FlownCell(
         contender=contender,
         flavour="px4",
         air=air,

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from helpers import until
 from skytether.__main__ import COMMANDS, main
 from skytether.cli.fly import FlyOptions
 from skytether.shared.core.endpoint import Address
@@ -335,11 +336,8 @@ def test_ctrl_c_ends_the_flight_and_still_shows_it(tmp_path: Path) -> None:
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     ) as fly:
-        deadline = time.monotonic() + PATIENCE_S
-        row_bytes = client_columns(2).itemsize
-        while sum(part.stat().st_size for part in tmp_path.glob("*/client")) < 20 * row_bytes:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        rows_bytes = 20 * client_columns(2).itemsize
+        until(lambda: sum(p.stat().st_size for p in tmp_path.glob("*/client")) >= rows_bytes)
         listed = Path(f"/proc/{fly.pid}/task/{fly.pid}/children").read_text().split()
         children = [int(pid) for pid in listed]
         assert len(children) == 3

@@ -8,12 +8,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from helpers import until
 from skytether.__main__ import main
 
 pytestmark = pytest.mark.long
@@ -231,14 +231,6 @@ def test_a_mistake_is_one_line_whatever_stands_in_it() -> None:
 
 
 # -- signals -------------------------------------------------------------------------------------
-
-
-def until(found: Callable[[], object]) -> None:
-    """Wait for something."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not found():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def about(pid: int, path: str) -> str:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.link import HELLO_NS
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
@@ -20,12 +21,11 @@ from skytether.shared.core.events import (
     SessionRefused,
 )
 from skytether.shared.law.terms import Difference
-from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
-    Drop,
     Heartbeat,
     Hello,
     Horizon,
@@ -47,10 +47,7 @@ OPENED = ModeChanged(vehicle=4, before="init", after="ready", reason="its sessio
 
 def scenario(**changes: Any) -> Scenario:
     """A short flight of the paper's, with some keys changed."""
-    table = reading.to_table(reading.load("paper-every-step")) | {"duration": 10.0}
-    for section, values in changes.items():
-        table[section] |= values
-    return reading.check(table, "test")
+    return packaged("paper-every-step", {"duration": 10.0}, changes)
 
 
 class Server:

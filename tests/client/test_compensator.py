@@ -10,7 +10,8 @@ from skytether.shared.law import rule
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reading import check
-from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon, ProtocolError
+from skytether.shared.wire.drop import ProtocolError
+from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon
 
 quick = settings(max_examples=60, deadline=None)
 

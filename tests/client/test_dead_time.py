@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers import packaged
 from skytether.client.filter import Kalman
 from skytether.client.navigation import Navigation
 from skytether.client.simulated.plant import FirstOrderPlant
@@ -14,7 +15,6 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.client.simulated.weather import Weather
 from skytether.shared.base.chance import stream
 from skytether.shared.law.dead_time import OnTheirWay
-from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
@@ -33,11 +33,8 @@ BRISK = {"shape": "figure-eight", "radius_m": 3.0, "period_s": 15.0}
 
 def scenario(**sections: Any) -> Scenario:
     """The demo in calm air, some 15 s; sections are laid over."""
-    table = reading.to_table(reading.load("demo-committed")) | {"duration": 15.0, "settle": 5.0}
-    table["vehicle"]["wind"] = 0.0
-    for section, values in sections.items():
-        table[section] |= values
-    return reading.check(table, "test")
+    calm = {"duration": 15.0, "settle": 5.0, "vehicle": {"wind": 0.0}}
+    return packaged("demo-committed", calm, sections)
 
 
 def flown(**sections: Any) -> tuple[Summary, Record]:

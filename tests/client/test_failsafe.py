@@ -32,11 +32,11 @@ from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.law import rule
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder, Rows, client_columns, parse
+from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
     NO_FEEDBACK,
     NO_HORIZON,
     Close,
-    Drop,
     Heartbeat,
     Hello,
     Horizon,

@@ -11,6 +11,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2
 
+from helpers import packaged
 from skytether.client import filter as aboard
 from skytether.client.endpoint import Client
 from skytether.client.filter import Kalman
@@ -24,7 +25,6 @@ from skytether.server.control import committed
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.law.model import Array, white_acceleration
-from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import VEHICLES, Entry
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
@@ -41,10 +41,7 @@ POSITIONS = {"position_noise_m": 0.02, "position_every_s": 0.2, "velocity_every_
 
 def scenario(name: str = "demo-committed", **changes: Any) -> Scenario:
     """A scenario that comes with Skytether, with some keys changed."""
-    table = reading.to_table(reading.load(name))
-    for key, value in changes.items():
-        table[key] = table[key] | value if isinstance(value, dict) else value
-    return reading.check(table, "test")
+    return packaged(name, changes)
 
 
 def matrices(flown: Scenario) -> tuple[Array, Array, Array]:

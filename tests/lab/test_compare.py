@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import skytether
+from helpers import refused_before_writing
 from skytether.__main__ import main
 from skytether.lab import contenders
 from skytether.lab.calibration import Rmse, SearchLimits
@@ -565,6 +566,5 @@ def test_an_impossible_comparison_is_refused(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In one line, before anything is written."""
-    assert main(["compare", "--out", str(tmp_path / "out"), *argv]) == 2
-    assert capsys.readouterr().err.strip() == f"compare: {said}"
-    assert not (tmp_path / "out").exists()
+    told = refused_before_writing(["compare", *argv], tmp_path, capsys)
+    assert told == f"compare: {said}"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import warm
 from skytether.__main__ import main
 from skytether.lab.commands import crowd as command
-from skytether.lab.crowd import EXACT, Crowd, CrowdPoint, Flown, Scheme, judge, points_csv
+from skytether.lab.crowd import EXACT, Crowd, CrowdPoint, FlownScheme, Scheme, judge, points_csv
 from skytether.shared.scenario import reading
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import fly
@@ -33,11 +33,11 @@ def point(vehicles: int, rmse_m: float | None = 0.3, **keys: Any) -> CrowdPoint:
 def test_the_largest_number_that_flies_is_found(flies: int, most: int) -> None:
     """To within a twentieth, or one vehicle; and no number is flown twice."""
     points: list[CrowdPoint] = []
-    while (number := Flown.of(points, "budget", 1.0).next(most)) is not None:
+    while (number := FlownScheme.of(points, "budget", 1.0).next(most)) is not None:
         assert 1 <= number <= most
         assert number not in {each.vehicles for each in points}
         points.append(point(number, 0.3 if number <= flies else 2.0))
-    found = Flown.of(points, "budget", 1.0)
+    found = FlownScheme.of(points, "budget", 1.0)
     assert found.flying <= flies
     if flies >= most:
         assert found.flying == most
@@ -51,9 +51,9 @@ def test_the_largest_number_that_flies_is_found(flies: int, most: int) -> None:
 def test_points_of_other_schemes_do_not_count() -> None:
     """Each scheme has numbers of its own."""
     points = [point(1), point(2, 9.0), point(5, scheme="threshold")]
-    assert Flown.of(points, "budget", 1.0).flying == 1
-    assert Flown.of(points, "threshold", 1.0).flying == 5
-    assert Flown.of(points, "paper", 1.0).next(8) == 1
+    assert FlownScheme.of(points, "budget", 1.0).flying == 1
+    assert FlownScheme.of(points, "threshold", 1.0).flying == 5
+    assert FlownScheme.of(points, "paper", 1.0).next(8) == 1
 
 
 @pytest.mark.parametrize(

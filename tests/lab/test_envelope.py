@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from helpers import demo_with, refused_before_writing
 from skytether.__main__ import main
 from skytether.cli import fly
 from skytether.client.simulated.plant import FirstOrderPlant
@@ -37,13 +38,6 @@ from skytether.shell import command
 from skytether.sim import flight
 
 DEMO = Envelope("demo-committed", reading.load("demo-committed"))
-
-
-def changed(**keys: Any) -> Scenario:
-    """The demo with some keys changed."""
-    table = reading.to_table(reading.load("demo-committed"))
-    lay({key.replace("__", "."): value for key, value in keys.items()}, table)
-    return reading.check(table, "test")
 
 
 # -- the points ----------------------------------------------------------------------------------
@@ -85,7 +79,9 @@ def test_a_point_is_the_same_whatever_else_is_flown() -> None:
 
 def test_the_command_line_of_a_point_flies_that_point() -> None:
     """All its keys, and those that the user has changed; what is the scenario's own is left out."""
-    plan = Envelope("demo-committed", changed(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2]))
+    plan = Envelope(
+        "demo-committed", demo_with(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2])
+    )
     line = plan.command(1).split()
     assert line[:4] == ["skytether", "fly", "demo-committed", "--virtual"]
     options = command.parse(fly.FlyOptions(), line[2:], "skytether fly", "")
@@ -95,7 +91,7 @@ def test_the_command_line_of_a_point_flies_that_point() -> None:
 
 # -- the verdict, on flights by hand -------------------------------------------------------------
 
-SCENARIO = changed(
+SCENARIO = demo_with(
     duration=40.0, control__dt=0.05, vehicle__wind=0.0, network__uplink__loss=0.0, seed=1
 )
 DT, STEPS = 0.05, SCENARIO.steps
@@ -312,7 +308,7 @@ def test_a_state_that_is_no_number_is_a_flyaway() -> None:
 
 def test_wind_may_carry_a_vehicle_that_brakes() -> None:
     """Wind may move it as far as it blows, and no further."""
-    windy = changed(duration=40.0, vehicle__steady_wind_mps=[0.1, 0.0], vehicle__wind=0.0)
+    windy = demo_with(duration=40.0, vehicle__steady_wind_mps=[0.1, 0.0], vehicle__wind=0.0)
     state = np.zeros((STEPS, 2, 2))
     state[:, 0, 0], state[:, 0, 1] = 0.1 * TIME_S, 0.1
     rows = record(state, np.zeros((STEPS, 2)), NO)
@@ -339,7 +335,7 @@ def test_a_vehicle_that_does_not_brake_is_caught_and_one_that_does_is_not() -> N
 
     def outcome(exhausted: str) -> str:
         keys = {"vehicle__exhausted": exhausted, "network__uplink__loss": 0.8} | BLIND
-        scenario = changed(**keys, duration=40.0)
+        scenario = demo_with(**keys, duration=40.0)
         return judge(scenario, flight.fly(scenario).client).outcome
 
     assert outcome("hold") == "flyaway"
@@ -449,7 +445,7 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Which flies that point again; what went astray is told, too, and is no failure."""
-    plan = Envelope("demo-committed", changed(duration=4.0, settle=0.0))
+    plan = Envelope("demo-committed", demo_with(duration=4.0, settle=0.0))
     lost = EnvelopePoint(0, "flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
     with closing(Journal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
         journal.append(EnvelopePoint(1, "astray", 1.25, 1.0, 0.0))
@@ -484,14 +480,13 @@ def test_an_impossible_envelope_is_refused(
     argv: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In one line, before anything is written."""
-    assert main(["envelope", "demo-committed", "--out", str(tmp_path / "out"), *argv]) == 2
-    assert capsys.readouterr().err == f"envelope: {line}\n"
-    assert not (tmp_path / "out").exists()
+    told = refused_before_writing(["envelope", "demo-committed", *argv], tmp_path, capsys)
+    assert told == f"envelope: {line}"
 
 
 def test_points_with_trajectories_are_flown_with_feedback() -> None:
     """At the same points, where committed inputs are drawn with it and without."""
-    along = changed(
+    along = demo_with(
         control__scheme="trajectory", control__trigger="expected_gap(0.05) | silence(1)"
     )
     plan = Envelope("demo", along)

@@ -16,7 +16,8 @@ from skytether.lab.benchmarks.wire import messages
 from skytether.server.secure import FORMS, SecureGate
 from skytether.shared.core.endpoint import Datagram, Form
 from skytether.shared.scenario.reading import load
-from skytether.shared.wire.protocol import Hello, Observation, ProtocolError, Welcome, encode
+from skytether.shared.wire.drop import ProtocolError
+from skytether.shared.wire.protocol import Hello, Observation, Welcome, encode
 from skytether.shell.udp import admit_only, kernel_drops, open_socket
 from skytether.sim.flight import make_keys
 

@@ -18,7 +18,8 @@ from skytether.server.reception import IMPLAUSIBLE
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import feed
 from skytether.shared.wire import handshake, protocol
-from skytether.shared.wire.protocol import Drop, decode
+from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.protocol import decode
 from skytether.shell import log
 from skytether.view import container
 

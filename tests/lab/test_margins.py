@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers import demo_with
 from skytether.__main__ import main
 from skytether.lab import linear, maps, margins
 from skytether.lab.linear import timing_of
@@ -21,20 +22,10 @@ from skytether.lab.margins import (
     timings,
 )
 from skytether.shared.law.model import Array, white_acceleration
-from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
 from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.sim.flight import fly_batch
-
-
-def changed(**keys: Any) -> Scenario:
-    """The demo with some keys changed."""
-    table = reading.to_table(reading.load("demo-committed"))
-    lay({key.replace("__", "."): value for key, value in keys.items()}, table)
-    return reading.check(table, "test")
-
 
 HOVER = {"reference__shape": "hover", "reference__points_m": [[0.0, 0.0]], "vehicle__wind": 0.01}
 BLIND = {
@@ -52,7 +43,7 @@ NOISE = {"sensor__position_noise_m": 0.01, "sensor__velocity_noise_mps": 0.02}
 
 def test_a_regulator_aboard_has_the_variance_of_its_lyapunov_equation() -> None:
     """Along a trajectory u = -K x, whatever arrives: P = F P Fᵀ + W, and ρ(F)² is the growth."""
-    scenario = changed(
+    scenario = demo_with(
         control__scheme="trajectory",
         control__trigger="expected_gap(1)",
         control__input_weight=0.01,
@@ -97,7 +88,7 @@ def test_the_variance_that_is_computed_is_flown(
     keys: dict[str, Any], runs: int, rel: float
 ) -> None:
     """Along the same timings; the share is what so few flights can tell of a variance."""
-    scenario = changed(**HOVER, **{"control__input_weight": 0.1, **keys}, duration=30.0)
+    scenario = demo_with(**HOVER, **{"control__input_weight": 0.1, **keys}, duration=30.0)
     flights = fly_batch(scenario, range(1, 1 + runs))
     settled = flights[0].client["step"] * scenario.control.dt >= 8.0
     positions = np.array([flight.client["state"][settled][..., 0] for flight in flights])
@@ -109,10 +100,12 @@ def test_the_variance_that_is_computed_is_flown(
 def test_only_what_looks_at_the_clock_is_linear() -> None:
     """For any other trigger the loop is computed at a period that sends as often."""
     for trigger in ("always", "periodic(7)", "periodic(7) | silence(1)", "always & budget(5, 2)"):
-        assert not looks_at_state(changed(control__trigger=trigger))
+        assert not looks_at_state(demo_with(control__trigger=trigger))
     for trigger in ("cost_gap", "deviation(0.1) | silence(1)", "state_gap(3.6, 1.5)"):
-        assert looks_at_state(changed(control__trigger=trigger))
-    rare = equivalent_period(changed(control__trigger="cost_gap(1e9) | silence(1)", duration=20.0))
+        assert looks_at_state(demo_with(control__trigger=trigger))
+    rare = equivalent_period(
+        demo_with(control__trigger="cost_gap(1e9) | silence(1)", duration=20.0)
+    )
     name, period = rare.control.trigger.rstrip(")").split("(")
     assert name == "periodic"
     assert 20 <= int(period) <= 23  # a second, but for what is lost
@@ -135,7 +128,7 @@ def test_pushes_come_anywhere_between_two_measurements(monkeypatch: pytest.Monke
     monkeypatch.setattr(margins, "FLIGHT_S", 40.0)
     monkeypatch.setattr(margins, "FOLLOWED_S", 8.0)
     keys = {"control__trigger": "always", **HOVER, **NOISE}
-    scenario = changed(**keys, sensor__position_every_s=0.2, sensor__velocity_every_s="never")
+    scenario = demo_with(**keys, sensor__position_every_s=0.2, sensor__velocity_every_s="never")
     given = timings(scenario, 1)
 
     def rms(pushes: int) -> float:
@@ -165,9 +158,9 @@ def test_a_loop_that_is_not_stable_ends_in_a_limit_cycle(monkeypatch: pytest.Mon
     monkeypatch.setattr(maps, "REST_S", 40.0)
     monkeypatch.setattr(maps, "RUNS", 1)
     monkeypatch.setattr(maps, "TIMINGS", 1)
-    tight = changed(**BLIND | {"control__input_weight": 0.01}, duration=10.0)
+    tight = demo_with(**BLIND | {"control__input_weight": 0.01}, duration=10.0)
     swings, rests = (
-        at("tight", each, tau=(0.5,)).fly(0) for each in (tight, changed(duration=10.0))
+        at("tight", each, tau=(0.5,)).fly(0) for each in (tight, demo_with(duration=10.0))
     )
     assert swings.cycles
     assert swings.growth > 1.0
@@ -182,11 +175,11 @@ def test_a_loop_that_is_not_stable_ends_in_a_limit_cycle(monkeypatch: pytest.Mon
 def test_the_worst_corners_of_the_box_are_stable_at_weights_that_bear_them() -> None:
     """Quick, too strong and late; slow, too weak and late: those of the demo, not tighter ones."""
     corners = (Differing(0.5, 1.3, 0.3), Differing(2.0, 0.7, 0.3))
-    scenario = changed(control__trigger="periodic(12)")
+    scenario = demo_with(control__trigger="periodic(12)")
     given = timings(scenario, 1)
     for corner in corners:
         assert margin(corner.of(scenario), "corner", given).growth < 0.99
-    tight = changed(control__input_weight=0.05, control__trigger="periodic(12)")
+    tight = demo_with(control__input_weight=0.05, control__trigger="periodic(12)")
     assert margin(corners[0].of(tight), "corner", given).growth > 1.05
 
 
@@ -195,7 +188,7 @@ def test_along_trajectories_the_worst_corner_asks_for_a_fifth_more(
     input_weight: float, stable: bool
 ) -> None:
     """The disturbance that the filter aboard has found is taken off at once, and so is firm."""
-    scenario = changed(
+    scenario = demo_with(
         control__scheme="trajectory",
         control__trigger="expected_gap(0.05) | silence(1)",
         control__input_weight=input_weight,
@@ -206,7 +199,7 @@ def test_along_trajectories_the_worst_corner_asks_for_a_fifth_more(
 
 def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
     """The last quarter of a flight is compared with the one before."""
-    scenario = maps.at_rest(changed())
+    scenario = maps.at_rest(demo_with())
     rows: Rows = np.zeros(400, client_columns(2))
     rows["step"] = np.arange(400)
     rows["state"][:, 0, 0] = 0.5 * np.sin(0.1 * rows["step"])
@@ -221,7 +214,7 @@ def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
 
 def test_a_place_of_the_box_differs_as_it_says() -> None:
     """Without wind, with bursts both ways; numbers count the time constants first."""
-    box = at("demo", changed(), tau=(0.5, 2.0), gain=(0.7,), dead_time_s=(0.1,), burst_s=(2.0,))
+    box = at("demo", demo_with(), tau=(0.5, 2.0), gain=(0.7,), dead_time_s=(0.1,), burst_s=(2.0,))
     assert [place.tau for place in box.places] == [0.5, 2.0]
     scenario = box.scenario_of(1)
     assert scenario.true_tau_s.tolist() == [1.68, 1.68]

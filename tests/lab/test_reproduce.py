@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from helpers import refused_before_writing
 from skytether.__main__ import main
 from skytether.lab import plates, report, studies
 from skytether.lab.calibration import TABLE_1
@@ -305,6 +306,5 @@ def test_an_impossible_reproduction_is_refused(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In one line, before anything is written."""
-    assert main(["reproduce", "--out", str(tmp_path / "out"), *argv]) == 2
-    assert capsys.readouterr().err.strip() == f"reproduce: {said}"
-    assert not (tmp_path / "out").exists()
+    told = refused_before_writing(["reproduce", *argv], tmp_path, capsys)
+    assert told == f"reproduce: {said}"

@@ -11,8 +11,8 @@ from skytether.lab.benchmarks.restarts import (
     CLOSED,
     KILLED,
     STOPPED,
-    Outage,
     ProcessLife,
+    ProcessOutage,
     RestartsCounts,
     judge,
 )
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.long
 
 DT_S = 0.05
 TAU_S = 0.84
-GONE = Outage("server", CLOSED, 10 * SECOND_NS, 14 * SECOND_NS)
+GONE = ProcessOutage("server", CLOSED, 10 * SECOND_NS, 14 * SECOND_NS)
 """Outage from 10 s to 14 s."""
 
 
@@ -47,7 +47,7 @@ def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -
     )
 
 
-def verdict(flown: ProcessLife, outage: Outage = GONE) -> restarts.RestartVerdict:
+def verdict(flown: ProcessLife, outage: ProcessOutage = GONE) -> restarts.RestartVerdict:
     """Verdict on a flight."""
     return judge(outage, [flown], restarts.scenario())
 
@@ -94,20 +94,22 @@ def test_a_vehicle_that_moves_on_although_it_is_told_to_stand_is_outside() -> No
 def test_a_process_that_is_back_at_once_leaves_no_curve() -> None:
     """The vehicle flies on with what it has."""
     flown = replace(life(), mode=np.full(400, Mode.TRACK, np.uint8), in_force=np.arange(400))
-    found = verdict(flown, Outage("netem", KILLED, 10 * SECOND_NS, 10 * SECOND_NS + 5 * 10**8))
+    found = verdict(
+        flown, ProcessOutage("netem", KILLED, 10 * SECOND_NS, 10 * SECOND_NS + 5 * 10**8)
+    )
     assert found.is_inside
     assert (found.brakes_s, found.over_commanded_mps, found.over_true_mps) == (None, None, None)
 
 
 def test_a_vehicle_that_slept_has_to_brake_when_it_wakes() -> None:
     """Its time counts from there."""
-    woken = Outage("client", STOPPED, 8 * SECOND_NS, 11 * SECOND_NS)
+    woken = ProcessOutage("client", STOPPED, 8 * SECOND_NS, 11 * SECOND_NS)
     assert verdict(life(brakes_s=1.0), woken).brakes_s == pytest.approx(0.0)
 
 
 def test_a_new_life_has_to_stand_until_it_flies() -> None:
     """From its first step on."""
-    died = Outage("client", KILLED, 10 * SECOND_NS, 11 * SECOND_NS)
+    died = ProcessOutage("client", KILLED, 10 * SECOND_NS, 11 * SECOND_NS)
     old, born = life(), life(brakes_s=-10.0, flies_s=-2.0, brake_mps2=1e6)
     old = ProcessLife(*(getattr(old, name)[:200] for name in old.__annotations__))
     later = born.time_ns + 11 * SECOND_NS

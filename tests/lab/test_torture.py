@@ -29,7 +29,7 @@ from skytether.lab.faults import RANGES, Kind, ScheduledFault, Trial, dumps, loa
 from skytether.lab.invariants import Violation, check_bounds
 from skytether.lab.torture import (
     CLOCK_NS,
-    Outcome,
+    TrialOutcome,
     fly,
     long_trial,
     make_scenario,
@@ -147,7 +147,7 @@ EFFECTS = [
 
 
 @cache
-def undisturbed() -> Outcome:
+def undisturbed() -> TrialOutcome:
     """A trial without faults."""
     return fly(Trial(1, ()))
 
@@ -283,6 +283,13 @@ def no_second_try(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(skytether.client.secure, "AGAIN_NS", skytether.client.secure.ATTEMPT_NS)
 
 
+def violated(trial: Trial, ablate: Patch, patch: pytest.MonkeyPatch) -> str:
+    """Invariant that a trial violates after an ablation; before it, the trial passes."""
+    assert not fly(trial).failure
+    ablate(patch)
+    return fly(trial).invariant
+
+
 ABLATIONS: list[tuple[Patch, str, tuple[ScheduledFault, ...]]] = [
     (no_clamp, "slew", ()),
     (no_window, "once", (fault(Kind.REPLAY, "downlink", 5, 2, 0.5),)),
@@ -320,9 +327,7 @@ def test_feedback_that_ends_too_early_is_caught(monkeypatch: pytest.MonkeyPatch)
         and make_scenario(seed)[0].control.feedback
     )
     trial = Trial(seed, (fault(Kind.LOSS, "downlink", 5, 8),))
-    assert not fly(trial).failure
-    no_feedback_at_the_end(monkeypatch)
-    assert fly(trial).invariant == "follows"
+    assert violated(trial, no_feedback_at_the_end, monkeypatch) == "follows"
 
 
 @pytest.mark.parametrize(("switch_off", "invariant", "faults"), ABLATIONS)
@@ -333,10 +338,7 @@ def test_a_guard_that_is_switched_off_is_caught(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its invariant is violated; with the guard the same flight passes."""
-    trial = Trial(PLANS, faults)
-    assert not fly(trial).failure
-    switch_off(monkeypatch)
-    assert fly(trial).invariant == invariant
+    assert violated(Trial(PLANS, faults), switch_off, monkeypatch) == invariant
 
 
 @pytest.mark.parametrize(
@@ -353,10 +355,8 @@ def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
 
     What a flood of forgeries does to a server that believes them may be found by what comes of it.
     """
-    trial = Trial(FOLLOWS, faults)
-    assert not fly(trial).failure
-    switch_off(monkeypatch)
-    assert fly(trial).invariant in (invariant, "recovers")
+    found = violated(Trial(FOLLOWS, faults), switch_off, monkeypatch)
+    assert found in (invariant, "recovers")
 
 
 def no_disturbance(patch: pytest.MonkeyPatch) -> None:
@@ -398,10 +398,7 @@ def test_a_rule_of_trajectories_that_is_broken_is_caught(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Also where no more than rounding would tell."""
-    trial = Trial(FOLLOWS, faults)
-    assert not fly(trial).failure
-    wrong(monkeypatch)
-    assert fly(trial).invariant == invariant
+    assert violated(Trial(FOLLOWS, faults), wrong, monkeypatch) == invariant
 
 
 def test_a_solver_that_fails_is_nothing_to_trajectories() -> None:

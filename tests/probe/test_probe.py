@@ -27,10 +27,10 @@ from skytether.probe.wire import (
     NONCE_BYTES,
     SESSION_BYTES,
     TRAIN_MAX,
-    Answer,
-    Hello,
     Probe,
-    Welcome,
+    ProbeAnswer,
+    ProbeHello,
+    ProbeWelcome,
     decode,
     encode,
 )
@@ -39,7 +39,8 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.path import path
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Drop, ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 from skytether.sim.world import Clock
 
 LISTENER = ("listener", 0)
@@ -77,11 +78,11 @@ def test_an_answer_tells_of_as_many_arrivals_as_have_room(
     arrivals: list[tuple[int, int]], sent_ns: int, size: int
 ) -> None:
     """It is no longer than its probe, and tells of two at least where there are two."""
-    answer = Answer(bytes(SESSION_BYTES), 3, sent_ns, 7, 7 + len(arrivals), tuple(arrivals))
+    answer = ProbeAnswer(bytes(SESSION_BYTES), 3, sent_ns, 7, 7 + len(arrivals), tuple(arrivals))
     payload = encode(answer, size)
     assert len(payload) <= size
     told = decode(payload)
-    assert isinstance(told, Answer)
+    assert isinstance(told, ProbeAnswer)
     assert len(told.arrivals) >= min(2, len(arrivals))
     assert told == answer._replace(arrivals=answer.arrivals[: len(told.arrivals)])
 
@@ -98,16 +99,16 @@ def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> Non
     """Every byte is changed in turn."""
     session = bytes(range(SESSION_BYTES))
     messages = (
-        Hello(b"12345678"),
-        Welcome(b"12345678", b"87654321", True),
+        ProbeHello(b"12345678"),
+        ProbeWelcome(b"12345678", b"87654321", True),
         Probe(session, 3, 16, 2),
-        Answer(session, 3, 99, 1, 3, ((5, 77), (6, 88))),
+        ProbeAnswer(session, 3, 99, 1, 3, ((5, 77), (6, 88))),
     )
     payload = bytearray(encode(messages[kind], 96))
     place = data.draw(st.integers(0, len(payload) - 1))
     payload[place] = data.draw(st.integers(0, 255))
     with suppress(ProtocolError):
-        assert type(decode(bytes(payload))) in (Hello, Welcome, Probe, Answer)
+        assert type(decode(bytes(payload))) in (ProbeHello, ProbeWelcome, Probe, ProbeAnswer)
 
 
 # -- the listener ---------------------------------------------------------------------------------
@@ -120,10 +121,10 @@ def listener() -> Listener:
 
 def session_of(far: Listener, peer: tuple[str, int], now_ns: int) -> bytes:
     """Session that a listener gives."""
-    far.receive(Datagram(encode(Hello(b"12345678"), 64), peer), now_ns=now_ns)
+    far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), peer), now_ns=now_ns)
     (packet,) = far.outbox()
     welcome = decode(packet.payload)
-    assert isinstance(welcome, Welcome)
+    assert isinstance(welcome, ProbeWelcome)
     assert len(packet.payload) <= 64
     return welcome.nonce + welcome.cookie
 
@@ -134,7 +135,7 @@ def test_a_listener_answers_with_no_more_than_it_got(payloads: list[bytes]) -> N
     far, peer = listener(), ("prober", 1)
     session = session_of(far, peer, 0)
     probes = [encode(Probe(session, n, n % 3, 0), 96 + n) for n in range(5)]
-    for payload in [*payloads, *probes, encode(Hello(b"abcdefgh"), 20)]:
+    for payload in [*payloads, *probes, encode(ProbeHello(b"abcdefgh"), 20)]:
         far.receive(Datagram(payload, peer), now_ns=0)
         assert sum(len(each.payload) for each in far.outbox()) <= len(payload) or payload in probes
     assert far.figures()["sessions"] == 1
@@ -166,10 +167,10 @@ def test_a_listener_has_room_for_so_many_measurements() -> None:
         far.receive(Datagram(encode(Probe(session, 0, 0, 0), 96), ("prober", port)), now_ns=0)
         assert len(far.outbox()) == 1
     for now_ns, room in ((1, False), (IDLE_NS + 2, True)):
-        far.receive(Datagram(encode(Hello(b"12345678"), 64), ("new", 1)), now_ns=now_ns)
+        far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), ("new", 1)), now_ns=now_ns)
         (packet,) = far.outbox()
         welcome = decode(packet.payload)
-        assert isinstance(welcome, Welcome)
+        assert isinstance(welcome, ProbeWelcome)
         assert welcome.room == room
         session = welcome.nonce + welcome.cookie
         probe = encode(Probe(session, 0, 0, 0), 96)
@@ -390,16 +391,16 @@ def test_strangers_and_forgers_change_nothing() -> None:
     near.outbox()
     far = listener()
     session = session_of(far, ("prober", 1), 0)
-    welcome = encode(Welcome(bytes(NONCE_BYTES), b"12345678", True))
+    welcome = encode(ProbeWelcome(bytes(NONCE_BYTES), b"12345678", True))
     near.receive(Datagram(welcome, ("stranger", 1)), now_ns=1)
-    near.receive(Datagram(encode(Welcome(b"87654321", b"12345678", True)), LISTENER), now_ns=1)
+    near.receive(Datagram(encode(ProbeWelcome(b"87654321", b"12345678", True)), LISTENER), now_ns=1)
     assert near.next_wake_ns() is not None
     near.receive(Datagram(welcome, LISTENER), now_ns=1)
     mine = bytes(NONCE_BYTES) + b"12345678"
     for answer in (
-        Answer(session, 0, 1, 0, 1, ((0, 1),)),
-        Answer(mine, 0, 1, 0, 1, ((500, 1),)),
-        Answer(mine, 0, 1, 0, 4_000_000, ()),
+        ProbeAnswer(session, 0, 1, 0, 1, ((0, 1),)),
+        ProbeAnswer(mine, 0, 1, 0, 1, ((500, 1),)),
+        ProbeAnswer(mine, 0, 1, 0, 4_000_000, ()),
     ):
         near.receive(Datagram(encode(answer, 200), LISTENER), now_ns=2)
     near.receive(Datagram(b"garbage", LISTENER), now_ns=2)

@@ -12,7 +12,7 @@ from skytether.client.fleet import apart_ns
 from skytether.lab.crowd import judge
 from skytether.server.control import budget as budgets
 from skytether.server.control import rate as rates
-from skytether.server.control.budget import BURST_S, GUESS_BYTES, WAIT_S, Budget
+from skytether.server.control.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.rate import RateControl
 from skytether.shared.base.errors import ConfigError
@@ -33,7 +33,7 @@ class Crowd:
     def __init__(self, bytes_per_s: float, sizes: list[int]) -> None:
         n = len(sizes)
         self.rows, self.sizes = np.arange(n), np.array(sizes)
-        self.budget = Budget(bytes_per_s, ClockMap(n, DT_NS), n)
+        self.budget = SharedBudget(bytes_per_s, ClockMap(n, DT_NS), n)
         self.since_s = np.zeros(n)
         self.now_ns = 0
 

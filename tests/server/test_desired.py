@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import packaged
 from skytether.server.control.controller import BLOCK
 from skytether.server.control.desired import EMPTY, PAGE, PAGES, Desired, _led
 from skytether.server.control.live import MEMORY_S, REST_S, LivePoint
@@ -17,7 +18,7 @@ from skytether.shared.base.kernel import plain
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario import reference as shapes
-from skytether.shared.scenario.reading import check, load, to_table
+from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
@@ -247,9 +248,7 @@ def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> 
 
 def replaced(name: str, changes: dict[str, Any], **reference: Any) -> Scenario:
     """A packaged scenario with some keys changed."""
-    table = to_table(load(name)) | changes
-    table["reference"] |= reference
-    return check(table, "test")
+    return packaged(name, changes, reference=reference)
 
 
 def first_difference(flights: list[Record]) -> int:

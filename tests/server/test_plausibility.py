@@ -25,7 +25,8 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
-from skytether.shared.wire.protocol import Drop, Mode, Observation, stamp_us, stamped_ns
+from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.protocol import Mode, Observation, stamp_us, stamped_ns
 from skytether.sim.flight import fly, fly_batch
 from skytether.sim.world import Clock
 

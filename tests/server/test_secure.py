@@ -21,6 +21,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.wire import channel as channels
 from skytether.shared.wire import handshake, noise_nnpsk0
 from skytether.shared.wire.channel import DATA, FRESH_NS, LIFE_NS, OVERLAP_NS, VERSION
+from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.handshake import (
     CHALLENGE,
     CHALLENGE_BYTES,
@@ -36,7 +37,7 @@ from skytether.shared.wire.handshake import (
 )
 from skytether.shared.wire.keys import Keyring, VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import MESSAGE_BYTES
-from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, ProtocolError, encode
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, encode
 
 HERE, ELSEWHERE = ("vehicle", 1), ("elsewhere", 2)
 SECRETS = {1: bytes([1]) * 32, 2: bytes([2]) * 32}

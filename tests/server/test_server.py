@@ -34,11 +34,11 @@ from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, parse, server_columns
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     Close,
-    Drop,
     Heartbeat,
     Hello,
     Horizon,
@@ -46,7 +46,6 @@ from skytether.shared.wire.protocol import (
     Message,
     Mode,
     Observation,
-    ProtocolError,
     Refusal,
     Welcome,
     decode,

@@ -36,15 +36,8 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.telemetry.summary import least_separation
-from skytether.shared.wire.protocol import (
-    NO_HORIZON,
-    NO_INPUT,
-    Drop,
-    Mode,
-    Observation,
-    ProtocolError,
-    Trajectory,
-)
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observation, Trajectory
 from skytether.sim import flight
 
 DT_S = 0.05

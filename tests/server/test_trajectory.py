@@ -32,13 +32,13 @@ from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
 from skytether.shared.telemetry.summary import position_error
+from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.protocol import (
     KNOTS_MAX,
     NO_HORIZON,
     VERSION,
     Mode,
     Observation,
-    ProtocolError,
     Trajectory,
     decode,
     encode,

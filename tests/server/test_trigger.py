@@ -18,7 +18,7 @@ from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.triggers import (
     Combined,
     Compared,
-    Known,
+    KnownArrays,
     Situation,
     Trigger,
     Verdict,
@@ -49,7 +49,7 @@ def figures_of(
     return figures
 
 
-KNOWN = Known(
+KNOWN = KnownArrays(
     model=discretise((0.84, 0.84), 0.1),
     dt_s=0.1,
     planned=3,

@@ -27,7 +27,7 @@ from skytether.shared.wire.channel import (
     Channel,
     ReplayWindow,
 )
-from skytether.shared.wire.protocol import ProtocolError
+from skytether.shared.wire.drop import ProtocolError
 
 LONG = os.environ.get("SKYTETHER_LONG") == "1"
 STEPS = 10**7 if LONG else 10**5

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import helpers
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -362,9 +363,7 @@ WRONG = {
 
 def refusal(path: Path | str) -> str:
     """Message about a scenario that cannot be flown."""
-    with pytest.raises(ConfigError) as caught:
-        reading.load(str(path))
-    return str(caught.value)
+    return helpers.refusal(lambda: reading.load(str(path)))
 
 
 def write(folder: Path, name: str, text: str) -> Path:

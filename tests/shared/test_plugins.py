@@ -7,7 +7,7 @@ import shlex
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, chdir
 from functools import partial
 from pathlib import Path
@@ -19,11 +19,10 @@ import numpy as np
 import pytest
 from hatchling.build import build_wheel
 
-from helpers import packaged
+from helpers import packaged, refusal
 from skytether.__main__ import main
 from skytether.lab.commands.pool import _equipped
 from skytether.lab.journal import digests
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.events import Fault
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.registry import REFERENCES, TABLES, TRIGGERS
@@ -92,13 +91,6 @@ def faults(flight: Record) -> list[str]:
     """Last lines of what was told of mistakes."""
     events = (each.event for each in flight.events)
     return [each.traceback.splitlines()[-1] for each in events if isinstance(each, Fault)]
-
-
-def refusal(run: Callable[[], object]) -> str:
-    """What is said of something that is refused."""
-    with pytest.raises(ConfigError) as caught:
-        run()
-    return str(caught.value)
 
 
 # -- what the documents say ------------------------------------------------------------------------

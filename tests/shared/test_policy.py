@@ -7,8 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from skytether.shared.base import errors
-from skytether.shared.base.errors import ConfigError
+import helpers
 from skytether.shared.scenario import policies, reading
 from skytether.shared.scenario.policies import (
     TEXT_MAX,
@@ -103,9 +102,7 @@ REFUSED = {
 
 def refusal(text: str) -> str:
     """What is said of a scenario with this trigger."""
-    with pytest.raises(ConfigError) as caught:
-        reading.check({"control": {"trigger": text}}, "mine")
-    return str(caught.value)
+    return helpers.refusal(lambda: reading.check({"control": {"trigger": text}}, "mine"))
 
 
 @pytest.mark.parametrize(("text", "read"), READ.items(), ids=READ)
@@ -144,11 +141,8 @@ def test_what_is_compared_needs_a_scheme_that_has_it(name: str, needed: str, giv
     """Deep in an expression, too."""
     text = f"silence(1) | {name} & budget(5, 2)"
     control: dict[str, Any] = {"trigger": text, "scheme": given, "feedback": given != "none"}
-    with pytest.raises(errors.ConfigError) as caught:
-        reading.check({"control": control}, "mine")
-    assert str(caught.value) == (
-        f"mine: control.scheme: got {given!r}, expected {needed} with the trigger {name}"
-    )
+    said = helpers.refusal(lambda: reading.check({"control": control}, "mine"))
+    assert said == f"mine: control.scheme: got {given!r}, expected {needed} with the trigger {name}"
     for scheme in needed.replace("'", "").split(" or "):
         feedback = scheme == "trajectory"
         reading.check({"control": control | {"scheme": scheme, "feedback": feedback}}, "mine")

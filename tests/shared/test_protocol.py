@@ -14,6 +14,7 @@ from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.wire import protocol
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     INPUTS_MAX,
@@ -25,7 +26,6 @@ from skytether.shared.wire.protocol import (
     TEXT_MAX,
     VERSION,
     Close,
-    Drop,
     Heartbeat,
     Hello,
     Horizon,
@@ -33,7 +33,6 @@ from skytether.shared.wire.protocol import (
     Message,
     Mode,
     Observation,
-    ProtocolError,
     Trajectory,
     Welcome,
     decode,

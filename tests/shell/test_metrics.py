@@ -25,7 +25,8 @@ from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX
 from skytether.shared.core.events import Measured
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
-from skytether.shared.wire.protocol import Drop, Mode
+from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.protocol import Mode
 from skytether.shell import command, metrics
 from skytether.shell.exporter import CONNECTIONS_MAX, Collected, Metrics, MetricsError, names
 from skytether.shell.log import LogLine

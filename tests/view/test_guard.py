@@ -1,7 +1,6 @@
 """The page's websocket with real clients: who may open it, and what may be sent by it."""
 
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from helpers import until
 from skytether.lab.benchmarks.hostile import (
     BINARY,
     CAMERA,
@@ -83,14 +83,6 @@ def told(browser: ClientConnection, kind: str) -> dict[str, Any]:
 def counts(page: Page) -> dict[TurnedAway, int]:
     """Number of refusals, by reason."""
     return dict(page._guard.counts)
-
-
-def until(true: Any, seconds: float = PATIENCE_S) -> None:
-    """Wait until something is true."""
-    ends_s = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < ends_s
-        time.sleep(0.01)
 
 
 @pytest.mark.parametrize(

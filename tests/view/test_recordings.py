@@ -387,19 +387,26 @@ def opened(columns: np.dtype[np.void], part: str = "client") -> Opened:
 # --- Torn files.
 
 
-@pytest.fixture(scope="module")
-def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording with many chunks and no end."""
-    path = tmp_path_factory.mktemp("torn") / "torn.mcap"
+def write_in_chunks(path: Path, frames: int, *, end: bool) -> Path:
+    """A recording of the short flight, a chunk for so many frames, with its end or without."""
     about = recorder._about(SCENARIO, "demo", began=None, offset_ns=0, secure=False)
     with path.open("wb") as file:
         recording = Recording(file, SCENARIO, about)
         for i, (_, process, frame) in enumerate(of_flight(SCENARIO, "demo", flown())):
             recording.add(process, frame)
-            if i % 12 == 0:
+            if i % frames == 0:
                 recording.flush()
-        recording.flush()
+        if end:
+            recording.finish(None)
+        else:
+            recording.flush()
     return path
+
+
+@pytest.fixture(scope="module")
+def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording with many chunks and no end."""
+    return write_in_chunks(tmp_path_factory.mktemp("torn") / "torn.mcap", 12, end=False)
 
 
 @cache
@@ -522,16 +529,7 @@ def test_without_its_checksum_a_changed_number_would_be_believed(
 @pytest.fixture(scope="module")
 def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole recording of many chunks."""
-    path = tmp_path_factory.mktemp("chunked") / "chunked.mcap"
-    about = recorder._about(SCENARIO, "demo", began=None, offset_ns=0, secure=False)
-    with path.open("wb") as file:
-        recording = Recording(file, SCENARIO, about)
-        for i, (_, process, frame) in enumerate(of_flight(SCENARIO, "demo", flown())):
-            recording.add(process, frame)
-            if i % 200 == 0:
-                recording.flush()
-        recording.finish(None)
-    return path
+    return write_in_chunks(tmp_path_factory.mktemp("chunked") / "chunked.mcap", 200, end=True)
 
 
 def places(path: Path) -> dict[str, list[int]]:

@@ -172,21 +172,28 @@ async def test_a_closed_port_and_an_unknown_network_are_lost_packets() -> None:
     assert driver.send_errors >= 1
 
 
+class Asker(Echo):
+    """Sends one datagram to a peer, and notes from which address the answer came."""
+
+    def __init__(self, peer: Address) -> None:
+        super().__init__(last=1)
+        self.seen: list[Address] = []
+        self._out.append(Datagram(b"who?", peer))
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Note the address."""
+        self.seen.append(datagram.peer)
+        super().receive(datagram, now_ns=now_ns)
+
+
 async def test_names_are_looked_up_and_seen_by_the_endpoint_as_names() -> None:
     """What it sends to ("localhost", port) is answered by ("localhost", port)."""
-    seen: list[Address] = []
-
-    class Asker(Echo):
-        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-            seen.append(datagram.peer)
-            super().receive(datagram, now_ns=now_ns)
-
-    answerer, asker = Shell(Echo(), LOOPBACK), Asker(last=1)
+    answerer = Shell(Echo(), LOOPBACK)
     peer = ("localhost", answerer.address[1])
-    asker._out.append(Datagram(b"who?", peer))
+    asker = Asker(peer)
     async with driven(answerer):
         await asyncio.wait_for(Shell(asker, LOOPBACK, [peer]).run(), 5)
-    assert seen == [peer]
+    assert asker.seen == [peer]
 
 
 async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,21 +220,14 @@ async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.Monk
 @pytest.mark.ipv6
 async def test_a_peer_is_seen_as_it_was_written_whatever_the_kernel_calls_it() -> None:
     """An IPv6 address in long form: its answers come from the endpoint's own peer."""
-    seen: list[Address] = []
-
-    class Asker(Echo):
-        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-            seen.append(datagram.peer)
-            super().receive(datagram, now_ns=now_ns)
-
-    answerer, asker = Shell(Echo(), LOOPBACK_6), Asker(last=1)
+    answerer = Shell(Echo(), LOOPBACK_6)
     peer = ("0:0:0:0:0:0:0:1", answerer.address[1])
-    asker._out.append(Datagram(b"who?", peer))
+    asker = Asker(peer)
     driver = Shell(asker, None, [peer])
     assert driver.address[0] == "::1"
     async with driven(answerer):
         await asyncio.wait_for(driver.run(), 5)
-    assert seen == [peer]
+    assert asker.seen == [peer]
 
 
 def test_the_scope_of_a_link_local_address_is_part_of_its_host() -> None:

@@ -14,10 +14,10 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import EVENTS_MAX, Address, Datagram, Endpoint
 from skytether.shared.core.events import Omitted
 from skytether.shared.scenario import reading
+from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     Close,
-    Drop,
     Heartbeat,
     Hello,
     Horizon,

@@ -55,7 +55,7 @@ _DELAYS = {"delay_s": 1.0, "delay_ms": 1e-3, "rtt_s": 0.5, "rtt_ms": 0.5e-3}
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordedPath:
     """Delays of a recorded path, a row a packet."""
 
     time_s: Array
@@ -97,7 +97,7 @@ class Trace(Impairment):
             fate.lost = True
 
 
-def recorded_in(file: str, way: Way = "auto") -> Recorded:
+def recorded_in(file: str, way: Way = "auto") -> RecordedPath:
     """Delays that a file holds.
 
     Args:
@@ -129,7 +129,7 @@ def _state_of(file: str) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=16)
-def _recorded(file: str, way: Way, *_: int) -> Recorded:
+def _recorded(file: str, way: Way, *_: int) -> RecordedPath:
     text = _text(file)
     if text.lstrip()[:1] == "{":
         rows = _of_irtt(file, text, way)
@@ -243,7 +243,7 @@ def _of_irtt(file: str, text: str, way: Way) -> tuple[Array, Array, Bools]:
     return table[:, 0] * 1e-9, table[:, 1] * factor, table[:, 2] != 0.0
 
 
-def _checked(file: str, time_s: Array, delay_s: Array, lost: Bools) -> Recorded:
+def _checked(file: str, time_s: Array, delay_s: Array, lost: Bools) -> RecordedPath:
     """Rows whose times rise and whose delays are possible.
 
     Raises:
@@ -267,4 +267,4 @@ def _checked(file: str, time_s: Array, delay_s: Array, lost: Bools) -> Recorded:
     time_s = time_s - time_s[0]
     if time_s[-1] > 1e9:
         raise ValueError(f"{file}: got {time_s[-1]:g} s, expected at most 1e9 s")
-    return Recorded(time_s, np.interp(time_s, time_s[came], delay_s[came]), lost)
+    return RecordedPath(time_s, np.interp(time_s, time_s[came], delay_s[came]), lost)

@@ -107,7 +107,7 @@ class Cell(NamedTuple):
     seed: int
 
 
-class Flown(msgspec.Struct, frozen=True, kw_only=True):
+class FlownCell(msgspec.Struct, frozen=True, kw_only=True):
     """Flight of a contender, and its repetition with the network cut for a while."""
 
     contender: str
@@ -189,7 +189,7 @@ def as_it_was(scenario: Scenario, flown: Record, truth: Rows) -> Record:
     return replace(flown, client=client, netem=netem)
 
 
-def fly_cell(cell: Cell) -> Flown:
+def fly_cell(cell: Cell) -> FlownCell:
     """Fly a cell twice: the second time with a cut."""
     scenario = scenario_of(cell)
     law = contenders(cell.flavour)[cell.contender]
@@ -206,7 +206,7 @@ def fly_cell(cell: Cell) -> Flown:
 
 def judged(
     cell: Cell, scenario: Scenario, whole: Record, cut: Record, *, secure: bool = False
-) -> Flown:
+) -> FlownCell:
     """Figures of both flights of a cell: with an intact network, and cut for a while."""
     times_s = cut.client["step"] * scenario.control.dt
     watched = (times_s >= CUT_S) & (times_s < WATCHED_S)
@@ -217,7 +217,7 @@ def judged(
         else summary_of(scenario, "autopilot", flown)
         for flown in (whole, cut)
     )
-    return Flown(
+    return FlownCell(
         **cell._asdict(),
         whole=whole_summary,
         cut=cut_summary,
@@ -239,7 +239,7 @@ HEADINGS = [
 ]
 
 
-def tables(flights: Sequence[Flown]) -> dict[str, TextTable]:
+def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
     """Tables by name: one for each flavour and air, and one of measurements elsewhere."""
     made = {}
     for flavour, air in product(get_args(FlavourName), get_args(Air)):
@@ -253,7 +253,7 @@ def tables(flights: Sequence[Flown]) -> dict[str, TextTable]:
     return made
 
 
-def _near(flights: Sequence[Flown]) -> list[list[str]]:
+def _near(flights: Sequence[FlownCell]) -> list[list[str]]:
     """Rows of ArduCopter's figures, with those of the simulated one."""
     rows = []
     for (name, air), actual_m in ACTUAL.items():
@@ -264,7 +264,7 @@ def _near(flights: Sequence[Flown]) -> list[list[str]]:
     return rows
 
 
-def row(name: str, flights: Sequence[Flown]) -> list[str]:
+def row(name: str, flights: Sequence[FlownCell]) -> list[str]:
     """Row of a contender: means over its flights; for errors also the largest."""
     errors = [each.whole.rmse_xy or np.nan for each in flights]
 
@@ -336,11 +336,11 @@ def main() -> int:
     return 0
 
 
-def kept(file: Path | None) -> list[Flown]:
+def kept(file: Path | None) -> list[FlownCell]:
     """Flights that a file has already."""
     if file is None or not file.exists():
         return []
-    return msgspec.json.decode(file.read_bytes(), type=list[Flown])
+    return msgspec.json.decode(file.read_bytes(), type=list[FlownCell])
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from skytether.lab.benchmarks.autopilots import (
     HEALED_S,
     Air,
     Cell,
-    Flown,
+    FlownCell,
     as_it_was,
     contenders,
     judged,
@@ -142,7 +142,7 @@ async def _cut(scenario: Scenario, control: Path, flies: asyncio.Event) -> None:
             assert not refused, refused
 
 
-async def fly_cell(cell: Cell, model: Mapping[str, Any]) -> Flown:
+async def fly_cell(cell: Cell, model: Mapping[str, Any]) -> FlownCell:
     """Fly a cell twice: the second time with a cut."""
     scenario = autopilots.scenario_of(cell, model)
     with temporary.folder() as parts:
@@ -152,7 +152,7 @@ async def fly_cell(cell: Cell, model: Mapping[str, Any]) -> Flown:
     return judged(cell, scenario, whole, broken, secure=True)
 
 
-def table(flights: list[Flown]) -> TextTable:
+def table(flights: list[FlownCell]) -> TextTable:
     """A row for each contender in each air."""
     cases = {(each.flavour, each.air, each.contender) for each in flights}
     rows = [
@@ -180,7 +180,7 @@ class UdpBenchmarkOptions:
     """Put the table into docs/straight.md."""
 
 
-async def fly_all(options: UdpBenchmarkOptions) -> list[Flown]:
+async def fly_all(options: UdpBenchmarkOptions) -> list[FlownCell]:
     """Identify and fly what is missing; returns all results."""
     free = asyncio.Semaphore(options.jobs)
     flavours = get_args(FlavourName)

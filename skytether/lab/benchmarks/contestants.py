@@ -320,7 +320,7 @@ class Ipopt:
         return self._z[: guess.size].copy().reshape(gradient.shape), np.array([True])
 
 
-class Nothing:
+class EmptySolver:
     """Empty solver: the cost of the measurement itself."""
 
     def __init__(self, problem: Problem) -> None:  # noqa: ARG002 - like any other
@@ -347,7 +347,7 @@ def contestants(tuned: Tuning) -> dict[str, Factory]:
     }
     return {
         OURS: ExactSolver,
-        NOTHING: Nothing,
+        NOTHING: EmptySolver,
         TUNED: tuned.make,
         "OSQP, defaults": lambda problem: Osqp(problem, joint),
         "OSQP, eps 1e-9": OsqpSolver,

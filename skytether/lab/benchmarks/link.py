@@ -38,8 +38,9 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario.reading import load
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import channel
+from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.keys import Keyring
-from skytether.shared.wire.protocol import Hello, ProtocolError, Welcome, encode
+from skytether.shared.wire.protocol import Hello, Welcome, encode
 from skytether.sim import flight
 
 PEER: Address = ("127.0.0.1", 1024)

@@ -54,7 +54,7 @@ class MissionsOptions:
     """File for the table as Markdown."""
 
 
-class Flown(NamedTuple):
+class FlownMission(NamedTuple):
     """What came of a mission."""
 
     seed: int
@@ -153,7 +153,7 @@ def _network(rng: np.random.Generator) -> str:
     return f"{late} & {lost}"
 
 
-def fly(options: MissionsOptions, seed: int) -> Flown:
+def fly(options: MissionsOptions, seed: int) -> FlownMission:
     """Fly one."""
     with tempfile.TemporaryDirectory() as folder:
         scenario = mission(options, seed, Path(folder))
@@ -174,7 +174,7 @@ def fly(options: MissionsOptions, seed: int) -> Flown:
         begins = int(np.argmax(rows["mode"] == Mode.TRACK))
         flown = rows["state"][begins:, :, 0]
         clear_m.append(float(kept.clearance(flown).min(initial=np.inf)))
-    return Flown(
+    return FlownMission(
         seed,
         len(each),
         scenario.network.uplink.text,
@@ -186,10 +186,10 @@ def fly(options: MissionsOptions, seed: int) -> Flown:
     )
 
 
-def table(options: MissionsOptions) -> tuple[TextTable, list[Flown]]:
+def table(options: MissionsOptions) -> tuple[TextTable, list[FlownMission]]:
     """Fly all; what was seen, and those of which something is to be told."""
     seeds = range(options.first, options.first + options.missions)
-    batch, flown = 4 * options.workers, list[Flown]()
+    batch, flown = 4 * options.workers, list[FlownMission]()
     with ProcessPoolExecutor(options.workers) as pool:
         for first in progress(range(0, len(seeds), batch), "missions"):
             flown += pool.map(partial(fly, options), seeds[first : first + batch])

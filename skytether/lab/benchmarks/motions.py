@@ -50,7 +50,7 @@ class MotionsOptions:
     """File for the tables as Markdown."""
 
 
-class Problem(NamedTuple):
+class MotionProblem(NamedTuple):
     """A QP, as `DualSolver` takes it."""
 
     solver: DualSolver
@@ -61,12 +61,12 @@ class Problem(NamedTuple):
 
 
 @contextmanager
-def kept(problems: list[Problem]) -> Iterator[None]:
+def kept(problems: list[MotionProblem]) -> Iterator[None]:
     """Keep every QP that is solved."""
     real = DualSolver.solve
 
     def solve(self: DualSolver, linear: Array, columns: Array, least: Array, equal: int) -> Any:
-        problems.append(Problem(self, linear.copy(), columns.copy(), least.copy(), equal))
+        problems.append(MotionProblem(self, linear.copy(), columns.copy(), least.copy(), equal))
         return real(self, linear, columns, least, equal)
 
     DualSolver.solve = solve  # type: ignore[method-assign]
@@ -76,14 +76,14 @@ def kept(problems: list[Problem]) -> Iterator[None]:
         DualSolver.solve = real  # type: ignore[method-assign]
 
 
-class Osqp:
+class MotionOsqp:
     """OSQP for problems with one Hessian."""
 
     def __init__(self, hessian: Array) -> None:
         self._hessian = sparse.csc_matrix(np.triu(hessian))
         self._made: dict[int, Any] = {}
 
-    def solve(self, problem: Problem) -> Array:
+    def solve(self, problem: MotionProblem) -> Array:
         """The minimum, at its tolerance."""
         least, most = problem.least, np.full(len(problem.least), np.inf)
         most[: problem.equal] = least[: problem.equal]
@@ -112,11 +112,11 @@ class Osqp:
         return found
 
 
-def rivals(hessian: Array) -> dict[str, Callable[[Problem], Array]]:
+def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
     """Solvers by name, each of problems with this Hessian."""
-    found: dict[str, Callable[[Problem], Array]] = {"OSQP": Osqp(hessian).solve}
+    found: dict[str, Callable[[MotionProblem], Array]] = {"OSQP": MotionOsqp(hessian).solve}
 
-    def of_daqp(problem: Problem) -> Array:
+    def of_daqp(problem: MotionProblem) -> Array:
         least, free = problem.least, np.full(len(problem.least), 1e30)
         most = np.where(np.arange(len(least)) < problem.equal, least, free)
         kind = np.where(np.arange(len(least)) < problem.equal, 5, 0).astype(np.int32)
@@ -130,7 +130,7 @@ def rivals(hessian: Array) -> dict[str, Callable[[Problem], Array]]:
 
         factor = np.linalg.inv(np.linalg.cholesky(hessian).T)
 
-        def of_quadprog(problem: Problem) -> Array:
+        def of_quadprog(problem: MotionProblem) -> Array:
             given = factor, problem.linear, problem.columns, problem.least, problem.equal, True
             result: Array = quadprog.solve_qp(*given)[0]
             return result
@@ -139,7 +139,7 @@ def rivals(hessian: Array) -> dict[str, Callable[[Problem], Array]]:
     if find_spec("piqp"):
         import piqp
 
-        def of_piqp(problem: Problem) -> Array:
+        def of_piqp(problem: MotionProblem) -> Array:
             solver, rows = piqp.DenseSolver(), np.ascontiguousarray(problem.columns.T)
             solver.settings.compute_timings = False
             n = problem.equal
@@ -164,14 +164,14 @@ def swap(vehicles: int, radius_m: float, duration: float) -> Scenario:
 
 def solvers(options: MotionsOptions) -> TextTable:
     """All solvers on the QPs of a flight."""
-    problems: list[Problem] = []
+    problems: list[MotionProblem] = []
     with kept(problems):
         flight.fly(swap(16, 4.0, options.duration), vehicles=16)
     step = max(1, len(problems) // options.problems)
     problems = problems[::step][: options.problems]
     root = problems[0].solver._root
     hessian = np.linalg.inv(root.T @ root).astype(np.float64)
-    solve: dict[str, Callable[[Problem], Any]] = {
+    solve: dict[str, Callable[[MotionProblem], Any]] = {
         "ours, dual active set": lambda problem: problem.solver.solve(*problem[1:]),
         **rivals(hessian),
     }

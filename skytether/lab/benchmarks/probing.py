@@ -21,7 +21,7 @@ from skytether.lab.benchmarks.harness import TextTable, progress
 from skytether.netem.proxy import Proxy
 from skytether.probe.listener import Listener
 from skytether.probe.outcome import PathTold, WayTold, outcome
-from skytether.probe.prober import Measured, Prober
+from skytether.probe.prober import MeasuredPath, Prober
 from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import PlainGate
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
@@ -73,7 +73,7 @@ def measure(
     size: int = 400,
     seed: int = 1,
     clock: Clock = CLOCK,
-) -> tuple[Measured, Rows]:
+) -> tuple[MeasuredPath, Rows]:
     """Measure a netem network in virtual time.
 
     Args:

@@ -76,7 +76,7 @@ class RecordedProblems:
         return saturated(inputs, self.problem)
 
 
-class Listener:
+class ProblemRecorder:
     """Exact solver that records the problems of generator and tracker in turn."""
 
     def __init__(self, problem: Problem) -> None:
@@ -132,15 +132,15 @@ def solving(make: Callable[[Problem], Solver]) -> Iterator[None]:
 
 
 @contextmanager
-def listening() -> Iterator[list[Listener]]:
+def listening() -> Iterator[list[ProblemRecorder]]:
     """Within the block, new planners solve exactly, and their problems are recorded.
 
     Yields the recorder of first steps and that of later steps.
     """
-    listeners: list[Listener] = []
+    listeners: list[ProblemRecorder] = []
 
     def make(problem: Problem) -> Solver:
-        listeners.append(Listener(problem))
+        listeners.append(ProblemRecorder(problem))
         return listeners[-1]
 
     with solving(make):

@@ -89,7 +89,7 @@ class PublishedOptions:
     """File for the table as Markdown."""
 
 
-class Done(NamedTuple):
+class TaskFlight(NamedTuple):
     """What came of a flight."""
 
     least_m: float
@@ -166,7 +166,7 @@ def timed() -> Iterator[list[float]]:
         Together.plan = real  # type: ignore[method-assign]
 
 
-def fly(task: Task, network: str, duration: float, seed: int) -> Done:
+def fly(task: Task, network: str, duration: float, seed: int) -> TaskFlight:
     """Fly one."""
     with tempfile.TemporaryDirectory() as folder, timed() as spent:
         flown = scenario(task, network, duration, seed, Path(folder))
@@ -185,7 +185,7 @@ def fly(task: Task, network: str, duration: float, seed: int) -> Done:
         last = int(away.max(initial=-1)) + 1
         arrived_s.append(last * dt_s - GOAL_AT_S if last < len(rows) else np.nan)
     sent = record.figures["server"]["counts"]["events"]
-    return Done(least, float(np.max(arrived_s)), 1e3 * sum(spent) / max(sent, 1))
+    return TaskFlight(least, float(np.max(arrived_s)), 1e3 * sum(spent) / max(sent, 1))
 
 
 def table(options: PublishedOptions) -> TextTable:

@@ -53,7 +53,7 @@ class RecordedBenchmarkOptions:
 
 
 @dataclass(frozen=True)
-class Flown:
+class FlownLink:
     """Flights of one contender over one link."""
 
     rmse_m: float
@@ -84,7 +84,7 @@ def network(link: str) -> NetworkConfig:
     return reading.load(link).network
 
 
-def flown(scenario: Scenario, seeds: Sequence[int]) -> Flown:
+def flown(scenario: Scenario, seeds: Sequence[int]) -> FlownLink:
     """Fly a scenario with each seed."""
     rmse, packets = [], []
     for seed, flight in zip(seeds, fly_batch(scenario, seeds), strict=True):
@@ -93,7 +93,7 @@ def flown(scenario: Scenario, seeds: Sequence[int]) -> Flown:
         rmse.append(np.nan if summary.rmse_xy is None else summary.rmse_xy)
         sent = (summary.uplink_packets or 0) + (summary.downlink_packets or 0)
         packets.append(sent / summary.duration_s)
-    return Flown(float(np.mean(rmse)), float(np.mean(packets)))
+    return FlownLink(float(np.mean(rmse)), float(np.mean(packets)))
 
 
 def main() -> int:

@@ -82,7 +82,7 @@ FULL, QUICK = (
 )
 
 
-class Outage(NamedTuple):
+class ProcessOutage(NamedTuple):
     """Outage of a process."""
 
     subject: Subject
@@ -217,16 +217,16 @@ class Processes:
         self._parts.append((part, child))
         return child
 
-    def suffer(self, subject: Subject, way: Way) -> Outage:
+    def suffer(self, subject: Subject, way: Way) -> ProcessOutage:
         """Kill or stop a process, and bring it back."""
         child = self._children[subject]
         if way == STOPPED:
-            return Outage(subject, way, *child.freeze(DOWN_S))
+            return ProcessOutage(subject, way, *child.freeze(DOWN_S))
         began_ns = child.kill()
         if way == CLOSED:
             time.sleep(DOWN_S)
         child = self._children[subject] = self._start(subject)
-        return Outage(subject, way, began_ns, child.listening_ns())
+        return ProcessOutage(subject, way, began_ns, child.listening_ns())
 
     def wait_for_flight(self) -> None:
         """Wait until the vehicle reports that it flies a plan, unless it does already."""
@@ -248,7 +248,9 @@ class Processes:
         return lives
 
 
-def judge(outage: Outage, lives: Sequence[ProcessLife], scenario: Scenario) -> RestartVerdict:
+def judge(
+    outage: ProcessOutage, lives: Sequence[ProcessLife], scenario: Scenario
+) -> RestartVerdict:
     """Reaction to an outage, from the record."""
     life = _life(outage, lives)
     died = outage.subject == "client" and outage.way != STOPPED
@@ -277,7 +279,7 @@ def judge(outage: Outage, lives: Sequence[ProcessLife], scenario: Scenario) -> R
     )
 
 
-def _life(outage: Outage, lives: Sequence[ProcessLife]) -> ProcessLife:
+def _life(outage: ProcessOutage, lives: Sequence[ProcessLife]) -> ProcessLife:
     """Run of the vehicle that goes on, or begins, after an outage."""
     for life in lives:
         if life.time_ns[-1] > outage.back_ns:
@@ -347,7 +349,7 @@ AROUND_S = (-1.0, 8.0)
 """Time around an outage that is drawn [s]."""
 
 
-def trace(outage: Outage, lives: Sequence[ProcessLife]) -> dict[str, Any]:
+def trace(outage: ProcessOutage, lives: Sequence[ProcessLife]) -> dict[str, Any]:
     """Speeds around an outage, rounded, for the figure."""
     begin_ns, end_ns = (outage.began_ns + round(at_s * SECOND_NS) for at_s in AROUND_S)
     runs = []

@@ -14,7 +14,7 @@ from rich.text import Text
 from skytether.cli import processes
 from skytether.lab import figures
 from skytether.lab.commands.pool import Interrupted, writing
-from skytether.lab.crowd import TITLES, Crowd, CrowdPoint, Flown, Scheme, judge, points_csv
+from skytether.lab.crowd import TITLES, Crowd, CrowdPoint, FlownScheme, Scheme, judge, points_csv
 from skytether.lab.journal import Journal, write
 from skytether.shared.base import kernel
 from skytether.shared.scenario.schema import Scenario
@@ -107,7 +107,7 @@ def _fly_all(
 ) -> bool:
     """Fly the missing points of a scheme; returns False if interrupted."""
     while True:
-        flown = Flown.of(journal.entries, scheme, options.limit)
+        flown = FlownScheme.of(journal.entries, scheme, options.limit)
         known = {point.vehicles for point in flown.points}
         left = [number for number in options.vehicles if number not in known]
         number = next(iter(left), None) if options.vehicles else flown.next(options.most)
@@ -156,7 +156,7 @@ def _fly(
 
 def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
     """Write and print the results."""
-    flown = {scheme: Flown.of(points, scheme, options.limit) for scheme in TITLES}
+    flown = {scheme: FlownScheme.of(points, scheme, options.limit) for scheme in TITLES}
     where = "over UDP" if options.udp else "in virtual time"
     title = f"{options.scenario}, {where}, seed {options.config.seed}"
     rows = [point for each in flown.values() for point in each.points]

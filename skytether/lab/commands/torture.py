@@ -15,7 +15,7 @@ from rich.table import Table
 
 from skytether.lab.commands.pool import Flags, Interrupted, crew
 from skytether.lab.faults import Trial, dumps, loads
-from skytether.lab.torture import Outcome, fly, long_trial, short_trial, shrunk
+from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.shared.base.errors import ConfigError
 from skytether.shell import command
 from skytether.shell.command import CommandError
@@ -65,12 +65,12 @@ def torture(argv: Sequence[str]) -> None:
     pool = Flags(workers=options.jobs)
     pool.check()
     trials, title = _trials(options)
-    done: list[Outcome] = []
+    done: list[TrialOutcome] = []
     interrupted = ""
     try:
         with crew(pool, title, len(trials), "flights") as flyers:
 
-            def keep(_: int, outcome: Outcome) -> None:
+            def keep(_: int, outcome: TrialOutcome) -> None:
                 done.append(outcome)
                 failed = sum(bool(each.failure) for each in done)
                 flyers.advance(1, f"{failed} failed" if failed else "")
@@ -139,7 +139,7 @@ def _read(path: Path) -> list[Trial]:
 
 
 def _finish(
-    options: TortureOptions, title: str, done: Sequence[Outcome], failed: list[Outcome]
+    options: TortureOptions, title: str, done: Sequence[TrialOutcome], failed: list[TrialOutcome]
 ) -> None:
     """Write and print the counters and the failures."""
     counts: Counter[str] = Counter()

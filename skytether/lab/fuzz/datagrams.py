@@ -24,7 +24,8 @@ from skytether.shared.core.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire import protocol
-from skytether.shared.wire.protocol import ProtocolError, decode, encode, kind_of
+from skytether.shared.wire.drop import ProtocolError
+from skytether.shared.wire.protocol import decode, encode, kind_of
 from skytether.sim.flight import make_keys
 
 SCENARIOS = (
