@@ -79,7 +79,9 @@ class Known:
         """All that may be flown, the one to be sent at this step included."""
         flown = [self.in_force.motion] if self.in_force else []
         flown += [each.motion for each in self.sent]
-        return [*flown, self.next] if self.next else flown
+        if self.next and not (self.in_force and self.next is self.in_force.motion):
+            flown.append(self.next)
+        return flown
 
     def learn(self, prompt: bool) -> None:
         """Send motions more often where one, or its acknowledgement, was lost; less often later.

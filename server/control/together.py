@@ -27,6 +27,7 @@ zones, `aims` what a vehicle flies towards, and `aside` who steps aside for whom
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
+from statistics import median
 
 import numpy as np
 
@@ -130,7 +131,9 @@ class Together:
         self._now, self._ahead = 0, dict[int, int]()
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
         self._flown = FlownMotions(terms.axes)
-        """All motions that may be flown at this tick."""
+        """All motions that may be flown at this tick; none until one vehicle is planned for."""
+        self._foreign: int | None = None
+        """Row of a vehicle that may still fly a motion of another server; None of none."""
 
     def forget(self, row: int) -> None:
         """See `Scheme`; motions stay, for the vehicle goes on with them."""
@@ -208,10 +211,10 @@ class Together:
         for name in ("state_gap", "expected_gap", "cost_gap", "deviation_m"):
             figures[name] = 0.0
         for i, (row, k) in enumerate(steps.items()):
-            known = self._rows.setdefault(row, Known())
+            known = self._rows.get(row) or self._rows.setdefault(row, Known())
+            known.again = known.owed(k) if known.sent else None
             turn = (k - self._number_of(row)) % SPACING == 0
-            known.again = known.owed(k)
-            if known.in_force is not None and known.heard and turn:
+            if turn and known.in_force is not None and known.heard:
                 self._decide(row, known, k)
             if known.next or known.again:
                 figures["expected_gap"][i] = 1e9
@@ -267,14 +270,30 @@ class Together:
     # -- what is decided ---------------------------------------------------------------------------
 
     def _meet(self, steps: dict[int, int]) -> None:
-        """Bring the steps of all vehicles onto one grid, and all motions that may be flown."""
+        """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
         known = [k - self._ahead[row] for row, k in steps.items() if row in self._ahead]
-        self._now = int(np.median(known)) if known else self._now + 1
+        self._now = int(median(known)) if known else self._now + 1
         self._ahead |= {row: k - self._now for row, k in steps.items()}
         self._flown.clear()
+        self._foreign = None
         for row, each in self._rows.items():
             if row in steps:
                 each.next = None
+            if (
+                self._foreign is None
+                and each.heard
+                and self.observed_step[row] <= each.unknown_until
+            ):
+                self._foreign = row
+
+    def _gather(self) -> None:
+        """Bring all motions that may be flown side by side, once a tick.
+
+        In most ticks nobody needs them: vehicles have arrived, or wait for an acknowledgement.
+        """
+        if self._flown.count:
+            return
+        for row, each in self._rows.items():
             for motion in each.motions():
                 self._flown.add(motion, self._ahead.get(row, 0), row, each.off_m)
 
@@ -304,10 +323,9 @@ class Together:
         if self._absent:
             known.waits = f"vehicle {min(self._absent)} to begin"
             return False
-        for other, each in self._rows.items():
-            if each.heard and self.observed_step[other] <= each.unknown_until:
-                known.waits = f"vehicle {self._number_of(other)}, of another server's motion"
-                return False
+        if self._foreign is not None:
+            known.waits = f"vehicle {self._number_of(self._foreign)}, of another server's motion"
+            return False
         return True
 
     def _fly_on(self, row: int, known: Known, k: int) -> None:
@@ -322,6 +340,7 @@ class Together:
             if known.aside:
                 known.waits = f"vehicle {self._number_of(known.aside.asker)} to pass"
             return
+        self._gather()
         way = self._way(row, goal)
         if known.is_stuck(k, goal, float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())):
             self._ask(row, way)

@@ -7,9 +7,17 @@ solvers get them one after the other, in turns. OSQP is set up once for each sha
 given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing. quadprog is
 given the Hessian's factor, DAQP and PIQP the dense problem; those that are installed take part.
 Ticks are of swaps in virtual time: all vehicles are heard and planned for by one thread.
+
+The last table has ticks of fleets of which a share is near others: pairs that change places again
+and again, 20 m from the next pair, beside vehicles that fly to and fro alone. The planning of each
+tick (everything, from the motions that may be flown to the one that is sent) is compared with OSQP
+on one QP for each vehicle planned for in that tick, the last of its rounds.
 """
 
+import itertools
+import math
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,6 +35,7 @@ from scipy import sparse
 
 from skytether.lab.benchmarks.harness import TextTable, progress
 from skytether.server.control.dual import DualSolver
+from skytether.server.control.together import Together
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -35,8 +44,19 @@ from skytether.sim import flight
 
 SWAPS = ((16, 4.0), (16, 40.0), (64, 16.0), (64, 160.0), (200, 50.0), (200, 500.0))
 """Numbers of vehicles, and the radius of their circle [m]: in each other's way, and far apart."""
-CACHED = 64
-"""Shapes of problems that OSQP is kept set up for."""
+ROWS = 64
+"""OSQP's problems are filled up to a multiple of this number of constraints with ones that always
+hold: it stays set up for a few sizes instead of one for every number."""
+FLEETS = (16, 64, 200)
+"""Numbers of vehicles in ticks by share."""
+SHARES = (0.0, 0.1, 0.5)
+"""Shares of vehicles near others."""
+LEG_M, APART_M = 3.0, 20.0
+"""How far a vehicle flies to and fro in these fleets, and how far the next is from it [m]."""
+LEG_S = 5.0
+"""Time from one goal to the next there [s]."""
+RIVALS = 60
+"""Number of ticks that OSQP solves the problems of."""
 
 
 @dataclass(frozen=True)
@@ -85,15 +105,18 @@ class MotionOsqp:
 
     def solve(self, problem: MotionProblem) -> Array:
         """The minimum, at its tolerance."""
-        least, most = problem.least, np.full(len(problem.least), np.inf)
+        given, (variables, count) = len(problem.least), problem.columns.shape
+        rows = -(-count // ROWS) * ROWS
+        least, most = np.full(rows, -1.0), np.full(rows, np.inf)
+        least[:given] = problem.least
         most[: problem.equal] = least[: problem.equal]
-        dense = sparse.csc_matrix(np.ones(problem.columns.T.shape))
-        dense.data = problem.columns.ravel()  # every entry, so that the pattern stays the same
-        solver = self._made.get(len(least))
+        columns = np.zeros((rows, variables))
+        columns[:count] = problem.columns.T
+        dense = sparse.csc_matrix(np.ones(columns.shape))
+        dense.data = columns.T.ravel()  # every entry, so that the pattern stays the same
+        solver = self._made.get(rows)
         if solver is None:
-            if len(self._made) == CACHED:
-                self._made.clear()
-            solver = self._made[len(least)] = osqp.OSQP()
+            solver = self._made[rows] = osqp.OSQP()
             solver.setup(
                 self._hessian,
                 -problem.linear,
@@ -229,11 +252,119 @@ def ticks(options: MotionsOptions) -> TextTable:
     return TextTable(headings, rows)
 
 
+def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> Scenario:
+    """Fleet of which a share flies in pairs that change places, in each other's way."""
+    near = 2 * round(share * vehicles / 2)
+    lines = ["vehicle,t,x,y"]
+    for vehicle in range(1, vehicles + 1):
+        # Both of a pair fly along the same line, in opposite directions.
+        place = (vehicle - 1) // 2 if vehicle <= near else vehicle
+        side = 1.0 if vehicle > near or vehicle % 2 else -1.0
+        for leg in range(math.ceil(duration / LEG_S) + 1):
+            x = side * LEG_M / 2 * (-1.0) ** leg
+            lines.append(f"{vehicle},{leg * LEG_S:g},{x:g},{APART_M * place:g}")
+    file = folder / f"fleet-{vehicles}-{near}.csv"
+    file.write_text("\n".join(lines))
+    made = reading.load("swap")
+    reference = msgspec.structs.replace(made.reference, shape="mission", file=str(file))
+    return msgspec.structs.replace(made, duration=duration, settle=1.0, reference=reference)
+
+
+@contextmanager
+def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) -> Iterator[None]:
+    """Take the time of planning at each tick [µs], or else keep the last QP of each vehicle in it.
+
+    Args:
+        plan_us: filled with the time of each tick, unless problems are kept.
+        problems: filled with those of each tick.
+    """
+    plan, toward = Together.plan, Together._toward
+    of_tick: list[MotionProblem] = []
+
+    def timed(self: Together, *given: Any) -> None:
+        began = time.perf_counter_ns()
+        plan(self, *given)
+        plan_us.append((time.perf_counter_ns() - began) / 1e3)
+
+    def collected(self: Together, *given: Any) -> None:
+        of_tick.clear()
+        plan(self, *given)
+        assert problems is not None
+        problems.append(list(of_tick))
+
+    def last_of(self: Together, *given: Any) -> Any:
+        rounds: list[MotionProblem] = []
+        with kept(rounds):
+            found = toward(self, *given)
+        of_tick.extend(rounds[-1:])
+        return found
+
+    own: Any = Together
+    if problems is None:
+        own.plan = timed
+    else:
+        own.plan, own._toward = collected, last_of
+    try:
+        yield
+    finally:
+        own.plan, own._toward = plan, toward
+
+
+def shares(options: MotionsOptions) -> TextTable:
+    """Planning of whole ticks beside OSQP for each vehicle in turn, by the share near others."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for vehicles, share in progress(list(itertools.product(FLEETS, SHARES)), "fleets"):
+            flown = shared_space(vehicles, share, options.duration, Path(folder))
+            spent: list[float] = []
+            problems: list[list[MotionProblem]] = []
+            with watched(spent, None):
+                flight.fly(flown, vehicles=vehicles)
+            with watched([], problems):  # the same flight once more, to the last bit
+                flight.fly(flown, vehicles=vehicles)
+            planned = [tick for tick, each in enumerate(problems) if each]
+            rows.append([str(vehicles), f"{share:.0%}", *_beside_osqp(spent, problems, planned)])
+    headings = [
+        "vehicles",
+        "near others",
+        "planned for in a tick",
+        "planning p50, p99 [ms]",
+        "OSQP p50, p99 [ms]",
+        "OSQP over it p50, p99",
+    ]
+    return TextTable(headings, rows)
+
+
+def _beside_osqp(
+    spent: list[float], problems: list[list[MotionProblem]], planned: list[int]
+) -> list[str]:
+    """Cells of a row: planning of the ticks in which vehicles are planned for, and OSQP's time."""
+    root = problems[planned[0]][0].solver._root
+    rival = MotionOsqp(np.linalg.inv(root.T @ root).astype(np.float64))
+    looked_at = planned[:: max(1, len(planned) // RIVALS)]
+    for each in problems[looked_at[0]]:
+        rival.solve(each)  # warms up
+    osqp_ms = []
+    for tick in looked_at:
+        began = time.perf_counter_ns()
+        for each in problems[tick]:
+            rival.solve(each)
+        osqp_ms.append((time.perf_counter_ns() - began) / 1e6)
+    ours_ms = [spent[tick] / 1e3 for tick in looked_at]
+    ours, theirs = np.quantile(ours_ms, (0.5, 0.99)), np.quantile(osqp_ms, (0.5, 0.99))
+    return [
+        f"{np.mean([len(problems[tick]) for tick in looked_at]):.1f}",
+        *(f"{each[0]:.2f}, {each[1]:.2f}" for each in (ours, theirs)),
+        f"{theirs[0] / ours[0]:.1f}, {theirs[1] / ours[1]:.1f}",
+    ]
+
+
 def main() -> int:
     """Measure, and print tables."""
     options = tyro.cli(MotionsOptions, description=__doc__)
-    found = [solvers(options), ticks(options)]
-    for each, title in zip(found, ("one QP", f"swaps of {options.duration:g} s"), strict=True):
+    titles = ("one QP", f"swaps of {options.duration:g} s", "planning of a tick by share near")
+    found = [solvers(options), ticks(options), shares(options)]
+    for each, title in zip(found, titles, strict=True):
         each.show(title)
     if options.markdown:
         options.markdown.write_text("\n".join(each.markdown() for each in found))
