@@ -256,8 +256,10 @@ class Compensator:
         Args:
             step: k, never smaller than before.
             state: position [m] and velocity [m/s] of each axis at the step.
-            disturbance: ŵ that the vehicle itself has found on each axis, of account only along a
+            disturbance: ŵ that the vehicle itself has found on each axis; counts only along a
                 spline [m/s].
+
+        Source: eq. (11).
         """
         stage = self._go_on(step)
         if self.guides:

@@ -137,7 +137,7 @@ class Navigation:
         return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: list[float]) -> Measurement:
-        """A measurement as it would be later, by eq. (1); an earlier time changes nothing.
+        """A measurement carried to a later time by the model; an earlier time changes nothing.
 
         A real vehicle measures when it likes. For a time in which an input acted that is another
         than that of the last step, the difference is left to the filter.
@@ -146,6 +146,8 @@ class Navigation:
             measured: what was measured.
             to_ns: the time [ns; the client's clock].
             due: the input that has acted in the last step, of each axis [m/s].
+
+        Source: eq. (1).
         """
         age = min(to_ns - measured.stamp_ns, CARRIED_NS) / SECOND_NS
         if age <= 0.0:

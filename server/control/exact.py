@@ -129,12 +129,14 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
     fresh: bool,
     u: F1,
 ) -> int:
-    """Fill in the optimal inputs of one axis; rounds taken, or CYCLED or NOT_FINITE.
+    """Fill in the optimal inputs U(k) of one axis; rounds taken, or CYCLED or NOT_FINITE.
 
     Args:
         which: FIRST or LATER weights. work: of `workspace`; what it has of OWN sets is written to.
         g: gradient; shape (H,). previous, gap, fresh: see `server.control.mpc.shifted`; what that
         is at its bound is the first set. u: what is filled in [m/s]; shape (H,).
+
+    Source: eqs. (6), (8), (10).
     """
     model, bound, W, H = axis_at(mpc.model, axis), mpc.bounds[axis], mpc.weights.states, len(g)
     a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
@@ -238,7 +240,10 @@ def workspace(mpc: MPC) -> Workspace:
 
 
 class ExactSolver:
-    """See `server.control.solver.Solver`; the answer depends on the problem alone, to rounding."""
+    """See `server.control.solver.Solver`; the answer depends on the problem alone, to rounding.
+
+    Source: eq. (10).
+    """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem

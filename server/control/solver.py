@@ -50,7 +50,10 @@ class Solver(Protocol):
 
 
 class OsqpSolver:
-    """OSQP, set up once per axis; only vectors change afterwards."""
+    """OSQP, set up once per axis; only vectors change afterwards.
+
+    Source: eq. (10).
+    """
 
     def __init__(self, problem: Problem) -> None:
         self._hessian = problem.hessian

@@ -28,7 +28,7 @@ class DeadTime(NamedTuple):
     steps: int
     """Number of whole steps n."""
     rest: Axis | None
-    """Eq. (4) over the rest r; None where there is no rest."""
+    """Model over the rest r, eq. (4) with r for Δt; None where there is no rest."""
     late: tuple[float, float]
     """L, for position [s] and velocity; 0 without a rest."""
 

@@ -26,7 +26,7 @@ Flags = NDArray[np.bool_]
 
 
 class Axis(NamedTuple):
-    """Eq. (4) on one axis."""
+    """Numbers of the discretised model, eq. (4), on one axis."""
 
     a01: float
     """Change of position in a step for each m/s of velocity [s]."""
@@ -39,7 +39,7 @@ class Axis(NamedTuple):
 
 
 class Model(NamedTuple):
-    """Eq. (4) on every axis; each field has the shape (axes,)."""
+    """Numbers of the discretised model, eq. (4), on every axis; each of shape (axes,)."""
 
     a01: Array
     """Change of position in a step for each m/s of velocity [s]."""
@@ -77,22 +77,30 @@ class Model(NamedTuple):
 
     @property
     def A(self) -> Array:  # noqa: N802 - the paper's letter
-        """A of eq. (4); shape (axes, 2, 2)."""
+        """A of the discretised model; shape (axes, 2, 2).
+
+        Source: eq. (4).
+        """
         one, zero = np.ones_like(self.a01), np.zeros_like(self.a01)
         return np.stack([np.stack([one, self.a01], -1), np.stack([zero, self.a11], -1)], -2)
 
     @property
     def B(self) -> Array:  # noqa: N802 - the paper's letter
-        """B of eq. (4); shape (axes, 2)."""
+        """B of the discretised model; shape (axes, 2).
+
+        Source: eq. (4).
+        """
         return np.stack([self.b0, self.b1], -1)
 
 
 def advance(axis: Any, p: Any, v: Any, u: Any) -> tuple[Any, Any]:
-    """Position and velocity a step later, x(k+1) = A x(k) + B u(k), eq. (4).
+    """Position and velocity a step later, x(k+1) = A x(k) + B u(k).
 
     Args:
         axis: an `Axis` and numbers, or a `Model` and arrays whose last axis is the spatial one.
         p, v, u: position [m], velocity and input [m/s].
+
+    Source: eq. (4).
     """
     return p + axis.a01 * v + axis.b0 * u, axis.a11 * v + axis.b1 * u
 
@@ -100,12 +108,14 @@ def advance(axis: Any, p: Any, v: Any, u: Any) -> tuple[Any, Any]:
 def discretise(
     tau_s: Array | Sequence[float], dt_s: float, gain: Array | Sequence[float] | float = 1.0
 ) -> Model:
-    """Exact zero-order hold of eq. (1)-(3): the matrix exponential in closed form.
+    """Exact zero-order hold of the continuous model: the matrix exponential in closed form.
 
     Args:
         tau_s: time constant of each axis [s]; shape (axes,).
         dt_s: length of a step [s].
         gain: g, steady velocity over desired velocity, of each axis or of all.
+
+    Source: eqs. (1), (2), (3).
     """
     tau, g = np.asarray(tau_s, dtype=np.float64), np.asarray(gain, dtype=np.float64)
     # 1 - exp(-dt/tau), without cancellation where tau is long.

@@ -30,7 +30,7 @@ class Held(NamedTuple):
     """A horizon as one axis flies it."""
 
     model: Axis
-    """Eq. (4)."""
+    """Model of the axis, eq. (4)."""
     inputs: Sequence[float] | Array
     """Inputs of the horizon, from k_h on [m/s]."""
     length: int
@@ -75,14 +75,20 @@ def late_max(horizon: int) -> int:
 
 
 def entry(stage: int, length: int) -> int:
-    """Index of the input that counts at a stage of a horizon with so many inputs."""
+    """Index of the input that counts at a stage of a horizon with so many inputs.
+
+    Source: eq. (11).
+    """
     if stage < 0:  # Python, which flies aboard, takes half the time for this of min and max
         return 0
     return stage if stage < length else length - 1
 
 
 def bounded(u: float, bound: float) -> float:
-    """An input within the bound of eq. (6) [m/s]."""
+    """An input within the bound u_max [m/s].
+
+    Source: eq. (6).
+    """
     if u < -bound:
         return -bound
     return min(u, bound)
@@ -185,6 +191,8 @@ def step(
     Returns:
         the input that is flown, u*(k) [m/s]; what of it is told, without feedback [m/s]; and x̄ at
         the next stage, position [m] and velocity [m/s], where there is feedback.
+
+    Source: eq. (11).
     """
     (told, share), back = tell(held, stage), 0.0
     if held.feeds_back:

@@ -38,7 +38,7 @@ class Guide(NamedTuple):
     """A spline as one axis flies along it."""
 
     model: Axis
-    """Eq. (4)."""
+    """Model of the axis, eq. (4)."""
     knots: Knots
     """Knots of the axis."""
     spacing: int

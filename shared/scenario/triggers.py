@@ -275,6 +275,8 @@ class StateGap(Trigger):
 
     V(k) = ‖x̂(k) - x_p(k|k-1)‖²_P, S(k) = V(k_i) exp(-λ Δt (k - k_i)) + ε. k_i is the last event; λ
     is per second (E5).
+
+    Source: eq. (16).
     """
 
     def __init__(
