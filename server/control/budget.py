@@ -86,6 +86,7 @@ class Budget:
             self._control.update(rows, self._spent, now_ns)
         rate = self.bytes_per_s
         tokens, most = self._tokens - self._spent + rate * passed_s, rate * BURST_S
+        # Debts are bounded as well, so that what is owed cannot keep plans waiting for long.
         self._tokens, self._spent = min(max(tokens, -most), most), 0
         self._tick += 1
 
@@ -107,8 +108,11 @@ class Budget:
         self._waited_s[rows] = np.where(since_s >= WAIT_S, since_s, 0.0)
         left = self._tokens - self._spent - self._bytes[rows[event & owed]].sum()
         waiting = (self._asked >= self._tick - 1).nonzero()[0]
+        # np.lexsort sorts by its last key first: longest wait, then largest gain.
         order = np.lexsort((-self._gain[waiting], -self._waited_s[waiting]))
         ranked = waiting[order]
+        # The first that does not fit holds up all behind it: smaller packets must not pass it for
+        # ever.
         goes = ranked[np.cumsum(self._bytes[ranked]) <= left]
         chosen = owed & event | np.isin(rows, goes) & asks
         late = int(asks.sum() - (chosen & asks).sum())

@@ -36,6 +36,7 @@ STEP_NS = 40 * MILLISECOND_NS
 ECHOES = 4
 """Newest echoes of a vehicle, which tell how long packets take to it just now."""
 
+# Two of them added stay within an int64, so that sums of minima need no check.
 UNSEEN = 2**61
 """In place of a minimum where nothing was seen."""
 
@@ -111,6 +112,7 @@ class ClockMap:
 
     def offset_ns(self, rows: Indices) -> Indices:
         """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
+        # Brings `adopted` up to date; the steps themselves are not needed.
         self.steps(rows, 0)
         offsets: Indices = self.seen.vehicles["adopted"][rows]
         return offsets
@@ -148,10 +150,12 @@ def shortest_ns(seen: Seen, row: int) -> int:
 def _observe(seen: Seen, row: int, forward: int, backward: int, heard: int, bucket: int) -> None:
     """Take F and G [ns] of a vehicle into the half second `bucket`."""
     vehicle = seen.vehicles[row]
+    # The same echo told once more is no new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard
         seen.echoes[row, vehicle.echoes % ECHOES] = backward
         vehicle.echoes += 1
+    # At most once round the ring, however long the vehicle was silent.
     for passed in range(max(vehicle.newest + 1, bucket - BUCKETS + 1), bucket + 1):
         slot = passed % BUCKETS
         seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
@@ -186,10 +190,13 @@ def _drop_stepped(seen: Seen, row: int) -> None:
             recent, recently = recent + count, age + 1
         elif age >= OLD:
             old += count
+    # Of a few samples, one that was delayed would look like a step.
     if min(recent, old) < STEP_SAMPLES:
         return
     forward = _change(seen.minimum[row, 0], newest, recently)
     backward = _change(seen.minimum[row, 1], newest, recently)
+    # A clock that steps moves one of the two up and the other down by as much; a network that
+    # changes moves both the same way, or one alone.
     large = min(abs(forward), abs(backward)) > STEP_NS
     if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
         for age in range(recently, BUCKETS):

@@ -228,6 +228,7 @@ class Replay:
             follow=float(np.exp(-terms.dt_s / FOLLOW_S)),
             feeds_back=terms.feedback,
         )
+        # One horizon a step at most, and none is flown for longer than `age_max`.
         room = terms.age_max + H
         self._memory = ReplayMemory(
             observed=np.zeros(capacity, dtype=np.int64),
@@ -237,6 +238,7 @@ class Replay:
             inputs=np.zeros((capacity, room, axes, most + H), dtype=np.float32),
             led=np.zeros((capacity, room, axes), dtype=LEAD),
         )
+        # From the oldest observation that counts to the end of a plan that is made from it.
         longest = terms.age_max + most + H + 1
         self._course = HorizonsInForce(
             np.empty(room + 2, dtype=np.int64), np.empty(room + 2, dtype=np.int64)
@@ -351,6 +353,7 @@ def _number(memory: ReplayMemory, row: int, made_for: int) -> int:
         return HOVERS
     room = memory.sent.shape[1]
     count = memory.seen[row].sent
+    # From the newest down: the horizon in force is mostly one of the last few.
     for number in range(count - 1, max(count - room, 0) - 1, -1):
         step = memory.sent[row, number % room].step
         if step <= made_for:
@@ -401,6 +404,7 @@ def _chart(
     course.begins[0], course.numbers[0] = begin, flown
     for number in following:
         due = memory.sent[row, number % room].due
+        # It is in force before the course begins, and the newest of these counts.
         if due <= begin:
             course.numbers[0] = number
             continue
@@ -527,7 +531,10 @@ def _observe_disturbance(
     if end == begin:
         return
     before, after = _number(memory, row, seen.base_in_force), _number(memory, row, seen.in_force)
+    # A vehicle that takes no horizon brakes by its failsafe: what it does then says nothing of
+    # wind.
     by_rule = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
+    # Further back than `age_max` the horizons of that time may be gone from the ring.
     follows = by_rule and begin >= 0 and end - begin <= settings.age_max
     m, legs, speed = end - begin, 0, _speed(memory.state[row].base_u)
     if follows:
@@ -546,6 +553,8 @@ def _observe_disturbance(
         if follows:
             x = (state.base_p, state.base_v, state.base_u, speed)
             _roll(settings, memory, row, axis, course, legs, end, x, track)
+            # A jump of the velocity may be noise: the observer follows it with FOLLOW_S, and
+            # carries the rest on as `lag`.
             off, left = state.v - track.states[m, 1], settings.follow**m
             memory.state[row, axis].w = learned(
                 state.w,
@@ -576,6 +585,7 @@ def _listen(
     age = k - memory.observed[row]
     if bound.steps[row] > age and age + bound.steps[row] > settings.age_max:
         bound.steps[row], bound.seen[row] = 0, 0
+    # No sample yet: half a round trip, rounded up, and a margin.
     if bound.steps[row] == 0:
         begin(bound, row, -(-half_trip_ns(clock, row) // settings.dt_ns) + MARGIN)
     at_least(bound, row, -(-shortest_ns(clock, row) // settings.dt_ns))
@@ -583,6 +593,7 @@ def _listen(
         return
     memory.seen[row].loss -= LEARNED * seen.loss
     oldest = max(seen.sent - room, 0)
+    # One that is older than all in the ring was sent too long ago to be a sample.
     if memory.sent[row, oldest % room].step <= seen.in_force:
         acknowledge(bound, row, seen.since - seen.in_force)
     memory.seen[row].acknowledged = seen.in_force
@@ -662,11 +673,14 @@ def _foresee(
         # Those that were due and are not in force have been overtaken, or are lost.
         first = _first_under_way(memory, row, seen.in_force, observed)
         for number in range(_first_after(memory, row, seen.in_force), first):
+            # It stays in the ring after it is lost, and is counted once.
             newly = memory.sent[row, number % room].due > seen.judged
             lost += newly
             if newly:
                 memory.seen[row].loss += LEARNED * (1.0 - memory.seen[row].loss)
         memory.seen[row].judged = observed
+        # Unless the vehicle takes horizons: none that is under way comes into force, and it stands
+        # still.
         flying, under_way = HOVERS, range(0)
         if seen.takes == 1:
             flying, under_way = _number(memory, row, seen.in_force), range(first, seen.sent)
@@ -714,6 +728,8 @@ def _remember(
         for axis in range(len(settings.laws)):
             for stage in range(length):
                 memory.inputs[row, slot, axis, stage] = found.horizons[i, axis, stage]
+            # Just as `Compensator._hold` does it aboard: both ends have to brake from the same
+            # speed.
             last = bounded(float(found.horizons[i, axis, length - 1]), settings.laws[axis].bound)
             squares += last * last
             led = memory.led[row, slot, axis]

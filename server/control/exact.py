@@ -148,9 +148,12 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
         side[i] = 1.0 if v >= NEAR * bound else -1.0 if v <= -NEAR * bound else 0.0
         if side[i] != 0.0:
             last = i
+        # A sum that is finite has finite terms: one check in place of H.
         total += g[i]
     for count in range(1, ROUNDS_MAX + PIVOTS_MAX + 1):
         singly = count > ROUNDS_MAX
+        # Stages behind the last change are as before: of the last round, or of the table of FREE
+        # sets.
         if last >= 0:
             after = (W[H - 1, 0], 0.0, W[H - 1, 1])
             if last < H - 1:
@@ -181,6 +184,7 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
             row = OWN if i <= changed else FREE
             v = own[i] - (stages[row, i, K0] * x0 + stages[row, i, K1] * x1)
             if side[i] == 0.0 and -bound <= v <= bound:
+                # Closed loop, x ← F x + B own: the chain from stage to stage does not wait for v.
                 u[i] = v
                 x0, x1 = (
                     stages[row, i, F00] * x0 + stages[row, i, F01] * x1 + b0 * own[i],
@@ -273,6 +277,7 @@ class ExactSolver:
         problem = self._problem
         hessian = problem.hessian[axis]
         bound = np.full(len(gradient), problem.mpc.bounds[axis])
+        # Without rows here, DAQP takes the bounds as simple bounds, which cost it least.
         nothing = np.zeros((0, len(gradient)))
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12

@@ -369,6 +369,7 @@ def active_sets(mpc: MPC, axis: int, to: Lanes, stages: F2, settled: B1) -> None
             held[lane] += abs(at)
             total[lane] += g[i, lane]
     for _ in range(ROUNDS_MAX):
+        # Where no lane has an input at its bound, one table of FREE stages serves all of them.
         if _any(held):
             _round(mpc, axis, to)
         else:

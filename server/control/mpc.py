@@ -65,9 +65,12 @@ def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
     Source: eqs. (5), (6), (9).
     """
     H = terms.horizon
+    # Stages 1 … H: no input changes the state at stage 0, so its Q of eq. (5) is left out.
     states = np.tile(np.array(control.state_weight), (H, 1))
     states[-1] = control.terminal_weight
     changes = np.zeros((2, H))
+    # The last input has no counterpart in the horizon before: the sum of S in eq. (9) ends at H -
+    # 2.
     changes[LATER, :-1] = control.change_weight
     weights = Weights(
         states=states,
@@ -104,8 +107,10 @@ def pose(model: Model, mpc: MPC, which: int) -> Problem:
     response = model.B
     for stage in range(H):
         for later in range(stage, H):
+            # Γ is a Toeplitz matrix: the response depends on the distance of the two stages alone.
             forced[:, later, :, later - stage] = response
         response = model.step(response, 0.0)
+    # In full, for it is made twice a flight; what every step needs is done in O(H) below.
     hessian = np.einsum("aipk,ip,aipl->akl", forced, mpc.weights.states, forced)
     return Problem(model, mpc, which, hessian + np.diag(mpc.weights.inputs[which]))
 

@@ -104,6 +104,7 @@ class Estimator:
             base_velocity=np.zeros((capacity, n)),
             base_flown=np.zeros((capacity, n)),
             disturbance=np.zeros((capacity, n)),
+            # No older observation is planned from, so no older input is ever asked for.
             inputs=np.zeros((capacity, n, terms.age_max)),
             last=np.full(capacity, -1, dtype=np.int64),
         )
@@ -161,10 +162,13 @@ def _observe_disturbance(
             memory.base_velocity[row, i],
             memory.base_flown[row, i],
         )
+        # One step at least, where Δt itself is longer than APART_NS.
         if begin >= 0 and 0 < m <= max(1, near):
             w, change = memory.disturbance[row, i], (memory.flown[row, i] - u) / m
             p, v = 0.0, velocity
             for step in range(m):
+                # Inputs between two observations are not told: a straight line between both is
+                # taken for them.
                 p, v = advance(axis, p, v, u + step * change + w)
             off, trip_ns = memory.state[row, i, 1] - v, (k - end) * settings.dt_ns
             memory.disturbance[row, i] = learned(
@@ -193,6 +197,7 @@ def _fly_on(
             p, v = memory.state[row, j, 0], memory.state[row, j, 1]
             if settings.compensate:
                 for step in range(memory.observed[row], k):
+                    # Steps behind `last`, at which nothing was computed, go on with its input.
                     u = memory.inputs[row, j, min(step, memory.last[row]) % reach]
                     p, v = advance(axis, p, v, u + w)
             found.estimate[i, j, 0], found.estimate[i, j, 1] = p, v

@@ -76,6 +76,7 @@ class OsqpSolver:
         return inputs, solved
 
     def _solve_axis(self, axis: int, gradient: Array, guess: Array) -> Array:
+        # One NaN would stay in OSQP's warm start for all vehicles after this one.
         if not (np.isfinite(gradient).all() and np.isfinite(guess).all()):
             raise SolverFailed("problem not finite")
         problem, bound = self._axes[axis], self._u_max[axis]

@@ -187,6 +187,7 @@ class Guidance:
             seen=desired.seen,
             bounds=self._loop_gain * terms.u_max,
             weight=control.state_weight[0],
+            # TINY: weights that ask for no gain on position would divide by 0.
             lead_s=(1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY),
             error_m=control.spline_error_m,
         )
@@ -226,6 +227,7 @@ class Guidance:
         self.observed_step[row] = observation.step
         known["in_force"], known["since"] = observation.in_force, observation.since
         self._memory.state[row] = observation.state
+        # A vehicle that takes none has dropped what it held, and drops what is under way.
         if not observation.takes:
             known["first"], known["in_force"] = known["sent"], NO_HORIZON
         return True
@@ -276,6 +278,7 @@ def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
     Args:
         intended: states from k on [m, m/s]; shape (seen + 1, 2).
     """
+    # Behind what is seen the trajectory goes straight on, as the spline will.
     last = min(stage, settings.seen)
     v = intended[last, 1]
     return intended[last, 0] + (stage - last) * settings.dt_s * v, v
@@ -343,6 +346,8 @@ def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
     if since > 0:
         known, later = min(bound.seen[row], SAMPLES), 0
         for slot in range(known):
+            # Laplace's rule below, (later + 1) / (known + 1): without samples the share is 1, and
+            # never quite 0.
             later += bound.samples[row, slot] > since
         left *= (later + 1) / (known + 1)
     return left / (left + loss)

@@ -52,6 +52,8 @@ class Model(NamedTuple):
 
     def axes(self) -> list[Axis]:
         """The model of each axis in plain numbers."""
+        # Plain floats: numpy takes twice as long for sums of two or three numbers, and the
+        # vehicle's loops have no more.
         columns = [field.tolist() for field in self]
         return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
 
@@ -102,6 +104,8 @@ def advance(axis: Any, p: Any, v: Any, u: Any) -> tuple[Any, Any]:
 
     Source: eq. (4).
     """
+    # The order of these operations is part of the rule: the client and the compiled kernels must
+    # agree to the last bit.
     return p + axis.a01 * v + axis.b0 * u, axis.a11 * v + axis.b1 * u
 
 
@@ -136,6 +140,7 @@ def white_acceleration(tau_s: Array, dt_s: float) -> Array:
         shape (axes, 2, 2).
     """
     tau = np.asarray(tau_s, dtype=np.float64)
+    # expm1 keeps the digits that 1 - exp(-x) loses where a step is short beside τ.
     one = -tau * np.expm1(-dt_s / tau)  # ∫ e^{-s/τ}
     two = -0.5 * tau * np.expm1(-2.0 * dt_s / tau)  # ∫ e^{-2s/τ}
     positions = tau**2 * (dt_s - 2.0 * one + two)

@@ -43,6 +43,7 @@ from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 
+# Below 0x80, so that msgpack writes it in one byte: `kind_of` and the quick decoder rely on that.
 VERSION = 7
 PAYLOAD_BYTES_MAX = 1200
 """Limit below which no datagram is fragmented: two fragments turn 10 % loss into 19 %."""
@@ -336,12 +337,14 @@ class Close(NamedTuple):
     session: int
 
 
+# With a tenth of all packets lost, all three are lost once in a thousand times.
 CLOSES = 3
 """Number of times that CLOSE is said, for some of them may be lost."""
 
 
 def stamp_us(time_ns: int) -> int:
     """Stamp of a time, or of a difference of two clocks: whole microseconds modulo STAMPS."""
+    # Python's % is never negative, so a negative difference of two clocks has a stamp as well.
     return time_ns // MICROSECOND_NS % STAMPS
 
 
@@ -352,6 +355,7 @@ def stamped_ns(stamp: int, near_ns: int) -> int:
     """
     near = near_ns // MICROSECOND_NS
     half = STAMPS // 2
+    # Signed distance of the stamp from what is expected, from -half to half - 1.
     return (near + (stamp - near + half) % STAMPS - half) * MICROSECOND_NS
 
 
@@ -378,6 +382,7 @@ def _terms(value: object, ours: Terms) -> Terms:
     if type(value) is not tuple or len(value) != len(ours):
         raise ProtocolError(Drop.FIELD)
     for theirs, our in zip(value, ours, strict=True):
+        # Exact types: True would pass for 1, and 1 for 1.0.
         if type(theirs) is not type(our) or not _is_plain(theirs):
             raise ProtocolError(Drop.FIELD)
     return Terms._make(value)
@@ -402,6 +407,7 @@ def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
     told = _FLOATS[axes * (2 if ours.splines else 3)]
     if type(value) is not bytes or len(value) != told.size:
         raise ProtocolError(Drop.SHAPE)
+    # Struct takes 0.2 µs for six numbers, np.frombuffer and tolist 0.7 µs.
     numbers = told.unpack(value)
     # Numbers that were float32 have a finite sum, unless one of them is not finite.
     if not math.isfinite(sum(numbers)):
@@ -467,6 +473,7 @@ def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, in
     count, rest = divmod(len(value), axes * dtype.itemsize)
     if rest or not counts[0] <= count <= counts[1]:
         raise ProtocolError(Drop.SHAPE)
+    # A read-only view of the datagram's own bytes: nothing is copied.
     return np.ndarray((axes, count), dtype, value)
 
 
@@ -479,6 +486,8 @@ _U64 = range(2**64)
 _CLOCK = range(2**63)
 _STAMP = range(STAMPS)
 _NUMBER = range(NUMBERS)
+# Negative where the server's clock was set and its clock map lags: the step then lies before the
+# observation.
 _AGE = range(-(2**15), 2**32)
 _SPACING = range(1, 2**16)
 
@@ -520,9 +529,11 @@ _QUICK = msgspec.msgpack.Decoder(
 """Decoder of an observation that checks types and ranges at once. A packet that it refuses is read
 again field by field, which finds the reason."""
 _MOTION = _TYPES[_OBSERVATION - 1][1].index(_motion)
+# 0x90 + n is msgpack's header of an array of n < 16 elements.
 _QUICK_START = bytes([0x90 | (2 + len(_TYPES[_OBSERVATION - 1][1])), VERSION, _OBSERVATION])
 
 _NUMBERS = {message: number for number, (message, _) in enumerate(_TYPES, start=1)}
+# One packer for all messages: packb, which makes one for each, takes three times as long.
 _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
@@ -531,6 +542,8 @@ def _told(said: Observation) -> list[object]:
     made_for, since = said.in_force, said.since
     numbers = said.state.ravel().tolist() + said.input.tolist()
     return [
+        # Steps are told as differences and mode and `takes` in one number: a byte each as a rule,
+        # where the numbers themselves took up to five.
         VERSION,
         _NUMBERS[Observation],
         said.vehicle,
@@ -552,6 +565,7 @@ def _observation(told: list[Any]) -> Observation:
     vehicle, session, step, flown, delay, backward_us, heard, does, motion, number, silence = told
     since = step - flown
     in_force = NO_HORIZON if delay is None else since - delay
+    # Differences may lead below step 0 though each of them is within its range.
     if since < 0 or (delay is not None and in_force < 0):
         raise ProtocolError(Drop.FIELD)
     mode, takes = divmod(does, 2)
@@ -618,6 +632,7 @@ def decode(payload: bytes, terms: Terms) -> Message:
     Raises:
         ProtocolError: it is none of ours.
     """
+    # The first check of all: nothing is parsed of a packet that is too long.
     if len(payload) > PAYLOAD_BYTES_MAX:
         raise ProtocolError(Drop.TOO_LONG)
     if payload.startswith(_QUICK_START):
@@ -626,6 +641,7 @@ def decode(payload: bytes, terms: Terms) -> Message:
             told[_MOTION] = _motion(told[_MOTION], terms)
             return _observation(told)
     try:
+        # No message has a map or an extension, so that none is ever built of a stranger's bytes.
         fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
     except (ValueError, msgpack.UnpackException) as error:
         raise ProtocolError(Drop.NOT_MSGPACK) from error
