@@ -131,6 +131,7 @@ class Client(Endpoint):
             self._port.receive(datagram, now_ns=now_ns)
             self._attend(self._port, now_ns)
             return
+        # Before anything is opened: a stranger's packet costs one comparison.
         if datagram.peer != self._server:
             self.dropped[Drop.ELSEWHERE] += 1
             return
@@ -233,6 +234,7 @@ class Client(Endpoint):
             self._port.close(now_ns=now_ns)
             self._attend(self._port, now_ns)
         if self._session.number is not None:
+            # Nobody acknowledges a CLOSE, so it is said more than once.
             for _ in range(CLOSES):
                 self._session.send(Close(self.vehicle, self._session.number))
 

@@ -40,6 +40,7 @@ class Sensing(NamedTuple):
 def sensing(scenario: Scenario) -> Sensing:
     """Properties of a scenario's sensor."""
     sensor, dt_ns = scenario.sensor, scenario.dt_ns
+    # Rounded up: a measurement is taken at the first step at which it is there.
     delay = -(-seconds_to_ns(sensor.delay_s) // dt_ns)
     position_ns, velocity_ns = (
         0 if every_s == "never" else max(seconds_to_ns(every_s), dt_ns)
@@ -121,6 +122,7 @@ class Navigation:
             if self._inputs is not None:
                 self.predicted = self._inputs.predict(self.estimate, self.filter.disturbance())
             numbers = chain.from_iterable(self.predicted)
+            # Told as float32, a larger number would reach the server as infinity.
             self.is_known = all(-FLOAT_MAX <= number <= FLOAT_MAX for number in numbers)
 
     def note(self, estimate: list[tuple[float, float]]) -> None:
@@ -156,6 +158,7 @@ class Navigation:
         acting = zip(self._motions, due, self.filter.disturbance(), strict=True)
         position, velocity = list(measured.position or ()), []
         for i, ((tau, gain), u, w) in enumerate(acting):
+            # Eq. (1) in closed form: the input is constant over the time that is bridged.
             left, steady = math.exp(-age / tau), gain * u + w
             velocity.append(steady + (known[i] - steady) * left)
             if position:
@@ -194,6 +197,7 @@ class Leaps:
                 time, noise = (stamp_ns - before[0]) / SECOND_NS, self.noise_mps
                 for v, after_v in zip(before[1], velocity, strict=True):
                     found |= velocity_leaps(v, after_v, time, noise)
+            # Also after a leap: else whatever is measured after it would be one, too.
             self._velocity = stamp_ns, velocity
         if position is not None:
             if self._position is not None and before is not None:

@@ -140,6 +140,7 @@ class Link:
         """Take a packet that enters, addressed to where it is to come out."""
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
+        # Packets of one slot have a rank, for else they would all meet one fate.
         lane.rank = lane.rank + 1 if slot == lane.slot else 0
         lane.slot = slot
         fate = lane.fates.at(slot, lane.rank)
@@ -193,11 +194,13 @@ class Link:
     ) -> None:
         """Lose a packet, or hold it until it is due; it has passed a finite rate now, if any."""
         counts, due_ns, size = self.counts, now_ns + fate.delay_ns, len(datagram.payload)
+        # Behind the bottleneck: a packet that is lost on the way has used the rate all the same.
         if fate.lost:
             counts.lost += 1
             self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)
             return
         if self._is_ordered:
+            # In order: what would overtake waits for the packet before it.
             due_ns = lane.latest_ns = max(due_ns, lane.latest_ns)
         if fate.flipped is not None and size:
             counts.corrupted += 1
@@ -212,6 +215,8 @@ class Link:
             self._bytes += size
             self._entered += 1
             delay_ns = due_ns - entered_ns
+            # The order of entry decides between equal times, so that no datagrams are ever
+            # compared.
             heappush(heap, (due_ns, self._entered, datagram, lane, number, delay_ns, is_copy))
             counts.depth_max = max(counts.depth_max, len(heap))
             is_copy = True

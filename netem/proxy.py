@@ -87,6 +87,7 @@ class Proxy(Endpoint):
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Take a packet that enters the network."""
         payload, peer, socket = datagram
+        # Socket 0 is the one that clients send to.
         if socket == 0:
             flow = self._answered.get(peer) or self._unanswered.get(peer)
             flow = flow or self._open(peer, now_ns)
@@ -97,10 +98,12 @@ class Proxy(Endpoint):
             self.downlink.take(onward, flow.downlink, now_ns=now_ns)
         else:
             flow = self._by_socket.get(socket)
+            # A flow's socket is open to anybody, and only the server may answer through it.
             if flow is None or peer != self._server:
                 self.refused += 1
                 return
             self.uplink.take(Datagram(payload, flow.client), flow.uplink, now_ns=now_ns)
+            # Its place is earned by the server's answer, for a sender's address can be made up.
             if flow.order is self._unanswered:
                 flow.order = self._answered
                 self._answered[flow.client] = self._unanswered.pop(flow.client)
@@ -109,7 +112,10 @@ class Proxy(Endpoint):
                 self._faults.add(lane.fates.fault)
                 self._events.append(Fault(traceback=lane.fates.fault))
         flow.used_ns = now_ns
+        # Both dictionaries stay ordered by use: the oldest flow is found without a search, also in
+        # a flood of new clients.
         flow.order.move_to_end(flow.client)
+        # What is not delayed leaves now, and not a wake later.
         self._forward(now_ns)
 
     def wake(self, *, now_ns: int) -> None:
@@ -132,6 +138,7 @@ class Proxy(Endpoint):
     def _open(self, client: Address, now_ns: int) -> Flow | None:
         socket = len(self._by_socket) + 1
         if socket > self._flows_max:
+            # Sockets are never closed: a flow that gives way leaves its own to the next.
             oldest = self._oldest(now_ns)
             if oldest is None:
                 return None

@@ -155,6 +155,7 @@ class Endpoint(ABC):
         """Datagrams to be sent; each is handed out once."""
         if not self._out:
             return []
+        # Copied and cleared, not replaced: the parts of an endpoint hold this very list.
         out = self._out.copy()
         self._out.clear()
         return out
