@@ -1,4 +1,4 @@
-"""The last clamp before the plant: whatever was chosen, no more than this is flown.
+"""Last clamp before the plant: bounds any input, whichever part of the client chose it.
 
 It shares no code with what reads a packet or chooses an input, so that a mistake there ends here.
 """

@@ -39,7 +39,7 @@ PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Re
 
 
 class Client(Endpoint):
-    """One vehicle.
+    """Endpoint of one vehicle.
 
     Args:
         scenario: the server's, as far as it makes the terms of a flight.
@@ -239,7 +239,7 @@ class Client(Endpoint):
                 self._session.send(Close(self.vehicle, self._session.number))
 
     def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
-        """Do and say what goes with another mode or reason.
+        """Act on another mode or reason, and tell the operator.
 
         That it coasts for a while is not said: where an event sends a horizon, that is as usual.
         """

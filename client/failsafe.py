@@ -1,4 +1,4 @@
-"""The failsafe: what the vehicle does at all, decided aboard by a table and a few timers.
+"""Failsafe: the vehicle's mode, decided aboard by a table and a few timers.
 
     INIT → SYNC → READY → TRACK ⇄ COAST → BRAKE → HOVER → LAND            and FAULT, for good
 
@@ -218,7 +218,7 @@ class Failsafe:
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
-        """Note a message that is the server's own and yet is none of ours."""
+        """Note a malformed message that the server itself has sent."""
         if _full(self._malformed, now_ns):
             self.meet(Reason.MALFORMED, now_ns=now_ns)
 
@@ -272,7 +272,7 @@ class Failsafe:
             self.meet(Reason.LEAPT, now_ns=now_ns)
 
     def meet(self, cause: Reason, *, now_ns: int) -> None:
-        """Go where the table leads from here, if anywhere."""
+        """Change mode and reason for a cause, where the table says so."""
         after = self._table.get((self.mode, cause))
         if after is None:
             return

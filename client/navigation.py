@@ -218,7 +218,7 @@ class Leaps:
 
 
 class Newest:
-    """In place of a filter: each number as it was measured last."""
+    """Stand-in for a filter: each number as it was measured last."""
 
     def __init__(self, axes: int) -> None:
         self._nothing = [0.0] * axes
@@ -230,10 +230,10 @@ class Newest:
         self.take(measured)
 
     def advance(self, due: list[float], swing: Sequence[float] = ()) -> None:
-        """Nothing changes by itself."""
+        """Go on by a step, in which no number changes by itself."""
 
     def disturbance(self) -> list[float]:
-        """Nothing is known of a disturbance."""
+        """Disturbance of each axis, of which nothing is known: 0 [m/s]."""
         return self._nothing
 
     def take(self, measured: Measurement) -> None:

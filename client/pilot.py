@@ -1,4 +1,4 @@
-"""The pilot: at every step it flies the input that was chosen, and writes down what it did.
+"""Pilot: flies the chosen input at every step, and records the step.
 
 The client's clock is the flight's clock: the epoch is the moment its session opened, step k begins
 at epoch + k Δt, and every stamp that control uses is read here. What the vehicle does at all,
@@ -274,7 +274,7 @@ class Pilot:
         return np.array(flown)
 
     def _rest(self) -> None:
-        """On a mission, hold the place where it hovers: others reckon with it."""
+        """Hold the place where a vehicle on a mission hovers: others keep away from there."""
         compensator, known = self.compensator, self._navigation
         hovers = self._terms.join and self._failsafe.mode in HOVERING and known.is_known
         if hovers and compensator.in_force == NO_HORIZON and not compensator.rests:

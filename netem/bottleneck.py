@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Waiting(Generic[T]):
-    """One packet in the queue."""
+    """Packet in the queue."""
 
     item: T
     size: int
@@ -110,7 +110,7 @@ class Bottleneck(Generic[T]):
         self.waiting = 0
         """Number of packets that wait, without the one that is served."""
         self.waiting_bytes = 0
-        """Their size on the wire [B]."""
+        """Size of these packets on the wire [B]."""
         self.dropped: list[T] = []
         """Dropped packets; the caller that counts them takes them out."""
         self._pace: _Rate | _Deliveries = (
@@ -118,7 +118,7 @@ class Bottleneck(Generic[T]):
         )
 
     def take(self, item: T, size: int, flow: int, *, now_ns: int) -> None:
-        """Take a packet that enters; all that was due before must have been given.
+        """Take a packet that enters; call `give` for the packets that passed before it first.
 
         Args:
             size: its bytes on the wire [B].

@@ -89,7 +89,7 @@ class Fates:
 
 
 def _possible(fate: Fate) -> Fate:
-    """A fate that can be met.
+    """Check a fate that a plug-in has changed.
 
     Raises:
         ValueError, TypeError: something in it cannot be.

@@ -24,15 +24,14 @@ from skytether.shared.scenario.schema import DirectionConfig, Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
-"""Most clients at once, unless another number is asked for; packets of others are dropped and
-counted."""
+"""Largest number of clients at once by default; packets of others are dropped and counted."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a packet after which a flow that was answered gives way to a new client [ns]."""
 
 
 @dataclass(slots=True)
 class Flow:
-    """One client address and what belongs to it."""
+    """State of one client address."""
 
     client: Address
     socket: int
@@ -76,7 +75,7 @@ class Proxy(Endpoint):
         self._answered: OrderedDict[Address, Flow] = OrderedDict()
         """Flows through which a packet of the server's has come, by client, oldest packet first."""
         self._unanswered: OrderedDict[Address, Flow] = OrderedDict()
-        """All other flows, likewise."""
+        """All other flows, by client, oldest packet first."""
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
         self._faults: set[str] = set()
@@ -180,7 +179,7 @@ class Proxy(Endpoint):
             flow.downlink.fates = self._fates("downlink", flow.downlink.flow)
 
     def _oldest(self, now_ns: int) -> Flow | None:
-        """Flow that gives way to a new client, if one does."""
+        """Flow that gives way to a new client; None where none does."""
         unanswered = next(iter(self._unanswered.values()), None)
         answered = next(iter(self._answered.values()), None)
         if answered is None or now_ns - answered.used_ns < IDLE_NS:

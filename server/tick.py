@@ -143,7 +143,7 @@ class Ticker:
         """Duration of each tick, while the stopwatch runs."""
 
     def tick(self, tick_ns: int, now_ns: int) -> None:
-        """One tick.
+        """Run a tick: plan, send, and record.
 
         Args:
             tick_ns: time that it was due at.
@@ -182,7 +182,7 @@ class Ticker:
         self.durations.add(self._stopwatch.spent_ns.total() - before_ns)
 
     def _tell_idle(self) -> None:
-        """Say where planning has stopped, and where it goes on."""
+        """Tell the operator for which vehicles planning has stopped, and for which it goes on."""
         idle = self._controller.idle
         for row in np.flatnonzero(idle != self._sessions.idle).tolist():
             self._sessions.idle[row] = idle[row]

@@ -1,4 +1,4 @@
-"""One budget of bytes for all vehicles of a server, spent where flying on is expected to cost most.
+"""Budget of bytes for all vehicles of a server, spent where flying on is expected to cost most.
 
 The trigger says of each vehicle whether it is worth a packet at all. Of those that are, the budget
 lets go as many as it has bytes for, in this order:
@@ -30,7 +30,7 @@ BURST_S = 0.1
 WAIT_S = 1.0
 """Time after its last packet from which a vehicle goes before others [s]."""
 NEVER = -2
-"""Tick before any other."""
+"""Tick of a vehicle that has not asked: before all ticks."""
 GUESS_BYTES = 100
 """Size of a packet on the line before one was sent [B]."""
 
@@ -58,7 +58,7 @@ class Budget:
         self._asked = np.full(capacity, NEVER)
         """Tick at which each vehicle asked last and was not sent anything; shape (capacity,)."""
         self._gain = np.zeros(capacity)
-        """What was at stake then, a byte; shape (capacity,)."""
+        """Figure that the trigger compared then, per byte of the packet; shape (capacity,)."""
         self._waited_s = np.zeros(capacity)
         """Time since its last packet where that is WAIT_S or more, else 0 [s]; shape
         (capacity,)."""

@@ -20,7 +20,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Indices
 
 BUCKET_NS = SECOND_NS // 2
-"""Minima are kept for each half second [ns]."""
+"""Length of the half seconds for which minima are kept [ns]."""
 BUCKETS = 40
 """Half seconds for which minima are kept: 20 s."""
 RECENT = 3
@@ -34,11 +34,11 @@ STEP_NS = 40 * MILLISECOND_NS
 """Smallest step of a clock: up in one direction, and down by about as much in the other [ns]."""
 
 ECHOES = 4
-"""Newest echoes of a vehicle, which tell how long packets take to it just now."""
+"""Number of newest echoes that are kept of a vehicle: how long packets to it take just now."""
 
 # Two of them added stay within an int64, so that sums of minima need no check.
 UNSEEN = 2**61
-"""In place of a minimum where nothing was seen."""
+"""Minimum of a half second in which nothing was seen."""
 
 
 class VehicleClock:
@@ -182,7 +182,7 @@ def _change(minimum: I1, newest: int, recently: int) -> int:
 
 @part
 def _drop_stepped(seen: Seen, row: int) -> None:
-    """Keep only what came since, where one of a vehicle's two clocks has stepped."""
+    """Forget the minima of before a step of the vehicle's clock or ours, where there was one."""
     recent, old, newest, recently = 0, 0, seen.vehicles[row]["newest"], RECENT
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]

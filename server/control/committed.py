@@ -84,8 +84,8 @@ LOSS, LEARNED = 0.1, 0.05
 """Share of lost horizons that is assumed at first, and by how much of itself each horizon that has
 come into force, or is lost, moves it."""
 HOVERS, UNKNOWN = -1, -2
-"""In place of the number of a horizon: none, so that it brakes and stands still; one that was sent
-in an earlier life of ours."""
+"""Number of a horizon where there is none (the vehicle brakes and stands still), and where it was
+sent in an earlier life of the server."""
 
 
 class Latest:
@@ -108,7 +108,7 @@ class Latest:
     takes: int
     """1 if horizons that come are flown at its newest observation, else 0."""
     base_takes: int
-    """1 if they were at the observation before, else 0."""
+    """1 if horizons that come were flown at the observation before, else 0."""
     loss: float
     """Share of horizons that were lost lately."""
 
@@ -125,7 +125,7 @@ class AxisState:
     base_p: float
     """Position in the observation before [m]."""
     base_v: float
-    """Velocity that the disturbance observer takes it for there [m/s]."""
+    """Velocity in it, as the disturbance observer follows it [m/s]."""
     base_u: float
     """Input flown at that step [m/s]."""
     w: float
@@ -181,7 +181,7 @@ class ReplaySettings(NamedTuple):
     decay: float
     """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
     follow: float
-    """Share of what is new of the velocity that the observer has not followed after a step."""
+    """Share of a velocity's jump that the observer has not followed after a step."""
     feeds_back: bool
     """Whether horizons bring feedback."""
 
@@ -198,7 +198,7 @@ class ReplayMemory(NamedTuple):
     sent: Annotated[NDArray[np.void], records(SENT_HORIZON, 2)]
     """Horizons that were sent, a ring; shape (capacity, room)."""
     inputs: S4
-    """Their inputs [m/s]; shape (capacity, room, axes, most + H), with the largest d."""
+    """Inputs of these horizons [m/s]; shape (capacity, room, axes, largest d + H)."""
     led: Annotated[NDArray[np.void], records(LEAD, 3)]
     """States that the horizons lead to; shape (capacity, room, axes)."""
 

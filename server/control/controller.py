@@ -1,4 +1,4 @@
-"""The algorithm of the server: what is computed at a step of n vehicles, and knows no datagram.
+"""Algorithm of the server: what is computed at a step of n vehicles, without any datagram.
 
     observations → x̂(k), x̂(k+d) (`replay` or `estimator`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`planner`) → event? (`trigger`) → what is sent, remembered.
@@ -35,7 +35,7 @@ from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
-"""As kernels take them."""
+"""Members of `Idle` as plain numbers, for kernels."""
 BLOCK = 128
 """Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""

@@ -33,9 +33,9 @@ PAGE = 128
 PAGES = 256
 """Places for pages: more than a block of vehicles can need at once."""
 EMPTY = -1
-"""In place of the key of the page that a place holds."""
+"""Key of a place that holds no page."""
 FOUND = -1
-"""In place of the vehicle whose page is missing."""
+"""Result of a search in which no vehicle's page is missing."""
 TRAJECTORY = 2**40
 """Number of pages that a trajectory may have, by which those of the next are told from them."""
 SPREAD = 31

@@ -28,13 +28,13 @@ from skytether.shared.law.model import Array, Axis, Flags
 ROUNDS_MAX = 8
 """Rounds in which the whole set may change; five have been the most on recorded flights."""
 PIVOTS_MAX = 200
-"""Rounds after that, in which one input enters the set or leaves it."""
+"""Further rounds, in which one input enters the set or leaves it."""
 SNAP = 1e-12
 """Distance from its bound at which DAQP may leave an input that belongs on it [m/s]."""
 RESIDUAL_MAX = 1e-7
 """Largest residual of the optimality conditions, relative to the gradient, of an answer of DAQP."""
 CYCLED, NOT_FINITE = -1, -2
-"""In place of a number of rounds."""
+"""Number of rounds where the active set went in a circle, and where a number was not finite."""
 
 # One stage of a backward pass: what depends on the active set alone. The cost to go from the stage
 # is ½ c u² + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.

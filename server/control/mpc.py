@@ -84,12 +84,12 @@ def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """The QPs of one Hessian, all that a solver has to know of them before it is given one."""
+    """Solver set-up that all QPs with one Hessian share."""
 
     model: Model
     """Model, eq. (4)."""
     mpc: MPC
-    """What they come from."""
+    """Weights, bounds and model of the QPs."""
     which: int
     """FIRST or LATER weights."""
     hessian: Array
@@ -253,7 +253,7 @@ def slope(mpc: MPC, axis: int, which: int, u: F1, g: F1, drift: F2) -> None:
 
 @part
 def add_cost(mpc: MPC, axis: int, x: tuple[float, float], change: F1, cost: float) -> float:
-    """Add to `cost` twice what other states and inputs cost, as far as that is quadratic.
+    """Add to `cost` twice the quadratic part of the cost of a change of state and inputs.
 
     Args:
         x: by how much position [m] and velocity [m/s] are others at stage 0; with 0 what is added

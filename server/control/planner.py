@@ -56,7 +56,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
 GENERATOR, TRACKER, CONCLUDE = 0, 1, 2
-"""First index of what both MPCs have; the last is the move behind both."""
+"""Moves of a plan; GENERATOR and TRACKER are also the first index of what both MPCs have."""
 
 
 class PlanFigures:

@@ -148,7 +148,8 @@ class Memory(NamedTuple):
     sent: Annotated[NDArray[np.void], records(SENT, 2)]
     """Trajectories that were sent, a ring; shape (capacity, ROOM)."""
     knots: F4
-    """Their knots as they are read aboard [m, m/s]; shape (capacity, ROOM, axes, 2 KNOTS_MAX)."""
+    """Knots of these trajectories as they are read aboard [m, m/s]; shape
+    (capacity, ROOM, axes, 2 KNOTS_MAX)."""
 
 
 class Guidance:

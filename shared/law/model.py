@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 """Rows of vehicles or step indices, one per vehicle; shape (n,)."""
 Flags = NDArray[np.bool_]
-"""One yes or no per vehicle; shape (n,)."""
+"""Flag of each vehicle; shape (n,)."""
 
 
 class Axis(NamedTuple):

@@ -58,7 +58,7 @@ class Known(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """Everything that a policy may look at, for n vehicles at one step k of each.
+    """Situation that a policy judges: n vehicles at one step k of each.
 
     Planning starts at step k+d, where a new horizon can be in force; its plan goes on to k+d+H.
     Nothing may be written into a situation, and it holds at this step alone.

@@ -63,7 +63,7 @@ LED_P = 0
 LED_V = 1
 """Column of `Horizon.feedback`: velocity x̄ there [m/s]."""
 LED = [LED_P, LED_V]
-"""Both columns of x̄."""
+"""Columns of `Horizon.feedback`: x̄, position and velocity."""
 DISTURBANCE = 2
 """Column of `Horizon.feedback`: disturbance ŵ that was reckoned with [m/s]."""
 GAIN_P = 3
@@ -87,7 +87,7 @@ class Refusal(IntEnum):
     """Why a server opens no session for a vehicle."""
 
     ACCEPTED = 0
-    """It opens one."""
+    """The server opens a session."""
     OTHER_TERMS = 1
     """The vehicle has other terms."""
     FULL = 2
@@ -122,9 +122,9 @@ class Drop(StrEnum):
     NOT_FOR_A_SERVER = "not for a server"
     NOT_FOR_A_CLIENT = "not for a client"
     OF_ANOTHER_VEHICLE = "of another vehicle"
-    """It names another vehicle than the one whose key it is sealed with."""
+    """The message names another vehicle than the one whose key it is sealed with."""
     FOR_ANOTHER_LIFE = "for another life"
-    """It answers a client that has ended."""
+    """The message answers a client that has ended."""
     UNKNOWN_SESSION = "unknown session"
     OTHER_TERMS = "other terms"
     FULL = "full"
@@ -150,7 +150,7 @@ class Drop(StrEnum):
     # It is a horizon that is not flown, see `client.compensator`.
     FROM_THE_FUTURE = "from the future"
     OBSERVATION = "observation"
-    """It was planned from an observation that there cannot be."""
+    """The horizon was planned from an observation that there cannot be."""
     TOO_OLD = "too old"
     TOO_LATE = "too late"
     NOT_TAKEN = "not taken"
@@ -165,7 +165,7 @@ class ProtocolError(Exception):
 
 
 class Hello(NamedTuple):
-    """A vehicle asks for a session."""
+    """Request of a vehicle for a session."""
 
     vehicle: int
     boot_id: int
@@ -173,7 +173,7 @@ class Hello(NamedTuple):
 
 
 class Welcome(NamedTuple):
-    """The server opens it, or says why it opens none."""
+    """Answer to HELLO: a session, or why there is none."""
 
     vehicle: int
     session: int
@@ -191,25 +191,25 @@ class Mode(IntEnum):
     """Mode of a vehicle, see `client.failsafe`."""
 
     INIT = 0
-    """It has no session yet."""
+    """Vehicle without a session."""
     SYNC = 1
-    """Its link is not good for long enough yet."""
+    """Vehicle whose link is not good for long enough yet."""
     READY = 2
-    """It waits for a horizon, and to be armed."""
+    """Vehicle that waits for a horizon, and to be armed."""
     TRACK = 3
-    """It flies a horizon."""
+    """Vehicle that flies a horizon."""
     COAST = 4
-    """It flies on along a horizon for want of a newer one."""
+    """Vehicle that flies on along a horizon for want of a newer one."""
     BRAKE = 5
-    """It takes the input that it flew last to zero."""
+    """Vehicle that takes the input that it flew last to zero."""
     HOVER = 6
-    """It stands still."""
+    """Vehicle that stands still."""
     LAND = 7
-    """It descends, and stays down."""
+    """Vehicle that descends, and stays down."""
     FAULT = 8
-    """Something is wrong aboard; it stands still, and flies nothing more."""
+    """Vehicle with a fault aboard: stands still, and flies nothing more."""
     MANUAL = 9
-    """Somebody else flies it, or nobody: it is told nothing."""
+    """Vehicle that a pilot or nobody flies: nothing is sent to its autopilot."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -293,7 +293,7 @@ class Idle(IntEnum):
     """Why the server makes no plan for a vehicle."""
 
     PLANS = 0
-    """It makes them, and has sent what is worth sending."""
+    """Plans are made, and the trigger has sent what was worth sending."""
     OBSERVATION = 1
     """The newest observation is older than `link.age_max_s`, or would be before a plan began."""
     DELAY = 2
@@ -314,7 +314,7 @@ IDLE_TEXTS = {
 
 
 class Heartbeat(NamedTuple):
-    """The server lives and has nothing else to say."""
+    """Sign of life of a server that has nothing else to say."""
 
     vehicle: int
     session: int
@@ -331,7 +331,7 @@ class Heartbeat(NamedTuple):
 
 
 class Close(NamedTuple):
-    """The sender is about to end; said `CLOSES` times."""
+    """Announcement that the sender ends; sent `CLOSES` times."""
 
     vehicle: int
     session: int
