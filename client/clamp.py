@@ -1,4 +1,4 @@
-"""The last clamp before the plant: whatever was chosen, no more than this is flown.
+"""Last clamp before the plant: bounds any input, whichever part of the client chose it.
 
 It shares no code with what reads a packet or chooses an input, so that a mistake there ends here.
 """
@@ -29,6 +29,7 @@ def clamped(
         told: part of it that is no feedback, of each axis [m/s].
         speed_max: bound of the magnitude of this part over all axes, within `ROUNDING` [m/s].
     """
+    # Before any min and max: with a NaN their result depends on the order of their arguments.
     if not all(map(math.isfinite, (*wanted, *told))):
         return None
     speed = math.hypot(*told)
@@ -51,4 +52,6 @@ def limited(
         bound: u_max of the axis [m/s].
     """
     near = min(max(u - excess * part, before - change_max), before + change_max)
+    # The bound comes last and so always holds; `before` is within it, so that the largest change
+    # holds too.
     return min(max(near, -bound), bound)

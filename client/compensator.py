@@ -110,10 +110,12 @@ class Compensator:
         """
         if horizon.step > step + self._H:
             raise ProtocolError(Drop.FROM_THE_FUTURE)
+        # Newest generation wins, whatever comes last (E11).
         if horizon.step <= self.newest:
             self.stale += 1
             self.repeated += horizon.step == self.in_force
             return False
+        # Without compensation the one input lasts for as long as its observation is young enough.
         given = self._age_max + self._H
         if self._indexed and isinstance(horizon, Horizon):
             given = horizon.inputs.shape[1]
@@ -149,6 +151,8 @@ class Compensator:
         """
         self.in_force, self.observed = NO_HORIZON, -1
         self._new = self.covered = False
+        # A horizon of one input, which is over: the rule of flight brakes along it from the next
+        # step on.
         self.begins = step
         self._hold(flown_last[:, None].tolist(), 1)
 
@@ -164,6 +168,8 @@ class Compensator:
         """
         last = [each[length - 1 if self._indexed else 0] for each in inputs]
         within = [bounded(u, bound) for u, bound in zip(last, self._bounds, strict=True)]
+        # No math.hypot: it rounds otherwise in 17 % of cases, and the server's replay has a plain
+        # root.
         speed = math.sqrt(sum(u * u for u in within))
         told = feedback or [[0.0] * FEEDBACK] * len(inputs)
         self.held = [
@@ -255,8 +261,10 @@ class Compensator:
         Args:
             step: k, never smaller than before.
             state: position [m] and velocity [m/s] of each axis at the step.
-            disturbance: ŵ that the vehicle itself has found on each axis, of account only along a
+            disturbance: ŵ that the vehicle itself has found on each axis; counts only along a
                 spline [m/s].
+
+        Source: eq. (11).
         """
         stage = self._go_on(step)
         if self.guides:
@@ -295,6 +303,7 @@ class Compensator:
     ) -> list[float]:
         """Input along the spline at a stage, see `choose`."""
         flown = []
+        # Not strict: NO_WIND has as many axes as there can be.
         for axis, (guide, w) in enumerate(zip(self.guides, disturbance, strict=False)):
             lead = spline.guided_to(guide, self.lead_stage, stage, *self.lead[axis])
             self.lead[axis] = lead

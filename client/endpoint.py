@@ -40,7 +40,7 @@ PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Re
 
 
 class Client(Endpoint):
-    """One vehicle.
+    """Endpoint of one vehicle.
 
     Args:
         scenario: the server's, as far as it makes the terms of a flight.
@@ -132,6 +132,7 @@ class Client(Endpoint):
             self._port.receive(datagram, now_ns=now_ns)
             self._attend(self._port, now_ns)
             return
+        # Before anything is opened: a stranger's packet costs one comparison.
         if datagram.peer != self._server:
             self.dropped[Drop.ELSEWHERE] += 1
             return
@@ -234,11 +235,12 @@ class Client(Endpoint):
             self._port.close(now_ns=now_ns)
             self._attend(self._port, now_ns)
         if self._session.number is not None:
+            # Nobody acknowledges a CLOSE, so it is said more than once.
             for _ in range(CLOSES):
                 self._session.send(Close(self.vehicle, self._session.number))
 
     def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
-        """Do and say what goes with another mode or reason.
+        """Act on another mode or reason, and tell the operator.
 
         That it coasts for a while is not said: where an event sends a horizon, that is as usual.
         """

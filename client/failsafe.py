@@ -1,4 +1,4 @@
-"""The failsafe: what the vehicle does at all, decided aboard by a table and a few timers.
+"""Failsafe: the vehicle's mode, decided aboard by a table and a few timers.
 
     INIT → SYNC → READY → TRACK ⇄ COAST → BRAKE → HOVER → LAND            and FAULT, for good
 
@@ -59,6 +59,8 @@ _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not
 _TO_BRAKE = (
     BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
 )
+# Not in INIT, where nothing is flown yet, nor in LAND and FAULT, which last until somebody has seen
+# to the vehicle.
 _YIELDS = {
     (mode, cause): Mode.MANUAL
     for mode in Mode
@@ -89,6 +91,7 @@ TABLE: Table = MappingProxyType(
         for mode in (Mode.SYNC, Mode.READY, Mode.HOVER)
         for cause in GROUNDING
     }
+    # LOST is left out: in SYNC the vehicle waits for a link in any case.
     | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
     | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
     | {(Mode.TRACK, cause): Mode.BRAKE for cause in _TO_BRAKE}
@@ -190,6 +193,7 @@ class Failsafe:
 
     def heard(self, *, now_ns: int) -> None:
         """Note a packet of the session, authenticated where the link is."""
+        # After a gap of more than half of the time-out the link has to prove itself anew.
         if not self._is_good(now_ns):
             self._good_ns = now_ns
         self._heard_ns = now_ns
@@ -214,7 +218,7 @@ class Failsafe:
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
-        """Note a message that is the server's own and yet is none of ours."""
+        """Note a malformed message that the server itself has sent."""
         if _full(self._malformed, now_ns):
             self.meet(Reason.MALFORMED, now_ns=now_ns)
 
@@ -233,6 +237,7 @@ class Failsafe:
             hindrance: cause on the vehicle's side for which it must not follow a plan.
             now_ns: time now.
         """
+        # First of all: a pilot who takes over must not wait for anything that is found below.
         if hindrance is not None:
             self.meet(hindrance, now_ns=now_ns)
         elif self.mode is Mode.MANUAL:
@@ -247,6 +252,7 @@ class Failsafe:
         if good and (locked or armed_now or self.mode is Mode.SYNC):
             self.meet(Reason.GOOD, now_ns=now_ns)
         if not self.armed:
+            # Disarming is how an operator says that the leap was seen to.
             self._has_leapt = False
             self.meet(Reason.UNARMED, now_ns=now_ns)
         elif self._has_leapt and self.reason not in LOCKING:
@@ -260,16 +266,18 @@ class Failsafe:
 
     def leapt(self, *, now_ns: int) -> None:
         """Note that its state has leapt: no horizon is taken until it is disarmed and armed."""
+        # With HOLD there is no failsafe, and a leap stops nothing.
         self._has_leapt = self.brakes
         if self.reason not in LOCKING:
             self.meet(Reason.LEAPT, now_ns=now_ns)
 
     def meet(self, cause: Reason, *, now_ns: int) -> None:
-        """Go where the table leads from here, if anywhere."""
+        """Change mode and reason for a cause, where the table says so."""
         after = self._table.get((self.mode, cause))
         if after is None:
             return
         if cause in LOCKING or cause is Reason.OPENED:
+            # The second for which the link has to be good begins now, whatever it was before.
             self._good_ns = now_ns
         if cause in CLOSING:
             self._heard_ns = None
@@ -285,5 +293,6 @@ def _full(times_ns: deque[int], now_ns: int) -> bool:
     times_ns.append(now_ns)
     full = len(times_ns) == times_ns.maxlen and now_ns - times_ns[0] <= WINDOW_NS
     if full:
+        # Else each further mistake within the window would make the vehicle brake again.
         times_ns.clear()
     return full

@@ -62,6 +62,8 @@ class Fence:
                 position is home.
             u_max: bound of each axis [m/s].
         """
+        # The first state that is known, and not the scenario's start: a real vehicle begins where
+        # it stands.
         self._home = self._home or [p for p, _ in state]
         rest = [p + tau * v for (p, v), tau in zip(state, self._tau, strict=True)]
         flown = self._inside(wanted, rest, u_max)
@@ -84,6 +86,7 @@ class Fence:
             return wanted
         away = [s - home for s, home in zip(rest, self._home, strict=True)]
         distance = math.hypot(*away)
+        # Right at home there is no direction that leads away.
         if not distance:
             return wanted
         n = [each / distance for each in away]

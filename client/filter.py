@@ -34,6 +34,7 @@ DRIFT = 0.3
 """Strength of the random walk of w as a share of q [1]: w moves by DRIFT q √t in the time t."""
 BEGIN_MPS = 1.0, 0.5
 """Standard deviation of the velocity at the begin, where it was not measured, and of w [m/s]."""
+# With a variance of 0 the covariance would become singular.
 LEAST = 1e-6
 """Smallest standard deviation that a measurement is taken to have [m], [m/s]."""
 
@@ -73,6 +74,7 @@ def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
     pp, pv, pw, vv, vw, ww = P
     total = pp + variance
     kp, kv, kw = pp / total, pv / total, pw / total
+    # (1 - K) P as variance / total · P, for 1 - K loses its digits where the sensor is good.
     left = variance / total
     return (kp, kv, kw), Spread(
         left * pp, left * pv, left * pw, vv - kv * pv, vw - kv * pw, ww - kw * pw
@@ -101,6 +103,7 @@ class Kalman:
     def __init__(self, scenario: Scenario, delay: int) -> None:
         terms, sensor = scenario.terms(), scenario.sensor
         self._model = terms.model.axes()
+        # One covariance for axes of the same numbers: it does not depend on what is measured.
         alike = sorted(set(self._model))
         self.kinds = [alike.index(axis) for axis in self._model]
         """Which of the axes that differ each one is like."""
@@ -185,6 +188,7 @@ class Kalman:
     def estimate(self) -> list[tuple[float, float]]:
         """Position [m] and velocity [m/s] of each axis at the present step."""
         present = [(p, v) for p, v, _ in self.x]
+        # From the step of the newest measurement to the present, by what has acted since.
         for inputs, more in self._acted:
             present = [
                 advance(axis, p, v, u + w)

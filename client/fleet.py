@@ -61,6 +61,8 @@ class Fleet(Endpoint):
     def next_wake_ns(self) -> int | None:
         """Earliest time at which a client wants to be woken."""
         heap, due_ns = self._heap, self._due_ns
+        # Wakes that a client no longer wants stay in the heap until their time: to take one out of
+        # the middle would mean to search it.
         while heap and due_ns[heap[0][1]] != heap[0][0]:
             heappop(heap)
         return heap[0][0] if heap else None

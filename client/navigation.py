@@ -40,6 +40,7 @@ class Sensing(NamedTuple):
 def sensing(scenario: Scenario) -> Sensing:
     """Properties of a scenario's sensor."""
     sensor, dt_ns = scenario.sensor, scenario.dt_ns
+    # Rounded up: a measurement is taken at the first step at which it is there.
     delay = -(-seconds_to_ns(sensor.delay_s) // dt_ns)
     position_ns, velocity_ns = (
         0 if every_s == "never" else max(seconds_to_ns(every_s), dt_ns)
@@ -121,6 +122,7 @@ class Navigation:
             if self._inputs is not None:
                 self.predicted = self._inputs.predict(self.estimate, self.filter.disturbance())
             numbers = chain.from_iterable(self.predicted)
+            # Told as float32, a larger number would reach the server as infinity.
             self.is_known = all(-FLOAT_MAX <= number <= FLOAT_MAX for number in numbers)
 
     def note(self, estimate: list[tuple[float, float]]) -> None:
@@ -137,7 +139,7 @@ class Navigation:
         return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: list[float]) -> Measurement:
-        """A measurement as it would be later, by eq. (1); an earlier time changes nothing.
+        """A measurement carried to a later time by the model; an earlier time changes nothing.
 
         A real vehicle measures when it likes. For a time in which an input acted that is another
         than that of the last step, the difference is left to the filter.
@@ -146,6 +148,8 @@ class Navigation:
             measured: what was measured.
             to_ns: the time [ns; the client's clock].
             due: the input that has acted in the last step, of each axis [m/s].
+
+        Source: eq. (1).
         """
         age = min(to_ns - measured.stamp_ns, CARRIED_NS) / SECOND_NS
         if age <= 0.0:
@@ -154,6 +158,7 @@ class Navigation:
         acting = zip(self._motions, due, self.filter.disturbance(), strict=True)
         position, velocity = list(measured.position or ()), []
         for i, ((tau, gain), u, w) in enumerate(acting):
+            # Eq. (1) in closed form: the input is constant over the time that is bridged.
             left, steady = math.exp(-age / tau), gain * u + w
             velocity.append(steady + (known[i] - steady) * left)
             if position:
@@ -192,6 +197,7 @@ class Leaps:
                 time, noise = (stamp_ns - before[0]) / SECOND_NS, self.noise_mps
                 for v, after_v in zip(before[1], velocity, strict=True):
                     found |= velocity_leaps(v, after_v, time, noise)
+            # Also after a leap: else whatever is measured after it would be one, too.
             self._velocity = stamp_ns, velocity
         if position is not None:
             if self._position is not None and before is not None:
@@ -212,7 +218,7 @@ class Leaps:
 
 
 class Newest:
-    """In place of a filter: each number as it was measured last."""
+    """Stand-in for a filter: each number as it was measured last."""
 
     def __init__(self, axes: int) -> None:
         self._nothing = [0.0] * axes
@@ -224,10 +230,10 @@ class Newest:
         self.take(measured)
 
     def advance(self, due: list[float], swing: Sequence[float] = ()) -> None:
-        """Nothing changes by itself."""
+        """Go on by a step, in which no number changes by itself."""
 
     def disturbance(self) -> list[float]:
-        """Nothing is known of a disturbance."""
+        """Disturbance of each axis, of which nothing is known: 0 [m/s]."""
         return self._nothing
 
     def take(self, measured: Measurement) -> None:

@@ -1,4 +1,4 @@
-"""The pilot: at every step it flies the input that was chosen, and writes down what it did.
+"""Pilot: flies the chosen input at every step, and records the step.
 
 The client's clock is the flight's clock: the epoch is the moment its session opened, step k begins
 at epoch + k Δt, and every stamp that control uses is read here. What the vehicle does at all,
@@ -80,6 +80,8 @@ class Pilot:
         """Compensator, which chooses the input."""
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
         self._fence = Fence(scenario) if scenario.fence.is_there else None
+        # The paper's vehicle bounds no change: with `exhausted = "hold"` the clamp keeps the input
+        # finite and bounded, and no more.
         self._change_max = (
             math.inf
             if self._terms.exhausted == "hold"
@@ -146,12 +148,16 @@ class Pilot:
             ProtocolError: it is dropped.
         """
         terms = self._terms
+        # One that was overtaken is late anyway, and says nothing of the newest.
         if horizon.step > self.compensator.newest:
             passed = self.step - horizon.step
             if isinstance(horizon, Horizon):
+                # Its committed inputs were meant to pass before it comes.
                 passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
         observed = horizon.step - horizon.age
+        # Planned before the server knew that horizons are flown: it begins where the vehicle would
+        # be without any.
         if self._takes_from is None or 0 <= observed < self._takes_from:
             raise ProtocolError(Drop.NOT_TAKEN)
         try:
@@ -177,8 +183,12 @@ class Pilot:
         """Advance to the present step; one that was slept through was flown with the old input."""
         assert self._epoch_ns is not None
         assert self.next_ns is not None
+        # A client that sleeps past the end of its flight still flies the last step, and ends as
+        # usual.
         present = min((now_ns - self._epoch_ns) // self._dt_ns, self.steps - 1)
         self.missed += present - self.step
+        # Steps that were slept through are navigated one by one, for the filter predicts a step at
+        # a time.
         for step in range(self.flown, present):
             self._navigate(step + 1)
         late_ns = now_ns - self.next_ns
@@ -212,6 +222,7 @@ class Pilot:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         if self._navigation.leapt:
             failsafe.leapt(now_ns=now_ns)
+        # Asked first: `choose` goes on to this step.
         had_plan = compensator.covered
         self._rest()
         wanted = compensator.choose(self.step, known.predicted, known.disturbance)
@@ -251,6 +262,8 @@ class Pilot:
             flown = told = [0.0] * self._terms.axes
         elif self._fence is not None:
             flown = self._fenced(self._fence, flown)
+        # The braking curve is for what is told; feedback is bounded by u_max alone
+        # (docs/failsafe.md).
         if compensator.feeds_back:
             self._speed = min(math.hypot(*told), speed_max)
         else:
@@ -260,7 +273,7 @@ class Pilot:
         return np.array(flown)
 
     def _rest(self) -> None:
-        """On a mission, hold the place where it hovers: others reckon with it."""
+        """Hold the place where a vehicle on a mission hovers: others keep away from there."""
         compensator, known = self.compensator, self._navigation
         hovers = self._terms.join and self._failsafe.mode in HOVERING and known.is_known
         if hovers and compensator.in_force == NO_HORIZON and not compensator.rests:

@@ -73,8 +73,12 @@ class SecureLink:
     def hello(self, payload: bytes, *, now_ns: int) -> bytes:
         """Datagram that carries a HELLO; one of a new attempt where the message is another."""
         attempt = self._attempt
+        # Noise seals one message per ephemeral key: another HELLO under the same key would use a
+        # nonce twice.
         if attempt is None or attempt.hello != payload or now_ns - attempt.began_ns > ATTEMPT_NS:
             key, private = self._key, self._entropy(KEY_BYTES)
+            # Padded to the length of the longest answer, so that nobody can use the server to
+            # amplify.
             noise = Initiator(key.psk, prologue(key), private, pad(payload))
             self._attempt = attempt = _Attempt(noise, payload, now_ns)
             self._candidate = None
@@ -111,6 +115,7 @@ class SecureLink:
         assert self._candidate is not None
         if self._current is not None:
             self._current.retire(now_ns=now_ns)
+        # Packets that the server sealed before it heard of the new channel are still under way.
         self._previous, self._current = self._current, self._candidate
         self._attempt = self._candidate = None
 
@@ -140,6 +145,7 @@ class SecureLink:
     def _initiation(self, attempt: _Attempt, now_ns: int) -> bytes:
         """INITIATION of an attempt, with the newest cookie."""
         tried_ns = attempt.tried_ns
+        # Taken out and put in again: the dictionary is ordered by time.
         tried_ns.pop(self._cookie, None)
         tried_ns[self._cookie] = now_ns
         if len(tried_ns) > COOKIES_MAX:

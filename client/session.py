@@ -140,6 +140,7 @@ class ServerSession:
         payload = self.link.open(datagram, now_ns=now_ns)
         if payload is None:
             self._out += [Datagram(answer, self._server) for answer in self.link.outbox()]
+            # The answer to a CHALLENGE carries the HELLO, so none is due for a while.
             self.hello_ns = now_ns + AGAIN_NS
             return None
         match self._decode(payload, now_ns):
@@ -170,6 +171,7 @@ class ServerSession:
         try:
             return decode(payload, self._terms)
         except ProtocolError:
+            # In plaintext a stranger could make the vehicle brake by five packets.
             if self.link.secure:
                 self._failsafe.malformed(now_ns=now_ns)
             raise
@@ -178,6 +180,8 @@ class ServerSession:
         if (welcome.vehicle, welcome.boot_id) != (self._vehicle, self._boot_id):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         if welcome.terms != self._terms:
+            # Only before the first session: in flight the vehicle keeps its horizon, and its
+            # failsafe decides.
             if self.number is None and self.failure is None:
                 differing = differences(self._terms, welcome.terms)
                 self._fail(SessionRefused(vehicle=self._vehicle, differences=differing))
@@ -189,6 +193,7 @@ class ServerSession:
         self._refusal = None
         restarted = self._server_boot_id not in (None, welcome.server_boot_id)
         if restarted:
+            # Another life of the server has another clock: stamps of the two cannot be compared.
             self.echo = NEVER
         if self.number != welcome.session:
             self.said = 0

@@ -85,4 +85,4 @@ class Vehicle(ABC):
         return None
 
     def change(self, scenario: Scenario) -> None:  # noqa: B027 - most have nothing that changes
-        """Be as another scenario says from now on, where `changeable` keys differ in it."""
+        """Take over the `changeable` keys of another scenario from now on."""

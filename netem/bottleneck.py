@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Waiting(Generic[T]):
-    """One packet in the queue."""
+    """Packet in the queue."""
 
     item: T
     size: int
@@ -71,6 +71,8 @@ class Codel:
             self.drop_ns += round(INTERVAL_NS / sqrt(self.count))
             return True
         self.dropping = True
+        # Soon after the last drops it goes on at about the rate that was reached there, as RFC 8289
+        # says.
         recent = now_ns - self.drop_ns < 16 * INTERVAL_NS
         self.count = max(1, self.count - self.last_count) if recent else 1
         self.last_count = self.count
@@ -108,7 +110,7 @@ class Bottleneck(Generic[T]):
         self.waiting = 0
         """Number of packets that wait, without the one that is served."""
         self.waiting_bytes = 0
-        """Their size on the wire [B]."""
+        """Size of these packets on the wire [B]."""
         self.dropped: list[T] = []
         """Dropped packets; the caller that counts them takes them out."""
         self._pace: _Rate | _Deliveries = (
@@ -116,7 +118,7 @@ class Bottleneck(Generic[T]):
         )
 
     def take(self, item: T, size: int, flow: int, *, now_ns: int) -> None:
-        """Take a packet that enters; all that was due before must have been given.
+        """Take a packet that enters; call `give` for the packets that passed before it first.
 
         Args:
             size: its bytes on the wire [B].
@@ -133,6 +135,7 @@ class Bottleneck(Generic[T]):
         line.packets.append(packet)
         self._count(key, packet, 1)
         while self.waiting_bytes > self._queue.room_bytes:
+            # The flow that fills the room loses its newest packet, and no other flow pays for it.
             longest = max(self._lines, key=lambda each: self._lines[each].bytes)
             last = self._lines[longest].packets.pop()
             self._count(longest, last, -1)
@@ -168,6 +171,8 @@ class Bottleneck(Generic[T]):
         """The packet to serve next, without those that CoDel drops before it."""
         while self.waiting:
             key, line = next(iter(self._lines.items()))
+            # Deficit round robin: a line that has used up its credit goes to the end, with a new
+            # quantum.
             if self._is_fair and line.credit <= 0:
                 line.credit += QUANTUM_BYTES
                 self._lines.move_to_end(key)
@@ -183,7 +188,9 @@ class Bottleneck(Generic[T]):
     def _is_late(self, line: WaitingLine[T], packet: Waiting[T], now_ns: int) -> bool:
         """Whether CoDel drops a packet that was next in its line."""
         waited_ns = now_ns - packet.entered_ns
+        # At a low rate one packet alone takes longer than 5 ms, and would be dropped for it.
         target_ns = max(TARGET_NS, round(self._largest / self._queue.bytes_per_s * SECOND_NS))
+        # With a packet or less behind it, dropping would leave the line idle.
         is_fine = waited_ns < target_ns or line.bytes <= self._largest
         return line.codel.drops(now_ns, is_fine=is_fine)
 
@@ -193,6 +200,7 @@ class Bottleneck(Generic[T]):
         line.bytes += one * packet.size
         self.waiting_bytes += one * packet.size
         self.waiting += one
+        # Its credit goes with it: a flow cannot save up turns while it is silent.
         if self._is_fair and not line.packets:
             del self._lines[key]
 
@@ -227,6 +235,7 @@ class _Deliveries:
         times_ns = self._times_ns
         rounds, at_ns = divmod(now_ns - self._began_ns, times_ns[-1])
         before = rounds * len(times_ns) + bisect_left(times_ns, at_ns)
+        # Deliveries that passed while nobody waited are lost, as in mahimahi.
         self._used_bytes = max(self._used_bytes, before * DELIVERY_BYTES) + size
         rounds, last = divmod(ceil(self._used_bytes / DELIVERY_BYTES) - 1, len(times_ns))
         return max(now_ns, self._began_ns + rounds * times_ns[-1] + times_ns[last])

@@ -68,6 +68,7 @@ class Fates:
             rank: number of the packets of the flow that have entered in that slot before it.
         """
         fate = Fate(slot, rank)
+        # Ours are trusted: the copies that guard against a plug-in would be made for every packet.
         if self._guarded:
             return self._tried(fate)
         for impairment, draws in self._impairments:
@@ -77,6 +78,7 @@ class Fates:
     def _tried(self, fate: Fate) -> Fate:
         """A fate without what impairments get wrong."""
         for impairment, draws in self._impairments:
+            # A copy: a plug-in that fails half-way has changed nothing.
             tried = replace(fate)
             try:
                 impairment(tried, draws)
@@ -87,7 +89,7 @@ class Fates:
 
 
 def _possible(fate: Fate) -> Fate:
-    """A fate that can be met.
+    """Check a fate that a plug-in has changed.
 
     Raises:
         ValueError, TypeError: something in it cannot be.
@@ -98,4 +100,5 @@ def _possible(fate: Fate) -> Fate:
         raise ValueError(f"got copies = {fate.copies}, expected 0 to {COPIES_MAX}")
     if fate.flipped is not None and not 0.0 <= fate.flipped < 1.0:
         raise ValueError(f"got flipped = {fate.flipped}, expected a share below 1")
+    # A plug-in may leave a float; the heap of the link compares integers.
     return replace(fate, delay_ns=int(fate.delay_ns), copies=int(fate.copies))

@@ -17,9 +17,9 @@ from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
 
 QUEUE_MAX = 65536
-"""Most packets under way in one direction; more are dropped, and counted apart from losses."""
+"""Largest number of packets under way in one direction; further ones are dropped, not "lost"."""
 QUEUE_BYTES_MAX = 64 * 1024 * 1024
-"""Most UDP payload under way in one direction, whatever `network.mtu` lets pass [B]: with both
+"""Largest UDP payload under way in one direction, whatever `network.mtu` lets pass [B]: with both
 directions full, and what Python takes for each packet, netem stays below 256 MiB."""
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
@@ -34,7 +34,7 @@ QUEUEING_BIN_NS = MILLISECOND_NS
 
 @dataclass(slots=True)
 class Lane:
-    """One flow in one direction."""
+    """State of one flow in one direction."""
 
     flow: int
     """Number of the flow, from 0."""
@@ -60,7 +60,7 @@ class Entered(NamedTuple):
     datagram: Datagram
     lane: Lane
     number: int
-    """Its number in the lane."""
+    """Number of the packet in its lane."""
     fate: Fate
     entered_ns: int
 
@@ -90,7 +90,7 @@ class Counts:
     corrupted: int = 0
     """Packets of which a bit was flipped."""
     depth_max: int = 0
-    """Most packets that were under way at once."""
+    """Largest number of packets that were under way at once."""
     delay: Histogram = field(default_factory=lambda: Histogram(DELAY_BIN_NS))
     """Delays of forwarded packets, as drawn."""
     error: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN_NS))
@@ -127,7 +127,7 @@ class Link:
         self.counts = Counts()
 
     def change(self, path: Path, *, now_ns: int) -> None:
-        """Have another order and rate; packets that wait go on to wait, if they fit."""
+        """Take another order and rate; packets that wait for a rate are queued anew if they fit."""
         self._pass(now_ns)
         was, self._path, self._is_ordered = self._path, path, path.is_ordered
         if path.queue is was.queue:
@@ -140,6 +140,7 @@ class Link:
         """Take a packet that enters, addressed to where it is to come out."""
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
+        # Packets of one slot have a rank, for else they would all meet one fate.
         lane.rank = lane.rank + 1 if slot == lane.slot else 0
         lane.slot = slot
         fate = lane.fates.at(slot, lane.rank)
@@ -193,11 +194,13 @@ class Link:
     ) -> None:
         """Lose a packet, or hold it until it is due; it has passed a finite rate now, if any."""
         counts, due_ns, size = self.counts, now_ns + fate.delay_ns, len(datagram.payload)
+        # Behind the bottleneck: a packet that is lost on the way has used the rate all the same.
         if fate.lost:
             counts.lost += 1
             self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)
             return
         if self._is_ordered:
+            # In order: what would overtake waits for the packet before it.
             due_ns = lane.latest_ns = max(due_ns, lane.latest_ns)
         if fate.flipped is not None and size:
             counts.corrupted += 1
@@ -212,6 +215,8 @@ class Link:
             self._bytes += size
             self._entered += 1
             delay_ns = due_ns - entered_ns
+            # The order of entry decides between equal times, so that no datagrams are ever
+            # compared.
             heappush(heap, (due_ns, self._entered, datagram, lane, number, delay_ns, is_copy))
             counts.depth_max = max(counts.depth_max, len(heap))
             is_copy = True
@@ -231,7 +236,7 @@ class Link:
             )
 
     def give(self, *, now_ns: int) -> list[Datagram]:
-        """Packets that are due, which so leave."""
+        """Remove the packets that are due, and return them."""
         self._pass(now_ns)
         heap, counts, out = self._heap, self.counts, []
         while heap and heap[0][0] <= now_ns:

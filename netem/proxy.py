@@ -24,15 +24,14 @@ from skytether.shared.scenario.schema import DirectionConfig, Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
-"""Most clients at once, unless another number is asked for; packets of others are dropped and
-counted."""
+"""Largest number of clients at once by default; packets of others are dropped and counted."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a packet after which a flow that was answered gives way to a new client [ns]."""
 
 
 @dataclass(slots=True)
 class Flow:
-    """One client address and what belongs to it."""
+    """State of one client address."""
 
     client: Address
     socket: int
@@ -76,7 +75,7 @@ class Proxy(Endpoint):
         self._answered: OrderedDict[Address, Flow] = OrderedDict()
         """Flows through which a packet of the server's has come, by client, oldest packet first."""
         self._unanswered: OrderedDict[Address, Flow] = OrderedDict()
-        """All other flows, likewise."""
+        """All other flows, by client, oldest packet first."""
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
         self._faults: set[str] = set()
@@ -87,6 +86,7 @@ class Proxy(Endpoint):
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Take a packet that enters the network."""
         payload, peer, socket = datagram
+        # Socket 0 is the one that clients send to.
         if socket == 0:
             flow = self._answered.get(peer) or self._unanswered.get(peer)
             flow = flow or self._open(peer, now_ns)
@@ -97,10 +97,12 @@ class Proxy(Endpoint):
             self.downlink.take(onward, flow.downlink, now_ns=now_ns)
         else:
             flow = self._by_socket.get(socket)
+            # A flow's socket is open to anybody, and only the server may answer through it.
             if flow is None or peer != self._server:
                 self.refused += 1
                 return
             self.uplink.take(Datagram(payload, flow.client), flow.uplink, now_ns=now_ns)
+            # Its place is earned by the server's answer, for a sender's address can be made up.
             if flow.order is self._unanswered:
                 flow.order = self._answered
                 self._answered[flow.client] = self._unanswered.pop(flow.client)
@@ -109,7 +111,10 @@ class Proxy(Endpoint):
                 self._faults.add(lane.fates.fault)
                 self._events.append(Fault(traceback=lane.fates.fault))
         flow.used_ns = now_ns
+        # Both dictionaries stay ordered by use: the oldest flow is found without a search, also in
+        # a flood of new clients.
         flow.order.move_to_end(flow.client)
+        # What is not delayed leaves now, and not a wake later.
         self._forward(now_ns)
 
     def wake(self, *, now_ns: int) -> None:
@@ -132,6 +137,7 @@ class Proxy(Endpoint):
     def _open(self, client: Address, now_ns: int) -> Flow | None:
         socket = len(self._by_socket) + 1
         if socket > self._flows_max:
+            # Sockets are never closed: a flow that gives way leaves its own to the next.
             oldest = self._oldest(now_ns)
             if oldest is None:
                 return None
@@ -173,7 +179,7 @@ class Proxy(Endpoint):
             flow.downlink.fates = self._fates("downlink", flow.downlink.flow)
 
     def _oldest(self, now_ns: int) -> Flow | None:
-        """Flow that gives way to a new client, if one does."""
+        """Flow that gives way to a new client; None where none does."""
         unanswered = next(iter(self._unanswered.values()), None)
         answered = next(iter(self._answered.values()), None)
         if answered is None or now_ns - answered.used_ns < IDLE_NS:

@@ -33,7 +33,7 @@ class Statement:
     """Record: an observation, but for its state."""
 
     step: int
-    """Its step, or -1 where there is no observation."""
+    """Step of that observation, or -1 where there is none."""
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
@@ -71,7 +71,7 @@ class HeardNumbers(NamedTuple):
     numbers: Annotated[NDArray[np.void], records(STATEMENT, 2)]
     """Observations at their three places; shape (3, capacity)."""
     states: F4
-    """Their positions [m] and velocities [m/s]; shape (3, capacity, axes, 2)."""
+    """Positions [m] and velocities [m/s]; shape (3, capacity, axes, 2)."""
 
 
 class Plausibility:

@@ -96,7 +96,7 @@ class _KeyedVehicle:
         self.attempts = _HandshakeRate(now_ns)
         """Attempts, which nobody else can make: repeats, which anybody can, take none of them."""
         self.repeats = _HandshakeRate(now_ns)
-        """Other answers to an attempt that has been answered."""
+        """Limit of further answers to an attempt that has been answered."""
         self.live: Channel | None = None
         """Channel that the vehicle sends in."""
         self.previous: Channel | None = None

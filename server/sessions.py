@@ -31,7 +31,7 @@ WELCOME_NS = 5 * SECOND_NS
 
 @dataclass(slots=True)
 class Session:
-    """One life of one vehicle."""
+    """Session of one life of a vehicle."""
 
     vehicle: int
     """Number of the vehicle."""
@@ -40,7 +40,7 @@ class Session:
     boot_id: int
     """Number of this life of the vehicle."""
     home: Address
-    """Where its newest HELLO came from, which has heard from us there."""
+    """Address of its newest HELLO; what is sent there has been shown to arrive."""
     address: Address
     """Address that its newest observation came from."""
     line: WayBack
@@ -128,7 +128,7 @@ class Sessions:
         return iter(self._live.values())
 
     def first(self, count: int) -> list[Session]:
-        """So many of the sessions."""
+        """First sessions, `count` of them at most."""
         return list(islice(self, count))
 
     def at(self, row: int) -> Session:

@@ -78,6 +78,8 @@ class Grid:
         """Time of the tick that is due, if one is; those that were slept through are counted."""
         if self.due_ns is None or now_ns < self.due_ns:
             return None
+        # Skipped and not made up for: plans for steps that are over are worth nothing, and a burst
+        # of ticks would delay the next one too.
         late = (now_ns - self.due_ns) // self._dt_ns
         self.missed += late
         self._note_missed(late, now_ns)
@@ -87,6 +89,7 @@ class Grid:
 
     def _note_missed(self, count: int, now_ns: int) -> None:
         """Note the ticks that were missed, and whether these are too many in a second."""
+        # An hour of sleep counts many ticks, of which the deque keeps the newest few in any case.
         self._missed_ns += [now_ns] * min(count, MISSES_MAX + 1)
         many = len(self._missed_ns) > MISSES_MAX and now_ns - self._missed_ns[0] <= SECOND_NS
         if many != self.degraded:
@@ -140,7 +143,7 @@ class Ticker:
         """Duration of each tick, while the stopwatch runs."""
 
     def tick(self, tick_ns: int, now_ns: int) -> None:
-        """One tick.
+        """Run a tick: plan, send, and record.
 
         Args:
             tick_ns: time that it was due at.
@@ -157,6 +160,7 @@ class Ticker:
         self._controller.owed[:] = False
         self._controller.owed[[each.row for each in owed]] = True
         able = self._controller.able(rows, step)
+        # Picking rows copies both arrays, which most ticks need not do.
         if not able.all():
             rows, step = rows[able], step[able]
         for first in range(0, len(rows), BLOCK):
@@ -172,12 +176,13 @@ class Ticker:
             LeftTube(vehicle=each, off_m=off_m) for each, off_m in self._controller.left
         ]
         self._controller.left.clear()
+        # Last, for a horizon that was sent at this tick stands in place of a heartbeat.
         self._send_heartbeats(owed, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.spent_ns.total() - before_ns)
 
     def _tell_idle(self) -> None:
-        """Say where planning has stopped, and where it goes on."""
+        """Tell the operator for which vehicles planning has stopped, and for which it goes on."""
         idle = self._controller.idle
         for row in np.flatnonzero(idle != self._sessions.idle).tolist():
             self._sessions.idle[row] = idle[row]
@@ -202,7 +207,10 @@ class Ticker:
         inputs, begin = in_a_row(found, sent), 0
         rows, step = decisions.rows[sent], decisions.step[sent]
         age = step - self._controller.observed_step[rows]
+        # The time of sending and not the tick's due time: the vehicle measures the delay by this
+        # stamp.
         columns, server_us = (sent, rows, step, age, found.ahead[sent]), stamp_us(now_ns)
+        # Plain ints: msgpack packs no numpy scalars, and a loop over them takes twice as long.
         for i, row, k, o, d in zip(*(each.tolist() for each in columns), strict=True):
             session, end = self._sessions.at(row), begin + width * (d + self._terms.planned)
             payload = encode_horizon(
@@ -265,6 +273,8 @@ class Ticker:
         datagrams, budget = session.sealed(payload), self._controller.budget
         self._out += datagrams
         if budget:
+            # The line carries the headers of IP and UDP as well: 28 bytes, more than a whole
+            # heartbeat.
             size = sum(len(each.payload) + HEADER_BYTES for each in datagrams)
             budget.charge(session.row, size, is_plan=is_plan)
 

@@ -41,7 +41,7 @@ CLOCK_BEGIN_NS, CLOCK_NS = 200 * MILLISECOND_NS, SECOND_NS
 UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a pilot that says nothing is gone [ns]: then nothing is sent either."""
 SETPOINTS_MAX_HZ = 50.0
-"""Most setpoints in a second."""
+"""Largest number of setpoints in a second."""
 LATE = 1.1
 """Share of the time between two setpoints after which one is repeated: a step may come late."""
 ZERO_NS = 50 * MILLISECOND_NS

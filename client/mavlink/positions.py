@@ -47,7 +47,7 @@ class Positions:
         """Stamp of the newest measurement."""
         self._jumps = 0
         self.origin: Vector = (0.0, 0.0, 0.0)
-        """Our origin in the autopilot's own local frame, in our axes [m]."""
+        """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]."""
         self.position: Vector | None = None
         """Newest position in that frame, in our axes [m]."""
         self.velocity: Vector = (0.0, 0.0, 0.0)

@@ -24,7 +24,7 @@ class Rule(NamedTuple):
     """Requirement on a parameter."""
 
     names: tuple[str, ...]
-    """Its names, the newest last: an autopilot has one of them."""
+    """Names of the parameter, the newest last: an autopilot has one of them."""
     meaning: Callable[[float], str]
     """Meaning of a value, in words."""
     is_safe: Callable[[float], bool] = lambda _: True

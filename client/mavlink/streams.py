@@ -17,7 +17,7 @@ BACK_OFF_MAX = 8
 
 
 class _Stream:
-    """One stream.
+    """Stream of one kind of message.
 
     Args:
         rate: rate asked for [Hz].

@@ -17,10 +17,12 @@ from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 
 class FirstOrderPlant:
-    """Eq. (1), with the true time constants, gain and dead time of a scenario.
+    """First-order vehicle with the true time constants, gain and dead time of a scenario.
 
     Args:
-        weather: what it flies in.
+        weather: air that it flies in.
+
+    Source: eq. (1).
     """
 
     def __init__(self, scenario: Scenario, weather: Weather, number: int = 1) -> None:

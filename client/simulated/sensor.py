@@ -32,7 +32,7 @@ class Sensor:
         self._bias = sensor.position_bias_m or nothing, sensor.velocity_bias_mps or nothing
         self._rng = rng
         self._states: deque[list[Sequence[float]]] = deque(maxlen=self.delay + 1)
-        """Those that are still to be had, the oldest first; each of the shape (axes, 2)."""
+        """Measurements that are not available yet, the oldest first; each of shape (axes, 2)."""
         self._step = 0
 
     def measure(self, state: Sequence[Sequence[float]], *, began_ns: int = 0) -> Measurement:

@@ -18,8 +18,8 @@ AIM_M = 3.0
 AHEAD_M = 1.5
 """Distance ahead on a way around zones at which a vehicle aims [m]."""
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
-"""By how much further round a vehicle aims that is stuck, how far at most before directions are
-drawn, and by how much less once it moves [rad]."""
+"""Angles to the right at which a stuck vehicle aims: step, largest before directions are drawn, and
+step back once it moves [rad]."""
 DETOUR_M, DETOUR_S = 5.0, 20.0
 """Distance up to which vehicles at rest are flown around by one that was stuck [m], and for how
 long it does so [s]."""

@@ -14,7 +14,7 @@ from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion
 
 KNOTS = INTERVALS + JOIN_MAX + 1
-"""Most knots of a motion."""
+"""Largest number of knots of a motion."""
 SAMPLES = 4
 """Number of straight pieces that an interval of a motion is taken for."""
 
@@ -31,7 +31,7 @@ class FlownMotions:
         self.clear(64)
 
     def clear(self, room: int = 0) -> None:
-        """Hold none; with room for so many where that is more than there was."""
+        """Remove all motions; makes room for so many where that is more than there was."""
         self.count = 0
         if room:
             self._first, self._knots, self._of = (np.zeros(room, dtype=np.int64) for _ in range(3))
@@ -39,7 +39,7 @@ class FlownMotions:
             self._position, self._velocity = np.zeros((2, room, KNOTS, self._axes))
 
     def add(self, motion: Motion, ahead: int, row: int, wide_m: float = 0.0) -> None:
-        """Hold one more.
+        """Add a motion.
 
         Args:
             motion: by the steps of its vehicle.
@@ -128,7 +128,7 @@ class HalfPlanes(NamedTuple):
     """Index of the other motion; shape (n,)."""
 
     def of_some(self, taken: Flags) -> "HalfPlanes":
-        """Those of some of the others."""
+        """Half-planes that keep apart from some of the other motions."""
         some = taken[self.of]
         return HalfPlanes(self.at[some], self.normal[some], self.least[some], self.of[some])
 

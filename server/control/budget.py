@@ -1,4 +1,4 @@
-"""One budget of bytes for all vehicles of a server, spent where flying on is expected to cost most.
+"""Budget of bytes for all vehicles of a server, spent where flying on is expected to cost most.
 
 The trigger says of each vehicle whether it is worth a packet at all. Of those that are, the budget
 lets go as many as it has bytes for, in this order:
@@ -30,7 +30,7 @@ BURST_S = 0.1
 WAIT_S = 1.0
 """Time after its last packet from which a vehicle goes before others [s]."""
 NEVER = -2
-"""Tick before any other."""
+"""Tick of a vehicle that has not asked: before all ticks."""
 GUESS_BYTES = 100
 """Size of a packet on the line before one was sent [B]."""
 
@@ -58,7 +58,7 @@ class SharedBudget:
         self._asked = np.full(capacity, NEVER)
         """Tick at which each vehicle asked last and was not sent anything; shape (capacity,)."""
         self._gain = np.zeros(capacity)
-        """What was at stake then, a byte; shape (capacity,)."""
+        """Figure that the trigger compared then, per byte of the packet; shape (capacity,)."""
         self._waited_s = np.zeros(capacity)
         """Time since its last packet where that is WAIT_S or more, else 0 [s]; shape
         (capacity,)."""
@@ -86,6 +86,7 @@ class SharedBudget:
             self._control.update(rows, self._spent, now_ns)
         rate = self.bytes_per_s
         tokens, most = self._tokens - self._spent + rate * passed_s, rate * BURST_S
+        # Debts are bounded as well, so that what is owed cannot keep plans waiting for long.
         self._tokens, self._spent = min(max(tokens, -most), most), 0
         self._tick += 1
 
@@ -107,8 +108,11 @@ class SharedBudget:
         self._waited_s[rows] = np.where(since_s >= WAIT_S, since_s, 0.0)
         left = self._tokens - self._spent - self._bytes[rows[event & owed]].sum()
         waiting = (self._asked >= self._tick - 1).nonzero()[0]
+        # np.lexsort sorts by its last key first: longest wait, then largest gain.
         order = np.lexsort((-self._gain[waiting], -self._waited_s[waiting]))
         ranked = waiting[order]
+        # The first that does not fit holds up all behind it: smaller packets must not pass it for
+        # ever.
         goes = ranked[np.cumsum(self._bytes[ranked]) <= left]
         chosen = owed & event | np.isin(rows, goes) & asks
         late = int(asks.sum() - (chosen & asks).sum())

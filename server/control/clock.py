@@ -20,7 +20,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Indices
 
 BUCKET_NS = SECOND_NS // 2
-"""Minima are kept for each half second [ns]."""
+"""Length of the half seconds for which minima are kept [ns]."""
 BUCKETS = 40
 """Half seconds for which minima are kept: 20 s."""
 RECENT = 3
@@ -34,10 +34,11 @@ STEP_NS = 40 * MILLISECOND_NS
 """Smallest step of a clock: up in one direction, and down by about as much in the other [ns]."""
 
 ECHOES = 4
-"""Newest echoes of a vehicle, which tell how long packets take to it just now."""
+"""Number of newest echoes that are kept of a vehicle: how long packets to it take just now."""
 
+# Two of them added stay within an int64, so that sums of minima need no check.
 UNSEEN = 2**61
-"""In place of a minimum where nothing was seen."""
+"""Minimum of a half second in which nothing was seen."""
 
 
 class VehicleClock:
@@ -111,6 +112,7 @@ class ClockMap:
 
     def offset_ns(self, rows: Indices) -> Indices:
         """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
+        # Brings `adopted` up to date; the steps themselves are not needed.
         self.steps(rows, 0)
         offsets: Indices = self.seen.vehicles["adopted"][rows]
         return offsets
@@ -148,10 +150,12 @@ def shortest_ns(seen: Seen, row: int) -> int:
 def _observe(seen: Seen, row: int, forward: int, backward: int, heard: int, bucket: int) -> None:
     """Take F and G [ns] of a vehicle into the half second `bucket`."""
     vehicle = seen.vehicles[row]
+    # The same echo told once more is no new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard
         seen.echoes[row, vehicle.echoes % ECHOES] = backward
         vehicle.echoes += 1
+    # At most once round the ring, however long the vehicle was silent.
     for passed in range(max(vehicle.newest + 1, bucket - BUCKETS + 1), bucket + 1):
         slot = passed % BUCKETS
         seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
@@ -178,7 +182,7 @@ def _change(minimum: I1, newest: int, recently: int) -> int:
 
 @part
 def _drop_stepped(seen: Seen, row: int) -> None:
-    """Keep only what came since, where one of a vehicle's two clocks has stepped."""
+    """Forget the minima of before a step of the vehicle's clock or ours, where there was one."""
     recent, old, newest, recently = 0, 0, seen.vehicles[row]["newest"], RECENT
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]
@@ -186,10 +190,13 @@ def _drop_stepped(seen: Seen, row: int) -> None:
             recent, recently = recent + count, age + 1
         elif age >= OLD:
             old += count
+    # Of a few samples, one that was delayed would look like a step.
     if min(recent, old) < STEP_SAMPLES:
         return
     forward = _change(seen.minimum[row, 0], newest, recently)
     backward = _change(seen.minimum[row, 1], newest, recently)
+    # A clock that steps moves one of the two up and the other down by as much; a network that
+    # changes moves both the same way, or one alone.
     large = min(abs(forward), abs(backward)) > STEP_NS
     if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
         for age in range(recently, BUCKETS):

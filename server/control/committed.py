@@ -84,8 +84,8 @@ LOSS, LEARNED = 0.1, 0.05
 """Share of lost horizons that is assumed at first, and by how much of itself each horizon that has
 come into force, or is lost, moves it."""
 HOVERS, UNKNOWN = -1, -2
-"""In place of the number of a horizon: none, so that it brakes and stands still; one that was sent
-in an earlier life of ours."""
+"""Number of a horizon where there is none (the vehicle brakes and stands still), and where it was
+sent in an earlier life of the server."""
 
 
 class Latest:
@@ -108,7 +108,7 @@ class Latest:
     takes: int
     """1 if horizons that come are flown at its newest observation, else 0."""
     base_takes: int
-    """1 if they were at the observation before, else 0."""
+    """1 if horizons that come were flown at the observation before, else 0."""
     loss: float
     """Share of horizons that were lost lately."""
 
@@ -125,7 +125,7 @@ class ObservedAxis:
     base_p: float
     """Position in the observation before [m]."""
     base_v: float
-    """Velocity that the disturbance observer takes it for there [m/s]."""
+    """Velocity in it, as the disturbance observer follows it [m/s]."""
     base_u: float
     """Input flown at that step [m/s]."""
     w: float
@@ -181,7 +181,7 @@ class ReplaySettings(NamedTuple):
     decay: float
     """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
     follow: float
-    """Share of what is new of the velocity that the observer has not followed after a step."""
+    """Share of a velocity's jump that the observer has not followed after a step."""
     feeds_back: bool
     """Whether horizons bring feedback."""
 
@@ -198,7 +198,7 @@ class ReplayMemory(NamedTuple):
     sent: Annotated[NDArray[np.void], records(SENT_HORIZON, 2)]
     """Horizons that were sent, a ring; shape (capacity, room)."""
     inputs: S4
-    """Their inputs [m/s]; shape (capacity, room, axes, most + H), with the largest d."""
+    """Inputs of these horizons [m/s]; shape (capacity, room, axes, largest d + H)."""
     led: Annotated[NDArray[np.void], records(LEAD, 3)]
     """States that the horizons lead to; shape (capacity, room, axes)."""
 
@@ -228,6 +228,7 @@ class Replay:
             follow=float(np.exp(-terms.dt_s / FOLLOW_S)),
             feeds_back=terms.feedback,
         )
+        # One horizon a step at most, and none is flown for longer than `age_max`.
         room = terms.age_max + H
         self._memory = ReplayMemory(
             observed=np.zeros(capacity, dtype=np.int64),
@@ -237,6 +238,7 @@ class Replay:
             inputs=np.zeros((capacity, room, axes, most + H), dtype=np.float32),
             led=np.zeros((capacity, room, axes), dtype=LEAD),
         )
+        # From the oldest observation that counts to the end of a plan that is made from it.
         longest = terms.age_max + most + H + 1
         self._course = HorizonsInForce(
             np.empty(room + 2, dtype=np.int64), np.empty(room + 2, dtype=np.int64)
@@ -351,6 +353,7 @@ def _number(memory: ReplayMemory, row: int, made_for: int) -> int:
         return HOVERS
     room = memory.sent.shape[1]
     count = memory.seen[row].sent
+    # From the newest down: the horizon in force is mostly one of the last few.
     for number in range(count - 1, max(count - room, 0) - 1, -1):
         step = memory.sent[row, number % room].step
         if step <= made_for:
@@ -401,6 +404,7 @@ def _chart(
     course.begins[0], course.numbers[0] = begin, flown
     for number in following:
         due = memory.sent[row, number % room].due
+        # It is in force before the course begins, and the newest of these counts.
         if due <= begin:
             course.numbers[0] = number
             continue
@@ -527,7 +531,10 @@ def _observe_disturbance(
     if end == begin:
         return
     before, after = _number(memory, row, seen.base_in_force), _number(memory, row, seen.in_force)
+    # A vehicle that takes no horizon brakes by its failsafe: what it does then says nothing of
+    # wind.
     by_rule = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
+    # Further back than `age_max` the horizons of that time may be gone from the ring.
     follows = by_rule and begin >= 0 and end - begin <= settings.age_max
     m, legs, speed = end - begin, 0, _speed(memory.state[row].base_u)
     if follows:
@@ -546,6 +553,8 @@ def _observe_disturbance(
         if follows:
             x = (state.base_p, state.base_v, state.base_u, speed)
             _roll(settings, memory, row, axis, course, legs, end, x, track)
+            # A jump of the velocity may be noise: the observer follows it with FOLLOW_S, and
+            # carries the rest on as `lag`.
             off, left = state.v - track.states[m, 1], settings.follow**m
             memory.state[row, axis].w = learned(
                 state.w,
@@ -576,6 +585,7 @@ def _listen(
     age = k - memory.observed[row]
     if bound.steps[row] > age and age + bound.steps[row] > settings.age_max:
         bound.steps[row], bound.seen[row] = 0, 0
+    # No sample yet: half a round trip, rounded up, and a margin.
     if bound.steps[row] == 0:
         begin(bound, row, -(-half_trip_ns(clock, row) // settings.dt_ns) + MARGIN)
     at_least(bound, row, -(-shortest_ns(clock, row) // settings.dt_ns))
@@ -583,6 +593,7 @@ def _listen(
         return
     memory.seen[row].loss -= LEARNED * seen.loss
     oldest = max(seen.sent - room, 0)
+    # One that is older than all in the ring was sent too long ago to be a sample.
     if memory.sent[row, oldest % room].step <= seen.in_force:
         acknowledge(bound, row, seen.since - seen.in_force)
     memory.seen[row].acknowledged = seen.in_force
@@ -662,11 +673,14 @@ def _foresee(
         # Those that were due and are not in force have been overtaken, or are lost.
         first = _first_under_way(memory, row, seen.in_force, observed)
         for number in range(_first_after(memory, row, seen.in_force), first):
+            # It stays in the ring after it is lost, and is counted once.
             newly = memory.sent[row, number % room].due > seen.judged
             lost += newly
             if newly:
                 memory.seen[row].loss += LEARNED * (1.0 - memory.seen[row].loss)
         memory.seen[row].judged = observed
+        # Unless the vehicle takes horizons: none that is under way comes into force, and it stands
+        # still.
         flying, under_way = HOVERS, range(0)
         if seen.takes == 1:
             flying, under_way = _number(memory, row, seen.in_force), range(first, seen.sent)
@@ -714,6 +728,8 @@ def _remember(
         for axis in range(len(settings.laws)):
             for stage in range(length):
                 memory.inputs[row, slot, axis, stage] = found.horizons[i, axis, stage]
+            # Just as `Compensator._hold` does it aboard: both ends have to brake from the same
+            # speed.
             last = bounded(float(found.horizons[i, axis, length - 1]), settings.laws[axis].bound)
             squares += last * last
             led = memory.led[row, slot, axis]

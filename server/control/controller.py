@@ -1,4 +1,4 @@
-"""The algorithm of the server: what is computed at a step of n vehicles, and knows no datagram.
+"""Algorithm of the server: what is computed at a step of n vehicles, without any datagram.
 
     observations → x̂(k), x̂(k+d) (`replay` or `estimator`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`planner`) → event? (`trigger`) → what is sent, remembered.
@@ -35,7 +35,7 @@ from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
-"""As kernels take them."""
+"""Members of `Idle` as plain numbers, for kernels."""
 BLOCK = 128
 """Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
@@ -66,7 +66,7 @@ class Decisions:
 
 
 class Controller:
-    """Algorithms 1 and 2 of the paper for up to `room` vehicles.
+    """Server's part of the paper's algorithms for up to `room` vehicles.
 
     Args:
         scenario: what to fly, and how to plan.
@@ -227,15 +227,17 @@ class Controller:
         Args:
             rows: the vehicles, no more than BLOCK; shape (n,).
             step: k of each; shape (n,).
+
+        Source: algorithms 1, 2.
         """
         n, found, stopwatch = len(rows), self._found, self._stopwatch
         self.last_step[rows] = step
-        self._scheme.foresee(rows, step, found)  # (13)
+        self._scheme.foresee(rows, step, found)  # eq. (13)
         stopwatch.lap("estimate")
-        self.planner.plan(rows, step, found)  # (14), (15)
+        self.planner.plan(rows, step, found)  # eq. (14), (15)
         figures, planned = self.planner.figures[:n], self.planner.planned[:n]
         situation = Situation(rows, figures, found.start[:n], planned, self._known)
-        verdict = self._trigger.test(situation)  # (16)
+        verdict = self._trigger.test(situation)  # eq. (16)
         # A vehicle flies no horizon that was planned before it said that it would.
         event = verdict.event & self._takes[rows]
         unsolved = _withhold(
@@ -246,7 +248,7 @@ class Controller:
             owed = self.owed[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
             event = self.budget.choose(rows, event, owed, worth, situation.since_sent_s)
         sent = event.nonzero()[0]
-        self._scheme.remember(rows, step, found, event)  # (12)
+        self._scheme.remember(rows, step, found, event)  # eq. (12)
         if len(sent):
             told = rows[sent]
             self._trigger.sent(told, figures[sent])

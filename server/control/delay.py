@@ -53,6 +53,7 @@ def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) ->
     """
     least = 1
     if fixed_s is not None:
+        # Rounded up, for d has to cover the whole delay.
         fixed = -(-seconds_to_ns(fixed_s) // seconds_to_ns(dt_s))
         least = most = min(max(fixed, 1), most)
     steps, seen = np.zeros((2, capacity), dtype=np.int64)
@@ -83,6 +84,7 @@ def acknowledge(bound: DelayBound, row: int, delay: int) -> None:
     newest = bound.seen[row] % SAMPLES
     bound.samples[row, newest] = delay
     bound.seen[row] += 1
+    # Up at once: with too small a d every horizon enters after inputs that it did not reckon with.
     d = max(bound.steps[row], min(delay, bound.most))
     known = min(bound.seen[row], SAMPLES)
     needed, since = 0, known  # samples that need d, and how many came after the last of these

@@ -33,9 +33,9 @@ PAGE = 128
 PAGES = 256
 """Places for pages: more than a block of vehicles can need at once."""
 EMPTY = -1
-"""In place of the key of the page that a place holds."""
+"""Key of a place that holds no page."""
 FOUND = -1
-"""In place of the vehicle whose page is missing."""
+"""Result of a search in which no vehicle's page is missing."""
 TRAJECTORY = 2**40
 """Number of pages that a trajectory may have, by which those of the next are told from them."""
 SPREAD = 31
@@ -95,6 +95,7 @@ class Desired:
         """Steps of a page behind its last; unless all is seen, the steps that are."""
         if not self._all:
             seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
+            # TINY: 0.15 / 0.05 is 2.9999999999999996.
             self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
         seen_s = self._reach * terms.dt_s
         self._ahead_s = late_s if self._all else np.minimum(late_s, seen_s)
@@ -206,6 +207,8 @@ class Desired:
             return self._found
         held = self._held
         while (i := _find(held, self._number, rows, steps, self._found)) != FOUND:
+            # Each search of `_place` ends at a free place at the latest: before the last one is
+            # taken, all pages go. A block of vehicles needs half of PAGES at most.
             if np.count_nonzero(held == EMPTY) == 1:
                 held[:] = EMPTY
             number, page = int(self._number[rows[i]]), int(steps[i]) // PAGE
@@ -213,6 +216,7 @@ class Desired:
             at = plain(_place)(held, number, page)
             times_s = (page * PAGE + self._steps) * self._dt_s
             states = sample(times_s).transpose(1, 0, 2)
+            # Where no axis is late both slices are the same rows, and this writes them twice.
             self._pages[at, : self._axes] = self._pages[at, -self._axes :] = states
             for axis in np.flatnonzero(self._ahead_s):
                 self._pages[at, axis] = sample(times_s + self._ahead_s[axis])[:, axis]

@@ -95,6 +95,8 @@ def _solve(
         room = -least[at]
         for j in range(n):
             room += columns[j, at] * x[j]
+        # An equality may be violated on either side: turned so that x always has to go along the
+        # normal.
         sign = -1.0 if at < equal and room > 0.0 else 1.0
         room *= sign
         normal[:n] = sign * columns[:, at]
@@ -103,10 +105,13 @@ def _solve(
             length, gain = _direction(J, R, normal, d, z, r, q)
             dual, leaves = np.inf, -1
             for i in range(q):
+                # Equalities are never let go.
                 if active[i] >= equal and r[i] > 0.0 and u[i] / r[i] < dual:
                     dual, leaves = u[i] / r[i], i
+            # A normal that depends on those in force leaves x no way: only letting one go helps.
             primal = np.inf if length <= DEPENDENT else -room / gain
             step = min(dual, primal)
+            # Neither a step nor a constraint that may leave: no x meets all of them.
             if step == np.inf:
                 return INFEASIBLE
             u[:q] -= step * r[:q]
@@ -176,6 +181,7 @@ def _let_go(J: F2, R: F2, u: F1, active: I1, leaves: int, q: int) -> None:
         active[i], u[i] = active[i + 1], u[i + 1]
         R[:q, i] = R[:q, i + 1]
     for i in range(leaves, q - 1):
+        # Givens rotations make R a triangle again after the column that left.
         one, other = R[i, i], R[i + 1, i]
         size = np.hypot(one, other)
         if size == 0.0:

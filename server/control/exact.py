@@ -28,13 +28,13 @@ from skytether.shared.law.model import Array, Axis, Flags
 ROUNDS_MAX = 8
 """Rounds in which the whole set may change; five have been the most on recorded flights."""
 PIVOTS_MAX = 200
-"""Rounds after that, in which one input enters the set or leaves it."""
+"""Further rounds, in which one input enters the set or leaves it."""
 SNAP = 1e-12
 """Distance from its bound at which DAQP may leave an input that belongs on it [m/s]."""
 RESIDUAL_MAX = 1e-7
 """Largest residual of the optimality conditions, relative to the gradient, of an answer of DAQP."""
 CYCLED, NOT_FINITE = -1, -2
-"""In place of a number of rounds."""
+"""Number of rounds where the active set went in a circle, and where a number was not finite."""
 
 # One stage of a backward pass: what depends on the active set alone. The cost to go from the stage
 # is ½ c u² + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
@@ -129,12 +129,14 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
     fresh: bool,
     u: F1,
 ) -> int:
-    """Fill in the optimal inputs of one axis; rounds taken, or CYCLED or NOT_FINITE.
+    """Fill in the optimal inputs U(k) of one axis; rounds taken, or CYCLED or NOT_FINITE.
 
     Args:
         which: FIRST or LATER weights. work: of `workspace`; what it has of OWN sets is written to.
         g: gradient; shape (H,). previous, gap, fresh: see `server.control.mpc.shifted`; what that
         is at its bound is the first set. u: what is filled in [m/s]; shape (H,).
+
+    Source: eqs. (6), (8), (10).
     """
     model, bound, W, H = axis_at(mpc.model, axis), mpc.bounds[axis], mpc.weights.states, len(g)
     a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
@@ -146,9 +148,12 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
         side[i] = 1.0 if v >= NEAR * bound else -1.0 if v <= -NEAR * bound else 0.0
         if side[i] != 0.0:
             last = i
+        # A sum that is finite has finite terms: one check in place of H.
         total += g[i]
     for count in range(1, ROUNDS_MAX + PIVOTS_MAX + 1):
         singly = count > ROUNDS_MAX
+        # Stages behind the last change are as before: of the last round, or of the table of FREE
+        # sets.
         if last >= 0:
             after = (W[H - 1, 0], 0.0, W[H - 1, 1])
             if last < H - 1:
@@ -179,6 +184,7 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
             row = OWN if i <= changed else FREE
             v = own[i] - (stages[row, i, K0] * x0 + stages[row, i, K1] * x1)
             if side[i] == 0.0 and -bound <= v <= bound:
+                # Closed loop, x ← F x + B own: the chain from stage to stage does not wait for v.
                 u[i] = v
                 x0, x1 = (
                     stages[row, i, F00] * x0 + stages[row, i, F01] * x1 + b0 * own[i],
@@ -238,7 +244,10 @@ def workspace(mpc: MPC) -> Workspace:
 
 
 class ExactSolver:
-    """See `server.control.solver.Solver`; the answer depends on the problem alone, to rounding."""
+    """See `server.control.solver.Solver`; the answer depends on the problem alone, to rounding.
+
+    Source: eq. (10).
+    """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
@@ -268,6 +277,7 @@ class ExactSolver:
         problem = self._problem
         hessian = problem.hessian[axis]
         bound = np.full(len(gradient), problem.mpc.bounds[axis])
+        # Without rows here, DAQP takes the bounds as simple bounds, which cost it least.
         nothing = np.zeros((0, len(gradient)))
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12

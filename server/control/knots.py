@@ -28,6 +28,7 @@ def fewest_knots(intended: F3, dt_s: float, error_m: float, knots: S2) -> tuple[
     """
     count, spacing, seen = 1, 1, intended.shape[1] - 1
     for intervals in INTERVALS:
+        # Knots lie within what the server sees; further on the spline goes straight.
         if intervals > seen:
             break
         count, spacing, away = intervals + 1, max(seen // max(intervals, 1), 1), 0.0
@@ -35,6 +36,7 @@ def fewest_knots(intended: F3, dt_s: float, error_m: float, knots: S2) -> tuple[
             for knot in range(count):
                 knots[axis, 2 * knot] = intended[axis, knot * spacing, 0]
                 knots[axis, 2 * knot + 1] = intended[axis, knot * spacing, 1]
+            # The knots as float32, as they will be read aboard.
             some = knots[axis, : 2 * count]
             for stage in range(seen + 1):
                 p, _ = spline_at(some, spacing, dt_s, stage)

@@ -20,7 +20,7 @@ COPY_STEPS = 4
 PATIENCE = 120
 """Steps without coming nearer to its goal after which a vehicle asks another to step aside."""
 NEARER_M = 0.3
-"""By how much it must come nearer [m]."""
+"""Distance that counts as having come nearer [m]."""
 PROMPT = 8
 """Number of motions in a row, each acknowledged at once, after which they are sent less often."""
 
@@ -76,7 +76,7 @@ class Known:
         """Motion that is sent once more at this step."""
 
     def motions(self) -> list[Motion]:
-        """All that may be flown, the one to be sent at this step included."""
+        """Motions that may be flown, the one to be sent at this step included."""
         flown = [self.in_force.motion] if self.in_force else []
         flown += [each.motion for each in self.sent]
         if self.next and not (self.in_force and self.next is self.in_force.motion):

@@ -155,7 +155,10 @@ def lead(mpc: MPC, axis: int, to: Lanes) -> None:
 
 @lanes
 def follow(mpc: MPC, axis: int, to: Lanes) -> None:
-    """Fill in the drift and the states from p, v, w, led_p, led_v and the inputs: `mpc.follow`."""
+    """Fill in the drift and the states from p, v, w, led_p, led_v and the inputs: `mpc.follow`.
+
+    Source: eq. (7).
+    """
     model, W = axis_at(mpc.model, axis), mpc.weights.states
     p, v, led_p, led_v, w = to.p, to.v, to.led_p, to.led_v, to.w
     states_p, states_v, u = to.states_p, to.states_v, to.inputs
@@ -176,7 +179,10 @@ def follow(mpc: MPC, axis: int, to: Lanes) -> None:
 
 @lanes
 def gradient(mpc: MPC, axis: int, to: Lanes, target_v: F2) -> None:
-    """Fill in the gradient from drift, w, horizon before, desired velocities: `mpc.gradient`."""
+    """Fill in the gradient from drift, w, horizon before, desired velocities: `mpc.gradient`.
+
+    Source: eqs. (5), (9).
+    """
     model, weights = axis_at(mpc.model, axis), mpc.weights
     R, T = weights.input, weights.target[axis]
     p, v, w, g, previous = to.p, to.v, to.w, to.gradient, to.previous
@@ -348,6 +354,8 @@ def active_sets(mpc: MPC, axis: int, to: Lanes, stages: F2, settled: B1) -> None
         lanes: gradient and horizon before; the inputs are filled in [m/s].
         stages: those of the FREE set; shape (H, 12).
         settled: set to False where a lane has no answer; shape (LANES,).
+
+    Source: eqs. (6), (8), (10).
     """
     bound, g, side, previous = mpc.bounds[axis], to.gradient, to.side, to.previous
     total, changed, held, x0, x1 = to.total, to.changed, to.held, to.led_p, to.led_v
@@ -361,6 +369,7 @@ def active_sets(mpc: MPC, axis: int, to: Lanes, stages: F2, settled: B1) -> None
             held[lane] += abs(at)
             total[lane] += g[i, lane]
     for _ in range(ROUNDS_MAX):
+        # Where no lane has an input at its bound, one table of FREE stages serves all of them.
         if _any(held):
             _round(mpc, axis, to)
         else:

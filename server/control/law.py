@@ -1,4 +1,4 @@
-"""Eq. (4) and the rule of flight, compiled: the functions of `shared`, for the server's kernels."""
+"""Model and rule of flight, compiled: the functions of `shared`, for the server's kernels."""
 
 from typing import Annotated
 
@@ -39,13 +39,13 @@ lead_to, step = shared(rule.lead_to), shared(rule.step)
 
 @inline
 def axis_of(record: Axis) -> Axis:
-    """Eq. (4) of a record that has it, in numbers of its own that stay in registers."""
+    """Model on one axis from a record that has its numbers; as a tuple they stay in registers."""
     return Axis(record.a01, record.a11, record.b0, record.b1)
 
 
 @inline
 def axis_at(model: Axes, axis: int) -> Axis:
-    """Eq. (4) on one axis of a model."""
+    """Model on one of its axes."""
     return axis_of(model[axis])
 
 

@@ -36,7 +36,7 @@ class LivePoint:
         """Time of its newest move, or of the first time it is asked for with a velocity told."""
 
     def move(self, position: Array, velocity: Array | None, now_ns: int) -> None:
-        """Move it, at once.
+        """Move the point at once.
 
         Args:
             position: where it is now [m]; shape (axes,).
@@ -48,7 +48,7 @@ class LivePoint:
         self._position, self._moved_ns = position, now_ns
 
     def at(self, now_ns: int) -> Array:
-        """Its state: the newest move, carried on by the velocity [m, m/s]; shape (axes, 2)."""
+        """State: the newest move, carried on by the velocity [m, m/s]; shape (axes, 2)."""
         if self._moved_ns is None:
             if not self._told:
                 return np.stack([self._position, self._velocity], axis=-1)

@@ -31,7 +31,7 @@ LAST = 5.0
 
 
 class MotionPlan:
-    """Solves it.
+    """Solver of the QP of one motion.
 
     Args:
         terms: the rule of flight.

@@ -1,7 +1,7 @@
-"""The optimal control problem (5)-(9) as algebra: problem → QP → plan.
+"""The optimal control problem, eq. (5)-(9), as algebra: problem → QP → plan.
 
-Eliminating the states of (4), X = Φ x + Γ U, leaves a box-constrained QP in the H inputs of each
-axis,
+Eliminating the states of eq. (4), X = Φ x + Γ U, leaves a box-constrained QP in the H inputs of
+each axis,
 
     minimise  ½ Uᵀ 𝓗 U + gᵀ U   subject to  |U| ≤ u_max,
 
@@ -26,7 +26,7 @@ from skytether.shared.scenario.schema import ControlConfig
 
 
 class Weights(NamedTuple):
-    """The weights of (9), for the first step of a flight and for all later ones.
+    """The weights of eq. (9), for the first step of a flight and for all later ones.
 
     Without a horizon before there is no S-term (E8): the first of two rows leaves it out.
     """
@@ -49,10 +49,10 @@ FIRST, LATER = 0, 1
 
 
 class MPC(NamedTuple):
-    """The problem (9) of every vehicle and step, but for state, target and horizon before."""
+    """The problem of eq. (9), but for what changes: state, target and horizon before."""
 
     model: Axes
-    """Eq. (4); shape (axes,)."""
+    """Model, eq. (4); shape (axes,)."""
     bounds: F1
     """Bound u_max of the input [m/s]; shape (axes,)."""
     weights: Weights
@@ -60,11 +60,17 @@ class MPC(NamedTuple):
 
 
 def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
-    """The problem of a scenario."""
+    """The problem of a scenario.
+
+    Source: eqs. (5), (6), (9).
+    """
     H = terms.horizon
+    # Stages 1 … H: no input changes the state at stage 0, so its Q of eq. (5) is left out.
     states = np.tile(np.array(control.state_weight), (H, 1))
     states[-1] = control.terminal_weight
     changes = np.zeros((2, H))
+    # The last input has no counterpart in the horizon before: the sum of S in eq. (9) ends at H -
+    # 2.
     changes[LATER, :-1] = control.change_weight
     weights = Weights(
         states=states,
@@ -78,12 +84,12 @@ def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """The QPs of one Hessian, all that a solver has to know of them before it is given one."""
+    """Solver set-up that all QPs with one Hessian share."""
 
     model: Model
-    """Eq. (4)."""
+    """Model, eq. (4)."""
     mpc: MPC
-    """What they come from."""
+    """Weights, bounds and model of the QPs."""
     which: int
     """FIRST or LATER weights."""
     hessian: Array
@@ -91,22 +97,27 @@ class Problem:
 
 
 def pose(model: Model, mpc: MPC, which: int) -> Problem:
-    """The QPs for the FIRST step or for LATER ones."""
+    """The QPs for the FIRST step or for LATER ones.
+
+    Source: eqs. (5), (9).
+    """
     axes, H = len(model.b0), len(mpc.weights.states)
     forced = np.zeros((axes, H, 2, H))
     """Γ: what the inputs add to the states 1 … H."""
     response = model.B
     for stage in range(H):
         for later in range(stage, H):
+            # Γ is a Toeplitz matrix: the response depends on the distance of the two stages alone.
             forced[:, later, :, later - stage] = response
         response = model.step(response, 0.0)
+    # In full, for it is made twice a flight; what every step needs is done in O(H) below.
     hessian = np.einsum("aipk,ip,aipl->akl", forced, mpc.weights.states, forced)
     return Problem(model, mpc, which, hessian + np.diag(mpc.weights.inputs[which]))
 
 
 @inline
 def shifted(inputs: F1, gap: int, fresh: bool, i: int) -> float:
-    """Input `i` of a horizon as seen `gap` steps later, its last repeated (11); 0 for the fresh."""
+    """Input `i` of a horizon as seen `gap` steps later, its last repeated; 0 if it is fresh."""
     return 0.0 if fresh else inputs[min(i + gap, len(inputs) - 1)]
 
 
@@ -138,13 +149,15 @@ def follow(
     states: F2,
     drift: F2,
 ) -> None:
-    """Fill in X(k) of eq. (7) of one vehicle, and `lead` another toward it, in one go.
+    """Fill in X(k) of one vehicle, and `lead` another toward it, in one go.
 
     Args:
         x, w, drift: see `lead`, of the vehicle that follows.
         led: position [m] and velocity [m/s] at stage 0 of the one that is followed.
         u: its inputs [m/s]; shape (H,).
         states: what is filled in: its states at the stages 0 … H [m, m/s]; shape (H + 1, 2).
+
+    Source: eq. (7).
     """
     model, W = axis_at(mpc.model, axis), mpc.weights.states
     (p, v), (led_p, led_v) = x, led
@@ -160,7 +173,7 @@ def follow(
 def adjoint(
     model: Axis, co: tuple[float, float], drift_p: float, drift_v: float
 ) -> tuple[float, float]:
-    """Costate λ of (4) a stage earlier, λ(i) = Aᵀ λ(i+1) + drift(i); Bᵀ λ is what an input does.
+    """Costate λ of eq. (4) a stage earlier, λ(i) = Aᵀ λ(i+1) + drift(i); Bᵀ λ is an input's effect.
 
     Args:
         model: eq. (4) on one axis.
@@ -196,7 +209,7 @@ def gradient(
     drift: F2,
     g: F1,
 ) -> None:
-    """Fill in g of the QP of one axis: Γᵀ drift by the adjoint of (4), less R and S terms.
+    """Fill in g of the QP of one axis: Γᵀ drift by the adjoint of eq. (4), less R and S terms.
 
     Args:
         which: FIRST or LATER.
@@ -205,6 +218,8 @@ def gradient(
         previous, gap, fresh: see `shifted`; the horizon before makes the S-term [m/s]; shape (H,).
         drift: see `lead`.
         g: what is filled in; shape (H,).
+
+    Source: eqs. (5), (9).
     """
     model, weights = axis_at(mpc.model, axis), mpc.weights
     S, R, T = weights.changes[which], weights.input, weights.target[axis]
@@ -238,7 +253,7 @@ def slope(mpc: MPC, axis: int, which: int, u: F1, g: F1, drift: F2) -> None:
 
 @part
 def add_cost(mpc: MPC, axis: int, x: tuple[float, float], change: F1, cost: float) -> float:
-    """Add to `cost` twice what other states and inputs cost, as far as that is quadratic.
+    """Add to `cost` twice the quadratic part of the cost of a change of state and inputs.
 
     Args:
         x: by how much position [m] and velocity [m/s] are others at stage 0; with 0 what is added

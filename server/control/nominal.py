@@ -1,9 +1,10 @@
 """Nominal motion of a vehicle: the plan that a trajectory is made from where the server sees ahead.
 
-It is the MPC (9) of an undisturbed vehicle, from where it is led at step k along the desired
-trajectory, as far as the server sees that, within the bounds of the input (6). Its states are what
-the vehicle is told to follow, so a trajectory asks for nothing that the vehicle cannot fly: it
-begins to turn before a turn that is too sharp, and smooths one that is not worth the effort.
+It is the MPC of eq. (9) for an undisturbed vehicle, from where it is led at step k along the
+desired trajectory, as far as the server sees that, within the bounds of the input, eq. (6). Its
+states are what the vehicle is told to follow, so a trajectory asks for nothing that the vehicle
+cannot fly: it begins to turn before a turn that is too sharp, and smooths one that is not worth the
+effort.
 """
 
 from typing import NamedTuple
@@ -22,7 +23,7 @@ class Nominal(NamedTuple):
     """The problem, and what is remembered of every vehicle to begin the next search with."""
 
     mpc: MPC
-    """The problem (9), without S-term."""
+    """The problem of eq. (9), without S-term."""
     work: Workspace
     """Scratch of the solver."""
     inputs: F3

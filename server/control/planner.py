@@ -1,9 +1,9 @@
-"""Hierarchical MPC of section 4.1: trajectory generator (14), and tracker (15) behind it.
+"""Hierarchical MPC of section 4.1: trajectory generator, eq. (14), then tracker, eq. (15).
 
-Both are the MPC of (9) in closed succession: each starts from its own horizon of the step before.
-The generator plans from its own last prediction and never looks at the UAV (E17); the tracker leads
-the UAV's estimated state along the generator's plan. What the new plan is worth is found out on the
-way: V of eq. (16), and the cost and the deviation of flying on with what was sent.
+Both are the MPC of eq. (9), one after the other: each starts from its own horizon of the step
+before. The generator plans from its own last prediction and never looks at the UAV (E17); the
+tracker leads the UAV's estimated state along the generator's plan. On the way the new plan is
+compared with what was sent: V of eq. (16), and the cost and the deviation of flying on with that.
 
 With the exact solver, all of that is one compiled pass over a vehicle, which touches no more memory
 than a horizon takes, or over several side by side (`server.control.lanes`). Another solver, or one
@@ -56,11 +56,11 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
 GENERATOR, TRACKER, CONCLUDE = 0, 1, 2
-"""First index of what both MPCs have; the last is the move behind both."""
+"""Moves of a plan; GENERATOR and TRACKER are also the first index of what both MPCs have."""
 
 
 class PlanFigures:
-    """Record: what is known of a vehicle once its plan is made; a cost is that of (9)."""
+    """Record: what is known of a vehicle once its plan is made; a cost is that of eq. (9)."""
 
     row: int
     """Row of the vehicle."""
@@ -206,12 +206,14 @@ class Planner:
         self._memory.step[row] = -1
 
     def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Plan for vehicles, eq. (14), then (15); fills in `found.horizons`, `figures`, `planned`.
+        """Plan for vehicles: generator, then tracker; `found.horizons` and `figures` are filled in.
 
         Args:
             rows: the vehicles; shape (n,).
             step: k of each; shape (n,).
             found: what is foreseen of them.
+
+        Source: eqs. (14), (15).
         """
         batch = Batch(
             mpc=self._mpc,
@@ -228,6 +230,8 @@ class Planner:
         )
         left = np.arange(len(rows))
         solver = self.solvers[LATER]
+        # No isinstance: a solver derived from it may solve otherwise, and the compiled pass would
+        # not ask it.
         if type(solver) is ExactSolver:
             undone = _plan(batch, rows, step, solver.work)
             left = np.flatnonzero(~self.figures["solved"][: len(rows)]) if undone else left[:0]
@@ -263,6 +267,7 @@ def _begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) 
     last, start = memory.step[row], k + ahead
     plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
     plan.solved = True
+    # Behind a gap longer than H nothing of the last plan is left to go on from (E17).
     plan.fresh = last < 0 or not 0 <= start - last <= memory.inputs.shape[3]
 
 
@@ -278,7 +283,10 @@ def _pose_generator(
     at: int,
     axis: int,
 ) -> None:
-    """Pose the generator's problem (14) on one axis of vehicle `i` of the block, at draft `at`."""
+    """Pose the generator's problem on one axis of vehicle `i` of the block, at draft `at`.
+
+    Source: eq. (14).
+    """
     row, gap, fresh, H = plan.row, plan.gap, plan.fresh, memory.inputs.shape[3]
     if fresh:
         x = (found.start[i, axis, 0], found.start[i, axis, 1])
@@ -305,7 +313,10 @@ def _pose_tracker(
     at: int,
     axis: int,
 ) -> None:
-    """Pose the tracker's problem (15) on one axis, behind the generator's answer in the draft."""
+    """Pose the tracker's problem on one axis, behind the generator's answer in the draft.
+
+    Source: eq. (15).
+    """
     u, states = draft.inputs[GENERATOR, at, axis], draft.states[at, axis]
     _rounded(u)
     x = (found.start[i, axis, 0], found.start[i, axis, 1])
@@ -363,6 +374,9 @@ def _add_gap(
         change: scratch, as long as inputs are compared; shape (flown,).
     """
     for stage in range(len(change)):
+        # The slope is 0 but where a bound is active, and there every change that is allowed costs
+        # more: less than 0 is rounding. Without this term the gap was wrong in 68 % of the tests of
+        # a flight in wind 0.3.
         change[stage] = held[stage] - u[stage]
         cost += 2.0 * max(0.0, steep[stage] * change[stage])
     return add_cost(mpc, axis, x, change, cost)
@@ -389,7 +403,10 @@ def _conclude(  # noqa: PLR0912 - each comparison on each axis
     i: int,
     at: int,
 ) -> None:
-    """Appraise the plan of vehicle `i`, whose answers are in the draft, and remember it."""
+    """Appraise the plan of vehicle `i`, with V(k) among its figures, and remember it.
+
+    Source: eq. (16).
+    """
     axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
     row, d, state_gap, cost = plan.row, found.ahead[i], 0.0, 0.0
     # Beyond that a plan is never flown: what was sent would seem to end too early at every step.
@@ -561,6 +578,7 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
     for i in range(len(rows)):
         _begin(memory, found.ahead[i], figures[i], rows[i], steps[i])
         if figures[i].fresh:
+            # Lanes have the LATER weights in common; a first plan has others (E8), and is rare.
             undone += not _plan_one(batch, i, work)
             continue
         picked[waiting] = i
@@ -571,6 +589,8 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
                 if not settled[lane]:
                     undone += not _plan_one(batch, picked[lane], work)
             waiting = 0
+    # Too few are left for a group of lanes; alone each gets the same bits
+    # (tests/server/test_planner.py).
     for lane in range(waiting):
         undone += not _plan_one(batch, picked[lane], work)
     return undone

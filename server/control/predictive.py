@@ -2,8 +2,8 @@
 
     x̂(k) = A^τ x(k-τ) + Σ_{i=1…τ} A^{i-1} B û(k-i)        τ: age of the observation in steps
 
-û is the history (12) of the first inputs the server computed, whether sent or not (E12). The sum is
-not formed: one step of (4) after the other says the same.
+û is the history of eq. (12): the first inputs the server computed, whether sent or not (E12). The
+sum is not formed: one step of eq. (4) after the other says the same.
 
 This is the scheme "predictive", and "none", which takes the newest observation for the present.
 `server.control.committed` is the other.
@@ -104,6 +104,7 @@ class Estimator:
             base_velocity=np.zeros((capacity, n)),
             base_flown=np.zeros((capacity, n)),
             disturbance=np.zeros((capacity, n)),
+            # No older observation is planned from, so no older input is ever asked for.
             inputs=np.zeros((capacity, n, terms.age_max)),
             last=np.full(capacity, -1, dtype=np.int64),
         )
@@ -128,7 +129,10 @@ class Estimator:
         return True
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """See `Scheme`: planning starts at k, from x̂(k) of eq. (13)."""
+        """See `Scheme`: planning starts at k, from x̂(k).
+
+        Source: eq. (13).
+        """
         _fly_on(self._settings, self._memory, rows, step, found)
 
     def remember(
@@ -138,9 +142,9 @@ class Estimator:
         found: Foresight,
         event: Flags,  # noqa: ARG002 - whether sent or not (E12)
     ) -> None:
-        """Take û(k) ← u(k|k), eq. (12).
+        """Take û(k) ← u(k|k); steps at which nothing was computed repeat the input before them.
 
-        Steps before at which nothing was computed flew on with the input of before them.
+        Source: eq. (12).
         """
         _write_down(self._memory.inputs, self._memory.last, rows, step, found.horizons)
 
@@ -158,10 +162,13 @@ def _observe_disturbance(
             memory.base_velocity[row, i],
             memory.base_flown[row, i],
         )
+        # One step at least, where Δt itself is longer than APART_NS.
         if begin >= 0 and 0 < m <= max(1, near):
             w, change = memory.disturbance[row, i], (memory.flown[row, i] - u) / m
             p, v = 0.0, velocity
             for step in range(m):
+                # Inputs between two observations are not told: a straight line between both is
+                # taken for them.
                 p, v = advance(axis, p, v, u + step * change + w)
             off, trip_ns = memory.state[row, i, 1] - v, (k - end) * settings.dt_ns
             memory.disturbance[row, i] = learned(
@@ -176,7 +183,10 @@ def _observe_disturbance(
 def _fly_on(
     settings: EstimatorSettings, memory: EstimatorMemory, rows: I1, steps: I1, found: Foresight
 ) -> None:
-    """Fill in x̂(k), eq. (13), as `estimate` and `start`, ŵ, and what feedback leads on from."""
+    """Fill in x̂(k) as `estimate` and `start`, ŵ, and the state that feedback leads on from.
+
+    Source: eq. (13).
+    """
     reach = memory.inputs.shape[2]
     for i in range(len(rows)):
         row, k = rows[i], steps[i]
@@ -187,6 +197,7 @@ def _fly_on(
             p, v = memory.state[row, j, 0], memory.state[row, j, 1]
             if settings.compensate:
                 for step in range(memory.observed[row], k):
+                    # Steps behind `last`, at which nothing was computed, go on with its input.
                     u = memory.inputs[row, j, min(step, memory.last[row]) % reach]
                     p, v = advance(axis, p, v, u + w)
             found.estimate[i, j, 0], found.estimate[i, j, 1] = p, v
@@ -200,7 +211,10 @@ def _fly_on(
 
 @kernel
 def _write_down(inputs: F3, last_step: I1, rows: I1, steps: I1, horizons: S3) -> None:
-    """Put the first input of each horizon into the history `inputs`, see `Estimator.remember`."""
+    """Put the first input of each horizon into the history `inputs`, see `Estimator.remember`.
+
+    Source: eq. (12).
+    """
     reach = inputs.shape[2]
     for i in range(len(rows)):
         row, step, last = rows[i], steps[i], last_step[rows[i]]

@@ -130,6 +130,8 @@ class RateControl:
         before, q, most = self.queueing_s, low - min(self._low_s), TARGET_S + middle - low
         told, self._sent = min(sent, self._sent), sent
         self.queueing_s = q
+        # Packets of these echoes were sent before the cut: cutting again for them would cut twice
+        # for one queue.
         if self._deaf:
             self._deaf -= 1
         elif q > most and q > FALLS * before:

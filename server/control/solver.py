@@ -50,7 +50,10 @@ class Solver(Protocol):
 
 
 class OsqpSolver:
-    """OSQP, set up once per axis; only vectors change afterwards."""
+    """OSQP, set up once per axis; only vectors change afterwards.
+
+    Source: eq. (10).
+    """
 
     def __init__(self, problem: Problem) -> None:
         self._hessian = problem.hessian
@@ -73,6 +76,7 @@ class OsqpSolver:
         return inputs, solved
 
     def _solve_axis(self, axis: int, gradient: Array, guess: Array) -> Array:
+        # One NaN would stay in OSQP's warm start for all vehicles after this one.
         if not (np.isfinite(gradient).all() and np.isfinite(guess).all()):
             raise SolverFailed("problem not finite")
         problem, bound = self._axes[axis], self._u_max[axis]

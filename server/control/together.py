@@ -63,7 +63,7 @@ ROUNDS = 5
 STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
 NEARER_M = 1e-3
-"""By how much motions may come nearer that are too near already [m]: a solver's tolerance."""
+"""Tolerance of a solver for motions that are too near already: they may come so much nearer [m]."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
 
@@ -108,7 +108,7 @@ class Together:
         mission = scenario.mission
         self._apart_m = mission.separation_m + 2.0 * mission.tube_m
         self._scale = np.ones(terms.axes)
-        """By what coordinates are multiplied before distances of vehicles are taken."""
+        """Factors of the coordinates before distances of vehicles are taken; shape (axes,)."""
         self._scale[2:] = mission.height_scale
         bend_m = apart.bend_m(float(np.sqrt(terms.axes)) * mission.acceleration_mps2, terms.dt_s)
         self._tube_m, self._bend_m, self._dt_s = mission.tube_m, bend_m, terms.dt_s

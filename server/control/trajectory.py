@@ -151,7 +151,8 @@ class Memory(NamedTuple):
     sent: Annotated[NDArray[np.void], records(SENT, 2)]
     """Trajectories that were sent, a ring; shape (capacity, ROOM)."""
     knots: F4
-    """Their knots as they are read aboard [m, m/s]; shape (capacity, ROOM, axes, 2 KNOTS_MAX)."""
+    """Knots of these trajectories as they are read aboard [m, m/s]; shape
+    (capacity, ROOM, axes, 2 KNOTS_MAX)."""
 
 
 class Guidance:
@@ -180,6 +181,7 @@ class Guidance:
         block: int,
     ) -> None:
         axes, given = terms.axes, control.delay_bound
+        # TINY: weights that ask for no gain on position would divide by 0.
         lead_s = (1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY)
         # A plan shorter than h ends before the vehicle is near what it follows, and beyond its end
         # the spline goes straight on: measured, such plans led up to 12 m away (docs/envelope.md).
@@ -234,6 +236,7 @@ class Guidance:
         self.observed_step[row] = observation.step
         known["in_force"], known["since"] = observation.in_force, observation.since
         self._memory.state[row] = observation.state
+        # A vehicle that takes none has dropped what it held, and drops what is under way.
         if not observation.takes:
             known["first"], known["in_force"] = known["sent"], NO_HORIZON
         return True
@@ -284,6 +287,7 @@ def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
     Args:
         intended: states from k on [m, m/s]; shape (seen + 1, 2).
     """
+    # Behind what is seen the trajectory goes straight on, as the spline will.
     last = min(stage, settings.seen)
     v = intended[last, 1]
     return intended[last, 0] + (stage - last) * settings.dt_s * v, v
@@ -351,6 +355,8 @@ def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
     if since > 0:
         known, later = min(bound.seen[row], SAMPLES), 0
         for slot in range(known):
+            # Laplace's rule below, (later + 1) / (known + 1): without samples the share is 1, and
+            # never quite 0.
             later += bound.samples[row, slot] > since
         left *= (later + 1) / (known + 1)
     return left / (left + loss)

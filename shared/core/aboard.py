@@ -11,7 +11,7 @@ class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
-    """AutopilotParameter of an autopilot, and what it means for who flies the vehicle."""
+    """Parameter of an autopilot, and what it means for whoever flies the vehicle."""
 
     name: str
     value: float | None
@@ -69,7 +69,7 @@ class AutopilotRefused(VehicleEvent, frozen=True, kw_only=True):
     asked: str
     """Command, in words."""
     answer: str
-    """Its answer: the name of a MAV_RESULT."""
+    """Answer of the autopilot: the name of a MAV_RESULT."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: its autopilot refuses to {self.asked}: {self.answer}"
@@ -109,7 +109,7 @@ class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
 
     @property
     def brief(self) -> str:
-        """All of them in one line, by name."""
+        """Names of the parameters in one line."""
         names = ", ".join(parameter.name for parameter in self.parameters)
         return f"vehicle {self.vehicle} is not armed: {names}; --set-parameters sets them"
 

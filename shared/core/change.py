@@ -82,6 +82,7 @@ class Running:
         except ConfigError as error:
             self.refuse(str(error))
             raise
+        # Only now, when the whole scenario was checked: a change is made as a whole, or not at all.
         self._endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
         changed = tuple(
@@ -138,6 +139,8 @@ class Running:
                 _at(table, key)
             except (KeyError, TypeError):
                 shown = key[:KEY_SHOWN_MAX]
+                # A request may come from anybody who can open the socket: no control characters
+                # into the log.
                 shown = shown if shown.isprintable() else repr(shown)
                 raise ConfigError(f"{shown}: no such key; {hint(key, may)}") from None
             what = f"what can be here: {', '.join(may)}"

@@ -1,4 +1,4 @@
-"""The one idea: server, client and netem are endpoints, driven by datagrams and time only.
+"""Endpoints: server, client and netem are driven by datagrams and time only.
 
 An endpoint opens no socket, reads no clock, draws no unseeded number and prints nothing. It
 speaks in three ways: by datagrams (`outbox`), by typed events (`events`), and by numbers when it
@@ -26,7 +26,7 @@ VEHICLES_TOLD_MAX = 16
 
 
 class Datagram(NamedTuple):
-    """One UDP datagram as an endpoint sees it."""
+    """UDP datagram as an endpoint sees it."""
 
     payload: bytes
     """UDP payload."""
@@ -71,7 +71,7 @@ class Events(deque[Event]):
         return self
 
     def take(self) -> Sequence[Event]:
-        """All of them, and before them how many were left out; none remain."""
+        """Remove and return all events; first of them how many were left out."""
         omitted = (Omitted(kind=kind, count=count) for kind, count in self._omitted.items())
         events = (*omitted, *self)
         self.clear()
@@ -80,7 +80,7 @@ class Events(deque[Event]):
 
 
 class Endpoint(ABC):
-    """Something that talks UDP. `now_ns` is always the driver's monotonic clock [ns]."""
+    """Base of whatever talks UDP. `now_ns` is always the driver's monotonic clock [ns]."""
 
     changeable: frozenset[str] = frozenset()
     """Keys of its scenario that may change in flight, see `shared.core.change`."""
@@ -135,7 +135,7 @@ class Endpoint(ABC):
         self._out.append(Datagram(payload, peer, socket))
 
     def tell(self, event: Event) -> None:
-        """Say something that was done to it from outside."""
+        """Report an event about the endpoint that comes from outside it."""
         self._events.append(event)
 
     def figures(self) -> dict[str, Any]:
@@ -155,6 +155,7 @@ class Endpoint(ABC):
         """Datagrams to be sent; each is handed out once."""
         if not self._out:
             return []
+        # Copied and cleared, not replaced: the parts of an endpoint hold this very list.
         out = self._out.copy()
         self._out.clear()
         return out

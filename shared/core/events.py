@@ -25,7 +25,7 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     host: str
     port: int
     waiting_for: str
-    """Whose datagrams it waits for."""
+    """Peers whose datagrams it waits for."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
@@ -101,7 +101,7 @@ class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Omitted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """More events of a kind have happened than are told one by one."""
+    """Events of a kind were left out, for more have happened than are told one by one."""
 
     kind: str
     """Name of their class; "lines" where nobody has read what was printed."""
@@ -195,7 +195,7 @@ class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Somebody has asked for a change in flight that cannot be, and nothing is changed."""
+    """A change in flight that was asked for is refused, and nothing is changed."""
 
     reason: str
     """Why it cannot be; names the key, what was given and what was expected."""

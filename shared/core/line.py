@@ -39,7 +39,7 @@ class Line(NamedTuple):
 
     @property
     def peer(self) -> Address | None:
-        """Whoever is at the other end; None where it is whoever speaks first."""
+        """Peer at the other end; None where the first to speak becomes the peer."""
         return {"udp": None, "udpout": self.address}.get(self.kind, LINE)
 
 

@@ -47,12 +47,15 @@ class Steady(Endpoint):
         seen_ns = now_ns if self._seen_ns is None else self._seen_ns
         self._seen_ns = now_ns
         if not 0 <= now_ns - seen_ns <= JUMP_NS and self._is_jump(seen_ns, now_ns):
+            # All of it, so that steady time stands still for the jump and goes on from there.
             self._jumps_ns += now_ns - seen_ns
         return now_ns - self._jumps_ns
 
     def _is_jump(self, seen_ns: int, now_ns: int) -> bool:
         if now_ns < seen_ns:
             return True
+        # Counted from when it was to be woken: an endpoint that sleeps for an hour until its wake
+        # has not jumped.
         due_ns = self.next_wake_ns()
         return due_ns is not None and now_ns - max(seen_ns, due_ns) > JUMP_NS
 

@@ -1,1 +1,1 @@
-"""Law of flight that both ends predict with: the model (1)-(4), the rule (11), and the terms."""
+"""Law of flight that both ends predict with: model, eq. (1)-(4), rule, eq. (11), and terms."""

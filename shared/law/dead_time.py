@@ -28,7 +28,7 @@ class DeadTime(NamedTuple):
     steps: int
     """Number of whole steps n."""
     rest: Axis | None
-    """Eq. (4) over the rest r; None where there is no rest."""
+    """Model over the rest r, eq. (4) with r for Δt; None where there is no rest."""
     late: tuple[float, float]
     """L, for position [s] and velocity; 0 without a rest."""
 
@@ -38,6 +38,7 @@ def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -
     steps, rest_ns = divmod(seconds_to_ns(dead_time_s), dt_ns)
     if not rest_ns:
         return DeadTime(steps, None, (0.0, 0.0))
+    # B is not linear in time, so B(Δt - r) is discretised anew and not taken as a share of B.
     times_s = (dt_ns / SECOND_NS, (dt_ns - rest_ns) / SECOND_NS, rest_ns / SECOND_NS)
     whole, after, rest = (discretise([tau_s], time_s, gain).axes()[0] for time_s in times_s)
     return DeadTime(steps, rest, (whole.b0 - after.b0, whole.b1 - after.b1))
@@ -53,6 +54,8 @@ class OnTheirWay:
 
     def __init__(self, model: Sequence[Axis], dead_times: Sequence[DeadTime]) -> None:
         self._axes = list(zip(model, dead_times, strict=True))
+        # n + 2 inputs: the newest, which is not due yet, back to that of n + 1 steps ago, which
+        # still acts for r.
         self._issued = [deque([0.0] * (each.steps + 2), each.steps + 2) for each in dead_times]
         """Inputs of each axis, those of n + 1 steps ago first [m/s]; before the flight 0."""
         self._has_rest = any(each.rest for each in dead_times)
@@ -82,6 +85,7 @@ class OnTheirWay:
         predicted = []
         axes = zip(self._axes, self._issued, known, disturbance, strict=True)
         for (model, late), issued, (p, v), w in axes:
+            # The input of n + 1 steps ago has ceased to act by the end of this step.
             inputs = iter(issued)
             next(inputs)
             first = next(inputs)

@@ -22,11 +22,11 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 """Rows of vehicles or step indices, one per vehicle; shape (n,)."""
 Flags = NDArray[np.bool_]
-"""One yes or no per vehicle; shape (n,)."""
+"""Flag of each vehicle; shape (n,)."""
 
 
 class Axis(NamedTuple):
-    """Eq. (4) on one axis."""
+    """Numbers of the discretised model, eq. (4), on one axis."""
 
     a01: float
     """Change of position in a step for each m/s of velocity [s]."""
@@ -39,7 +39,7 @@ class Axis(NamedTuple):
 
 
 class Model(NamedTuple):
-    """Eq. (4) on every axis; each field has the shape (axes,)."""
+    """Numbers of the discretised model, eq. (4), on every axis; each of shape (axes,)."""
 
     a01: Array
     """Change of position in a step for each m/s of velocity [s]."""
@@ -52,6 +52,8 @@ class Model(NamedTuple):
 
     def axes(self) -> list[Axis]:
         """The model of each axis in plain numbers."""
+        # Plain floats: numpy takes twice as long for sums of two or three numbers, and the
+        # vehicle's loops have no more.
         columns = [field.tolist() for field in self]
         return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
 
@@ -77,35 +79,47 @@ class Model(NamedTuple):
 
     @property
     def A(self) -> Array:  # noqa: N802 - the paper's letter
-        """A of eq. (4); shape (axes, 2, 2)."""
+        """A of the discretised model; shape (axes, 2, 2).
+
+        Source: eq. (4).
+        """
         one, zero = np.ones_like(self.a01), np.zeros_like(self.a01)
         return np.stack([np.stack([one, self.a01], -1), np.stack([zero, self.a11], -1)], -2)
 
     @property
     def B(self) -> Array:  # noqa: N802 - the paper's letter
-        """B of eq. (4); shape (axes, 2)."""
+        """B of the discretised model; shape (axes, 2).
+
+        Source: eq. (4).
+        """
         return np.stack([self.b0, self.b1], -1)
 
 
 def advance(axis: Any, p: Any, v: Any, u: Any) -> tuple[Any, Any]:
-    """Position and velocity a step later, x(k+1) = A x(k) + B u(k), eq. (4).
+    """Position and velocity a step later, x(k+1) = A x(k) + B u(k).
 
     Args:
         axis: an `Axis` and numbers, or a `Model` and arrays whose last axis is the spatial one.
         p, v, u: position [m], velocity and input [m/s].
+
+    Source: eq. (4).
     """
+    # The order of these operations is part of the rule: the client and the compiled kernels must
+    # agree to the last bit.
     return p + axis.a01 * v + axis.b0 * u, axis.a11 * v + axis.b1 * u
 
 
 def discretise(
     tau_s: Array | Sequence[float], dt_s: float, gain: Array | Sequence[float] | float = 1.0
 ) -> Model:
-    """Exact zero-order hold of eq. (1)-(3): the matrix exponential in closed form.
+    """Exact zero-order hold of the continuous model: the matrix exponential in closed form.
 
     Args:
         tau_s: time constant of each axis [s]; shape (axes,).
         dt_s: length of a step [s].
         gain: g, steady velocity over desired velocity, of each axis or of all.
+
+    Source: eqs. (1), (2), (3).
     """
     tau, g = np.asarray(tau_s, dtype=np.float64), np.asarray(gain, dtype=np.float64)
     # 1 - exp(-dt/tau), without cancellation where tau is long.
@@ -126,6 +140,7 @@ def white_acceleration(tau_s: Array, dt_s: float) -> Array:
         shape (axes, 2, 2).
     """
     tau = np.asarray(tau_s, dtype=np.float64)
+    # expm1 keeps the digits that 1 - exp(-x) loses where a step is short beside τ.
     one = -tau * np.expm1(-dt_s / tau)  # ∫ e^{-s/τ}
     two = -0.5 * tau * np.expm1(-2.0 * dt_s / tau)  # ∫ e^{-2s/τ}
     positions = tau**2 * (dt_s - 2.0 * one + two)

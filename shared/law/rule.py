@@ -30,7 +30,7 @@ class Held(NamedTuple):
     """A horizon as one axis flies it."""
 
     model: Axis
-    """Eq. (4)."""
+    """Model of the axis, eq. (4)."""
     inputs: Sequence[float] | Array
     """Inputs of the horizon, from k_h on [m/s]."""
     length: int
@@ -62,6 +62,7 @@ def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
         observed: step of the observation that they were planned from.
         age_max: largest age of that observation [steps].
     """
+    # The input at the age `age_max` itself is still flown, hence + 1.
     return min(length, observed + age_max - made_for + 1)
 
 
@@ -71,18 +72,26 @@ def late_max(horizon: int) -> int:
     By then the vehicle has flown other inputs than its plan begins with; a few are made good with
     the next plan, many would make the server's estimate and its plans swing.
     """
+    # A longer allowance let the estimate swing until the vehicle flew away
+    # (tests/server/test_slow.py).
     return max(2, horizon // 4)
 
 
 def entry(stage: int, length: int) -> int:
-    """Index of the input that counts at a stage of a horizon with so many inputs."""
+    """Index of the input that counts at a stage of a horizon with so many inputs.
+
+    Source: eq. (11).
+    """
     if stage < 0:  # Python, which flies aboard, takes half the time for this of min and max
         return 0
     return stage if stage < length else length - 1
 
 
 def bounded(u: float, bound: float) -> float:
-    """An input within the bound of eq. (6) [m/s]."""
+    """An input within the bound u_max [m/s].
+
+    Source: eq. (6).
+    """
     if u < -bound:
         return -bound
     return min(u, bound)
@@ -97,8 +106,10 @@ def remaining(stage: int, length: int, speed: float, brake: float) -> float:
         speed: magnitude of its last input over all axes [m/s].
         brake: speed that braking takes away in a step [m/s]; 0 holds the last input for ever.
     """
+    # Brake 0 is the paper's vehicle, which holds its last input for ever (E10).
     if stage < length or brake == 0.0:
         return 1.0
+    # One share for all axes: the vehicle slows down without turning.
     return max(0.0, speed - (stage - length + 1) * brake) / speed if speed > 0.0 else 0.0
 
 
@@ -110,6 +121,7 @@ def leading(told: float, disturbance: float, share: float) -> float:
         disturbance: ŵ [m/s].
         share: `remaining`; at 0, x̄ comes to rest.
     """
+    # With ŵ left in, x̄ would drift on for ever after the vehicle was told to stand still.
     return told + disturbance if share > 0.0 else 0.0
 
 
@@ -132,6 +144,8 @@ def flown(stage: int, told: float, back: float, bound: float) -> float:
         back: `led_back`, or 0 without feedback [m/s].
         bound: u_max [m/s].
     """
+    # Before stage 0 there is no x̄ to be led back to: it begins at the step the horizon was made
+    # for.
     u = told + back if stage >= 0 else told
     return bounded(u, bound)
 
@@ -139,6 +153,7 @@ def flown(stage: int, told: float, back: float, bound: float) -> float:
 def tell(held: Held, stage: int) -> tuple[float, float]:
     """Input that a horizon tells at a stage, without feedback [m/s], and its share `remaining`."""
     share = remaining(stage, held.length, held.speed, held.brake)
+    # Without compensation the first input is flown at every stage (E21).
     index = entry(stage, held.length) if held.indexed else 0
     return share * bounded(held.inputs[index], held.bound), share
 
@@ -185,6 +200,8 @@ def step(
     Returns:
         the input that is flown, u*(k) [m/s]; what of it is told, without feedback [m/s]; and x̄ at
         the next stage, position [m] and velocity [m/s], where there is feedback.
+
+    Source: eq. (11).
     """
     (told, share), back = tell(held, stage), 0.0
     if held.feeds_back:

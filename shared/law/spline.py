@@ -38,7 +38,7 @@ class Guide(NamedTuple):
     """A spline as one axis flies along it."""
 
     model: Axis
-    """Eq. (4)."""
+    """Model of the axis, eq. (4)."""
     knots: Knots
     """Knots of the axis."""
     spacing: int
@@ -70,9 +70,11 @@ def spline_at(knots: Knots, spacing: int, dt_s: float, stage: int) -> tuple[floa
         dt_s: length of a step [s].
         stage: steps since the first knot; before that it is negative.
     """
+    # Knots are one flat row of positions and velocities: numba and Python index it alike.
     last = len(knots) // 2 - 1
     knot = stage // spacing
     if knot < 0 or knot >= last:
+        # Straight on at both ends: a spline that is late or has ended never bends away.
         knot = 0 if knot < 0 else last
         v = float(knots[2 * knot + 1])
         return float(knots[2 * knot]) + (stage - knot * spacing) * dt_s * v, v
@@ -89,6 +91,8 @@ def along(model: Axis, knots: Knots, spacing: int, dt_s: float, stage: int) -> f
     """Input ū under which the velocity of eq. (4) follows a spline at a stage [m/s]."""
     _, v = spline_at(knots, spacing, dt_s, stage)
     _, ahead = spline_at(knots, spacing, dt_s, stage + 1)
+    # The second row of eq. (4), solved for u: the velocity is met exactly at each step, and the
+    # position to within the curvature of a step.
     return (ahead - model.a11 * v) / model.b1
 
 

@@ -35,13 +35,13 @@ class Terms(NamedTuple):
     axes: int
     """Spatial axes, 2 or 3."""
     tau_s: tuple[float, ...]
-    """Time constant of the model (2)-(3) of each axis [s]."""
+    """Time constant of the model, eq. (2)-(3), of each axis [s]."""
     gain: tuple[float, ...]
     """Gain of the model of each axis: steady velocity over desired velocity."""
     dead_time_s: tuple[float, ...]
     """Dead time of the model of each axis [s]."""
     u_max: tuple[float, ...]
-    """Bound (6) of the input on each axis [m/s]."""
+    """Bound of the input, eq. (6), on each axis [m/s]."""
     scheme: str
     """Delay compensation at both ends, as in `control.scheme`."""
     feedback: bool

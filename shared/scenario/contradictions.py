@@ -31,13 +31,13 @@ TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 
 FENCED_STEPS_MAX = 100_000
-"""Most steps of a trajectory that are held against the fence."""
+"""Largest number of steps of a trajectory that are checked against the fence."""
 LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
 
 def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterator[Contradiction]:
-    """All that is wrong with a scenario whose values are right one by one.
+    """Contradictions of a scenario whose values are right one by one.
 
     Args:
         known: a scenario with which nothing is wrong; a trajectory that it has is not made again.
@@ -366,7 +366,7 @@ def _outside(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Contradiction]:
-    """Where states at the steps of a flight that begins at home are outside the fence."""
+    """Contradictions of a flight that begins at home and leaves the fence, or is too fast."""
     fence = scenario.fence
     position, speed = states[..., 0], np.linalg.norm(states[..., 1], axis=1)
     low, high, radius = inner(scenario)

@@ -4,9 +4,9 @@ It is the K on position and velocity, the same at every step, that makes the cos
 
     xᵀ Q x + (R + S) u²                     at every step, in flight for ever without bounds
 
-smallest: what (9) comes to without end and bounds. The model's gain is in it. A dead time is not:
-feedback is on the state in which the next input meets the vehicle, for which there is none
-(`shared.law.dead_time`).
+smallest: the limit of eq. (9) for a horizon without end and an input without bounds. The model's
+gain is in K. A dead time is not: feedback is on the state in which the next input meets the
+vehicle, for which there is none (`shared.law.dead_time`).
 """
 
 from functools import lru_cache
@@ -33,7 +33,7 @@ def feedback_gain(scenario: Scenario) -> Array:
 
 
 def stationary_gain(model: Model, control: ControlConfig) -> Array:
-    """K for the model (4).
+    """K for a model.
 
     Args:
         model: eq. (4).
@@ -48,7 +48,7 @@ def stationary_gain(model: Model, control: ControlConfig) -> Array:
 
 @lru_cache(maxsize=64)
 def _settled(a: bytes, b: bytes, state_weight: tuple[float, float], input_weight: float) -> Array:
-    """K, which many vehicles of one scenario ask for; arguments are A and B of (4), Q and R + S."""
+    """K from A and B of eq. (4), Q and R + S; cached, for many vehicles of one scenario need it."""
     Q, R = np.diag(state_weight), input_weight
     B = np.frombuffer(b).reshape(-1, 2)
     A = np.frombuffer(a).reshape(-1, 2, 2)

@@ -20,7 +20,7 @@ SWAP_AT_S = 2.0
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Angle by which points that are spread evenly over a sphere turn from one to the next [rad]."""
 TIMES_MAX = 500
-"""Most times at which goals are looked at for being too near to each other."""
+"""Largest number of times at which goals are checked for being too near to each other."""
 
 
 class Mission:

@@ -80,7 +80,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Something that a scenario can name."""
+    """Entry of a table: a policy, shape or impairment that a scenario can name."""
 
     make: Callable[..., Any]
     """Function or class that makes it, of what its table gives and of its numbers."""

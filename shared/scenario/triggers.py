@@ -58,7 +58,7 @@ class KnownArrays(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """Everything that a policy may look at, for n vehicles at one step k of each.
+    """Situation that a policy judges: n vehicles at one step k of each.
 
     Planning starts at step k+d, where a new horizon can be in force; its plan goes on to k+d+H.
     Nothing may be written into a situation, and it holds at this step alone.
@@ -275,6 +275,8 @@ class StateGap(Trigger):
 
     V(k) = ‖x̂(k) - x_p(k|k-1)‖²_P, S(k) = V(k_i) exp(-λ Δt (k - k_i)) + ε. k_i is the last event; λ
     is per second (E5).
+
+    Source: eq. (16).
     """
 
     def __init__(

@@ -104,7 +104,7 @@ class ReplayWindow:
 
 
 class Channel:
-    """One end of a channel.
+    """End of a channel, which seals what it sends and opens what it hears.
 
     Args:
         vehicle: number of the vehicle.

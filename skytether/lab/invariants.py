@@ -74,7 +74,10 @@ class Ledger:
     def seal(self, vehicle: int, payload: bytes, life: int) -> None:
         """Note a message that is sent."""
         entry = self._sealed.setdefault((vehicle, payload), [life, 0, 0])
+        # The same bytes may be sent more than once, as CLOSE is.
         entry[1] += 1
+        # The oldest goes first: a message that is opened after that would be reported as forged, so
+        # REMEMBERED is far more than can be under way.
         if len(self._sealed) > REMEMBERED:
             self._sealed.popitem(last=False)
 
@@ -272,6 +275,7 @@ class WatchedLife(Recorder):
         self._link.adopt(now_ns=now_ns)
         self._adopted_ns = now_ns
         assert self._welcome is not None
+        # Another life of the server: the link has to be good for a second anew.
         if self._session is None or self._welcome[1] != self._session[1]:
             self._good_ns = None
         self._session = self._welcome
@@ -313,6 +317,7 @@ class WatchedLife(Recorder):
         self._check_follows(step, known, flown, covered=bool(covered))
         self._check_silence(mode, flown)
         self._check_place(state[::2], asleep)
+        # Safe for ever is not enough: a vehicle that never flies again would break no other rule.
         if mode not in FLYING and mode is not Mode.LAND and self._overdue():
             raise Violation("recovers", f"{mode}, though nothing has happened for long")
         self.step, self.missed, self.mode, self.input = step, int(missed), mode, flown
@@ -347,6 +352,7 @@ class WatchedLife(Recorder):
             raise Violation("table", "in fault, with a state and an input that are finite")
         if covered != (mode in FLYING):
             raise Violation("table", f"{mode}, and a horizon is {'' if covered else 'not '}flown")
+        # By the world's clock: the vehicle's own may have been set or have stood still.
         late_ns = now_ns - self.row_ns - self._dt_ns
         if self.row_ns >= 0 and late_ns > STALL_NS + MILLISECOND_NS and mode in FLYING:
             raise Violation("asleep", f"{mode} on waking {late_ns / SECOND_NS:.2f} s late")
@@ -372,6 +378,7 @@ class WatchedLife(Recorder):
             self._held = self._find(in_force)
             self._course = None
             good_ns = self._good_ns
+            # Two steps of tolerance: what came within a step is noticed at the begin of the next.
             if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * self._dt_ns:
                 since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
                 raise Violation("good link", f"a horizon is flown, the link good for {since}")
@@ -390,6 +397,8 @@ class WatchedLife(Recorder):
 
     def _find(self, made_for: int) -> tuple[int, int, Horizon | Trajectory]:
         """Find the horizon in force, by the step that it was made for and its observation."""
+        # A step alone does not name a horizon: two lives of the server may have planned for the
+        # same.
         for session, life, payload in reversed(self._horizons):
             horizon = decode(payload, self._terms)
             assert isinstance(horizon, Horizon | Trajectory)
@@ -415,11 +424,14 @@ class WatchedLife(Recorder):
         told = course.told(stage)
         if not covered:
             most = max(0.0, self._speed - (0.0 if self._covered else self._terms.brake))
+        # Behind the last input the told part may not speed up; feedback comes on top of it.
         told = told * min(1.0, most / max(float(np.linalg.norm(told)), ROUNDING))
         bound = np.array(self._terms.u_max)
         want = np.clip(told + course.back(stage, state, found), -bound, bound)
         near = np.clip(want, before - self._change_max, before + self._change_max)
         for u, should, meant in zip(flown, near.tolist(), want.tolist(), strict=True):
+            # Within rounding by an independent computation in float64; `_check_rule` then compares
+            # bit by bit.
             if abs(u - should) > 2.0 * ROUNDING:
                 raise Violation("follows", f"{u:.4f} m/s flown, {meant:.4f} planned")
         if covered:
@@ -445,6 +457,7 @@ class WatchedLife(Recorder):
     def _check_age(self, step: int, observed: int) -> None:
         """Check that no input is flown later after its observation than allowed."""
         limit_ns = self._terms.age_max * self._dt_ns
+        # By both clocks: a vehicle whose clock is slow must not fly old inputs either.
         old_ns = max(self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns)
         if old_ns > limit_ns + 2 * self._dt_ns or step - observed > self._terms.age_max:
             raise Violation(
@@ -458,6 +471,7 @@ class WatchedLife(Recorder):
             return
         speed = math.hypot(*flown)
         if mode is Mode.LAND:
+            # A landing vehicle may sink; everything else it does in silence has to be braking.
             sinks = len(flown) > ALTITUDE and -LAND_MPS <= flown[ALTITUDE] <= 0.0
             speed = math.hypot(*flown[:ALTITUDE]) if sinks else speed
         most = max(0.0, self._speed_lost - lost * self._terms.brake)
@@ -474,6 +488,7 @@ class WatchedLife(Recorder):
         )
         if away <= MARGIN_M:  # the vehicle is back at the reference
             self.drifted_m = 0.0
+        # While it was frozen it flew on with its last input, wherever that led.
         self.drifted_m += _speed_max(self._terms) * asleep * self._terms.dt_s
         if away > self._reach_m + self.drifted_m:
             raise Violation("place", f"{away:.1f} m outside of the reference")
@@ -512,6 +527,7 @@ def _speed_max(terms: Terms) -> float:
 
 def _reach_m(age_max_s: float, terms: Terms) -> float:
     """Largest distance of a vehicle from the region of the reference [m]."""
+    # At full speed for as long as an input may be old, a second to brake, and the dead time.
     return _speed_max(terms) * (age_max_s + 1.0 + max(terms.dead_time_s)) + MARGIN_M
 
 
@@ -546,11 +562,13 @@ def check_bounds(name: str, endpoint: object) -> None:
 
 def _sizes(thing: Any, name: str, seen: set[int]) -> Iterator[tuple[str, int]]:
     """Names and sizes of all containers within an object."""
+    # Parts of an endpoint refer to each other in circles.
     if id(thing) in seen:
         return
     seen.add(id(thing))
     if isinstance(thing, dict | list | deque | set):
         yield name, len(thing)
+        # What is beyond the bound is a violation already, and need not be searched.
         for each in list(thing.values() if isinstance(thing, dict) else thing)[:BOUND]:
             yield from _sizes(each, name, seen)
     elif type(thing).__module__.startswith(OURS):

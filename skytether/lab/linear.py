@@ -60,9 +60,9 @@ class Loop(NamedTuple):
     """Linear loop on one axis."""
 
     model: Axis
-    """Eq. (4) of the model that both ends know."""
+    """Model that both ends know, eq. (4)."""
     true: Axis
-    """Eq. (4) of the true vehicle, with its gain in b0 and b1."""
+    """Model of the true vehicle, eq. (4), with its gain in b0 and b1."""
     late: F1
     """Part of b0 and b1 that belongs to the input of the previous step, due to the dead time; shape
     (2,)."""
@@ -73,7 +73,7 @@ class Loop(NamedTuple):
     known_dead_steps: int
     """Whole steps of the dead time that both ends know."""
     rest: Axis
-    """Eq. (4) of the model over the fractional step of the known dead time; over zero time without
+    """Model, eq. (4), over the fractional step of the known dead time; over zero time without
     one."""
     push: F2
     """Square root of a step's covariance under white acceleration of strength 1; shape (2, 2)."""
@@ -310,7 +310,7 @@ def _observe(loop: Loop, timing: Timing, past: Past, t: int) -> None:
 
 @making_part
 def _observe_between(loop: Loop, timing: Timing, past: Past, t: int) -> None:
-    """Disturbance observer of eq. (13), to the observation of tick `t`."""
+    """Disturbance observer of the scheme "predictive", to the observation of tick `t`."""
     begin, end, reach = past.marks[BASE], timing.observed[t], len(past.reported)
     m = end - begin
     past.marks[BASE] = end
@@ -332,7 +332,10 @@ def _observe_between(loop: Loop, timing: Timing, past: Past, t: int) -> None:
 
 @making_part
 def _estimate(loop: Loop, timing: Timing, past: Past, t: int) -> None:
-    """Eq. (13): predict the newest observation to the present by û."""
+    """Predict the newest observation to the present by û.
+
+    Source: eq. (13).
+    """
     k, o, reach = timing.step[t], timing.observed[t], len(past.first)
     past.track[0] = past.reported[o % len(past.reported)]
     if loop.scheme == NONE:
@@ -349,7 +352,10 @@ def _estimate(loop: Loop, timing: Timing, past: Past, t: int) -> None:
 
 @making_part
 def _plan(loop: Loop, past: Past, start: int, x: F2) -> None:
-    """Plan from a state at step `start`, without bounds; the result is in `past.plan`."""
+    """Plan from a state at step `start`, without bounds; the result is in `past.plan`.
+
+    Source: eq. (10).
+    """
     H, w, plan = len(loop.plan), past.disturbance, past.plan
     gap = start - past.marks[START]
     past.marks[START] = start
@@ -591,7 +597,7 @@ def make_loops(scenario: Scenario, steps: int) -> list[Loop]:
 
 
 def _plans(model: Model, mpc: MPC) -> tuple[Array, Array]:
-    """Unconstrained plans of (9), U = -𝓗⁻¹ g, as gains from the quantities in g.
+    """Unconstrained plans of eq. (9), U = -𝓗⁻¹ g, as gains from the quantities in g.
 
     Returns:
         for position and velocity where planning starts and ŵ, shape (axes, H, 3), and for the

@@ -34,7 +34,7 @@ class AxisAboard:
     """Record: constants of one axis of a vehicle."""
 
     true_a01: float
-    """Eq. (4) of the true vehicle: position gained per unit of velocity in a step [s]."""
+    """Model of the true vehicle, eq. (4): position gained per unit of velocity in a step [s]."""
     true_a11: float
     """Share of the true velocity that is left after a step."""
     true_b0: float
@@ -54,7 +54,7 @@ class AxisAboard:
     shove_v: float
     """Velocity added per unit of white acceleration's second random number [m/s]."""
     a01: float
-    """Eq. (4) with the terms' model: position gained per unit of velocity in a step [s]."""
+    """Model of the terms, eq. (4): position gained per unit of velocity in a step [s]."""
     a11: float
     """Share of the velocity that is left after a step, in the model."""
     b0: float

@@ -63,7 +63,10 @@ class Constant(Delay):
 
 @impairment(name="paper")
 class Paper(Delay):
-    """Delays by minimum_s + slot_s · Poisson(slots_mean), as the paper, eq. (17) as corrected."""
+    """Delays by minimum_s + slot_s · Poisson(slots_mean): the paper's law, as corrected (E1, E2).
+
+    Source: eq. (17).
+    """
 
     def __init__(
         self,
