@@ -16,11 +16,11 @@ from pathlib import Path
 from socket import socket
 from typing import Annotated
 
+from skytether.server.control.controller import other_schemes
 from skytether.server.endpoint import VEHICLES_MAX, Server
-from skytether.server.gate import PlainGate
-from skytether.server.secure import FORMS, SecureGate
+from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base import kernel
-from skytether.shared.core.endpoint import Address
+from skytether.shared.core.endpoint import Address, Form
 from skytether.shared.core.steady import Steady
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario.schema import Scenario
@@ -98,7 +98,7 @@ def serve(argv: Sequence[str]) -> None:
             )
         )
 
-    _ready()
+    _ready(options.config)
     try:
         worst = workers.run(options.workers, bind, work)
     except AddressError as error:
@@ -107,10 +107,11 @@ def serve(argv: Sequence[str]) -> None:
         raise CommandError("a worker has failed", worst)
 
 
-def _ready() -> None:
+def _ready(scenario: Scenario) -> None:
     """Have what plans in memory before a vehicle waits for it, and workers share it."""
-    command.prepare(kernel.missing())
-    kernel.load()
+    others = other_schemes(scenario)
+    command.prepare(kernel.missing(without=others))
+    kernel.load(without=others)
 
 
 def _work(
@@ -128,7 +129,12 @@ def _work(
         return path and path.with_name(path.name + suffix)
 
     # Each worker knows sessions of its own.
-    gate = SecureGate(keyring, entropy=secrets.token_bytes) if keyring else PlainGate()
+    gate: Gate = PlainGate()
+    forms: tuple[Form, ...] = ()
+    if keyring:
+        from skytether.server.secure import FORMS, SecureGate  # its ciphers take 30 ms, and 9 MB
+
+        gate, forms = SecureGate(keyring, entropy=secrets.token_bytes), FORMS
     axes, planned = options.config.model.axes, options.config.control.horizon
     record, columns = own(options.record), server_columns(axes, options.config.control.scheme)
     part = command.part_of(record)
@@ -152,7 +158,7 @@ def _work(
             Steady(endpoint),
             options,
             bind=bind,
-            forms=FORMS if keyring else (),
+            forms=forms,
             waiting_for="vehicles",
             secure=gate.secure,
             insecure=options.insecure,
@@ -164,5 +170,5 @@ def _work(
             feed=feed,
             metrics=metrics,
             warnings=command.flight_warnings(options.config),
-            ready=_ready,
+            ready=lambda: _ready(options.config),
         )

@@ -11,6 +11,7 @@ for planning is a small part of what a step costs.
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -39,6 +40,23 @@ PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
 BLOCK = 128
 """Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
+
+_PACKAGE = __name__.rpartition(".")[0]
+_MISSION = ("apart", "dual")
+_SCHEMES = {
+    "predictive": ("predictive", "planner", "exact"),
+    "none": ("predictive", "planner", "exact"),
+    "committed": ("committed", "planner", "exact"),
+    "trajectory": ("trajectory", "knots", "exact"),
+}
+"""Modules whose kernels plan by each scheme; the others' kernels are called with any of them."""
+
+
+def other_schemes(scenario: Scenario) -> set[str]:
+    """Names of the modules whose kernels are not called where a scenario is flown."""
+    own = _MISSION if scenario.is_mission else _SCHEMES[scenario.control.scheme]
+    names = {*_MISSION, *chain.from_iterable(_SCHEMES.values())} - {*own}
+    return {f"{_PACKAGE}.{name}" for name in names}
 
 
 @dataclass(frozen=True, slots=True)

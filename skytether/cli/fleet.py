@@ -19,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from skytether.cli import page_process, processes
+from skytether.figures import film
 from skytether.figures import flights as figures
 from skytether.shared.base import kernel
 from skytether.shared.core.events import Event, NotFlown
@@ -66,7 +67,7 @@ class FleetOptions:
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
-    """File for a picture of the flight (.png, .pdf or .svg)."""
+    """File for a picture of the flight (.png, .pdf or .svg), or a film (.gif)."""
     plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
@@ -168,7 +169,7 @@ def fleet(argv: Sequence[str]) -> None:
         if options.virtual:
             raise CommandError("--page: got --virtual as well, which nobody can follow", 2)
     if options.figure:
-        figures.check(options.figure)
+        figures.check(options.figure, film.SUFFIX)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
     command.prepare(kernel.missing())
@@ -186,7 +187,9 @@ def fleet(argv: Sequence[str]) -> None:
     _show(summary, title)
     if options.json:
         command.write(options.json, msgspec.json.encode(summary))
-    if options.figure:
+    if options.figure and options.figure.suffix == film.SUFFIX:
+        film.write(options.figure, title, options.config, flown.client, apart)
+    elif options.figure:
         told = flown.client, flown.server, apart
         figures.fleet(options.figure, title, options.config, *told)
     if flown.failure:

@@ -22,15 +22,20 @@ FORMATS = (".png", ".pdf", ".svg")
 """Suffixes of picture files that can be written."""
 
 
-def check(path: Path) -> None:
+def check(path: Path, *others: str) -> None:
     """Refuse a file that is no picture, before anything is flown.
+
+    Args:
+        path: file to write.
+        others: suffixes accepted beside FORMATS.
 
     Raises:
         ConfigError: with the suffixes that are accepted.
         ModuleNotFoundError: matplotlib is not installed.
     """
-    if path.suffix not in FORMATS:
-        raise ConfigError(f"{path}: expected a file in {', '.join(FORMATS)}")
+    accepted = (*FORMATS, *others)
+    if path.suffix not in accepted:
+        raise ConfigError(f"{path}: expected a file in {', '.join(accepted)}")
     import_module("matplotlib.figure")
 
 

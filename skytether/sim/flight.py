@@ -21,14 +21,13 @@ from typing import Any
 
 import msgspec
 
-from skytether.client import secure as client_secure
 from skytether.client import vehicles as kinds
 from skytether.client.endpoint import Client
 from skytether.client.fleet import apart_ns
 from skytether.client.link import ClientLink
 from skytether.netem.proxy import Proxy
-from skytether.server import secure as server_secure
 from skytether.server.endpoint import Server
+from skytether.server.gate import Gate
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
@@ -272,9 +271,17 @@ def make_keys(seed: int, vehicles: int) -> Keyring:
 def _link(keyring: Keyring | None, seed: int, vehicle: int) -> ClientLink | None:
     if keyring is None:
         return None
-    return client_secure.SecureLink(
-        keyring.of(vehicle), entropy=stream(seed, "entropy", vehicle).bytes
-    )
+    from skytether.client.secure import SecureLink  # its ciphers take a while
+
+    return SecureLink(keyring.of(vehicle), entropy=stream(seed, "entropy", vehicle).bytes)
+
+
+def _gate(keyring: Keyring | None, entropy: Callable[[int], bytes]) -> Gate | None:
+    if keyring is None:
+        return None
+    from skytether.server.secure import SecureGate  # its ciphers take a while
+
+    return SecureGate(keyring, entropy=entropy)
 
 
 def _fly(
@@ -316,7 +323,7 @@ def _fly(
         scenario,
         boot_id=BOOT_ID,
         entropy=entropy,
-        gate=server_secure.SecureGate(keyring, entropy=entropy) if keyring else None,
+        gate=_gate(keyring, entropy),
         room=len(seeds) * vehicles,
         recorder=recorder,
         plans=plans,

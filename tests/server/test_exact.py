@@ -16,8 +16,8 @@ from skytether.lab.benchmarks.problems import gradients
 from skytether.server.control import exact
 from skytether.server.control.exact import ExactSolver, active_set, workspace
 from skytether.server.control.mpc import LATER, Problem, make_mpc, pose
+from skytether.server.control.osqp_solver import OsqpSolver
 from skytether.server.control.planner import make_solver
-from skytether.server.control.solver import OsqpSolver
 from skytether.shared.base.kernel import part
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading

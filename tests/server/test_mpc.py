@@ -22,7 +22,7 @@ from skytether.server.control.mpc import (
     pose,
     shifted,
 )
-from skytether.server.control.solver import OsqpSolver
+from skytether.server.control.osqp_solver import OsqpSolver
 from skytether.shared.law.model import Array, discretise
 from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 

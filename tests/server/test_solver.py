@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import skytether.server.control.solver
+import skytether.server.control.osqp_solver
 from skytether.server.control.mpc import LATER, make_mpc, pose
-from skytether.server.control.solver import OsqpSolver, SolverFailed
+from skytether.server.control.osqp_solver import OsqpSolver
+from skytether.server.control.solver import SolverFailed
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 
@@ -97,7 +98,7 @@ def test_nothing_bad_sticks() -> None:
 
 def test_iteration_limit_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """An unfinished iterate is not passed on: the guess comes back, marked as unsolved."""
-    monkeypatch.setattr(skytether.server.control.solver, "ITERATIONS_MAX", 1)
+    monkeypatch.setattr(skytether.server.control.osqp_solver, "ITERATIONS_MAX", 1)
     gradient, guess = problems(4, 2)
     u, solved = OsqpSolver(PROBLEM).solve(gradient, guess)
     assert solved.tolist() == [False, False]

@@ -21,7 +21,8 @@ from scipy.linalg import block_diag
 
 from skytether.server.control.exact import ExactSolver
 from skytether.server.control.mpc import Problem
-from skytether.server.control.solver import OsqpSolver, Solver
+from skytether.server.control.osqp_solver import OsqpSolver
+from skytether.server.control.solver import Solver
 from skytether.shared.law.model import Array, Flags
 
 Factory = Callable[[Problem], Solver]
