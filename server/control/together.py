@@ -209,10 +209,13 @@ class Together:
             figures[name] = 0.0
         for i, (row, k) in enumerate(steps.items()):
             known = self._rows.setdefault(row, Known())
+            # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
+            # before it.
             turn = (k - self._number_of(row)) % SPACING == 0
             known.again = known.owed(k)
             if known.in_force is not None and known.heard and turn:
                 self._decide(row, known, k)
+            # A figure above any threshold: a motion that was found has to be sent.
             if known.next or known.again:
                 figures["expected_gap"][i] = 1e9
         self.planned[: len(rows)] = self._state[rows]
@@ -268,6 +271,7 @@ class Together:
 
     def _meet(self, steps: dict[int, int]) -> None:
         """Bring the steps of all vehicles onto one grid, and all motions that may be flown."""
+        # The median, for one vehicle that begins anew must not move the grid of all others.
         known = [k - self._ahead[row] for row, k in steps.items() if row in self._ahead]
         self._now = int(np.median(known)) if known else self._now + 1
         self._ahead |= {row: k - self._now for row, k in steps.items()}
@@ -275,6 +279,7 @@ class Together:
         for row, each in self._rows.items():
             if row in steps:
                 each.next = None
+            # All that may be flown, also those whose acknowledgement is still under way.
             for motion in each.motions():
                 self._flown.add(motion, self._ahead.get(row, 0), row, each.off_m)
 
@@ -406,6 +411,7 @@ class Together:
                     break
                 taken |= hit
                 planes = planes or self._planes(row, base, due)
+            # A plan that hardly moves is taken for stuck, and another aim is tried.
             moved_m, far_m = (float(np.linalg.norm(end - p0)) for end in (p[-1], aim))
             if moved_m >= STUCK * min(far_m, 2.0) and not hit.any():
                 known.waits, known.turned = "", max(0.0, known.turned - TURN_BACK)
@@ -442,6 +448,7 @@ class Together:
         if not self._zones:
             return found
         near = self._zones.planes(held, plan.reach_m + self._tube_m + MARGIN_M)
+        # A vehicle that is nearer to a zone already need only come no nearer.
         least = np.minimum(self._tube_m + MARGIN_M, near.away_m - 1e-4)
         least += np.einsum("ij,ij->i", near.normal, near.border)
         return HalfPlanes(
