@@ -120,8 +120,8 @@ def fly(argv: Sequence[str]) -> None:
             line = parse_line("vehicle.address", scenario.vehicle.address)
             command.check_count(f"--vehicles with {scenario.vehicle.kind}", len(numbers), 1)
         if options.set_parameters and not flying[0].set_parameters():
-            said = f"--set-parameters: a vehicle of the kind {scenario.vehicle.kind} has none"
-            raise CommandError(said, command.CONFIGURATION)
+            kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
+            raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
         clients = [
             Client(
                 scenario,

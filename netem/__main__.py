@@ -117,7 +117,8 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
 
 
 def _flows(given: int | None) -> int:
-    """Most clients at once; less than usual, and then said, where the system allows no more.
+    """Largest number of clients at once; smaller than FLOWS_MAX, and printed, where the system
+    allows no more.
 
     Raises:
         CommandError: so many cannot be.
@@ -127,8 +128,8 @@ def _flows(given: int | None) -> int:
     command.check_sockets("--flows", flows)
     if given is None and flows < FLOWS_MAX:
         print(
-            f"netem: room for {flows} clients and not {FLOWS_MAX}: {files_max()} files may be open "
-            "here (ulimit -n)",
+            f"netem: room for {flows} clients instead of {FLOWS_MAX}: {files_max()} files may be "
+            "open here (ulimit -n)",
             file=sys.stderr,
         )
     return flows

@@ -131,6 +131,8 @@ def _against(said: HeardNumbers, row: int, which: int, H: int, dt: float, noise_
     if new.in_force > new.since + H or new.since > new.step:
         verdict = HORIZON
     elif before.step >= 0:
+        # F of one observation and G of another make a round trip as well, which cannot be shorter
+        # than nothing.
         trip = min(new.forward + before.backward, new.backward + before.forward)
         if min(trip, new.forward + new.backward) < -SLACK_NS:
             verdict = CLOCK
@@ -185,6 +187,8 @@ def _judge(
     verdict = _against(said, row, LAST, H, dt, noise_m)
     if verdict != BELIEVED:
         place = DOUBTED
+        # Three that agree with each other are believed after all: the vehicle may have been
+        # carried, or have a new clock.
         agrees = numbers[DOUBTED, row].step >= 0 and (
             _against(said, row, DOUBTED, H, dt, noise_m) == BELIEVED
         )

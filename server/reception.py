@@ -164,6 +164,7 @@ class Reception:
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
         self._out.append(Datagram(call.line.seal(encode(welcome)), address))
+        # After the answer is sealed, which is what makes the channel.
         if refusal is Refusal.ACCEPTED:
             self._gate.admit(call, now_ns=now_ns)
 
@@ -184,6 +185,7 @@ class Reception:
             return Refusal.ACCEPTED
         self.refused[refusal] += 1
         told = vehicle, hello.boot_id, refusal
+        # Said once a life and reason, for a vehicle that is refused says HELLO every 0.4 s.
         if told not in self._told:
             self._told.append(told)
             self._events.append(event)
@@ -204,6 +206,7 @@ class Reception:
         if verdict == ANEW:
             self._anew(row)
             session.hearing.begin()
+        # Only after it was believed: an observation that is not does not keep a session alive.
         session.heard_ns = now_ns
         session.asked_ns = observation.silence * self._terms.dt_ns // 2
         session.hearing.hear(observation.number, observation.step)
@@ -213,6 +216,8 @@ class Reception:
         if not self._controller.observe(row, observation):
             session.stale += 1
             return
+        # Only the packet with the highest counter moves the address: a copy that is sent on from
+        # elsewhere does not, once the original has come.
         if call.moves:
             session.address, session.line = address, call.line
         self._grid.arm(now_ns)

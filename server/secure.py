@@ -80,6 +80,7 @@ class _HandshakeRate:
 
     def grant(self, now_ns: int) -> bool:
         """Whether one more is granted."""
+        # A bucket of one second: what was not used before that is gone.
         begun_ns = max(self._granted_ns, now_ns - SECOND_NS)
         if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
             return False
@@ -134,6 +135,7 @@ class _KeyedVehicle:
             del self.pending[each]
             if each == number:
                 break
+        # For a while both are opened: packets of the old channel are still under way.
         if self.live is not None:
             self.live.retire(now_ns=now_ns)
         self.previous, self.live = self.live, channel
@@ -217,6 +219,7 @@ class SecureGate:
     def number(self, vehicle: int) -> int:
         """Number for a new channel of a vehicle, which nobody can guess."""
         known = self._vehicles[vehicle]
+        # Drawn again where the vehicle has a channel of this number, once in 2^32.
         while True:
             (number,) = CHANNEL.unpack(self.entropy(CHANNEL.size))
             if known.find(number) is None:
@@ -247,6 +250,7 @@ class SecureGate:
             raise ProtocolError(Drop.UNKNOWN_KEY)
         cookie, message = read_initiation(key, packet)
         if not self._is_valid(cookie, peer, now_ns):
+            # Nothing is kept of a sender before a cookie has shown that it hears at its address.
             fresh = self._cookie(peer, now_ns // COOKIE_NS)
             challenge = write_challenge(key, fresh, message[:KEY_BYTES])
             self._out.append(Datagram(challenge, peer))
@@ -258,6 +262,7 @@ class SecureGate:
         if public in known.done:  # the vehicle has closed this attempt
             raise ProtocolError(Drop.REPLAYED)
         response = known.response(public)
+        # A new attempt needs the key, a repeated one only ears: so the two do not share a limit.
         if response is None:
             if not known.attempts.grant(now_ns):
                 raise ProtocolError(Drop.TOO_MANY_HANDSHAKES)
@@ -282,5 +287,6 @@ class SecureGate:
     def _cookie(self, peer: Address, time: int) -> bytes:
         """Cookie for an address in the given one of the times of COOKIE_NS."""
         host, port = peer
+        # Made anew to be compared and never stored: any number of strangers costs no memory.
         told = f"{host} {port} {time}".encode()
         return hashlib.blake2s(told, key=self._secret, digest_size=COOKIE_BYTES).digest()

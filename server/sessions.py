@@ -78,6 +78,8 @@ class Session:
         It may have another address since its HELLO, or somebody may send on copies of its packets
         that come before the packets themselves: it must be heard at home then.
         """
+        # Sealed once: with keys the vehicle opens the copy that comes first, and drops the other as
+        # repeated.
         packet = self.line.seal(payload)
         if self.address == self.home:
             return (Datagram(packet, self.home),)
@@ -173,6 +175,8 @@ class Sessions:
             number, hearing = self._number(), self._hearing()
             session = Session(hello.vehicle, number, hello.boot_id, address, address, line, hearing)
         session.home, session.heard_ns = address, now_ns
+        # The one that said HELLO longest ago gives way: `is_full` has found that it is not expected
+        # any more.
         if waiting is self.coming and len(waiting) == len(self._free_rows):
             self.coming.popitem(last=False)
         waiting[hello.vehicle] = session
@@ -180,6 +184,7 @@ class Sessions:
 
     def _number(self) -> int:
         """Number of a new session, which nobody can guess, and as long on the wire as any other."""
+        # The highest bit is set, so that msgpack takes five bytes for every number.
         return int.from_bytes(self._entropy(4)) | 2**31
 
     def _waiting(self, vehicle: int) -> dict[int, Session]:
@@ -206,9 +211,11 @@ class Sessions:
         session = waiting.get(observation.vehicle)
         if session is None or session.number != observation.session:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
+        # Checked here again: the earlier life may have come back since the WELCOME.
         if before is not None and self._is_heard(before, now_ns):
             raise ProtocolError(Drop.TAKEN)
         del waiting[session.vehicle]
+        # The lowest free row, so that arrays are used from the front.
         session.row = heappop(self._free_rows) if before is None else before.row
         session.sent_ns = now_ns
         self._live[session.vehicle] = self._by_row[session.row] = session
@@ -237,6 +244,7 @@ class Sessions:
     def _forget(self, session: Session) -> None:
         del self._live[session.vehicle], self._by_row[session.row]
         heappush(self._free_rows, session.row)
+        # A new life that was waiting for the old one to fall silent takes the free place.
         again = self._again.pop(session.vehicle, None)
         if again is not None:
             self.coming[session.vehicle] = again

@@ -154,7 +154,7 @@ class Launch:
             self._wait("not flown", f"it is in the air in {mode}; {expected}", now_ns)
         elif condition.armed and condition.mode not in flavour.own:
             expected = f"expected it disarmed, or in {guided}"
-            self._wait("not flown", f"somebody has armed it in {mode}; {expected}", now_ns)
+            self._wait("not flown", f"it was armed by somebody else in {mode}; {expected}", now_ns)
         elif may_arm and condition.battery_is_weak:
             self._wait("not armed", "its battery is low, see mavlink.battery_min", now_ns)
         elif may_arm:

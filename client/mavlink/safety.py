@@ -49,14 +49,14 @@ def _timeout(value: float) -> bool:
 
 
 _STATION_ACTIONS = {
-    0: "once we are gone it hovers for ever",
-    1: "once we are gone it returns home and lands",
-    2: "once we are gone it goes on with a mission, or returns home and lands",
-    3: "once we are gone it returns home the way it came, and lands",
-    4: "once we are gone it returns home the way it came, or lands",
-    5: "once we are gone it lands where it is",
-    6: "once we are gone it returns home or to a landing of its mission",
-    7: "once we are gone it brakes and hovers for ever",
+    0: "without our heartbeats it hovers for ever",
+    1: "without our heartbeats it returns home and lands",
+    2: "without our heartbeats it goes on with a mission, or returns home and lands",
+    3: "without our heartbeats it returns home the way it came, and lands",
+    4: "without our heartbeats it returns home the way it came, or lands",
+    5: "without our heartbeats it lands where it is",
+    6: "without our heartbeats it returns home or to a landing of its mission",
+    7: "without our heartbeats it brakes and hovers for ever",
 }
 _SILENCE_ACTIONS = {
     0: "without setpoints it hovers for ever where there is a remote control (position mode)",
@@ -118,7 +118,7 @@ def ardupilot(system: int) -> tuple[Rule, ...]:
         ),
         Rule(
             ("FS_GCS_ENABLE",),
-            _table(_STATION_ACTIONS, "nobody knows what it does once we are gone"),
+            _table(_STATION_ACTIONS, "it is not known what it does without our heartbeats"),
             _among(1, 2, 3, 4, 5, 6),
             "one that lands: set 5",
             5.0,
@@ -178,7 +178,7 @@ def px4() -> tuple[Rule, ...]:
         ),
         Rule(
             ("COM_OBL_RC_ACT",),
-            _table(_SILENCE_ACTIONS, "nobody knows what it does without setpoints"),
+            _table(_SILENCE_ACTIONS, "it is not known what it does without setpoints"),
             _among(3, 4),
             "3 (return) or 4 (land): set 4",
             4.0,
@@ -193,7 +193,7 @@ def px4() -> tuple[Rule, ...]:
         ),
         Rule(
             ("NAV_DLL_ACT",),
-            _table(_LINK_ACTIONS, "nobody knows what it does without a ground station"),
+            _table(_LINK_ACTIONS, "it is not known what it does without a ground station"),
             _among(0, 1, 2, 3),
             "one with which it does not fall: set 0",
             0.0,
@@ -232,6 +232,6 @@ def judged(rule: Rule, values: Mapping[str, float]) -> AutopilotParameter:
             return AutopilotParameter(
                 name=name, value=value, meaning=rule.meaning(value), wanted=wanted
             )
-    meaning = "its autopilot does not have it, or does not tell"
+    meaning = "its autopilot does not have it, or has not answered"
     wanted = rule.wanted if rule.required else ""
     return AutopilotParameter(name=rule.names[0], value=None, meaning=meaning, wanted=wanted)

@@ -48,6 +48,7 @@ class Sensor:
             return Measurement(stamp_ns, [p for p, _ in state], [v for _, v in state])
         states = self._states
         states.append(list(state))
+        # Before the first measurement is due, the vehicle has stood where it begins.
         while len(states) <= self.delay:
             states.append(states[0])
         position, velocity = (self._measure(states[0], which) for which in (0, 1))
@@ -61,6 +62,8 @@ class Sensor:
     def _measure(self, state: list[Sequence[float]], which: int) -> list[float] | None:
         """Position (0) or velocity (1) of a state, where one is due."""
         every_ns, time_ns = self._every_ns[which], self._step * self._dt_ns
+        # Due at the first step at or after a multiple of the interval, though that is no multiple
+        # of Δt.
         if not every_ns or time_ns % every_ns >= self._dt_ns:
             return None
         noise, bias = self._noise[which], self._bias[which]

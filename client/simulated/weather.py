@@ -49,6 +49,8 @@ class Weather:
         white = vehicle.wind * white_acceleration(self._tau, self._dt_s)
         self.white = white.tolist() if vehicle.wind else []
         self._gust_mps2 = vehicle.gust_mps2
+        # Chance in a step of an event that comes at a constant rate: exact for any length of a
+        # step.
         self._gust_end_chance = float(-np.expm1(-self._dt_s / vehicle.gust_s))
         self._gust_start_chance = float(-np.expm1(-self._dt_s / vehicle.gust_every_s))
         self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(self._tau)))
@@ -84,6 +86,7 @@ class Weather:
         """Gusts begin and end by chance, each blowing one way all along."""
         if self._gust_mps2 == 0.0:
             return
+        # Drawn at every step, so that a gust's strength changes nothing of when gusts come.
         chance = self._rng.random()
         if self._gust is not None:
             if chance < self._gust_end_chance:
@@ -98,4 +101,5 @@ class Weather:
         if self._gust is None:
             return AirStep(self._steady_mps.tolist(), [])
         gust_mps2 = self._gust_mps2 * self._gust / np.linalg.norm(self._gust)
+        # An acceleration a acts like an input τ a under eq. (1).
         return AirStep((self._steady_mps + self._tau * gust_mps2).tolist(), [])

@@ -218,6 +218,8 @@ def _least_apart(
             for x in range(axes):
                 way += (there[x] - here[x]) ** 2
                 off -= here[x] * (there[x] - here[x])
+            # Nearest point of the straight piece from `here` to `there` to the origin, where the
+            # other one is.
             t = min(max(off / way, 0.0), 1.0) if way > 0.0 else 0.0
             square = 0.0
             for x in range(axes):
@@ -258,8 +260,12 @@ def _half_planes(
                 off[x] = scale[x] * (held[i, x] - place[x])
                 square += off[x] * off[x]
             away = np.sqrt(square)
+            # Out of reach, the constraint could never be active; at the very same place it has no
+            # direction.
             if away >= apart[m] + reach[i] or away == 0.0:
                 continue
+            # Where two are too near already, the plane runs just behind the motion in force, which
+            # so remains a solution.
             offset = min(apart[m], away - 1e-4)
             for x in range(axes):
                 normal[n, x] = scale[x] * off[x] / away

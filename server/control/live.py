@@ -52,8 +52,11 @@ class LivePoint:
         if self._moved_ns is None:
             if not self._told:
                 return np.stack([self._position, self._velocity], axis=-1)
+            # With its velocity told, the point moves from the first time that somebody asks for it.
             self._moved_ns = now_ns
+        # Never negative: a tick may be due before the move that has just come.
         since_s = max(0, now_ns - self._moved_ns) / SECOND_NS
+        # Nobody has moved it for long, so that it is taken to be where it was left.
         if not self._told and since_s > REST_S:
             return np.stack([self._position, np.zeros_like(self._velocity)], axis=-1)
         return np.stack([self._position + since_s * self._velocity, self._velocity], axis=-1)
@@ -67,5 +70,6 @@ class LivePoint:
         if h_s > 0.0:
             share = -math.expm1(-h_s / MEMORY_S)
             before = before + share * ((position - self._position) / h_s - before)
+        # Two moves a moment apart would else make a velocity that no vehicle can follow.
         velocity: Array = np.clip(before, -self._fastest, self._fastest)
         return velocity

@@ -45,6 +45,8 @@ class MotionPlan:
         tau_s, gain = np.array(terms.tau_s), np.array(terms.gain)
         most = SHARE * np.array(terms.u_max) * gain
         if speed_mps:
+            # On each axis alone, so that the constraints stay linear: on the diagonal it is exact,
+            # along an axis cautious.
             most = np.minimum(most, speed_mps / np.sqrt(axes))
         self._acceleration = acceleration_mps2
         place = np.arange(n)
@@ -92,6 +94,8 @@ class MotionPlan:
         a = np.full(n * axes, self._acceleration)
         most, v = np.repeat(self._most, n), np.repeat(v0, n)
         low = [-v0, -a, -most - v, -most - v, -a, v - most, v - most]
+        # The constraints that are always there are kept as columns, and half-planes are put behind
+        # them.
         columns = self._fixed
         if planes is not None and len(planes[0]):
             at, normal, least = planes
@@ -105,6 +109,7 @@ class MotionPlan:
             return None
         found = x.reshape(axes, n).T
         velocity = np.vstack([v0, v0 + self._to_velocity @ found])
+        # It is 0 to within the solver's tolerance, and a motion that ends has to rest exactly.
         velocity[-1] = 0.0
         # Positions of what is flown: that velocity, whatever the solver's tolerance has left.
         steps = 0.5 * T * (velocity[1:] + velocity[:-1])

@@ -213,9 +213,12 @@ class Together:
         for i, (row, k) in enumerate(steps.items()):
             known = self._rows.get(row) or self._rows.setdefault(row, Known())
             known.again = known.owed(k) if known.sent else None
+            # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
+            # before it.
             turn = (k - self._number_of(row)) % SPACING == 0
             if turn and known.in_force is not None and known.heard:
                 self._decide(row, known, k)
+            # A figure above any threshold: a motion that was found has to be sent.
             if known.next or known.again:
                 figures["expected_gap"][i] = 1e9
         self.planned[: len(rows)] = self._state[rows]
@@ -271,6 +274,7 @@ class Together:
 
     def _meet(self, steps: dict[int, int]) -> None:
         """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
+        # The median, for one vehicle that begins anew must not move the grid of all others.
         known = [k - self._ahead[row] for row, k in steps.items() if row in self._ahead]
         self._now = int(median(known)) if known else self._now + 1
         self._ahead |= {row: k - self._now for row, k in steps.items()}
@@ -294,6 +298,7 @@ class Together:
         if self._flown.count:
             return
         for row, each in self._rows.items():
+            # All that may be flown, also those whose acknowledgement is still under way.
             for motion in each.motions():
                 self._flown.add(motion, self._ahead.get(row, 0), row, each.off_m)
 
@@ -425,6 +430,7 @@ class Together:
                     break
                 taken |= hit
                 planes = planes or self._planes(row, base, due)
+            # A plan that hardly moves is taken for stuck, and another aim is tried.
             moved_m, far_m = (float(np.linalg.norm(end - p0)) for end in (p[-1], aim))
             if moved_m >= STUCK * min(far_m, 2.0) and not hit.any():
                 known.waits, known.turned = "", max(0.0, known.turned - TURN_BACK)
@@ -461,6 +467,7 @@ class Together:
         if not self._zones:
             return found
         near = self._zones.planes(held, plan.reach_m + self._tube_m + MARGIN_M)
+        # A vehicle that is nearer to a zone already need only come no nearer.
         least = np.minimum(self._tube_m + MARGIN_M, near.away_m - 1e-4)
         least += np.einsum("ij,ij->i", near.normal, near.border)
         return HalfPlanes(

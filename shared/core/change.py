@@ -143,7 +143,7 @@ class Running:
                 # into the log.
                 shown = shown if shown.isprintable() else repr(shown)
                 raise ConfigError(f"{shown}: no such key; {hint(key, may)}") from None
-            what = f"what can be here: {', '.join(may)}"
+            what = f"expected one of {', '.join(may)}"
             raise ConfigError(f"{key}: cannot be changed in flight; {what}")
         laid = reading.to_table(self._scenario)
         for key, value in values.items():

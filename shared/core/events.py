@@ -169,7 +169,7 @@ class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     def __str__(self) -> str:
         newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"
-        return f"{self.count} datagrams so far are not taken for a vehicle's, {newest}"
+        return f"{self.count} datagrams dropped so far that were no vehicle's, {newest}"
 
 
 class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -178,7 +178,7 @@ class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     degraded: bool
 
     def __str__(self) -> str:
-        return "degraded: it misses ticks" if self.degraded else "it is in time again"
+        return "degraded: ticks are missed" if self.degraded else "ticks are in time again"
 
 
 class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -216,10 +216,10 @@ class SessionOpened(VehicleEvent, frozen=True, kw_only=True):
 
 
 class SessionEnded(VehicleEvent, frozen=True, kw_only=True):
-    """The server has forgotten a vehicle that was silent for long."""
+    """A session has ended: the vehicle has closed it, or was silent for long."""
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle} is gone"
+        return f"the session of vehicle {self.vehicle} has ended"
 
 
 class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
@@ -335,9 +335,9 @@ DOES = {
     "coast": "holds its last input, as vehicle.exhausted says",
     "brake": "brakes",
     "hover": "hovers",
-    "land": "lands, and is not to be flown before somebody has seen to it",
-    "manual": "is left to whoever flies it now",
-    "fault": "stands still, and is not to be flown before somebody has seen to it",
+    "land": "lands, and must be checked before it flies again",
+    "manual": "is flown by somebody else, or by nobody",
+    "fault": "stands still, and must be checked before it flies again",
 }
 """What a vehicle does in each mode, as far as it is told: along a plan it coasts in silence."""
 
@@ -355,7 +355,7 @@ class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
     """The server does not believe the state that a vehicle reports, since it did so before."""
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle} reports a state that it cannot have come to: not believed"
+        return f"vehicle {self.vehicle} reports a state that it cannot have reached: not believed"
 
 
 class LeftTube(VehicleEvent, frozen=True, kw_only=True):
@@ -380,7 +380,7 @@ class PlanningResumed(VehicleEvent, frozen=True, kw_only=True):
     """The server plans for a vehicle again."""
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle} is planned for again"
+        return f"vehicle {self.vehicle} gets plans again"
 
 
 class NotFlown(VehicleEvent, frozen=True, kw_only=True):

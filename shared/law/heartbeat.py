@@ -59,6 +59,7 @@ def silences(timeout_ns: int, step_ns: int) -> tuple[tuple[float, int], ...]:
     """
     fewest, most = -(-timeout_ns // (MOST * step_ns)), timeout_ns // (FEWEST * step_ns)
     counts = range(max(most, 1), max(fewest, 1) - 1, -1) or (1,)
+    # A table, made once: each packet then costs a bisection only.
     grid = [i / 1000 for i in range(1001)]
     found: list[tuple[float, int]] = []
     for count in counts:
@@ -112,6 +113,7 @@ class Hearing:
             self.newest += ahead
             self._newest_at = at
         else:
+            # A late packet was not lost, and takes back that it seemed so.
             self._came |= 1 << (self.newest - number) % NUMBERS
         if self._fixed_ns is None:
             self._told = 0
@@ -121,6 +123,8 @@ class Hearing:
         """Share of the other end's packets that are lost, rather too large than too small."""
         known = min(self.newest + 1, WINDOW)
         lost = known - self._came.bit_count()
+        # A prior of WEIGHT packets: after the first few of a session a single loss must not look
+        # like a third.
         return (lost + WEIGHT * ASSUMED) / (known + WEIGHT)
 
     @property

@@ -32,5 +32,6 @@ def position_leaps(
         time: between the two [s].
         noise: what noise may add to the change of position [m].
     """
+    # By the mean of both velocities, so that only what an acceleration cannot explain is left.
     off = after_p - p - 0.5 * (v + after_v) * time
     return abs(off) > noise + 0.5 * ACCELERATION_MPS2 * time * time

@@ -114,10 +114,10 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
     if not scenario.is_mission:
         if scenario.mission.zones:
-            expected = "none, but on a mission: reference.shape = 'mission', or a swap"
+            expected = "none without a mission: reference.shape = 'mission', or a swap"
             yield "mission.zones", repr(scenario.mission.zones), expected
         if scenario.mission.goals:
-            expected = "none, but on a mission: reference.shape = 'mission', or a swap"
+            expected = "none without a mission: reference.shape = 'mission', or a swap"
             yield "mission.goals", repr(scenario.mission.goals), expected
         return
     if control.scheme != "trajectory":
@@ -265,7 +265,7 @@ def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
         key = f"network.{way}"
         short = msgspec.structs.replace(direction, impairments="")
         if direction.impairments and short != DirectionConfig():
-            expected = "no other keys beside it, for it says all: add to the text instead"
+            expected = "no other keys of the direction beside it: add them to the text instead"
             yield f"{key}.impairments", repr(direction.impairments), expected
         try:
             _ = direction.path

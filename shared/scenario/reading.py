@@ -208,7 +208,7 @@ def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 
 
 _PLAIN = {
-    "Number out of range": "a number that is not as large",
+    "Number out of range": "a smaller number",
     "float": "a number",
     "int": "a whole number",
     "bool": "true or false",

@@ -92,7 +92,7 @@ class Situation(NamedTuple):
             ValueError: the scheme is not "committed", and they are not known.
         """
         if self.known.held is None:
-            raise ValueError("held: what is held aboard is known with the scheme 'committed' alone")
+            raise ValueError("held: expected control.scheme = 'committed', which alone knows it")
         return self.known.held[: len(self.rows)].copy()
 
     @property

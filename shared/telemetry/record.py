@@ -82,7 +82,7 @@ REASON_TEXTS = {
     Reason.STILL: "it stands still",
     Reason.ALONE: "the server has been silent for long",
     Reason.NOT_FINITE: "its state or its input is not finite",
-    Reason.LEAPT: "its state has leapt as no vehicle can",
+    Reason.LEAPT: "its state has jumped further than a vehicle can move",
     Reason.TAKEN: "a pilot, or its autopilot, has taken over",
     Reason.DISARMED: "its motors are disarmed",
     Reason.RETURNED: "its autopilot obeys again",
@@ -297,7 +297,7 @@ def columns_of(descr: Any) -> np.dtype[np.void]:
         fields = [(name, kind, *map(tuple, shape)) for name, kind, *shape in descr]
         # numpy reads other kinds as Python does, and has any of its errors for what is none.
         if not all(_NUMBER.fullmatch(kind) for _, kind, *_ in fields):
-            raise ValueError("some are no numbers")
+            raise ValueError("got a column of another kind, expected numbers")
         columns = np.dtype(fields)
     except TypeError as error:
         raise ValueError(str(error)) from None

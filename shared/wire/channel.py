@@ -159,21 +159,25 @@ class Channel:
         if now_ns > self._opens_until_ns or counter >= PACKETS_MAX:
             raise ProtocolError(Drop.EXPIRED)
         window = self._window
+        # Before the tag is checked: a repeated packet costs no cryptography.
         if not window.is_new(counter):
             raise ProtocolError(Drop.REPLAYED)
         try:
             payload = self._open(_NONCE.pack(counter), packet[HEADER.size :], packet[: HEADER.size])
         except InvalidTag:
             raise ProtocolError(Drop.FORGED) from None
+        # Only after the tag was checked: a forged counter must not move the window.
         newest = counter > window.newest
         window.add(counter)
         return OpenedPacket(payload, newest)
 
     def retire(self, *, now_ns: int) -> None:
         """Open what is still under way to this end, and then nothing more."""
+        # The smaller of both: retiring never prolongs the life of a channel.
         self._opens_until_ns = min(self._opens_until_ns, now_ns + OVERLAP_NS)
 
     def wants_successor(self, now_ns: int) -> bool:
         """Whether it has been used for so long that another one is to follow."""
+        # Both directions count, for one handshake renews the keys of both.
         packets = max(self._sent, self._window.newest + 1)
         return now_ns >= self._fresh_until_ns or packets >= FRESH_PACKETS

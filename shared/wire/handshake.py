@@ -96,6 +96,7 @@ def pad(hello: bytes) -> bytes:
 
 def unpad(padded: bytes) -> bytes:
     """The HELLO that was padded."""
+    # The byte 0x80 ends the message, so that a HELLO may end with zeros itself.
     return padded.rstrip(b"\0")[:-1]
 
 
@@ -170,6 +171,7 @@ def read_response(key: VehicleKey, packet: bytes, public: bytes) -> Response:
 
 def is_authentic(key: VehicleKey, packet: bytes, public: bytes = b"") -> bool:
     """Whether who made a packet has the key; `public` is the ephemeral key that it answers."""
+    # In constant time: the time of a comparison would tell how many bytes of a guess are right.
     return hmac.compare_digest(packet[-MAC_BYTES:], _mac(key, packet[:-MAC_BYTES] + public))
 
 

@@ -247,7 +247,7 @@ class Idle(IntEnum):
 
 IDLE_TEXTS = {
     Idle.PLANS: "no newer horizon has come",
-    Idle.OBSERVATION: "what is known of it at the server is older than link.age_max_s",
+    Idle.OBSERVATION: "its newest observation at the server is older than link.age_max_s",
     Idle.DELAY: "the delay to it is longer than a horizon has room for",
     Idle.UNSOLVED: "the solver has found none",
 }

@@ -43,7 +43,7 @@ def export(argv: Sequence[str]) -> None:
     """
     options = read(ExportOptions(tyro.MISSING), argv, "skytether export", export.__doc__)
     if not (options.csv or options.parquet or options.traces or options.pcap):
-        said = "got none of --csv, --parquet, --traces and --pcap, expected where to write"
+        said = "expected at least one of --csv, --parquet, --traces and --pcap"
         raise CommandError(said, CONFIGURATION)
     to_parquet = view.parquet() if options.parquet else None
     with recordings.opened(options.file) as recorded:
@@ -71,7 +71,7 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
     """
     packets = recorded.parts().get("netem")
     if packets is None or not len(packets):
-        said = f"{options.file}: netem has recorded nothing in it, expected packets"
+        said = f"{options.file}: got no packets of netem, expected some"
         raise CommandError(said, CONFIGURATION)
     if options.traces:
         options.traces.mkdir(parents=True, exist_ok=True)

@@ -163,11 +163,11 @@ def fleet(argv: Sequence[str]) -> None:
     command.check_count("--vehicles", vehicles, 65_535)
     command.check_count("--workers", options.workers, 64)
     if options.virtual and options.workers > 1:
-        raise CommandError("--workers: got --virtual as well, where there is but one", 2)
+        raise CommandError("--workers: got --virtual as well, expected 1 in virtual time", 2)
     if options.page:
         command.address("--page", options.page)
         if options.virtual:
-            raise CommandError("--page: got --virtual as well, which nobody can follow", 2)
+            raise CommandError("--page: got --virtual as well, expected a flight in real time", 2)
     if options.figure:
         figures.check(options.figure, film.SUFFIX)
     where = "in virtual time" if options.virtual else "over UDP on loopback"

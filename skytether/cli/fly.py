@@ -179,12 +179,12 @@ def _make_folder(folder: Path, *, virtual: bool) -> None:
         CommandError: the folder cannot be created, or the flight is in virtual time.
     """
     if virtual:
-        said = "--control: got a folder, expected none with --virtual, which nobody can follow"
+        said = "--control: got --virtual as well, expected a flight in real time"
         raise CommandError(said, command.CONFIGURATION)
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
     except OSError as error:
-        said = f"--control: {folder}: no folder can be made: {error.strerror}"
+        said = f"--control: {folder}: cannot be created: {error.strerror}"
         raise CommandError(said, command.CONFIGURATION) from None
 
 

@@ -16,7 +16,7 @@ from skytether.shell import command
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
 
-HEAD = "# VEHICLE KEY SECRET. Who reads the secret of a vehicle can fly it.\n"
+HEAD = "# VEHICLE KEY SECRET. Whoever reads a vehicle's secret can fly the vehicle.\n"
 """First line of a new file."""
 
 
@@ -56,14 +56,14 @@ def keygen(argv: Sequence[str]) -> None:
             f"--key-id: got {options.key_id}, expected 0 to {NUMBERS[-1]}", CONFIGURATION
         )
     if options.if_missing and options.file.exists():
-        print(f"{options.file}: is there, and stays as it is.")
+        print(f"{options.file}: exists already, and was left unchanged.")
         return
     make(options.file, vehicles, options.key_id, add=options.add)
     many = len(vehicles) > 1
     named = f"vehicles {vehicles[0]} to {vehicles[-1]}" if many else f"vehicle {vehicles[0]}"
     print(f"{options.file}: wrote {len(vehicles)} key{'s' if many else ''}, of {named}.")
     print(f"Next: start the server with `--keys {options.file}`; give each vehicle a file of mode")
-    print("0600 with its own line alone, by a way that nobody reads, and start it with `--keys`.")
+    print("0600 with its own line alone, which nobody else may read, and start it with `--keys`.")
 
 
 def make(
@@ -133,7 +133,7 @@ def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
             os.fsync(file.fileno())
     except FileExistsError:
         raise CommandError(
-            f"{path}: is there already, expected a new file (or --add)", CONFIGURATION
+            f"{path}: exists already, expected a new file (or --add)", CONFIGURATION
         ) from None
     except OSError as error:
         raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None

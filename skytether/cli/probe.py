@@ -177,14 +177,16 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
     try:
         found = outcome(measured, options.target, secure=link.secure)
     except ValueError as error:
-        raise CommandError(f"nothing can be told: {error}") from None
+        raise CommandError(f"too little was measured: {error}") from None
     _write(options, found)
     if options.record:
         _record(options.record, rows(measured, found.clocks))
     _tell(options, found)
     if not prober.finished:
         seconds = found.told.seconds
-        raise CommandError(f"ended early, after {seconds:.3g} s: all this is of these", INTERRUPTED)
+        raise CommandError(
+            f"ended early, after {seconds:.3g} s: all figures are of this time", INTERRUPTED
+        )
 
 
 def _say(event: Event) -> None:
@@ -260,7 +262,7 @@ def _tell(options: ProbeOptions, found: ProbeOutcome) -> None:
     command.show(_table(ways))
     command.show(_models(ways))
     doubt = f"{told.drift_doubt_ppm:.1f} ppm"
-    drift = f"no drift was seen that is sure (standard error {doubt})"
+    drift = f"no significant drift (standard error {doubt})"
     if told.drift_ppm:
         drift = f"the other end's gains {told.drift_ppm:+.1f} ± {doubt}"
     print(

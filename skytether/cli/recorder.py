@@ -207,7 +207,7 @@ class Live:
             source.begun = True
         else:
             if source.resumed and frame.time_ns > source.last_ns:
-                self._miss(f"the recorder was too slow for what {process} tells")
+                self._miss(f"the recorder could not keep up with {process}")
             source.resumed = False
             if not source.is_new(frame):
                 return

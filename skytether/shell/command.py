@@ -201,7 +201,7 @@ def check_sealed(bind: Address, *, secure: bool) -> None:
 def _unsealed(*addresses: Address) -> CommandError:
     at = ", ".join(address_text(*address) for address in addresses)
     expected = "expected --keys FILE (see skytether keygen), or --insecure"
-    said = f"{at} is not on this machine alone, and there are no keys: {expected}"
+    said = f"{at}: other machines can reach it and there are no keys, {expected}"
     return CommandError(said, CONFIGURATION)
 
 
@@ -549,7 +549,7 @@ def prepare(kernels: Sequence[Callable[[], None]]) -> None:
     """
     if not kernels:
         return
-    title = "compiling what flies, once on this machine"
+    title = "compiling the control loops, once on this machine"
     print(f"{title}: it takes up to a minute", file=sys.stderr, flush=True)
     with progress(title, len(kernels), "kernels") as bar:
         for done, compile_one in enumerate(kernels):

@@ -162,7 +162,7 @@ def _answers(sock: socket.socket, path: Path) -> "tempfile.TemporaryDirectory[st
                 folder.cleanup()
             else:
                 return folder
-    raise OSError("no address for answers can be made")
+    raise OSError("no socket for the answer can be created")
 
 
 _DECODER = msgspec.json.Decoder(Answer)
@@ -177,7 +177,7 @@ def answer_of(text: bytes) -> Answer:
     try:
         return _DECODER.decode(text)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        raise ControlError("whoever listens there answers as no process of ours does") from None
+        raise ControlError("got an answer that is no answer of skytether") from None
 
 
 @contextmanager

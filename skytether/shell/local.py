@@ -62,7 +62,7 @@ def _clear(path: Path, kind: socket.SocketKind) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
-        raise OSError("expected a path where nothing is, or a socket that was left behind")
+        raise OSError("expected a new path, or a socket that an ended process left behind")
     with socket.socket(socket.AF_UNIX, kind) as caller:
         caller.setblocking(False)  # a listener whose queue is full counts as alive
         if caller.connect_ex(str(path)) == ECONNREFUSED:

@@ -115,7 +115,7 @@ def start() -> Iterator[Callable[..., Process]]:
         (
             ["fly", "demo", "--virtual", "--control", "sockets"],
             2,
-            "fly: --control: got a folder, expected none with --virtual, which nobody can follow",
+            "fly: --control: got --virtual as well, expected a flight in real time",
         ),
         (["set", "nobody", "armed"], 2, "set: got 'armed', expected KEY=VALUE"),
         (

@@ -240,11 +240,11 @@ def test_a_fleet_has_a_page_where_one_is_asked_for() -> None:
         (["fleet", "--workers", "99"], "fleet: --workers: got 99, expected 1 to 64"),
         (
             ["fleet", "--virtual", "--workers", "2"],
-            "fleet: --workers: got --virtual as well, where there is but one",
+            "fleet: --workers: got --virtual as well, expected 1 in virtual time",
         ),
         (
             ["fleet", "--virtual", "--page", "127.0.0.1:0"],
-            "fleet: --page: got --virtual as well, which nobody can follow",
+            "fleet: --page: got --virtual as well, expected a flight in real time",
         ),
         (["server", "--vehicles", "-1"], "server: --vehicles: got -1, expected 1 to 65536"),
         (["netem", "--flows", "0"], "netem: --flows: got 0, expected 1 to 65536"),

@@ -580,10 +580,10 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again(
         hand.flies.plant.x = [(x + p, w + v) for x, w in hand.flies.plant.x]
         hand.fly(0.02, plans=True)
         assert (hand.mode, hand.speed) == (Mode.BRAKE, pytest.approx(SPEED - 0.04))
-        assert hand.changes[-1] == ("brake", "its state has leapt as no vehicle can")
+        assert hand.changes[-1] == ("brake", "its state has jumped further than a vehicle can move")
         hand.fly(20.0, plans=True)
         assert (hand.mode, hand.takes) == (Mode.HOVER, False)
-        assert hand.changes[-1] == ("hover", "its state has leapt as no vehicle can")
+        assert hand.changes[-1] == ("hover", "its state has jumped further than a vehicle can move")
         for armed in (False, True):
             flown = msgspec.structs.replace(hand.scenario, armed=armed)
             hand.client.change(flown, frozenset({"armed"}), now_ns=hand.now_ns)
@@ -602,7 +602,7 @@ def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
     assert hand.changes[-1] == ("hover", "the server is silent")
     hand.fly(3.0, plans=True)
     assert (hand.mode, hand.takes) == (Mode.HOVER, False)
-    assert hand.changes[-1] == ("hover", "its state has leapt as no vehicle can")
+    assert hand.changes[-1] == ("hover", "its state has jumped further than a vehicle can move")
 
 
 @pytest.mark.parametrize(("slept_s", "mode"), [(0, Mode.TRACK), (30, Mode.TRACK), (31, Mode.BRAKE)])

@@ -498,7 +498,7 @@ def test_what_was_measured_until_ctrl_c_is_kept(
         (["simulated", "--also", "0"], "--also: got 0, expected 0.05 to 1.6 m/s"),
         (["simulated", "--repeats", "0"], "--repeats: got 0, expected 1 to 100"),
         (["simulated", "--hold", "0.1"], "--hold: got 0.1, expected 0.5 to 60 s"),
-        (["simulated", "--set-parameters"], "--set-parameters: a vehicle of the kind simulated"),
+        (["simulated", "--set-parameters"], "--set-parameters: got vehicle.kind = 'simulated'"),
         (["mavlink", "--vehicle.address", "here"], "vehicle.address: got 'here', expected udp:"),
         (
             ["mavlink", "--also", "1", "--vehicle.address", "udp:127.0.0.1:0"],

@@ -457,6 +457,6 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
     said = [event for _, _, event in flight.events]
     assert StateDoubted(vehicle=1) in said
     changes = [(each.after, each.reason) for each in said if isinstance(each, ModeChanged)]
-    why = "its state has leapt as no vehicle can"
+    why = "its state has jumped further than a vehicle can move"
     assert changes[-2:] == [("brake", why), ("hover", why)]
     assert np.abs(flight.client["input"][-1]).max() == 0.0

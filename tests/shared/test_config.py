@@ -145,7 +145,7 @@ WRONG = {
     ),
     "more digits than a line has room for": (
         f"control.dt = 1{'0' * 400}",
-        f"control.dt: got 1{'0' * 199}…, expected a number that is not as large",
+        f"control.dt: got 1{'0' * 199}…, expected a smaller number",
     ),
     "tables nested deeply": (
         f"model = {'{a=' * 5000}1{'}' * 5000}",

@@ -113,17 +113,17 @@ SENTENCES = [
     (AutopilotSaid(text="Arming motors", severity=6), "Arming motors"),
     (
         Unauthenticated(count=3, host="::1", port=5, reason="forged"),
-        "3 datagrams so far are not taken for a vehicle's, the newest from [::1]:5: forged",
+        "3 datagrams dropped so far that were no vehicle's, the newest from [::1]:5: forged",
     ),
-    (Degraded(degraded=True), "degraded: it misses ticks"),
-    (Degraded(degraded=False), "it is in time again"),
+    (Degraded(degraded=True), "degraded: ticks are missed"),
+    (Degraded(degraded=False), "ticks are in time again"),
     (
         Changed(key="network.uplink.loss", before="0.1", after="0.3"),
         "network.uplink.loss is 0.3 from now on, it was 0.1",
     ),
     (ChangeRefused(reason="wind: no such key"), "a change is refused: wind: no such key"),
     (SessionOpened(vehicle=1, host="::1", port=5), "vehicle 1 flies, from [::1]:5"),
-    (SessionEnded(vehicle=1), "vehicle 1 is gone"),
+    (SessionEnded(vehicle=1), "the session of vehicle 1 has ended"),
     (
         SessionRefused(
             vehicle=1,
@@ -163,10 +163,7 @@ SENTENCES = [
     ),
     (
         ModeChanged(vehicle=1, before="hover", after="land", reason="the server is silent"),
-        (
-            "vehicle 1 lands, and is not to be flown before somebody has seen to it: "
-            "the server is silent"
-        ),
+        ("vehicle 1 lands, and must be checked before it flies again: the server is silent"),
     ),
     (
         ModeChanged(vehicle=1, before="track", after="coast", reason="no newer horizon has come"),
@@ -176,7 +173,7 @@ SENTENCES = [
         PlanningStopped(vehicle=1, why="the solver has found none"),
         "vehicle 1 is sent no plan: the solver has found none",
     ),
-    (PlanningResumed(vehicle=1), "vehicle 1 is planned for again"),
+    (PlanningResumed(vehicle=1), "vehicle 1 gets plans again"),
     (
         FenceHolds(vehicle=1),
         "vehicle 1 is held back by its fence",
@@ -187,7 +184,7 @@ SENTENCES = [
     ),
     (
         StateDoubted(vehicle=1),
-        "vehicle 1 reports a state that it cannot have come to: not believed",
+        "vehicle 1 reports a state that it cannot have reached: not believed",
     ),
     (
         NotFlown(vehicle=1, covered=0, steps=200, why="no newer horizon has come"),
@@ -199,7 +196,7 @@ SENTENCES = [
     ),
     (
         ModeChanged(vehicle=1, before="track", after="manual", reason="its motors are disarmed"),
-        "vehicle 1 is left to whoever flies it now: its motors are disarmed",
+        "vehicle 1 is flown by somebody else, or by nobody: its motors are disarmed",
     ),
     (
         AutopilotFound(vehicle=1, name="ArduCopter 4.5.6", system=1),

@@ -124,7 +124,7 @@ def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
     """A line where there is no terminal; nothing where machine code is on disk."""
     (tmp_path / "helper.py").write_text(HELPER)
     (tmp_path / "caller.py").write_text(CALLER.split("\nvalues = ", maxsplit=1)[0])
-    said = "compiling what flies, once on this machine: it takes up to a minute\n"
+    said = "compiling the control loops, once on this machine: it takes up to a minute\n"
     assert quiet(tmp_path, PREPARED) == said
     assert quiet(tmp_path, PREPARED) == ""
 

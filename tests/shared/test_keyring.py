@@ -217,7 +217,7 @@ def test_keygen_adds_the_next_key_and_no_third(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["k"], "k: is there already, expected a new file (or --add)"),
+        (["k"], "k: exists already, expected a new file (or --add)"),
         (["none", "--add"], "none: cannot be read: No such file or directory"),
         (["no/k"], "no/k: cannot be written: No such file or directory"),
         (["new", "--vehicles", "0"], "--vehicles: got 0, expected 1 to 65536"),

@@ -190,7 +190,9 @@ def test_an_answer_of_something_else_is_a_control_error(said: bytes, tmp_path: P
         other.bind(str(path))
         with closing(Caller(path)) as caller:
             other.sendto(said, caller._socket.getsockname())
-            with pytest.raises(ControlError, match=f"{path}: whoever listens there answers as no"):
+            with pytest.raises(
+                ControlError, match=f"{path}: got an answer that is no answer of skytether"
+            ):
                 caller.ask({})
 
 
@@ -230,8 +232,8 @@ def test_nothing_else_gives_way(kind: str, tmp_path: Path) -> None:
     with pytest.raises(LocalError) as refused:
         Control(path, running())
     assert str(refused.value) == (
-        f"{path}: no socket can be made: expected a path where nothing is, or a socket that was "
-        "left behind"
+        f"{path}: no socket can be made: expected a new path, or a socket that an ended "
+        "process left behind"
     )
     assert path.lstat() == before
 
@@ -358,7 +360,7 @@ def test_where_no_address_for_answers_can_be_made_that_is_said(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
     path = tmp_path / "gone" / "netem"
     assert command.main(set_keys, [str(path)], "set") == 1
-    said = f"set: {path}: no address for answers can be made\n"
+    said = f"set: {path}: no socket for the answer can be created\n"
     assert capsys.readouterr().err == said
 
 
@@ -404,7 +406,7 @@ def test_set_prints_what_may_change_what_has_and_what_was_refused(
             '"paper(0.4, 0.02, 2.0) & loss(0.3)"'
         ),
     ]
-    assert err.startswith(f"set: {path}: control.dt: cannot be changed in flight; what can be here")
+    assert err.startswith(f"set: {path}: control.dt: cannot be changed in flight; expected one of")
 
 
 def test_no_loop_is_needed_to_close_what_was_never_driven(tmp_path: Path) -> None:

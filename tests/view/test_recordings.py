@@ -767,7 +767,7 @@ def test_a_gap_in_a_feed_is_told_once(live: tuple[Live, Feeds, list[str]], tmp_p
         for frame in (opened(client_columns(2)), row_at(begin)):
             feeds.take("client", frame)
         feeds.lost("client")
-    said = f"{tmp_path / 'live.mcap'}: the recorder was too slow for what client tells"
+    said = f"{tmp_path / 'live.mcap'}: the recorder could not keep up with client"
     assert made.finish() == said
     assert told == [f"{said}: the record is incomplete, the flight goes on"]
     assert recorded_steps(tmp_path / "live.mcap") == [1, 3, 5]

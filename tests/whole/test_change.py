@@ -100,7 +100,7 @@ def test_a_value_that_a_key_has_already_is_passed_on_and_no_news() -> None:
         (
             {"control.epsilon": 1, "control.dt": 0.1},
             (
-                "control.dt: cannot be changed in flight; what can be here: control.epsilon, "
+                "control.dt: cannot be changed in flight; expected one of control.epsilon, "
                 "network.uplink.loss, vehicle.steady_wind_mps"
             ),
         ),
@@ -108,7 +108,7 @@ def test_a_value_that_a_key_has_already_is_passed_on_and_no_news() -> None:
         (
             {"control": {}},
             (
-                "control: cannot be changed in flight; what can be here: control.epsilon, "
+                "control: cannot be changed in flight; expected one of control.epsilon, "
                 "network.uplink.loss, vehicle.steady_wind_mps"
             ),
         ),
@@ -340,7 +340,7 @@ def test_only_a_live_point_can_be_led() -> None:
     ((_, host, refused),) = told(flight, ChangeRefused)
     assert host == "server"
     assert str(refused).startswith(
-        "a change is refused: reference.points_m: cannot be changed in flight; what can be here: "
+        "a change is refused: reference.points_m: cannot be changed in flight; expected one of "
         "control.cost_gap, "
     )
 

@@ -55,6 +55,7 @@ class Stream:
     """
 
     def __init__(self, *names: str | int) -> None:
+        # A hash and no generator: the number of any place is found without drawing those before it.
         self._seeded = blake2b(repr(names).encode(), digest_size=_DRAWN.size)
         self._at, self._number, self._pair = -1, -1, (0.0, 0.0)
         """Place and number of the pair that was drawn last, and the pair."""
@@ -63,10 +64,12 @@ class Stream:
         """Two numbers below 1."""
         if place == self._at and number == self._number:
             return self._pair
+        # Copying the seeded state hashes the names once per stream and not once per packet.
         drawn = self._seeded.copy()
         drawn.update(_PLACE.pack(place, number))
         one, other = _DRAWN.unpack(drawn.digest())
         self._at, self._number = place, number
+        # 53 bits, as many as a float in [0, 1) has.
         self._pair = pair = (one >> 11) * 2.0**-53, (other >> 11) * 2.0**-53
         return pair
 
@@ -118,4 +121,6 @@ class Draws:
                 state, number = drawn, number + 1
             if state is not None:
                 return state
+            # No moment in this cell before the time: the state is that of the newest moment of an
+            # earlier cell.
             cell -= 1

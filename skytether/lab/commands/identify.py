@@ -123,8 +123,8 @@ def identify(argv: Sequence[str]) -> None:
     if len(plans) > 1 and flies.port:
         raise CommandError("--also: got a vehicle of real hardware, expected one computed", 2)
     if options.set_parameters and not flies.set_parameters():
-        said = f"--set-parameters: a vehicle of the kind {scenario.vehicle.kind} has none"
-        raise CommandError(said, command.CONFIGURATION)
+        kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
+        raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
     figures.check(options.out / PICTURE)
     with writing(options.out):
         options.out.mkdir(parents=True, exist_ok=True)
@@ -188,9 +188,8 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
     """
     flies = vehicles.make(scenario, NUMBER)
     if sets and not flies.set_parameters():
-        raise CommandError(
-            f"--set-parameters: a vehicle of the kind {scenario.vehicle.kind} has none", 2
-        )
+        kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
+        raise CommandError(f"--set-parameters: {kind}", 2)
     within = fenced(scenario, plan)
     if within is not scenario:
         _say(f"no fence is given: it stays within {within.fence.radius_m:g} m of where it began")
