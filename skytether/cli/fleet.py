@@ -30,7 +30,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import separations, summarise
-from skytether.shell import command, temporary
+from skytether.shell import command, temporary, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 
@@ -171,10 +171,10 @@ def fleet(argv: Sequence[str]) -> None:
         figures.check(options.figure)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
-        command.progress(f"flying {title}", options.config.duration) as on_second,
+        terminal.progress(f"flying {title}", options.config.duration) as on_second,
     ):
         flown = (_virtually if options.virtual else _really)(
             options, vehicles, on_second, interrupted
