@@ -23,7 +23,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 # Kernels are compiled once, the server's beside the laboratory's, and not by each worker of pytest.
 LOAD = from skytether.shared.base import kernel; kernel.load()
-KERNELS = $(BIN)/python -c "import skytether.lab.linear, skytether.quadrotor.loops; $(LOAD)" & \
+KERNELS = $(BIN)/python -c "import skytether.lab.loops, skytether.quadrotor.loops; $(LOAD)" & \
 	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
 
 .PHONY: setup demo reproduce test long-test check format lock keys pictures equations docs docker-test page-test autopilot-test bench fuzz clean

@@ -27,7 +27,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import client_columns
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import keys
-from skytether.shell import command
+from skytether.shell import command, process, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
@@ -102,18 +102,18 @@ def fly(argv: Sequence[str]) -> None:
     columns = client_columns(scenario.model.axes)
     with (
         (
-            command.recorded(part, columns)
-            if (part := command.part_of(options.record))
-            else command.recorded_meanwhile(columns)
+            process.recorded(part, columns)
+            if (part := process.part_of(options.record))
+            else process.recorded_meanwhile(columns)
         ) as recording,
-        command.fed(
+        process.fed(
             options.feed, options.record, "client", options, secure=keyring is not None
         ) as feed,
     ):
-        recorder = command.recorder("client", columns, recording, feed)
+        recorder = process.recorder("client", columns, recording, feed)
         flying = [vehicles.make(scenario, number) for number in numbers]
         if kernel := sys.modules.get("skytether.shared.base.kernel"):  # what flies has some
-            command.prepare(kernel.missing())
+            terminal.prepare(kernel.missing())
             kernel.load()
         line = None
         if flying[0].port:
@@ -136,7 +136,7 @@ def fly(argv: Sequence[str]) -> None:
         ]
         alone = len(clients) == 1
         endpoint = clients[0] if alone else Fleet(clients, apart_ns(len(clients), scenario.dt_ns))
-        command.drive(
+        process.drive(
             "client",
             Steady(endpoint),
             options,
@@ -158,7 +158,7 @@ def fly(argv: Sequence[str]) -> None:
             summary = summarise(scenario, options.scenario, rows, secure=keyring is not None)
             title = "client, as far as it is recorded" if recording.fault() else "client"
             if options.log == "text":
-                command.finish(summary, title, options.json)
+                terminal.finish(summary, title, options.json)
             elif options.json:
                 command.write(options.json, msgspec.json.encode(summary))
         if failure := endpoint.failure:

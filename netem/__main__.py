@@ -17,7 +17,7 @@ from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
-from skytether.shell import command
+from skytether.shell import command, process
 from skytether.shell.command import ScenarioFlags, ScenarioName
 from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
@@ -79,14 +79,14 @@ def emulate(argv: Sequence[str]) -> None:
     flows = _flows(options.flows)
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
-    part = command.part_of(options.record)
+    part = process.part_of(options.record)
     with (
-        command.recorded(part, PACKET_COLUMNS) if part else nullcontext() as recording,
-        command.fed(options.feed, options.record, "netem", options, secure=False) as feed,
+        process.recorded(part, PACKET_COLUMNS) if part else nullcontext() as recording,
+        process.fed(options.feed, options.record, "netem", options, secure=False) as feed,
     ):
-        recorder = command.recorder("netem", PACKET_COLUMNS, recording, feed)
+        recorder = process.recorder("netem", PACKET_COLUMNS, recording, feed)
         endpoint = Proxy(options.config, server=server, flows=flows, recorder=recorder)
-        command.drive(
+        process.drive(
             "netem",
             endpoint,
             options,

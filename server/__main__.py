@@ -27,7 +27,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import RECORDING, plan_columns, server_columns
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
-from skytether.shell import command, workers
+from skytether.shell import command, process, terminal, workers
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
@@ -110,7 +110,7 @@ def serve(argv: Sequence[str]) -> None:
 def _ready(scenario: Scenario) -> None:
     """Have what plans in memory before a vehicle waits for it, and workers share it."""
     others = other_schemes(scenario)
-    command.prepare(kernel.missing(without=others))
+    terminal.prepare(kernel.missing(without=others))
     kernel.load(without=others)
 
 
@@ -137,11 +137,11 @@ def _work(
         gate, forms = SecureGate(keyring, entropy=secrets.token_bytes), FORMS
     axes, planned = options.config.model.axes, options.config.control.horizon
     record, columns = own(options.record), server_columns(axes, options.config.control.scheme)
-    part = command.part_of(record)
+    part = process.part_of(record)
     stopwatch = Stopwatch(time.perf_counter_ns)
     with (
-        command.recorded(part, columns) if part else nullcontext() as recording,
-        command.fed(own(options.feed), record, "server", options, secure=gate.secure) as feed,
+        process.recorded(part, columns) if part else nullcontext() as recording,
+        process.fed(own(options.feed), record, "server", options, secure=gate.secure) as feed,
     ):
         endpoint = Server(
             options.config,
@@ -149,11 +149,11 @@ def _work(
             entropy=secrets.token_bytes,
             gate=gate,
             room=options.vehicles,
-            recorder=command.recorder("server", columns, recording, feed),
-            plans=command.recorder("plan", plan_columns(axes, planned), None, feed),
+            recorder=process.recorder("server", columns, recording, feed),
+            plans=process.recorder("plan", plan_columns(axes, planned), None, feed),
             stopwatch=stopwatch,
         )
-        command.drive(
+        process.drive(
             f"server{suffix}",
             Steady(endpoint),
             options,

@@ -19,7 +19,7 @@ from skytether.autopilot.flavours import FlavourName
 from skytether.shared.base import kernel
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS
-from skytether.shell import command
+from skytether.shell import command, process, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
@@ -90,7 +90,7 @@ def pilot(argv: Sequence[str]) -> None:
         raise CommandError(f"--bind: {said}: expected an address of 127.0.0.1, or --insecure", 2)
     peers = [to] if to else []
     record = options.record
-    with command.recorded(record, TRUTH_COLUMNS) if record else nullcontext() as recording:
+    with process.recorded(record, TRUTH_COLUMNS) if record else nullcontext() as recording:
         endpoint = Autopilot(
             options.config,
             options.flavour,
@@ -99,7 +99,7 @@ def pilot(argv: Sequence[str]) -> None:
             faults=[faults.parse(each) for each in options.fault],
             recorder=recording.recorder if recording else None,
         )
-        command.drive(
+        process.drive(
             "autopilot",
             endpoint,
             options,
@@ -118,5 +118,5 @@ def pilot(argv: Sequence[str]) -> None:
 
 def _ready() -> None:
     """Import and compile everything that flies before a peer waits for it."""
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
     kernel.load()

@@ -18,7 +18,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.summary import summarise
-from skytether.shell import command, temporary
+from skytether.shell import command, temporary, terminal
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 from skytether.sim import flight
@@ -60,7 +60,7 @@ def duel(argv: Sequence[str]) -> None:
     at = command.address("--page", options.page)
     one, other = both(options)
     names = titles(options.one, options.other)
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
     if options.virtual:
         flown = [flight.fly(each) for each in (one, other)]
         frames = [
@@ -129,7 +129,7 @@ def _really(scenarios: Sequence[Scenario], names: Sequence[str], folder: Path, p
     with (
         page_process.beside(sockets, page, say),
         command.interruptible() as interrupted,
-        command.progress(title, scenarios[0].duration) as on_second,
+        terminal.progress(title, scenarios[0].duration) as on_second,
         ThreadPoolExecutor(len(names)) as pool,
     ):
         flying = [pool.submit(fly, place, on_second) for place in range(len(names))]
@@ -140,4 +140,4 @@ def _really(scenarios: Sequence[Scenario], names: Sequence[str], folder: Path, p
         if not len(rows[0]):
             raise CommandError("interrupted before the first step", command.INTERRUPTED)
         title = f"{name}, over UDP on loopback, seed {scenario.seed}"
-        command.finish(summarise(scenario, name, *rows), title)
+        terminal.finish(summarise(scenario, name, *rows), title)

@@ -31,7 +31,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import separations, summarise
-from skytether.shell import command, temporary
+from skytether.shell import command, temporary, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 
@@ -172,10 +172,10 @@ def fleet(argv: Sequence[str]) -> None:
         figures.check(options.figure, film.SUFFIX)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     title = f"{vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
-        command.progress(f"flying {title}", options.config.duration) as on_second,
+        terminal.progress(f"flying {title}", options.config.duration) as on_second,
     ):
         flown = (_virtually if options.virtual else _really)(
             options, vehicles, on_second, interrupted
@@ -188,7 +188,9 @@ def fleet(argv: Sequence[str]) -> None:
     if options.json:
         command.write(options.json, msgspec.json.encode(summary))
     if options.figure and options.figure.suffix == film.SUFFIX:
-        film.write(options.figure, title, options.config, flown.client, apart)
+        flight = options.config, flown.client
+        with terminal.progress("drawing the film", film.length(*flight), "frames") as bar:
+            film.write(options.figure, title, *flight, apart, bar)
     elif options.figure:
         told = flown.client, flown.server, apart
         figures.fleet(options.figure, title, options.config, *told)

@@ -29,7 +29,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import command, temporary
+from skytether.shell import command, temporary, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
@@ -106,10 +106,10 @@ def fly(argv: Sequence[str]) -> None:
             page_process.say(warning)
     vehicles.make(scenario, 0)  # compiles the vehicle's own kernels; fails now if it cannot be made
     with _paged(options) as sockets:
-        command.prepare(kernel.missing())
+        terminal.prepare(kernel.missing())
         with (
             command.interruptible() as interrupted,
-            command.progress(f"flying {title}", scenario.duration) as on_second,
+            terminal.progress(f"flying {title}", scenario.duration) as on_second,
         ):
             if options.virtual:
                 flown, unrecorded = _virtually(options, on_second, interrupted)
@@ -148,9 +148,9 @@ def _show(
         other = flight.fly(beside)
         other_title = f"{options.beside}, in virtual time, seed {beside.seed}"
         flights[other_title] = beside, other
-        command.finish(_summarise(beside, str(options.beside), other), other_title)
+        terminal.finish(_summarise(beside, str(options.beside), other), other_title)
     summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
-    command.finish(summary, title, options.json)
+    terminal.finish(summary, title, options.json)
     if options.figure:
         figures.flights(options.figure, flights)
     if missing := _missing(scenario, flown) or unrecorded:

@@ -24,7 +24,7 @@ from skytether.shared.core.events import Counted, Event, Listening
 from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorder, Rows
 from skytether.shared.wire import keys
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
-from skytether.shell import command, driver
+from skytether.shell import command, driver, terminal
 from skytether.shell.command import CONFIGURATION, INTERRUPTED, CommandError
 from skytether.shell.log import Log
 from skytether.shell.options import Argument, read
@@ -167,7 +167,7 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         shell = driver.Shell(prober, None, [listener])
     except AddressError as error:
         raise CommandError(str(error)) from None
-    with command.progress(f"probing {options.target}", options.seconds) as bar:
+    with terminal.progress(f"probing {options.target}", options.seconds) as bar:
         driver.run([shell], on_event=_say, on_second=lambda: bar(prober.probed_s))
     if prober.refused:
         raise CommandError(f"{options.target} has no room for another measurement")
@@ -259,8 +259,8 @@ def _tell(options: ProbeOptions, found: ProbeOutcome) -> None:
     """Print tables of both directions, doubts about them, and the network text to fly."""
     told = found.told
     ways = {"downlink": told.downlink, "uplink": told.uplink}
-    command.show(_table(ways))
-    command.show(_models(ways))
+    terminal.show(_table(ways))
+    terminal.show(_models(ways))
     doubt = f"{told.drift_doubt_ppm:.1f} ppm"
     drift = f"no significant drift (standard error {doubt})"
     if told.drift_ppm:

@@ -9,7 +9,7 @@ import tyro
 
 from skytether.cli import recordings
 from skytether.shared.base import files
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 from skytether.view.report import page
@@ -34,7 +34,7 @@ def report(argv: Sequence[str]) -> None:
     options = read(ReportOptions(tyro.MISSING), argv, "skytether report", report.__doc__)
     command.check_output("--out", options.out)
     with recordings.opened(options.file) as recorded:
-        summary = command.summary_rows(recorded.summary) if recorded.summary else []
+        summary = terminal.summary_rows(recorded.summary) if recorded.summary else []
         written = page(recorded, summary)
     try:
         files.write(options.out, written.encode())

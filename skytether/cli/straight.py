@@ -15,7 +15,7 @@ from skytether.shared.core.events import Event, Fault
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record, read
-from skytether.shell import command, temporary
+from skytether.shell import command, temporary, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import straight as virtual
 from skytether.station import laws
@@ -57,12 +57,12 @@ def straight(argv: Sequence[str]) -> None:
     scenario = options.config
     if options.figure:
         figures.check(options.figure)
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
     where = "over UDP on loopback" if options.udp else "in virtual time"
     title = f"{options.scenario}, {_words(law)}, {where}, seed {scenario.seed}"
     with (
         command.interruptible() as interrupted,
-        command.progress(f"flying {title}", scenario.duration) as on_second,
+        terminal.progress(f"flying {title}", scenario.duration) as on_second,
     ):
         fly = _really if options.udp else _virtually
         flown = fly(options, law, on_second, interrupted)
@@ -70,7 +70,7 @@ def straight(argv: Sequence[str]) -> None:
         raise CommandError(str(flown.failure))
     if not len(flown.client):
         raise CommandError("interrupted before the first step", command.INTERRUPTED)
-    command.finish(summary_of(scenario, options.scenario, flown), title, options.json)
+    terminal.finish(summary_of(scenario, options.scenario, flown), title, options.json)
     if options.figure:
         figures.flights(options.figure, {title: (scenario, flown)})
 

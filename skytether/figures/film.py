@@ -1,6 +1,6 @@
 """Film of a fleet's flight, as an animated GIF: who is where, and how near the nearest two are."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,6 @@ from skytether.shared.base import files
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows
-from skytether.shell import command
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -28,24 +27,37 @@ COLOURS = 64
 """Number of colours of a frame, which decides the size of the file."""
 
 
+def length(scenario: Scenario, client: Rows) -> int:
+    """Number of frames of the film of a flight."""
+    flown_s = float(np.ptp(client["step"])) * scenario.control.dt
+    return min(FRAMES_MAX, max(1, round(flown_s / SPEED * RATE_HZ)))
+
+
 def write(
     path: Path,
     title: str,
     scenario: Scenario,
     client: Rows,
-    separations: tuple[Array, Array] | None = None,
+    separations: tuple[Array, Array] | None,
+    on_frame: Callable[[int], None],
 ) -> None:
     """Write a film of a fleet's flight.
 
     Args:
         path: file to write, with the suffix `.gif`.
+        title: shown above it.
+        scenario: scenario that was flown.
         client: rows of all vehicles' records.
         separations: times and distances of a mission, see `summary.separations`.
+        on_frame: called with the number of frames drawn so far.
 
     Raises:
         OSError: the file cannot be written.
     """
-    frames = list(_frames(title, scenario, client, separations))
+    frames = []
+    for frame in _frames(title, scenario, client, separations):
+        frames.append(frame)
+        on_frame(len(frames))
     with files.create(path) as file:
         frames[0].save(
             file,
@@ -66,8 +78,7 @@ def _frames(
     from PIL import Image
 
     dt_s, steps = scenario.control.dt, client["step"]
-    count = min(FRAMES_MAX, max(1, round(float(np.ptp(steps)) * dt_s / SPEED * RATE_HZ)))
-    shown = np.linspace(steps.min(), steps.max(), count + 1)[1:]
+    shown = np.linspace(steps.min(), steps.max(), length(scenario, client) + 1)[1:]
     tracks = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
 
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
@@ -97,18 +108,16 @@ def _frames(
         nearest.set_xlabel("time [s]")
         nearest.set_ylabel("distance [m]")
         nearest.legend(loc="upper right", fontsize=7)
-    with command.progress("drawing the film", count, "frames") as progress:
-        for number, step in enumerate(shown):
-            figure.suptitle(f"{title}: {step * dt_s:.0f} s", fontsize=8)
-            for rows, trail, place in drawn:
-                past = rows["step"] <= step
-                recent = past & (rows["step"] >= step - TRAIL_S / dt_s)
-                trail.set_data(*rows["state"][recent, :2, 0].T)
-                place.set_data(*rows["state"][past, :2, 0][-1:].T)
-            if nearest is not None:
-                until = times_s - times_s[0] <= (step - steps.min()) * dt_s
-                line.set_data(times_s[until] - times_s[0], nearest_m[until])
-            canvas.draw()
-            frame = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-            yield frame.quantize(COLOURS, dither=Image.Dither.NONE)
-            progress(number + 1)
+    for step in shown:
+        figure.suptitle(f"{title}: {step * dt_s:.0f} s", fontsize=8)
+        for rows, trail, place in drawn:
+            past = rows["step"] <= step
+            recent = past & (rows["step"] >= step - TRAIL_S / dt_s)
+            trail.set_data(*rows["state"][recent, :2, 0].T)
+            place.set_data(*rows["state"][past, :2, 0][-1:].T)
+        if nearest is not None:
+            until = times_s - times_s[0] <= (step - steps.min()) * dt_s
+            line.set_data(times_s[until] - times_s[0], nearest_m[until])
+        canvas.draw()
+        frame = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+        yield frame.quantize(COLOURS, dither=Image.Dither.NONE)

@@ -21,7 +21,8 @@ import numpy as np
 from msgspec.structs import replace
 from scipy import stats
 
-from skytether.lab.linear import WIND, Loop, Timing, make_loops, no_packets, respond, timing_of
+from skytether.lab.linear import WIND, Loop, Timing
+from skytether.lab.loops import make_loops, no_packets, respond, timing_of
 from skytether.lab.sweep import interval
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import policies

@@ -148,9 +148,9 @@ def prepare() -> None:
     """Compile the server's kernels if this machine has not yet, with a note on stderr."""
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.shared.base import kernel
-    from skytether.shell import command
+    from skytether.shell import terminal
 
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
 
 
 def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, process
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.shell.log import LogFormat
 from skytether.shell.udp import is_loopback, look_up
@@ -57,9 +57,9 @@ def fly(argv: Sequence[str]) -> None:
         said = f"got {options.bind}, where other machines can reach it, and MAVLink has no keys"
         raise CommandError(f"--bind: {said}: expected an address of 127.0.0.1, or --insecure", 2)
     columns, record = station_columns(scenario.model.axes), options.record
-    with command.recorded(record, columns) if record else nullcontext() as recording:
+    with process.recorded(record, columns) if record else nullcontext() as recording:
         station = Station(scenario, law, recording.recorder if recording else None)
-        command.drive(
+        process.drive(
             "station",
             station,
             options,

@@ -10,8 +10,8 @@ import pytest
 
 from helpers import demo_with
 from skytether.__main__ import main
-from skytether.lab import linear, maps, margins
-from skytether.lab.linear import timing_of
+from skytether.lab import loops, maps, margins
+from skytether.lab.loops import timing_of
 from skytether.lab.maps import Box, resting
 from skytether.lab.margins import (
     AS_IT_IS,
@@ -139,7 +139,7 @@ def test_pushes_come_anywhere_between_two_measurements(monkeypatch: pytest.Monke
 
     every_step = rms(1000)
     assert rms(20) == pytest.approx(every_step, rel=0.05)
-    monkeypatch.setattr(linear, "_periods", lambda _: [])
+    monkeypatch.setattr(loops, "_periods", lambda _: [])
     assert rms(20) != pytest.approx(every_step, rel=0.05)
 
 

@@ -60,7 +60,7 @@ REFUSED = (
 PREPARED = """
 import caller
 from skytether.shared.base import kernel
-from skytether.shell.command import prepare
+from skytether.shell.terminal import prepare
 prepare(kernel.missing())
 """
 

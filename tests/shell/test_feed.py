@@ -45,7 +45,7 @@ from skytether.shared.telemetry.feed import (
 )
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, parse, plan_columns
 from skytether.shared.wire.protocol import Message, Trajectory
-from skytether.shell import command
+from skytether.shell import command, process
 from skytether.shell.driver import Shell, run
 from skytether.shell.feed import (
     BACKLOG_BYTES_MAX,
@@ -608,7 +608,7 @@ def test_a_process_tells_its_readers_while_it_is_driven(
         recorder.follow(feed.part("netem", PACKET_COLUMNS))
         endpoint = Passing(recorder)
         running = Running(endpoint, DEMO)
-        feed.open(command.opened("netem", "demo", running, feed))
+        feed.open(process.opened("netem", "demo", running, feed))
         driver = Shell(endpoint, ("127.0.0.1", 0), feed=feed)
         run([driver], on_start=start, on_event=feed.say)
     thread.join(PATIENCE_S)

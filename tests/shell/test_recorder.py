@@ -12,7 +12,8 @@ from skytether.shared.base import files
 from skytether.shared.core.events import RecordIncomplete
 from skytether.shared.telemetry.record import PACKET_COLUMNS, read
 from skytether.shell import recording
-from skytether.shell.command import CommandError, recorded, recorded_meanwhile
+from skytether.shell.command import CommandError
+from skytether.shell.process import recorded, recorded_meanwhile
 from skytether.shell.recording import RecordFile
 
 

@@ -16,7 +16,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, client_columns
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
-from skytether.shell.command import summary_rows
+from skytether.shell.terminal import summary_rows
 from skytether.sim.flight import fly, fly_batch
 
 

@@ -37,9 +37,9 @@ from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Frame
 from skytether.shared.telemetry.record import Recorder, plan_columns, server_columns
-from skytether.shell.command import opened
 from skytether.shell.driver import Shell, run
 from skytether.shell.feed import Feed, Subscriber
+from skytether.shell.process import opened
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.page import Page
 

@@ -19,8 +19,9 @@ from skytether.lab.journal import Journal, write
 from skytether.shared.base import kernel
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
-from skytether.shell import command, temporary
-from skytether.shell.command import Bar, CommandError, ScenarioFlags, ScenarioName
+from skytether.shell import command, temporary, terminal
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.terminal import Bar
 from skytether.sim import flight
 
 VEHICLES_MAX = 4096
@@ -70,14 +71,14 @@ def crowd(argv: Sequence[str]) -> None:
     plan = Crowd(options.scenario, options.config, options.udp)
     for scheme in options.schemes:
         plan.of(scheme)
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
     with (
         writing(options.out),
         closing(Journal(options.out, plan.settings(), CrowdPoint)) as journal,
     ):
         with (
             command.interruptible() as interrupted,
-            command.progress(f"flying {options.scenario}", len(options.schemes), "schemes") as bar,
+            terminal.progress(f"flying {options.scenario}", len(options.schemes), "schemes") as bar,
         ):
             done = 0
             for scheme in options.schemes:
@@ -170,7 +171,7 @@ def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
     for each in flown.values():
         for point in each.points:
             table.add_row(*_cells(point, options.limit))
-    command.show(table)
+    terminal.show(table)
     for scheme, each in flown.items():
         if each.points:
             beyond = f"{each.too_many} do not" if each.too_many else "no more were tried"

@@ -17,7 +17,7 @@ from skytether.lab.commands.pool import Flags, PoolFlags, crew, writing
 from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
 from skytether.lab.journal import Journal, write
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
@@ -91,7 +91,7 @@ def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopeP
         table.add_column(heading, justify="left" if heading == "outcome" else "right")
     for outcome in get_args(Outcome):
         table.add_row(outcome, str(counts[outcome]), f"{counts[outcome] / len(points):.1%}")
-    command.show(table)
+    terminal.show(table)
     for point in worst_first(points)[:TOLD_MAX]:
         said = f": {point.line}" if point.line else f": {point.error_max:.2f} m from the reference"
         print(f"{point.outcome}{said}\n    {plan.command(point.number)}")

@@ -37,7 +37,7 @@ from skytether.shared.core.line import parse_line
 from skytether.shared.core.steady import Steady
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, driver
+from skytether.shell import command, driver, terminal
 from skytether.shell.command import CommandError, ScenarioFlags
 from skytether.shell.options import Argument
 from skytether.shell.udp import AddressError
@@ -194,9 +194,9 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
     if within is not scenario:
         _say(f"no fence is given: it stays within {within.fence.radius_m:g} m of where it began")
     flight = Identifying(within, flies, Experiment(within, plan))
-    command.prepare(kernel.missing() if "skytether.shared.base.kernel" in sys.modules else [])
+    terminal.prepare(kernel.missing() if "skytether.shared.base.kernel" in sys.modules else [])
     title = f"identifying {scenario.vehicle.kind}"
-    with command.progress(title, plan.duration_s) as bar:
+    with terminal.progress(title, plan.duration_s) as bar:
 
         def show(*_: object) -> None:
             bar(flight.flown_s, _doing(flight))
@@ -274,12 +274,12 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlow
         write(out / OUTCOME, msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n")
         write(out / MEASURED, _measured(first.flight, scenario.model.axes).encode())
         figures.save(picture.drawn(first.axes), out / PICTURE, dpi=130)
-    command.show(_table(first))
+    terminal.show(_table(first))
     for name, axis in zip(AXES, first.axes, strict=False):
         print(f"{name}: {verdict(axis.fit) if axis.fit else outcome.describe(axis)}")
     if costs:
         print("What a wrong size costs, as the largest difference from steps of the first row's:")
-        command.show(_cost_table(flown, costs))
+        terminal.show(_cost_table(flown, costs))
 
 
 def _all_told(flown: SizeFlown) -> list[AxisTold]:

@@ -21,7 +21,7 @@ from skytether.lab.margins import Margin
 from skytether.shared.base import kernel
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 POINTS_MAX = 100_000
@@ -84,10 +84,10 @@ def margins(argv: Sequence[str]) -> None:
     rows = {lab.AS_IT_IS: scenario}
     rows |= {name: each.of(scenario) for name, each in lab.VEHICLES.items() if each.is_of(scenario)}
     total = len(rows) + 1 + rates
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
-        command.progress("computing margins", total, "parts") as bar,
+        terminal.progress("computing margins", total, "parts") as bar,
     ):
 
         def check(done: int) -> None:
@@ -182,7 +182,7 @@ def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
             f"{np.nanmax(rmse):.3f}",
             f"{saturated:.1%}",
         )
-    command.show(table)
+    terminal.show(table)
 
 
 def _show(options: MarginsOptions, scenario: Scenario, found: Sequence[Margin]) -> None:
@@ -220,4 +220,4 @@ def _show(options: MarginsOptions, scenario: Scenario, found: Sequence[Margin]) 
             *rms,
             "-" if beyond is None else f"{beyond:.1%}",
         )
-    command.show(table)
+    terminal.show(table)

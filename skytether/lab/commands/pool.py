@@ -32,9 +32,10 @@ from skytether.lab.sweep import Done, FlightTask, Results, Sweep
 from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.schema import TABLES, Scenario
-from skytether.shell import command, plugins, temporary
-from skytether.shell.command import Bar, CommandError
+from skytether.shell import command, plugins, temporary, terminal
+from skytether.shell.command import CommandError
 from skytether.shell.plugins import Plugin
+from skytether.shell.terminal import Bar
 from skytether.shell.workers import die_with_parent
 
 UNDER_WAY_MAX = 256
@@ -219,11 +220,11 @@ def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator
         total: amount of work in total, including finished work, in the unit.
     """
     if not flags.scheduler:  # compile now: otherwise each worker would compile all kernels
-        command.prepare(kernel.missing())
+        terminal.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
         _executor(flags) as executor,
-        command.progress(title, total, unit) as bar,
+        terminal.progress(title, total, unit) as bar,
     ):
         yield Crew(executor, bar, total, unit, interrupted)
 

@@ -22,7 +22,7 @@ from skytether.lab import report
 from skytether.lab.report import Drawn
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import terminal
 
 PAGE = "report.html"
 """File of the page."""
@@ -96,7 +96,7 @@ def show(table: Table) -> None:
         shown.add_column(Text(heading), no_wrap=True)
     for row in table.rows:
         shown.add_row(*map(Text, row))
-    command.show(shown)
+    terminal.show(shown)
 
 
 def _processor() -> str:

@@ -26,7 +26,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Record
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 from skytether.sim.flight import fly_batch
@@ -83,7 +83,7 @@ def _measure(
     sweeps = options.out / "sweeps"
     # A folder of another reproduction is refused before anything is flown.
     Journal(sweeps / table.name, table.first().settings(), Done).close()
-    command.prepare(kernel.missing())
+    terminal.prepare(kernel.missing())
     # Real-time measurements come first, while the cores are idle.
     delay_ms = _delays(options.out, scenario, scale)
     real = {method: _really(options.out, table, method, scale) for method in (EVERY, EVENT)}
@@ -121,7 +121,7 @@ def _delays(out: Path, scenario: Scenario, scale: ReproductionSize) -> Array:
         folder.mkdir(exist_ok=True)
         seconds = scale.delay_packets * delays.EVERY_S
         content = io.BytesIO()
-        with command.progress("packets through netem, over UDP", seconds) as on_second:
+        with terminal.progress("packets through netem, over UDP", seconds) as on_second:
             np.save(content, delays.measure(scenario, folder, scale.delay_packets, on_second))
         write(file, content.getvalue())
     kept: Array = np.load(file)
@@ -139,7 +139,7 @@ def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> re
         title = f"flying over UDP: {method}"
         with (
             command.interruptible() as interrupted,
-            command.progress(title, scale.real_s) as on_second,
+            terminal.progress(title, scale.real_s) as on_second,
         ):
             shortfalls = processes.run(scenario, part, on_second=on_second, interrupted=interrupted)
         if shortfalls:

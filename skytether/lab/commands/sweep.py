@@ -16,7 +16,7 @@ from skytether.lab.commands.pool import Flags, PoolFlags, Spent, crew, writing
 from skytether.lab.journal import Journal, write
 from skytether.lab.sweep import Done, Sweep, estimate, parse_axis, results
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.command import ScenarioFlags, ScenarioName
 
 DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
@@ -103,7 +103,7 @@ def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: S
             mean, half = estimate(runs, figure)
             row.append(_interval(mean, half, spec))
         table.add_row(*map(Text, row))
-    command.show(table)
+    terminal.show(table)
     failed = sum(not run.steps for runs in cells for run in runs)
     if failed:
         print(f"{failed} runs found no server and count in no mean of the error")

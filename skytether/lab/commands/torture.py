@@ -17,7 +17,7 @@ from skytether.lab.commands.pool import Flags, Interrupted, crew
 from skytether.lab.faults import Trial, dumps, loads
 from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.shared.base.errors import ConfigError
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 
@@ -160,7 +160,7 @@ def _finish(
     table.add_row("flights", f"{len(done)}, {flown_s / 3600:.2f} h in virtual time")
     for name, amount in sorted(counts.items()):
         table.add_row(name, str(amount))
-    command.show(table)
+    terminal.show(table)
     for outcome in failed[:TOLD_MAX]:
         print(f"seed {outcome.trial.seed}: {outcome.failure}")
         print(f"    skytether torture --schedule {shlex.quote(dumps(outcome.trial))}")

@@ -1,0 +1,142 @@
+"""Output of commands on the terminal: progress bars, tables, and a flight's summary."""
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import msgspec
+
+from skytether.shared.telemetry.summary import Summary
+from skytether.shell.command import write
+
+# for type checking alone: they are slow to import, and a process that flies does without
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+class Bar(Protocol):
+    """A progress bar."""
+
+    def __call__(self, done: float, text: str = "") -> None:
+        """Set how much is done, in the bar's unit, and a remark."""
+
+
+@contextmanager
+def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
+    """Progress bar on stderr: title, how much of the total is done, and the time remaining.
+
+    The bar vanishes at the end. It is not shown where stderr is no terminal, or a terminal that
+    cannot move its cursor. Lines printed on stderr meanwhile appear above the bar.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    with Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.completed:.0f} of {task.total:.0f} " + unit),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[text]}", markup=False),
+        console=console,
+        transient=True,
+        speed_estimate_period=600.0,  # one step may take minutes: the clock must go on meanwhile
+        disable=not console.is_interactive,
+    ) as shown:
+        row = shown.add_task(title, total=total, text="")
+
+        def show(done: float, text: str = "") -> None:
+            shown.update(row, completed=min(done, total), text=text)
+
+        yield show
+
+
+def prepare(kernels: Sequence[Callable[[], None]]) -> None:
+    """Compile the kernels that this machine has not compiled yet, with a note on stderr.
+
+    Args:
+        kernels: functions that compile one kernel each, from the server's `missing`.
+    """
+    if not kernels:
+        return
+    title = "compiling the control loops, once on this machine"
+    print(f"{title}: it takes up to a minute", file=sys.stderr, flush=True)
+    with progress(title, len(kernels), "kernels") as bar:
+        for done, compile_one in enumerate(kernels):
+            bar(done)
+            compile_one()
+
+
+def show(table: "Table") -> None:
+    """Print a table in full width: a number cut off would be worse than a line too long."""
+    from rich.console import Console
+
+    Console(width=max(Console().width, Console(width=1000).measure(table).maximum)).print(table)
+
+
+def finish(summary: Summary, title: str, json: Path | None = None) -> None:
+    """Print a summary as a table, and write it to a file.
+
+    Raises:
+        CommandError: the file cannot be written.
+    """
+    # The file comes first: the table's reader may be gone, and printing then fails.
+    if json is not None:
+        write(json, msgspec.json.encode(summary))
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left", show_header=False)
+    for row in summary_rows(summary):
+        table.add_row(*map(Text, row))  # Rendered as text: rich would take "[m]" for markup.
+    Console().print(table)
+
+
+def summary_rows(summary: Summary) -> list[tuple[str, str]]:
+    """Names and values of a summary's known figures, for a table."""
+    s = summary
+    ages = _values(".3f", s.aoi_s_mean, s.aoi_s_peak, s.plan_age_s_mean)
+    rows = [
+        ("steps", f"{s.steps} in {s.duration_s:g} s"),
+        ("RMSE x, y, xy [m]", _values(".4f", s.rmse_x, s.rmse_y, s.rmse_xy)),
+        ("RMSE z [m]", _values(".4f", s.rmse_z)),
+        ("largest error [m]", _values(".4f", s.error_max)),
+        ("error of the estimate [m]", _values(".4f", s.estimate_error_m)),
+        ("steps with a planned input", _values(".3f", s.covered)),
+        ("modes [s]", ", ".join(f"{mode} {seconds:g}" for mode, seconds in s.modes.items())),
+        ("event ratio", _values(".3f", s.event_ratio)),
+        ("uplink horizons, other packets", _values("d", *_uplink(s))),
+        ("uplink packets, bytes", _values("d", s.uplink_packets, s.uplink_bytes)),
+        ("downlink packets, bytes", _values("d", s.downlink_packets, s.downlink_bytes)),
+        (
+            "packets/s up, down, both",
+            _values(".2f", s.uplink_packets_per_s, s.downlink_packets_per_s, s.packets_per_s),
+        ),
+        (
+            "bytes/s with headers up, down, both",
+            _values(".0f", s.uplink_bytes_per_s, s.downlink_bytes_per_s, s.bytes_per_s),
+        ),
+        ("lost, reordered packets", _values("d", s.lost, s.reordered)),
+        ("stale packets", _values("d", s.stale)),
+        ("link", "sealed" if s.secure else "plaintext"),
+        ("age p50, p99 [ms]", _values(".0f", s.age_ms_p50, s.age_ms_p99)),
+        ("mean age, its peaks, age of the plan [s]", ages),
+        ("effort [m/s], share of steps at a bound", _values(".3f", s.effort_mps, s.saturated)),
+        ("solve p50, p99 [ms]", _values(".2f", s.solve_ms_p50, s.solve_ms_p99)),
+        ("deadline misses", _values("d", s.deadline_misses)),
+    ]
+    return [(name, values) for name, values in rows if values]
+
+
+def _uplink(s: Summary) -> tuple[int, ...]:
+    """Numbers of horizons and of other packets sent up, where both are known."""
+    if s.uplink_horizons is None or s.uplink_packets is None:
+        return ()
+    return s.uplink_horizons, max(0, s.uplink_packets - s.uplink_horizons)
+
+
+def _values(spec: str, *values: float | None) -> str:
+    return ", ".join(format(value, spec) for value in values if value is not None)
