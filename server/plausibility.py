@@ -187,8 +187,8 @@ def _judge(
     verdict = _against(said, row, LAST, H, dt, noise_m)
     if verdict != BELIEVED:
         place = DOUBTED
-        # Three that agree with each other are believed after all: the vehicle may have been
-        # carried, or have a new clock.
+        # Three observations that agree with each other are believed after all: the vehicle may have
+        # been carried away, or have a new clock.
         agrees = numbers[DOUBTED, row].step >= 0 and (
             _against(said, row, DOUBTED, H, dt, noise_m) == BELIEVED
         )

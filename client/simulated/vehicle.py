@@ -65,6 +65,8 @@ class SimulatedVehicle(Vehicle):
         if self._step < 0:
             self._began_ns, self._step = now_ns, 0
             self._measure(told)
+        # The plant stands at the begin of a step and is flown on when it is looked at: it needs no
+        # clock of its own.
         while self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
             self.plant.advance(self._velocity)
             self._step += 1

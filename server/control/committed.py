@@ -404,7 +404,7 @@ def _chart(
     course.begins[0], course.numbers[0] = begin, flown
     for number in following:
         due = memory.sent[row, number % room].due
-        # It is in force before the course begins, and the newest of these counts.
+        # In force already when the course begins: the newest such horizon counts.
         if due <= begin:
             course.numbers[0] = number
             continue
@@ -673,14 +673,13 @@ def _foresee(
         # Those that were due and are not in force have been overtaken, or are lost.
         first = _first_under_way(memory, row, seen.in_force, observed)
         for number in range(_first_after(memory, row, seen.in_force), first):
-            # It stays in the ring after it is lost, and is counted once.
+            # A lost horizon stays in the ring, and is counted once.
             newly = memory.sent[row, number % room].due > seen.judged
             lost += newly
             if newly:
                 memory.seen[row].loss += LEARNED * (1.0 - memory.seen[row].loss)
         memory.seen[row].judged = observed
-        # Unless the vehicle takes horizons: none that is under way comes into force, and it stands
-        # still.
+        # A vehicle that takes no horizons stands still, whatever is under way to it.
         flying, under_way = HOVERS, range(0)
         if seen.takes == 1:
             flying, under_way = _number(memory, row, seen.in_force), range(first, seen.sent)

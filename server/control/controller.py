@@ -104,6 +104,7 @@ class Controller:
         references: Callable[[int], Reference] | None = None,
     ) -> None:
         control = scenario.control
+        # Arrays of a block are allocated once, and written anew for each block of a tick.
         block = min(room, BLOCK)
         self._age_max = terms.age_max
         self._clock = clock
@@ -262,10 +263,14 @@ class Controller:
             rows, step, found.ahead, self.observed_step, self._age_max, figures, self.idle, event
         )
         if self.budget:
+            # A trigger that compares nothing, as `periodic`, gives no figure to rank its vehicles
+            # by.
             worth = verdict.figure if verdict.compares else figures["cost_gap"]
+            # A vehicle without a plan to fly on with cannot wait for bytes.
             owed = self.owed[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
             event = self.budget.choose(rows, event, owed, worth, situation.since_sent_s)
         sent = event.nonzero()[0]
+        # After the budget: the committed scheme may replay only what is really sent.
         self._scheme.remember(rows, step, found, event)  # eq. (12)
         if len(sent):
             told = rows[sent]
@@ -301,6 +306,7 @@ def _able(
         if step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:
+            # Such a horizon would be over, or refused as too late, before it could be flown.
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
 

@@ -109,7 +109,8 @@ class MotionPlan:
             return None
         found = x.reshape(axes, n).T
         velocity = np.vstack([v0, v0 + self._to_velocity @ found])
-        # It is 0 to within the solver's tolerance, and a motion that ends has to rest exactly.
+        # The last velocity is 0 to within the tolerance of the solver, and a motion has to end at
+        # rest.
         velocity[-1] = 0.0
         # Positions of what is flown: that velocity, whatever the solver's tolerance has left.
         steps = 0.5 * T * (velocity[1:] + velocity[:-1])

@@ -69,8 +69,7 @@ def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
     states = np.tile(np.array(control.state_weight), (H, 1))
     states[-1] = control.terminal_weight
     changes = np.zeros((2, H))
-    # The last input has no counterpart in the horizon before: the sum of S in eq. (9) ends at H -
-    # 2.
+    # Eq. (9) sums S up to H - 2 only: the last input has no counterpart in the horizon before.
     changes[LATER, :-1] = control.change_weight
     weights = Weights(
         states=states,

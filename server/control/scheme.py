@@ -106,6 +106,7 @@ def in_a_row(found: Foresight, sent: Indices) -> memoryview:
         sent: which vehicles, by index; their horizons have d + H inputs on each axis; shape (n,).
     """
     _, axes, most = found.horizons.shape
+    # One array for all horizons of a block, of which the packets take slices without copying.
     packed = np.empty(len(sent) * axes * most, dtype=np.float32)
     _pack(found.horizons, found.ahead, sent, found.held.shape[2], packed)
     return packed.data.cast("B")

@@ -52,8 +52,8 @@ from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Steps that a motion takes at most."""
 MARGIN_M = 0.03
-"""By how much more than D motions are planned apart: between the times at which the plan keeps it,
-and for the solver's tolerance [m]."""
+"""Margin beyond D with which motions are planned apart: for the time between the times at which a
+plan keeps D, and for the solver's tolerance [m]."""
 RESTS_MPS = 0.2
 """Measured speed up to which a vehicle rests [m/s]."""
 ARRIVED_M = 0.02
@@ -188,7 +188,7 @@ class Together:
         known.off_m = 0.0 if number in self._absent else max(off_m, 0.0)
 
     def _place(self, row: int, observed: Array) -> Array:
-        """Where a vehicle without a motion rests: where the mission begins, unless it has begun."""
+        """Resting place of a vehicle without a motion: where it begins its mission, or is."""
         number = self._number_of(row)
         if number not in self._absent:
             return observed

@@ -61,7 +61,7 @@ class Terms(NamedTuple):
     period_s: float
     """Time for one round of them [s]."""
     altitude_m: float
-    """Their height in 3-D [m]."""
+    """Height of these shapes in 3-D [m]."""
     points: str
     """Digest of the waypoints."""
     speed_mps: float

@@ -1,4 +1,4 @@
-"""Everything about a flight: its keys, the files that hold them, triggers, trajectories."""
+"""Scenarios of flights: their keys, the files that hold them, triggers, trajectories."""
 
 # With these the tables of what a scenario can name hold what comes with Skytether.
 from skytether.shared.scenario import observing, trajectories, triggers

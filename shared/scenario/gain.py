@@ -55,6 +55,7 @@ def _settled(a: bytes, b: bytes, state_weight: tuple[float, float], input_weight
     cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 2, 2))
     gain = np.zeros_like(B)
     for _ in range(ROUNDS):
+        # Riccati recursion until the cost matrix stands still, but for rounding.
         if (np.abs(cost - before) <= 1e-12 * np.abs(before)).all():
             break
         ahead = np.einsum("ai,aij->aj", B, cost)
@@ -62,5 +63,6 @@ def _settled(a: bytes, b: bytes, state_weight: tuple[float, float], input_weight
         gain = np.einsum("ai,aij->aj", ahead, A) / weight[:, None]
         left = A - B[:, :, None] * gain[:, None, :]
         cost, before = Q + np.einsum("aji,ajk,akl->ail", A, cost, left), cost
+    # Shared by all that ask for it: nobody may write into it.
     gain.setflags(write=False)
     return gain

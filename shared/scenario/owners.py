@@ -17,14 +17,14 @@ class Owner(Enum):
     """Owner of a key: which end uses its value, and so whether two ends may have different ones."""
 
     BOTH = "both ends"
-    """Both ends predict with the value: it is a term of the flight, and must be equal."""
+    """Value with which both ends predict: a term of the flight, which must be equal."""
     EACH = "each end"
-    """Each end has a value of its own."""
+    """Value that each end has for itself."""
     SERVER = "server"
     VEHICLE = "vehicle"
     NETEM = "netem"
     VIRTUAL_TIME = "virtual time"
-    """The value describes the computers, which are what they are outside virtual time."""
+    """Value that describes the computers in virtual time; real ones are as they are."""
 
 
 class InFlight(Enum):

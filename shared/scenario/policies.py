@@ -73,7 +73,7 @@ def parse(text: str, table: PluginTable = TRIGGERS) -> Expression:
 
 
 def shape(text: str, table: PluginTable) -> Policy:
-    """The one entry of a table that a text names, with its numbers.
+    """Entry of a table that a text names, with its numbers.
 
     Raises:
         PolicyError: with the part of it that is wrong.

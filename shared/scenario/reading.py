@@ -268,7 +268,7 @@ def _written(given: object) -> str:
 
 
 def _short(given: str) -> str:
-    """Given value, cut to what a line has room for."""
+    """Value as it was given, cut to what a line has room for."""
     return given if len(given) <= GIVEN_MAX else f"{given[:GIVEN_MAX]}…"
 
 

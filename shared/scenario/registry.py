@@ -228,7 +228,7 @@ def _parameters(
 
 
 def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -> Parameter:
-    """One parameter, with the bounds and the key in its annotation.
+    """Parameter of an entry, with the bounds and the key in its annotation.
 
     Raises:
         ConfigError: nothing that a scenario writes can be given for it.

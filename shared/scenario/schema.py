@@ -360,17 +360,17 @@ class MavlinkConfig(Section, frozen=True):
 
 
 class DirectionConfig(Section, frozen=True):
-    """One direction of the network. A text in its place is that of `impairments`."""
+    """Direction of the network. A text in place of the table is the key `impairments`."""
 
     impairments: OfImpairment[Annotated[str, Meta(max_length=air.TEXT_MAX)]] = ""
     """Impairments, combined with &, see `skytether impairments`; left out: those that the keys
     below are short for. Also written as the direction itself: network.uplink = "…"."""
     delay: OfImpairment[Literal["poisson", "constant", "none"]] = "poisson"
-    """Law of the delay: minimum_s + slot_s · Poisson(slots_mean) (17), just minimum_s, or none."""
+    """Law of the delay: eq. (17), minimum_s + slot_s · Poisson(slots_mean); minimum_s; or none."""
     minimum_s: OfImpairment[Duration] = 0.4
     """Smallest delay [s]."""
     slot_s: OfImpairment[Duration] = 0.02
-    """Length of a slot of the delay (17) [s]."""
+    """Length of a slot of the delay, eq. (17) [s]."""
     slots_mean: OfImpairment[Annotated[float, Meta(ge=0, le=1e6)]] = 2.0
     """Mean number of slots on top of the smallest delay."""
     loss: OfImpairment[Annotated[float, Meta(ge=0, le=1)]] = 0.1
@@ -456,7 +456,7 @@ class SimulationConfig(Section, frozen=True):
 
 
 class Scenario(Section, frozen=True):
-    """Everything about a flight."""
+    """Scenario: all keys of a flight."""
 
     title: OfEach[str] = ""
     """Title: what the scenario shows, in a line."""

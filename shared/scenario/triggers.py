@@ -221,6 +221,7 @@ class _Stateless(Trigger):
         said = self._function(situation, *self._values)
         if isinstance(said, Verdict):
             return said
+        # A vehicle that holds nothing is sent its first horizon, whatever the policy says.
         new = situation.figures["fresh"] | (situation.known.sent_step[situation.rows] < 0)
         return _timed(new | said, situation.figures)
 
@@ -302,6 +303,7 @@ class StateGap(Trigger):
         if fresh.any():  # V(k_0) = 0
             self._event_step[rows[fresh]], self._event_gap[rows[fresh]] = step[fresh], 0.0
         since = step - self._event_step[rows]
+        # λ is per second and not per step (E5): per step, 1.5 would be gone within three steps.
         threshold = self._event_gap[rows] * np.exp(-self._decay * since) + self._epsilon
         return Verdict(fresh | (gap > threshold), gap, threshold, Compared.STATE_GAP)
 
@@ -400,12 +402,14 @@ class Budget(Trigger):
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         """See `Trigger`."""
+        # Never below 0: a packet without a token, asked for by a policy behind a |, leaves no debt.
         self._tokens[rows] = np.maximum(self._filled(rows, figures) - 1.0, 0.0)
         self._step[rows] = figures["step"]
 
     def _filled(self, rows: Indices, figures: Figures) -> Array:
         """Tokens b at these steps; shape (n,)."""
         gained = self._gain * (figures["step"] - self._step[rows])
+        # Computed from the steps that have passed, so that a missed tick fills the bucket as well.
         return np.minimum(self._tokens[rows] + gained, self._burst)
 
 
@@ -427,6 +431,7 @@ class Combined(Trigger):
     def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
         left, right = self._left.test(situation), self._right.test(situation)
+        # The record has one figure: that of the leftmost policy which compares one.
         shown = left if left.compares or not right.compares else right
         event = self._combine(left.event, right.event)
         return Verdict(event, shown.figure, shown.threshold, shown.compared)
@@ -464,6 +469,7 @@ class Guarded(Trigger):
     def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
         rows, figures, estimate, planned, known = situation
+        # Views that cannot be written into: a policy's mistake must not change what is sent.
         seen = map(_sealed, (rows, figures, estimate, planned))
         shown = Situation._make((*seen, known))
         try:

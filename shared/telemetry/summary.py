@@ -17,7 +17,7 @@ AT_BOUND = 1.0 - 1e-6
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """One vehicle's flight; None is what was not measured or whose part of the record is absent."""
+    """Summary of one vehicle's flight; None where nothing was measured, or a record is missing."""
 
     scenario: str
     seed: int

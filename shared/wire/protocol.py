@@ -402,7 +402,7 @@ def _knots(value: object, ours: Terms) -> NDArray[np.float32]:
 
 
 def committed_max(terms: Terms) -> int:
-    """Most committed steps that a horizon has room for beside those that are planned; 1 or more."""
+    """Largest number of committed steps that a horizon has room for beside its plan; 1 or more."""
     return max(1, min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max))
 
 

@@ -306,7 +306,7 @@ class Recorded:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        """Its file."""
+        """File of the recording."""
         self._file, size = opened(path)
         self._bytes = Bounded(self._file, size)
         self._checked = False

@@ -33,6 +33,11 @@ NOUN_FIRST = [
     and name not in NOT_YET
 ]
 """Files whose docstrings begin with the noun that they describe, or with a verb."""
+PRONOUN = (
+    r"(It|Its|They|Their|Them|Those|That|This|These|The ones?|Everything|Anything|Nothing|Something"
+    r"|Somebody|Anybody|Whoever|In place of|By how much)\b"
+)
+"""Words that stand for a noun, as the first of a docstring."""
 DEFINITIONS = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
@@ -96,6 +101,18 @@ def test_a_docstring_begins_with_what_it_describes(name: str) -> None:
         f"{name}:{text.lineno}: {text.value[:60]!r}"
         for text, _ in docstrings(tree)
         if re.match(words, str(text.value).strip())
+    ]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if not name.startswith("tests/")])
+def test_a_docstring_begins_with_no_pronoun(name: str) -> None:
+    """Its noun may stand in another docstring, which whoever reads this one does not see."""
+    tree = ast.parse((ROOT / name).read_text())
+    found = [
+        f"{name}:{text.lineno}: {text.value[:60]!r}"
+        for text, _ in docstrings(tree)
+        if re.match(PRONOUN, str(text.value).strip())
     ]
     assert not found, "\n".join(found)
 

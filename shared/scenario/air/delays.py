@@ -198,9 +198,11 @@ def _poisson(mean: float) -> tuple[int, Sequence[float]]:
         The number that the first of them is of, and the probabilities of no more than each number.
     """
     if mean == 0.0:
+        # log(0) would fail, and no slot is added in any case.
         return 0, (1.0,)
     wide = 10.0 * sqrt(mean) + 20.0
     numbers = range(max(0, floor(mean - wide)), floor(mean + wide))
+    # By logarithms: mean^m and m! overflow for large means. With m! in place of the printed m (E1).
     logs = [number * log(mean) - mean - lgamma(number + 1.0) for number in numbers]
     cumulative = np.cumsum(np.exp(logs))
     return numbers[0], (cumulative / cumulative[-1]).tolist()

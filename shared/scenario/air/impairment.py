@@ -29,7 +29,7 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Impairment:
-    """One thing that a network does to packets. It keeps nothing from packet to packet."""
+    """Base of the effects of a network on packets. None keeps anything from packet to packet."""
 
     kind: Literal["delay", "loss", "other"] = "other"
     """Delays and losses of a direction keep their random numbers when another is added."""

@@ -1,4 +1,4 @@
-"""One direction of the network as a scenario writes it: `constant(0.05) & loss(0.1)`.
+"""Direction of the network as a scenario writes it: `constant(0.05) & loss(0.1)`.
 
     direction  := impairment | impairment & direction
     impairment := name | name(argument, …)

@@ -48,9 +48,9 @@ NETWORKS = {
 }
 """Networks, both ways alike."""
 MORTAL = "10 %, a server that dies"
-"""The one of which the server dies."""
+"""Network with which the server dies."""
 DEATHS, DOWN_S = 3, (0.5, 20.0)
-"""How often it does so, and for how long at least and at most [s]."""
+"""Number of times that the server dies, and shortest and longest time that it is down [s]."""
 PLANNERS: dict[str, Callable[[list[Motion]], list[Motion]]] = {
     "all that may be flown": lambda motions: motions,
     "the newest alone": lambda motions: motions[-1:],
