@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from skytether.cli import keygen
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import (
     Counted,
@@ -230,6 +229,8 @@ def run(
     except OSError as error:
         raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
     if secure:
+        from skytether.cli import keygen  # a command of its own, with tyro: 0.05 s
+
         keygen.make(parts / "keys", range(1, vehicles + 1))
     keys = ["--keys", str(parts / "keys")] if secure else []
     shortfalls: list[Shortfall] = []

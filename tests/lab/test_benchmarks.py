@@ -24,6 +24,7 @@ from skytether.lab.benchmarks import (
     netem,
     restarts,
     solvers,
+    starting,
     tick,
     versions,
     wire,
@@ -60,6 +61,7 @@ TINY = MappingProxyType(
         ),
         "flood": flood.FloodCounts(seconds=1, forged=2000, hellos=200, lead_s=0.5),
         "restarts": restarts.RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("netem",)),
+        "starting": starting.StartingCounts(warm=1, cold=0),
     }
 )
 

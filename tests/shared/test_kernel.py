@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 HELPER = """
 from typing import NamedTuple
 from skytether.shared.base.kernel import F1, inline
@@ -157,3 +159,35 @@ def test_a_full_disk_is_no_reason_to_fail(tmp_path: Path) -> None:
     assert run(tmp_path, file_bytes=100) == "2.0 0"
     assert run(tmp_path) == "2.0 0"
     assert run(tmp_path) == "2.0 1"
+
+
+CALLED = """
+import sys
+import msgspec
+from numba.core import event
+from skytether.server.control.controller import other_schemes
+from skytether.shared.base import kernel
+from skytether.shared.scenario import reading
+from skytether.sim import flight
+
+def in_memory():
+    return {f"{each.__module__}.{each.__name__}" for each in kernel.KERNELS if each.overloads}
+
+scenario = msgspec.structs.replace(reading.load(sys.argv[1]), duration=8.0)
+kernel.load(without=other_schemes(scenario))
+loaded = in_memory()
+with event.install_recorder("numba:compile") as compiled:
+    flight.fly(scenario, vehicles=16 if scenario.is_mission else 1)
+print(*(in_memory() - loaded), len(compiled.buffer))
+"""
+
+
+@pytest.mark.parametrize(
+    "scenario", ["demo", "demo-committed", "paper", "paper-no-compensation", "swap"]
+)
+def test_a_server_has_all_kernels_of_its_scheme_in_memory_before_it_flies(scenario: str) -> None:
+    """No other kernel is called in flight, and nothing at all is compiled, not even for figures."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", CALLED, scenario], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["0"]

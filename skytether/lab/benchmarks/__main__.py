@@ -21,6 +21,7 @@ from skytether.lab.benchmarks import (
     netem,
     restarts,
     solvers,
+    starting,
     tick,
     wire,
 )
@@ -31,7 +32,16 @@ ROOT = Path(__file__).parents[3]
 RESULTS = Path(__file__).with_name("results.json")
 DOCUMENT = ROOT / "docs" / "performance.md"
 Section = Literal[
-    "netem", "solvers", "tick", "growth", "wire", "accuracy", "link", "flood", "restarts"
+    "netem",
+    "solvers",
+    "tick",
+    "growth",
+    "wire",
+    "accuracy",
+    "link",
+    "flood",
+    "restarts",
+    "starting",
 ]
 SECTIONS: dict[Section, ModuleType] = {
     "netem": netem,
@@ -43,6 +53,7 @@ SECTIONS: dict[Section, ModuleType] = {
     "link": link,
     "flood": flood,
     "restarts": restarts,
+    "starting": starting,
 }
 
 

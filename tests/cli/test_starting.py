@@ -1,0 +1,76 @@
+"""Commands import what they need and no more: imports are most of what a start takes.
+
+`python -m skytether.lab.benchmarks.starting` measures the time; here no module is imported that a
+command can do without.
+"""
+
+import subprocess
+import sys
+
+import pytest
+
+MODULES = """
+import signal, sys
+from skytether.__main__ import main
+from skytether.shell import log
+
+def listens(self, event):
+    signal.raise_signal(signal.SIGTERM)
+
+if sys.argv[1] in ("server", "client"):
+    log.Log.say = listens
+main(sys.argv[1:])
+print("imported:", *sys.modules)
+"""
+HEAVY = {
+    "cryptography",
+    "jinja2",
+    "matplotlib",
+    "numba",
+    "osqp",
+    "rich",
+    "scipy",
+    "tyro",
+    "viser",
+    "websockets",
+}
+COMPILER = {"scipy.linalg", "numba.np.linalg"}
+"""Modules that numba imports to compile, and not to load what was compiled."""
+
+
+def imported(*argv: str) -> set[str]:
+    """Modules that a command has imported at its end; a process by hand ends once it listens."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", MODULES, *argv], capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.rpartition("imported: ")[2].split())
+
+
+@pytest.mark.parametrize("command", ["--help", "scenarios", "client demo", "client paper"])
+def test_what_is_light_imports_nothing_heavy(command: str) -> None:
+    """Neither help nor a vehicle has to wait for what plans, draws or encrypts."""
+    modules = imported(*command.split())
+    assert "skytether.shell.command" in modules
+    assert modules & HEAVY == set()
+
+
+@pytest.mark.parametrize("scenario", ["demo", "paper"])
+def test_a_server_imports_its_own_solver_and_no_ciphers_without_keys(scenario: str) -> None:
+    """Numba is what it needs; scipy's own package is imported by numba, which asks its version."""
+    modules = imported("server", scenario, "--bind", "127.0.0.1:0")
+    assert "numba" in modules
+    assert modules & (HEAVY | {"scipy.sparse"}) <= {"numba", "scipy"}
+    assert modules & COMPILER == set()
+
+
+def test_a_server_with_osqp_imports_it() -> None:
+    """The solver that a scenario names is there before a vehicle waits for it."""
+    modules = imported("server", "paper", "--bind", "127.0.0.1:0", "--control.solver", "osqp")
+    assert "osqp" in modules
+
+
+def test_a_flight_in_virtual_time_draws_encrypts_and_compiles_nothing() -> None:
+    """Its summary is printed by rich; all else that is heavy belongs to other options."""
+    modules = imported("fly", "demo", "--virtual", "--duration", "1")
+    assert modules & HEAVY <= {"numba", "rich", "scipy"}
+    assert modules & COMPILER == set()
