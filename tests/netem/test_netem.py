@@ -117,11 +117,12 @@ def test_a_ground_station_and_an_autopilot(tmp_path: Path) -> None:
     """MAVLink passes both ways, and some of it is lost."""
     station, netem, autopilot = block("--law led")
     with (
-        running(f"{station} --duration 10", tmp_path),
+        running(f"{station} --duration 10", tmp_path) as flight,
         running(netem, tmp_path, "listening") as relay,
         running(autopilot, tmp_path),
     ):
-        time.sleep(12.0)  # real programs, on their own clocks
+        # It begins once it has heard the autopilot, which takes as long as that takes to start.
+        flight.communicate(timeout=PATIENCE_S)
         said = ended(relay)
     assert min(counted(said, "forwarded")) > 50
     assert max(counted(said, "lost")) > 0
