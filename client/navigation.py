@@ -237,7 +237,7 @@ class Newest:
         return self._nothing
 
     def take(self, measured: Measurement) -> None:
-        """Take what was measured."""
+        """Keep a measurement, in place of the one before."""
         self._position = measured.position or self._position
         self._velocity = measured.velocity or self._velocity
 

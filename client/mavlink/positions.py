@@ -16,7 +16,7 @@ AHEAD_NS = 20 * MILLISECOND_NS
 """Time by which a stamp may lie ahead, for the clock is known only so well [ns]; more is
 impossible."""
 OLD_NS = SECOND_NS
-"""Age of a measurement above which it is not taken, of an autopilot aboard [ns]."""
+"""Largest age of a measurement that is used, for an autopilot aboard [ns]."""
 SPEED_MAX = 1e3
 """Largest speed on an axis that is believed [m/s]."""
 

@@ -86,7 +86,7 @@ class Weather:
         """Gusts begin and end by chance, each blowing one way all along."""
         if self._gust_mps2 == 0.0:
             return
-        # Drawn at every step, so that a gust's strength changes nothing of when gusts come.
+        # Drawn at every step, so that the times of gusts do not depend on their strength.
         chance = self._rng.random()
         if self._gust is not None:
             if chance < self._gust_end_chance:

@@ -89,7 +89,7 @@ def create(path: Path, buffering: int = -1) -> BinaryIO:
         OSError: it cannot be written, or is no plain file.
     """
     check(path)
-    # Should somebody exchange the file just now, it is not followed, not waited for, and not cut.
+    # Another program may exchange the file just now: then it is not followed, waited for or cut.
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=buffering)
     try:

@@ -37,7 +37,7 @@ Delay = Callable[[float], float]
 """Delay of a packet [s], by the time since the first [s]."""
 
 TIGHT = {"feedback": False, "input_weight": 0.01, "input_reference": False}
-"""Keys of committed inputs alone, at weights that answer all at once."""
+"""Keys for committed inputs without feedback, with weights that correct an error at once."""
 OUTSIDE_M = 3.2
 """Largest allowed distance from the centre of the figure eight of 2 m [m]."""
 

@@ -258,7 +258,7 @@ class Containers:
         """Wait until orders reach the vehicle, newly made ones."""
         until("the session", lambda: self.has_said("server", "vehicle 1 flies"))
         first = self.figures("client")
-        # A second later netem holds nothing that it held until now.
+        # A second later all packets that netem holds now have been delivered.
         second = self.figures_with("step", number("step", first) + STEPS_PER_S)
         server = self.figures("server")
         last = self.figures_with("horizons", number("horizons", second) + HORIZONS)
