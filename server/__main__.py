@@ -108,7 +108,7 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _ready() -> None:
-    """Have what plans in memory before a vehicle waits for it, and workers share it."""
+    """Load the planner before a vehicle waits for it, so that workers share its memory."""
     command.prepare(kernel.missing())
     kernel.load()
 

@@ -102,7 +102,7 @@ def missing() -> list[Callable[[], None]]:
 
 
 def load() -> None:
-    """Have every kernel in memory, so that none has to be compiled in flight."""
+    """Load or compile every kernel, so that none has to be compiled in flight."""
     for each in KERNELS:
         _compile(each)
 
@@ -133,7 +133,7 @@ def _compile(dispatcher: Any) -> None:
 
 
 def _keep(dispatcher: Any) -> None:
-    """Let machine code come from and go to the disk, where there is a place for it."""
+    """Cache machine code on disk, where there is a place for it."""
     before, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, ",".join(LOCATORS)
     with suppress(RuntimeError):  # no place can be written to
         dispatcher.enable_caching()
