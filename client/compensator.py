@@ -281,7 +281,7 @@ class Compensator:
         return self.in_force != NO_HORIZON and step - self.begins < self._length
 
     def _go_on(self, step: int) -> int:
-        """Go on to a step, and return its stage."""
+        """Advance to a step; returns its stage in the horizon."""
         if self._new:
             self.since, self._new = step, False
         self._chosen = step

@@ -212,7 +212,7 @@ class Client(Endpoint):
             session.send(observation)
 
     def _end(self, now_ns: int) -> None:
-        """Say how the flight ended, and see the vehicle down."""
+        """Report how the flight ended, and let the vehicle land."""
         self._flies.land()
         pilot, vehicle = self._pilot, self.vehicle
         if pilot.covered and pilot.without_ns <= self._timeout_ns:

@@ -230,7 +230,7 @@ class Failsafe:
     # -- what time brings --------------------------------------------------------------------
 
     def step(self, *, late_ns: int, hindrance: Reason | None, now_ns: int) -> None:
-        """Meet what has become true by the start of a step.
+        """Handle the causes that hold at the start of a step.
 
         Args:
             late_ns: time by which the vehicle was woken late for it [ns].

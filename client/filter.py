@@ -145,7 +145,7 @@ class Kalman:
         self.x = [(p, v, 0.0) for p, v in zip(measured.position, velocity, strict=True)]
 
     def advance(self, due: list[float], swing: Sequence[float] = ()) -> None:
-        """Go on by a step, over which these inputs act, see `shared.law.dead_time`.
+        """Advance by a step, over which these inputs act, see `shared.law.dead_time`.
 
         Args:
             due: the input that acts at its end, of each axis [m/s].

@@ -85,12 +85,12 @@ class Fleet(Endpoint):
         return next(filter(None, said), "")
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """Let every vehicle fly the other scenario."""
+        """Change the scenario of every vehicle."""
         for client in self._clients:
             client.change(scenario, keys, now_ns=now_ns)
 
     def close(self, *, now_ns: int) -> None:
-        """Let every vehicle say that it ends."""
+        """Close every client."""
         for n, client in enumerate(self._clients):
             client.close(now_ns=now_ns)
             self._after(n)

@@ -93,7 +93,7 @@ class Navigation:
         """Whether the estimate is finite, also when it is told, and can be flown by."""
 
     def advance(self, measurements: Sequence[Measurement], command: Array, *, now_ns: int) -> None:
-        """Go on to a step; before the first the vehicle stands.
+        """Advance to a step; before the first the vehicle stands still.
 
         Args:
             measurements: what has been measured and is had since the step before.
@@ -230,7 +230,7 @@ class Newest:
         self.take(measured)
 
     def advance(self, due: list[float], swing: Sequence[float] = ()) -> None:
-        """Go on by a step, in which no number changes by itself."""
+        """Advance by a step, in which no number changes by itself."""
 
     def disturbance(self) -> list[float]:
         """Disturbance of each axis, of which nothing is known: 0 [m/s]."""

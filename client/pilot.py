@@ -170,7 +170,7 @@ class Pilot:
             self._failsafe.horizon_taken(now_ns=now_ns)
 
     def mode_changed(self, cause: Reason) -> None:
-        """Do what goes with another mode, or another reason for it."""
+        """Drop the horizon, or the readiness for one, as another mode or reason asks for."""
         if not self._failsafe.takes:
             self._takes_from = None
         if cause in DROPPING:

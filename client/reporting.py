@@ -38,7 +38,7 @@ class BelievedState:
         return hypot(*((p - q) + tau * (v - w) for tau, (p, v), (q, w) in axes))
 
     def told(self, states: States, flown: Sequence[float]) -> None:
-        """Go on from an observation to the next step.
+        """Advance from an observation to the next step.
 
         Args:
             states: what it says.
@@ -47,7 +47,7 @@ class BelievedState:
         self._states = self._compensator.foresee(states, flown)
 
     def silent(self) -> None:
-        """Go on to the next step, at which nothing was said."""
+        """Advance from a step without an observation to the next."""
         self._states = self._compensator.foresee(self._states)
 
 

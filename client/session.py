@@ -163,7 +163,7 @@ class ServerSession:
         return None
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
-        """The message in a payload; one that is none is a mistake of the server, if it is its own.
+        """Message in a payload; a malformed one is a mistake of the server, if it is its own.
 
         In plaintext anybody could make the vehicle brake by such mistakes: there they count for
         nothing.
@@ -259,12 +259,12 @@ class ServerSession:
             self.hello_ns = max(self.hello_ns, now_ns + AGAIN_NS)
 
     def send(self, message: Observation | Close) -> None:
-        """Say something in the session."""
+        """Send a message in the session."""
         self.said = (self.said + 1) % NUMBERS
         self._out.append(Datagram(self.link.seal(encode(message)), self._server))
 
     def close(self) -> None:
-        """Let the session not go on: another WELCOME is needed."""
+        """Close the session: only another WELCOME opens one again."""
         self._is_open = False
 
     def wait(self, *, now_ns: int) -> bool:

@@ -52,7 +52,7 @@ class Vehicle(ABC):
         """
 
     def set_parameters(self) -> bool:
-        """Let its hardware's parameters be set where they are not safe; False without any.
+        """Allow unsafe parameters of its hardware to be set; False for a vehicle without any.
 
         It is called before anything else, if at all.
         """

@@ -156,7 +156,7 @@ class Link:
             self._queue(Entered(datagram, lane, number, fate, now_ns), now_ns)
 
     def _queue(self, entered: Entered, now_ns: int) -> None:
-        """Let a packet enter the bottleneck, where there is one."""
+        """Put a packet into the bottleneck, or delay it at once where there is none."""
         bottleneck, size = self._bottleneck, len(entered.datagram.payload)
         if bottleneck is None:
             self._delay(*entered, now_ns)

@@ -118,7 +118,7 @@ class Proxy(Endpoint):
         self._forward(now_ns)
 
     def wake(self, *, now_ns: int) -> None:
-        """Let out the packets that are due."""
+        """Send the packets that are due."""
         self._forward(now_ns)
 
     def _forward(self, now_ns: int) -> None:

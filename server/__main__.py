@@ -108,7 +108,7 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _ready(scenario: Scenario) -> None:
-    """Have what plans in memory before a vehicle waits for it, and workers share it."""
+    """Load the planner before a vehicle waits for it, so that workers share its memory."""
     others = other_schemes(scenario)
     terminal.prepare(kernel.missing(without=others))
     kernel.load(without=others)

@@ -42,7 +42,7 @@ class Gate(Protocol):
         """
 
     def admit(self, call: Call, *, now_ns: int) -> None:
-        """Let the vehicle that says HELLO in this call send more."""
+        """Admit the vehicle that says HELLO in this call: its further packets are opened."""
 
     def outbox(self) -> list[Datagram]:
         """Datagrams of the gate's own to be sent; each is handed out once."""

@@ -120,7 +120,7 @@ class Plausibility:
 
 
 ANEW, BELIEVED, CLOCK, HORIZON, JUMP = map(int, Belief)
-"""As kernels take them."""
+"""Members of `Belief` as plain numbers, for kernels."""
 
 
 @part

@@ -65,13 +65,13 @@ class Grid:
         """Whether more ticks are missed than may be."""
 
     def arm(self, now_ns: int) -> None:
-        """Let a tick be due, for there is a vehicle to tick for."""
+        """Schedule the next tick, for there is a vehicle to plan for."""
         dt_ns = self._dt_ns
         if self.due_ns is None or self.due_ns > now_ns + dt_ns:  # also where our clock went back
             self.due_ns = -(-now_ns // dt_ns) * dt_ns  # the next, or now
 
     def rest(self) -> None:
-        """Let no tick be due."""
+        """Cancel the next tick."""
         self.due_ns = None
 
     def take(self, now_ns: int) -> int | None:
@@ -254,7 +254,7 @@ class Ticker:
             self._send(session, encode(message), is_plan=True)
 
     def _send_heartbeats(self, owed: Sequence[Session], now_ns: int) -> None:
-        """Say that the server lives to vehicles that nothing else was sent to at this tick."""
+        """Send a heartbeat to each vehicle that is owed one and was sent nothing at this tick."""
         for session in owed:
             if session.is_owed(now_ns):
                 idle = int(self._sessions.idle[session.row])

@@ -26,15 +26,15 @@ class LaunchStep(Enum):
     """A step on the way into the air."""
 
     HOLD = auto()
-    """Be in a mode that flies by itself, and not in one of a pilot's."""
+    """Step: a mode that flies by itself, and none of a pilot's."""
     GUIDE = auto()
-    """Be in the mode that follows setpoints."""
+    """Step: the mode that follows setpoints."""
     ARM = auto()
-    """Be armed."""
+    """Step: armed."""
     LIFT = auto()
-    """Have heard the command to take off."""
+    """Step: the command to take off is acknowledged."""
     CLIMB = auto()
-    """Be at the altitude of take-off."""
+    """Step: at the altitude of take-off."""
 
 
 @dataclass(frozen=True)

@@ -244,7 +244,7 @@ class Launch:
             self._enter(Phase.LANDING, now_ns)
 
     def close(self, *, now_ns: int) -> list[Message]:
-        """Let nothing begin any more; messages that make it land, where it is ours now."""
+        """End the launch; returns messages that make the vehicle land, where it is ours now."""
         self._closed = True
         if self.phase is Phase.GROUND or not self._is_ours(now_ns):
             return []

@@ -182,7 +182,7 @@ class Port(Endpoint):
             self._send_velocity(self.now_ns)
 
     def land(self) -> None:
-        """Let the autopilot land by itself from now on."""
+        """Command the autopilot to land by itself."""
         if self._launch is not None:
             self._launch.land(now_ns=self.now_ns)
             self._tick_ns = self.now_ns

@@ -114,7 +114,7 @@ class Positions:
         return "late" if boot_ms < self._newest_boot_ms else ""
 
     def begin(self) -> None:
-        """Let our origin be where the vehicle is, less where it starts."""
+        """Set our origin: the vehicle's place less its start in the scenario."""
         if self.position is not None:
             x, y, z = (at - start for at, start in zip(self.position, self._start, strict=True))
             self.origin = x, y, z

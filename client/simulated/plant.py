@@ -62,5 +62,5 @@ class FirstOrderPlant:
             self.x[i] = (p + shove_p, v + shove_v)
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Let other winds blow from the next step on."""
+        """Change the winds from the next step on."""
         self.weather.change(vehicle)

@@ -54,5 +54,5 @@ class QuadrotorPlant:
         self._quadrotor.advance(command, self._dt_ns)
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Let other winds blow from the next step on."""
+        """Change the winds from the next step on."""
         self._quadrotor.blow(vehicle.steady_wind_mps, vehicle.turbulence_mps)

@@ -33,7 +33,7 @@ class Plant(Protocol):
         """Fly one step with this desired velocity [m/s]; shape (axes,)."""
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Let other winds blow from the next step on."""
+        """Change the winds from the next step on."""
 
 
 class SimulatedVehicle(Vehicle):
@@ -88,7 +88,7 @@ class SimulatedVehicle(Vehicle):
         self._sensor.measured_at(step)
 
     def _measure(self, told: list[Measurement]) -> None:
-        """Add what is had at the step, if that is anything."""
+        """Add the measurement that is available at the step, if there is one."""
         measured = self._sensor.measure(self.plant.x, began_ns=self._began_ns)
         if measured.position or measured.velocity:
             told.append(measured)

@@ -45,7 +45,7 @@ class Weather:
         self.change(scenario.vehicle)
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Let other winds blow from the next step on."""
+        """Change the winds from the next step on."""
         white = vehicle.wind * white_acceleration(self._tau, self._dt_s)
         self.white = white.tolist() if vehicle.wind else []
         self._gust_mps2 = vehicle.gust_mps2

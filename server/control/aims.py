@@ -47,7 +47,7 @@ class Aims:
         self.change_zones(zones)
 
     def change_zones(self, zones: Zones) -> None:
-        """Go around other zones from now on."""
+        """Replace the zones that ways lead around."""
         self._zones, self.routes = zones, Routes(zones, self._tube_m)
 
     def of(

@@ -37,7 +37,7 @@ class Aside(NamedTuple):
 
 
 def first_on(way: Array, homes: Array, apart_m: float) -> int | None:
-    """Index of the first of some places that a way passes too near to; None of none.
+    """Index of the first of some places that a way passes too near to; None where it passes none.
 
     Args:
         way: where it begins, its corners and its end [m]; shape (n, axes).

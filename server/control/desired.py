@@ -133,7 +133,7 @@ class Desired:
         """Predicted states; not used where everything is seen."""
 
     def assign(self, row: int, vehicle: int) -> None:
-        """Let a vehicle begin in this row."""
+        """Assign a row to a vehicle, whose trajectory is looked up by its number."""
         self._number[row] = vehicle if self._references else 0
 
     def number(self, row: int) -> int:

@@ -176,7 +176,7 @@ def _direction(J: F2, R: F2, normal: F1, d: F1, z: F1, r: F1, q: int) -> tuple[f
 
 @making_part
 def _let_go(J: F2, R: F2, u: F1, active: I1, leaves: int, q: int) -> None:
-    """Let a constraint go, of q in force."""
+    """Remove one of the q constraints in force."""
     for i in range(leaves, q - 1):
         active[i], u[i] = active[i + 1], u[i + 1]
         R[:q, i] = R[:q, i + 1]

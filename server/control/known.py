@@ -111,7 +111,7 @@ class Known:
         return False
 
     def owed(self, step: int) -> Sent | None:
-        """Motion that is to be sent once more at a step; None of none."""
+        """Motion that is to be sent once more at a step; None where there is none."""
         if not self.sent:
             return None
         since = step - self.sent[-1].step

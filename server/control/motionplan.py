@@ -80,7 +80,7 @@ class MotionPlan:
         goal: Array,
         planes: tuple[Indices, Array, Array] | None = None,
     ) -> tuple[Array, Array] | None:
-        """Positions and velocities of the knots from a state on, that state first; None of none.
+        """Positions and velocities of the knots, the given state first; None without a solution.
 
         Args:
             p0, v0: where it begins [m, m/s]; shape (axes,).

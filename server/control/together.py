@@ -374,7 +374,7 @@ class Together:
         return bool(aside.off_way(home[None] * self._scale, way)[0] < self._apart_m + MARGIN_M)
 
     def _ask(self, row: int, way: Array) -> None:
-        """Have the first vehicle at rest at its goal step aside that is in a vehicle's way."""
+        """Ask the first vehicle that rests at its goal in another vehicle's way to step aside."""
         keep_m, ends, homes = self._apart_m + MARGIN_M, list[tuple[int, Array]](), list[int]()
         for other, each in self._rows.items():
             if other == row or each.in_force is None or other not in self._ahead:

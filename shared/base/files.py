@@ -1,4 +1,4 @@
-"""Files that a user names: read whole and of a size that was thought of, written where no harm is.
+"""Files that a user names: read up to a largest size, written only where nothing else is lost.
 
 Whatever a command writes is a plain file: a device, a pipe or a link at its place is refused. With
 `--out /dev/sda`, or a link that somebody has left there, it would otherwise write elsewhere.
@@ -104,7 +104,7 @@ def create(path: Path, buffering: int = -1) -> BinaryIO:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file anew, in place of a plain one that is there.
+    """Write a file anew; a plain file of that name is replaced.
 
     Raises:
         OSError: it cannot be written, or is no plain file.

@@ -109,7 +109,7 @@ def missing(without: Collection[str] = ()) -> list[Callable[[], None]]:
 
 
 def load(without: Collection[str] = ()) -> None:
-    """Have every kernel in memory, so that none has to be compiled in flight.
+    """Load or compile every kernel, so that none has to be compiled in flight.
 
     Args:
         without: names of the modules whose kernels are not needed.
@@ -147,7 +147,7 @@ def _compile(dispatcher: Any) -> None:
 
 
 def _keep(dispatcher: Any) -> None:
-    """Let machine code come from and go to the disk, where there is a place for it."""
+    """Cache machine code on disk, where there is a place for it."""
     if isinstance(dispatcher._cache, Kept):
         return
     with suppress(RuntimeError):  # no place can be written to

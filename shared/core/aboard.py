@@ -1,4 +1,4 @@
-"""Events of a vehicle's own autopilot, as who flies it hears and judges what it says."""
+"""Events of a vehicle's own autopilot: what the client hears of it, and how it judges that."""
 
 import msgspec
 

@@ -96,7 +96,7 @@ class Running:
         return changed
 
     def refuse(self, reason: str) -> None:
-        """Let the endpoint say that a change is refused."""
+        """Report through the endpoint that a change is refused."""
         self._endpoint.tell(ChangeRefused(reason=reason))
 
     def answer(self, request: bytes, *, now_ns: int) -> bytes:

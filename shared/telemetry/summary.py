@@ -269,7 +269,7 @@ def _quantile(values: Array, share: float) -> float | None:
 def least_separation(
     each: Sequence[Rows], began_s: Sequence[float], dt_s: float, height_scale: float = 1.0
 ) -> float | None:
-    """Smallest distance between two vehicles while both are on a mission [m]; None of none.
+    """Smallest distance between two vehicles while both are on a mission [m]; None without.
 
     See `separations`.
     """

@@ -96,7 +96,7 @@ class Shell:
             admit_only(bound, forms)
         self._sockets = {0: bound}
         self._stream: ByteStream | None = None
-        """What socket 1 is, where it is none."""
+        """Stream that serves as socket 1; None without a line."""
         if line is not None:
             with contextlib.ExitStack() as failed:
                 failed.enter_context(bound)

@@ -241,7 +241,7 @@ def part_of(record: Path | None) -> Path | None:
 def fed(
     path: Path | None, record: Path | None, process: str, options: Options, *, secure: bool
 ) -> Iterator[Feed | None]:
-    """Open a feed for as long as the block takes; None where nobody is to read it.
+    """Open a feed for as long as the block takes; None where no feed was asked for.
 
     Args:
         path: path of its socket; None for no readers other than a recorder.
