@@ -94,6 +94,9 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Smallest distance that vehicles of a mission are asked to keep [m]."""
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
+    left_tube: int | None
+    """Observations of vehicles of a mission that were further from their motions than
+    `mission.tube_m`: the separation is guaranteed only without any."""
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
@@ -401,6 +404,9 @@ def _summarise(options: FleetOptions, flown: FleetFlight, least_m: float | None)
         rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
         separation_m=scenario.mission.separation_m if scenario.is_mission else None,
         least_separation_m=least_m,
+        left_tube=sum(server["counts"].get("left_tube", 0) for server in servers)
+        if scenario.is_mission
+        else None,
         uplink_packets_per_s=links[0]["packets"] / duration_s,
         downlink_packets_per_s=links[1]["packets"] / duration_s,
         lost=sum(link["lost"] for link in links),
@@ -436,6 +442,7 @@ def _show(summary: FleetSummary, title: str) -> None:
             if s.least_separation_m is None
             else f"{s.least_separation_m:.3f}, {s.separation_m:g}",
         ),
+        ("observations outside a tube", None if s.left_tube is None else str(s.left_tube)),
         ("link", "sealed" if s.secure else "plaintext"),
         ("event ratio", f"{s.event_ratio:.3f}"),
         (

@@ -173,6 +173,7 @@ def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None
     assert (tmp_path / "swap.png").stat().st_size > 10_000
     assert (swap["vehicles"], swap["separation_m"]) == (4, 0.5)
     assert swap["least_separation_m"] > 0.5
+    assert swap["left_tube"] == 0
     show = tmp_path / "show.csv"
     show.write_text("vehicle,t,x,y,z\n1,0,0,0,2\n1,5,0,0,4\n2,0,3,0,2\n")
     film = tmp_path / "show.gif"
