@@ -25,13 +25,10 @@ from itertools import pairwise
 from math import pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skytether.probe.prober import Longs, MeasuredPath, Way
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
-from skytether.shared.law.model import Array
-
-Bools = NDArray[np.bool_]
+from skytether.shared.law.model import Array, Flags
 
 DRIFT_MAX = 500e-6
 """Largest believable drift between two clocks: the fastest rate at which clocks are slewed."""
@@ -102,7 +99,7 @@ class Delays:
     """Rate of the direction; None where trains show no finite one."""
 
     @property
-    def came(self) -> Bools:
+    def came(self) -> Flags:
         """Whether each packet arrived; shape (n,)."""
         return np.isfinite(self.delay_s)
 
@@ -289,7 +286,7 @@ def wilson(share: float, count: float) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def bursts(lost: Bools) -> tuple[int, float]:
+def bursts(lost: Flags) -> tuple[int, float]:
     """Number of runs of lost packets, and their mean length in packets; 0 without any."""
     edges = np.diff(lost.astype(np.int8), prepend=0)
     count = int((edges == 1).sum())

@@ -13,8 +13,8 @@ from math import exp, lgamma, log, pi, sqrt
 
 import numpy as np
 
-from skytether.probe.analysis import Bools, highest
-from skytether.shared.law.model import Array
+from skytether.probe.analysis import highest
+from skytether.shared.law.model import Array, Flags
 
 RESOLUTION_S = 50e-6
 """Time resolution of the likelihoods [s]."""
@@ -186,7 +186,7 @@ def _paper(delay_s: Array) -> Found | None:
 # -- losses -------------------------------------------------------------------------------------
 
 
-def fit_losses(time_s: Array, lost: Bools) -> list[FittedImpairment]:
+def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
     """Models of losses, the best first; none where nothing was lost, or everything.
 
     The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and

@@ -30,6 +30,7 @@ from skytether.probe.wire import (
 )
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.law.model import Flags
 from skytether.shared.wire.channel import OVERHEAD_BYTES
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
@@ -55,7 +56,6 @@ LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
 trip."""
 
 Longs = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Way:
     """Time of sending, on the sender's clock [ns]; shape (n,)."""
     came_ns: Longs
     """Time of arrival, on the receiver's clock [ns]; 0 for a lost packet; shape (n,)."""
-    came: Bools
+    came: Flags
     """Whether each packet arrived; shape (n,)."""
     train: Longs
     """Number of each packet's train, -1 for a packet sent alone; shape (n,)."""

@@ -21,11 +21,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skytether.shared.base import files
 from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.law.model import Array
+from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.air.delays import interpolated
 from skytether.shared.scenario.air.draws import Draws, Fate
 from skytether.shared.scenario.air.impairment import Impairment, impairment
@@ -42,7 +41,6 @@ DELAY_MAX_S = 3600.0
 DELIVERY_BYTES = 1504
 """Bytes that may go at a time of mahimahi's."""
 
-Bools = NDArray[np.bool_]
 Way = Literal["auto", "send", "receive"]
 
 _PING = re.compile(
@@ -62,7 +60,7 @@ class RecordedPath:
     """Times at which packets were sent, rising from 0 [s]; shape (n,)."""
     delay_s: Array
     """One-way delays [s]; those of lost packets are interpolated; shape (n,)."""
-    lost: Bools
+    lost: Flags
     """Whether each was lost; shape (n,)."""
 
 
@@ -190,7 +188,7 @@ def _table(file: str, text: str, names: list[str]) -> Array:
         raise ValueError(f"{file}: {str(error).partition(';')[0]}, expected numbers") from None
 
 
-def _of_csv(file: str, text: str) -> tuple[Array, Array, Bools]:
+def _of_csv(file: str, text: str) -> tuple[Array, Array, Flags]:
     names = [name.strip() for name in text.split("\n", 1)[0].split(",")]
     time = next((name for name in names if name in _TIMES), None)
     delay = next((name for name in names if name in _DELAYS), None)
@@ -205,7 +203,7 @@ def _of_csv(file: str, text: str) -> tuple[Array, Array, Bools]:
     return table[:, names.index(time)], table[:, names.index(delay)] * _DELAYS[delay], lost
 
 
-def _of_ping(file: str, text: str) -> tuple[Array, Array, Bools]:
+def _of_ping(file: str, text: str) -> tuple[Array, Array, Flags]:
     """Rows of ping's output: those that it has no answer to are lost."""
     heard: dict[int, tuple[float, float]] = {}
     for number, found in enumerate(_PING.finditer(text)):
@@ -228,7 +226,7 @@ def _of_ping(file: str, text: str) -> tuple[Array, Array, Bools]:
     return np.interp(np.arange(low, high + 1), numbers, sent_s), delay_s, lost
 
 
-def _of_irtt(file: str, text: str, way: Way) -> tuple[Array, Array, Bools]:
+def _of_irtt(file: str, text: str, way: Way) -> tuple[Array, Array, Flags]:
     key = "rtt" if way == "auto" else way
     rows = []
     try:
@@ -243,7 +241,7 @@ def _of_irtt(file: str, text: str, way: Way) -> tuple[Array, Array, Bools]:
     return table[:, 0] * 1e-9, table[:, 1] * factor, table[:, 2] != 0.0
 
 
-def _checked(file: str, time_s: Array, delay_s: Array, lost: Bools) -> RecordedPath:
+def _checked(file: str, time_s: Array, delay_s: Array, lost: Flags) -> RecordedPath:
     """Rows whose times rise and whose delays are possible.
 
     Raises:
