@@ -13,6 +13,7 @@ import msgspec
 from skytether.cli import page_process, processes
 from skytether.client import vehicles
 from skytether.figures import flights as figures
+from skytether.server.control.controller import other_schemes
 from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.events import (
@@ -106,7 +107,8 @@ def fly(argv: Sequence[str]) -> None:
             page_process.say(warning)
     vehicles.make(scenario, 0)  # compiles the vehicle's own kernels; fails now if it cannot be made
     with _paged(options) as sockets:
-        terminal.prepare(kernel.missing())
+        both = [scenario, beside] if beside else [scenario]
+        terminal.prepare(kernel.missing(set.intersection(*map(other_schemes, both))))
         with (
             command.interruptible() as interrupted,
             terminal.progress(f"flying {title}", scenario.duration) as on_second,

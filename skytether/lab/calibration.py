@@ -120,6 +120,9 @@ WEIGHTS = (
 """Weights that are searched for; only their ratios matter, so the position's is fixed."""
 REGULATOR = (WEIGHTS[0], WEIGHTS[3])
 """Weights that determine the feedback gain, where nothing is planned."""
+NOMINAL = (*REGULATOR, WEIGHTS[4])
+"""Weights that determine the motion of a trajectory that is planned as well; what of the target's
+movement it leaves out depends on the weight of changes most."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
 """Key of a trajectory that the server knows ahead."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
@@ -176,10 +179,11 @@ class Rmse:
         searched for.
         """
         control, table = self.scenario.control, plain(self.scenario)
-        weights = REGULATOR if control.scheme == "trajectory" else WEIGHTS
         observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
-        ahead = control.scheme == "trajectory" and self.scenario.reference.preview != "none"
-        spline = SPLINE_KEYS if ahead else ()
+        weights, spline = WEIGHTS, ()
+        if control.scheme == "trajectory":
+            ahead = self.scenario.reference.preview != "none"
+            weights, spline = (NOMINAL, SPLINE_KEYS) if ahead else (REGULATOR, ())
         keys = [*weights, *trigger_keys(control.trigger), *observer, *spline]
         return [key for key in keys if key.of(table) > 0.0]
 
