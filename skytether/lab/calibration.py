@@ -180,11 +180,11 @@ class Rmse:
         """
         control, table = self.scenario.control, plain(self.scenario)
         observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
-        weights, spline = WEIGHTS, ()
+        weights: Sequence[Free] = WEIGHTS
         if control.scheme == "trajectory":
             ahead = self.scenario.reference.preview != "none"
-            weights, spline = (NOMINAL, SPLINE_KEYS) if ahead else (REGULATOR, ())
-        keys = [*weights, *trigger_keys(control.trigger), *observer, *spline]
+            weights = (*NOMINAL, *SPLINE_KEYS) if ahead else REGULATOR
+        keys = [*weights, *trigger_keys(control.trigger), *observer]
         return [key for key in keys if key.of(table) > 0.0]
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
