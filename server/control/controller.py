@@ -10,7 +10,7 @@ for planning is a small part of what a step costs.
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,8 +41,7 @@ BLOCK = 128
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
 
 
-@dataclass(frozen=True, slots=True)
-class Decisions:
+class Decisions(NamedTuple):
     """Decisions on n vehicles at a step; valid until the next decisions are made."""
 
     rows: Indices
@@ -124,6 +123,10 @@ class Controller:
         """Step at which each vehicle was sent a horizon last, or -1; shape (room,)."""
         self.owed: Flags = np.zeros(room, dtype=np.bool_)
         """Whether each vehicle is sent a heartbeat at this tick if nothing else; shape (room,)."""
+        self._is_owed = False
+        """Whether any is."""
+        self._all, self._none = np.arange(block), np.arange(0)
+        """Indices of all vehicles of a block, and of none."""
         self.change_trigger(control)
         self._stopwatch = stopwatch
         self.last_step = np.full(room, -1, dtype=np.int64)
@@ -205,6 +208,18 @@ class Controller:
             self._takes[row] = bool(observation.takes)
         return kept
 
+    def owe(self, rows: list[int]) -> None:
+        """Note the vehicles that are sent a heartbeat at this tick if nothing else."""
+        if rows or self._is_owed:
+            self.owed[:] = False
+            self.owed[rows] = True
+            self._is_owed = bool(rows)
+
+    def those_able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
+        """Vehicles to decide on, of some, and their steps, see `able`."""
+        able = self.able(rows, step)
+        return (rows, step) if able.all() else (rows[able], step[able])
+
     def able(self, rows: Indices, step: Indices) -> Flags:
         """Flags of the vehicles to decide on: the step is new, and `idle` has no reason."""
         able = np.empty(len(rows), dtype=np.bool_)
@@ -229,31 +244,46 @@ class Controller:
             step: k of each; shape (n,).
         """
         n, found, stopwatch = len(rows), self._found, self._stopwatch
-        self.last_step[rows] = step
         self._scheme.foresee(rows, step, found)  # (13)
         stopwatch.lap("estimate")
         self.planner.plan(rows, step, found)  # (14), (15)
         figures, planned = self.planner.figures[:n], self.planner.planned[:n]
         situation = Situation(rows, figures, found.start[:n], planned, self._known)
         verdict = self._trigger.test(situation)  # (16)
-        # A vehicle flies no horizon that was planned before it said that it would.
-        event = verdict.event & self._takes[rows]
-        unsolved = _withhold(
-            rows, step, found.ahead, self.observed_step, self._age_max, figures, self.idle, event
+        event = verdict.event.copy()
+        unsolved, events = _withhold(
+            rows,
+            step,
+            found.ahead,
+            self.observed_step,
+            self._age_max,
+            figures,
+            self._takes,
+            self.last_step,
+            self.idle,
+            event,
         )
         if self.budget:
             worth = verdict.figure if verdict.compares else figures["cost_gap"]
             owed = self.owed[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
             event = self.budget.choose(rows, event, owed, worth, situation.since_sent_s)
-        sent = event.nonzero()[0]
+            events = int(np.count_nonzero(event))
         self._scheme.remember(rows, step, found, event)  # (12)
-        if len(sent):
+        if events == n:  # of one vehicle: all or none
+            sent = self._all[:n]
+            self._trigger.sent(rows, figures)
+            self._sent_step[rows] = step
+        elif events:
+            sent = event.nonzero()[0]
             told = rows[sent]
             self._trigger.sent(told, figures[sent])
             self._sent_step[told] = step[sent]
-        self._counts["steps"] += n
-        self._counts["events"] += len(sent)
-        self._counts["unsolved"] += unsolved
+        else:
+            sent = self._none
+        counts = self._counts
+        counts["steps"] += n
+        counts["events"] += events
+        counts["unsolved"] += unsolved
         stopwatch.lap("trigger")
         solve_ns = self.planner.solve_ns
         return Decisions(rows, step, found, figures, planned, verdict, event, sent, solve_ns)
@@ -293,16 +323,24 @@ def _withhold(
     observed_step: I1,
     age_max: int,
     figures: Figures,
+    takes: B1,
+    last_step: I1,
     idle: I1,
     event: B1,
-) -> int:
-    """Take back events whose plan is none, with the reason in `idle`; the number of the unsolved.
+) -> tuple[int, int]:
+    """Take back events whose plan is none, with the reason in `idle`; note that k is decided.
 
-    A plan that would begin when its observation has become too old is not flown.
+    A plan that would begin when its observation has become too old is not flown. Neither is one
+    that was made before its vehicle said that it would fly it.
+
+    Returns:
+        number of vehicles whose plan is unsolved, and of events that are left.
     """
-    unsolved = 0
+    unsolved, events = 0, 0
     for i in range(len(rows)):
         row = rows[i]
+        last_step[row] = steps[i]
+        event[i] = event[i] and takes[row]
         if not figures[i].solved:
             unsolved += 1
             idle[row] = UNSOLVED
@@ -310,4 +348,5 @@ def _withhold(
         elif steps[i] + ahead[i] - observed_step[row] > age_max:
             idle[row] = OBSERVATION
             event[i] = False
-    return unsolved
+        events += event[i]
+    return unsolved, events

@@ -479,7 +479,7 @@ class Guarded(Trigger):
     def sent(self, rows: Indices, figures: Figures) -> None:
         """See `Trigger`."""
         try:
-            self._inner.sent(rows, figures)
+            self._inner.sent(rows.copy(), figures.copy())
         except Exception as error:
             self._fail(error)
 
