@@ -5,7 +5,7 @@ never caught up with.
 """
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
 from skytether.shared.core.events import Degraded, Fault, LeftTube, PlanningResumed, PlanningStopped
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
@@ -41,6 +41,8 @@ MISSES_MAX = 5
 """Number of ticks that may be missed in a second before the server calls itself degraded."""
 EXPECTED_GAP, OWN = str(Compared.EXPECTED_GAP), str(Compared.OWN)
 """Columns of the record that may be empty."""
+NOTHING = memoryview(b"")
+"""Bytes that go with a horizon without feedback."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
@@ -97,17 +99,6 @@ class Grid:
             self._events.append(Degraded(degraded=many))
 
 
-def in_blocks(rows: Indices, step: Indices) -> Iterator[tuple[Indices, Indices]]:
-    """Vehicles and their steps, BLOCK of them at a time."""
-    if len(rows) <= BLOCK:
-        if len(rows):
-            yield rows, step
-        return
-    for first in range(0, len(rows), BLOCK):
-        block = slice(first, first + BLOCK)
-        yield rows[block], step[block]
-
-
 class Ticker:
     """Decides for all vehicles in session, sends them horizons and heartbeats, and records.
 
@@ -148,6 +139,7 @@ class Ticker:
         self._out = out
         self._events = events
         self._recorder, self._plans = recorder, plans
+        self._records = recorder is not None or plans is not None
         self._packing = Packing(terms.axes, committed_max(terms) + terms.planned, terms.planned)
         self._columns = [str(each) for each in FIGURES[terms.scheme]]
         """Columns of the record that figures of plans are written to."""
@@ -161,38 +153,43 @@ class Ticker:
             tick_ns: time that it was due at.
             now_ns: time now.
         """
+        controller = self._controller
         self._stopwatch.start()
         before_ns = self._stopwatch.total_ns
         rows = self._sessions.rows
         step = self._clock.steps(rows, tick_ns)
-        self._controller.desired.tick(tick_ns)
-        if self._controller.budget:
-            self._controller.budget.fill(rows, now_ns)
-        owed = [each for each in self._sessions if each.is_owed(now_ns)]
-        self._controller.owe([each.row for each in owed])
-        rows, step = self._controller.those_able(rows, step)
-        for some, steps in in_blocks(rows, step):
-            decisions = self._controller.decide(some, steps)
-            self._send_horizons(decisions, now_ns)
+        controller.desired.tick(tick_ns)
+        if controller.budget:
+            controller.budget.fill(rows, now_ns)
+        owed = self._sessions.owed(now_ns)
+        if owed or controller.owes:
+            controller.owe([each.row for each in owed])
+        rows, step = controller.able(rows, step)
+        for first in range(0, len(rows), BLOCK):
+            block = slice(first, first + BLOCK)
+            decisions = controller.decide(rows[block], step[block])
+            if len(decisions.sent):
+                self._send_horizons(decisions, now_ns)
             self._stopwatch.lap("encode")
-            self._record(decisions)
-        self._tell_idle()
-        if self._controller.faults:
-            self._events += [Fault(traceback=said) for said in self._controller.faults]
-            self._controller.faults.clear()
-        if left := self._controller.left:
+            if self._records:
+                self._record(decisions)
+        # Bytes are compared in a sixth of the time of numbers, and seldom differ.
+        if controller.idle.tobytes() != self._sessions.idle.tobytes():
+            self._tell_idle()
+        if controller.faults:
+            self._events += [Fault(traceback=said) for said in controller.faults]
+            controller.faults.clear()
+        if left := controller.left:
             self._events += [LeftTube(vehicle=each, off_m=off_m) for each, off_m in left]
             left.clear()
-        self._send_heartbeats(owed, now_ns)
+        if owed:
+            self._send_heartbeats(owed, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)
 
     def _tell_idle(self) -> None:
         """Say where planning has stopped, and where it goes on."""
         idle = self._controller.idle
-        # Bytes are compared in a sixth of the time of numbers, and seldom differ.
-        if idle.tobytes() == self._sessions.idle.tobytes():
-            return
         for row in np.flatnonzero(idle != self._sessions.idle).tolist():
             self._sessions.idle[row] = idle[row]
             vehicle, why = self._sessions.at(row).vehicle, Idle(idle[row])
@@ -203,16 +200,14 @@ class Ticker:
 
     def _send_horizons(self, decisions: Decisions, now_ns: int) -> None:
         sent, found = decisions.sent, decisions.found
-        if not len(sent):
-            return
         if self._terms.splines:
             self._send_trajectories(decisions, now_ns)
             return
         # Bytes of one input on all axes, and of what goes with a horizon.
         width = 4 * self._terms.axes
-        feedback, told = found.feedback.data.cast("B"), 0
+        feedback, told = NOTHING, 0
         if self._terms.feedback:
-            told = width * FEEDBACK
+            feedback, told = found.feedback.data.cast("B"), width * FEEDBACK
         observed_step = self._controller.observed_step
         heads, inputs = self._packing.pack(
             found, sent, decisions.rows, decisions.step, observed_step

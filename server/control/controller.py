@@ -75,6 +75,9 @@ class Controller:
         references: see `Desired`.
     """
 
+    owes = False
+    """Whether a vehicle is sent a heartbeat at this tick if nothing else."""
+
     def __init__(
         self,
         scenario: Scenario,
@@ -123,8 +126,8 @@ class Controller:
         """Step at which each vehicle was sent a horizon last, or -1; shape (room,)."""
         self.owed: Flags = np.zeros(room, dtype=np.bool_)
         """Whether each vehicle is sent a heartbeat at this tick if nothing else; shape (room,)."""
-        self._is_owed = False
-        """Whether any is."""
+        self._able = np.zeros(room, dtype=np.bool_)
+        """Scratch: whether each of some vehicles is decided on; shape (room,)."""
         self._all, self._none = np.arange(block), np.arange(0)
         """Indices of all vehicles of a block, and of none."""
         self.change_trigger(control)
@@ -210,20 +213,14 @@ class Controller:
 
     def owe(self, rows: list[int]) -> None:
         """Note the vehicles that are sent a heartbeat at this tick if nothing else."""
-        if rows or self._is_owed:
-            self.owed[:] = False
-            self.owed[rows] = True
-            self._is_owed = bool(rows)
+        self.owed[:] = False
+        self.owed[rows] = True
+        self.owes = bool(rows)
 
-    def those_able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
-        """Vehicles to decide on, of some, and their steps, see `able`."""
-        able = self.able(rows, step)
-        return (rows, step) if able.all() else (rows[able], step[able])
-
-    def able(self, rows: Indices, step: Indices) -> Flags:
-        """Flags of the vehicles to decide on: the step is new, and `idle` has no reason."""
-        able = np.empty(len(rows), dtype=np.bool_)
-        _able(
+    def able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
+        """Vehicles to decide on, and their steps: the step is new, and `idle` has no reason."""
+        n, able = len(rows), self._able
+        if n == _able(
             rows,
             step,
             self.last_step,
@@ -233,8 +230,9 @@ class Controller:
             self._uplink_max_ns,
             self.idle,
             able,
-        )
-        return able
+        ):
+            return rows, step
+        return rows[able[:n]], step[able[:n]]
 
     def decide(self, rows: Indices, step: Indices) -> Decisions:
         """Plan for vehicles that are able, and decide which are sent their horizon.
@@ -269,15 +267,13 @@ class Controller:
             event = self.budget.choose(rows, event, owed, worth, situation.since_sent_s)
             events = int(np.count_nonzero(event))
         self._scheme.remember(rows, step, found, event)  # (12)
+        _note_sent(rows, step, event, self._sent_step)
         if events == n:  # of one vehicle: all or none
             sent = self._all[:n]
             self._trigger.sent(rows, figures)
-            self._sent_step[rows] = step
         elif events:
             sent = event.nonzero()[0]
-            told = rows[sent]
-            self._trigger.sent(told, figures[sent])
-            self._sent_step[told] = step[sent]
+            self._trigger.sent(rows[sent], figures[sent])
         else:
             sent = self._none
         counts = self._counts
@@ -300,8 +296,9 @@ def _able(
     uplink_max: int,
     idle: I1,
     able: B1,
-) -> None:
-    """Fill in `Controller.able`, and `Controller.idle` for vehicles whose step is new."""
+) -> int:
+    """Fill in `idle` of vehicles whose step is new, and which are `able`; how many those are."""
+    count = 0
     for i in range(len(rows)):
         row, step = rows[i], steps[i]
         able[i] = False
@@ -313,6 +310,8 @@ def _able(
         elif shortest_ns(seen, row) > uplink_max:
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
+        count += able[i]
+    return count
 
 
 @kernel
@@ -350,3 +349,11 @@ def _withhold(
             event[i] = False
         events += event[i]
     return unsolved, events
+
+
+@kernel
+def _note_sent(rows: I1, steps: I1, event: B1, sent_step: I1) -> None:
+    """Note the step at which vehicles are sent a horizon."""
+    for i in range(len(rows)):
+        if event[i]:
+            sent_step[rows[i]] = steps[i]
