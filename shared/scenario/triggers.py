@@ -201,7 +201,7 @@ def above(situation: Situation, figure: Array | Compared, threshold: float) -> V
 
 @lru_cache(maxsize=256)
 def _each(n: int, number: float) -> Array:
-    """The same number for each of n vehicles; read only, for it is made once; shape (n,)."""
+    """Column with one number for each of n vehicles; read only, made once; shape (n,)."""
     column = np.full(n, number)
     column.flags.writeable = False
     return column
@@ -209,7 +209,7 @@ def _each(n: int, number: float) -> Array:
 
 @lru_cache(maxsize=256)
 def _all_of(n: int) -> Flags:
-    """True for each of n vehicles; read only; shape (n,)."""
+    """Flags that are set for each of n vehicles; read only, made once; shape (n,)."""
     flags = np.ones(n, dtype=np.bool_)
     flags.flags.writeable = False
     return flags

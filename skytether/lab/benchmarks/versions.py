@@ -190,7 +190,7 @@ def measure(other: str, counts: VersionsCounts) -> dict[str, Any]:
 
 def _start(folder: Path) -> subprocess.Popen[str]:
     """A worker that imports from this folder; closing its stdin ends it."""
-    worker = next((folder / name for name in WORKERS if (folder / name).exists()), None)
+    worker = next((name for name in WORKERS if (folder / name).exists()), None)
     if worker is None:
         raise ValueError(f"{folder}: got a folder without benchmarks, expected a checkout")
     harness = ".".join(Path(worker).with_name("harness").parts)
