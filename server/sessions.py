@@ -133,6 +133,11 @@ class Sessions:
         """First sessions, `count` of them at most."""
         return list(islice(self, count))
 
+    def owed(self, now_ns: int) -> list[Session]:
+        """Those that nothing was sent to for as long as their vehicles ask, see `is_owed`."""
+        live = self._live.values()
+        return [each for each in live if 0 < each.asked_ns <= now_ns - each.sent_ns]
+
     def at(self, row: int) -> Session:
         """The session in a row."""
         return self._by_row[row]

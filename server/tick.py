@@ -15,7 +15,7 @@ from skytether.server.control.clock import ClockMap
 from skytether.server.control.controller import BLOCK, Controller, Decisions
 from skytether.server.control.knots import inputs_along
 from skytether.server.control.law import axes_of
-from skytether.server.control.scheme import in_a_row
+from skytether.server.control.scheme import Packing
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
@@ -31,6 +31,7 @@ from skytether.shared.wire.protocol import (
     Heartbeat,
     Idle,
     Trajectory,
+    committed_max,
     encode,
     encode_horizon,
     stamp_us,
@@ -40,6 +41,8 @@ MISSES_MAX = 5
 """Number of ticks that may be missed in a second before the server calls itself degraded."""
 EXPECTED_GAP, OWN = str(Compared.EXPECTED_GAP), str(Compared.OWN)
 """Columns of the record that may be empty."""
+NOTHING = memoryview(b"")
+"""Bytes that go with a horizon without feedback."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
@@ -89,6 +92,8 @@ class Grid:
 
     def _note_missed(self, count: int, now_ns: int) -> None:
         """Note the ticks that were missed, and whether these are too many in a second."""
+        if not (count or self.degraded):
+            return
         # An hour of sleep counts many ticks, of which the deque keeps the newest few in any case.
         self._missed_ns += [now_ns] * min(count, MISSES_MAX + 1)
         many = len(self._missed_ns) > MISSES_MAX and now_ns - self._missed_ns[0] <= SECOND_NS
@@ -137,6 +142,8 @@ class Ticker:
         self._out = out
         self._events = events
         self._recorder, self._plans = recorder, plans
+        self._records = recorder is not None or plans is not None
+        self._packing = Packing(terms.axes, committed_max(terms) + terms.planned, terms.planned)
         self._columns = [str(each) for each in FIGURES[terms.scheme]]
         """Columns of the record that figures of plans are written to."""
         self.durations = Histogram(TICK_BIN_NS)
@@ -149,37 +156,40 @@ class Ticker:
             tick_ns: time that it was due at.
             now_ns: time now.
         """
+        controller = self._controller
         self._stopwatch.start()
-        before_ns = self._stopwatch.spent_ns.total()
+        before_ns = self._stopwatch.total_ns
         rows = self._sessions.rows
         step = self._clock.steps(rows, tick_ns)
-        self._controller.desired.tick(tick_ns)
-        if self._controller.budget:
-            self._controller.budget.fill(rows, now_ns)
-        owed = [each for each in self._sessions if each.is_owed(now_ns)]
-        self._controller.owed[:] = False
-        self._controller.owed[[each.row for each in owed]] = True
-        able = self._controller.able(rows, step)
-        # Picking rows copies both arrays, which most ticks need not do.
-        if not able.all():
-            rows, step = rows[able], step[able]
+        controller.desired.tick(tick_ns)
+        if controller.budget:
+            controller.budget.fill(rows, now_ns)
+        owed = self._sessions.owed(now_ns)
+        if owed or controller.owes:
+            controller.owe([each.row for each in owed])
+        rows, step = controller.able(rows, step)
         for first in range(0, len(rows), BLOCK):
             block = slice(first, first + BLOCK)
-            decisions = self._controller.decide(rows[block], step[block])
-            self._send_horizons(decisions, now_ns)
+            decisions = controller.decide(rows[block], step[block])
+            if len(decisions.sent):
+                self._send_horizons(decisions, now_ns)
             self._stopwatch.lap("encode")
-            self._record(decisions)
-        self._tell_idle()
-        self._events += [Fault(traceback=said) for said in self._controller.faults]
-        self._controller.faults.clear()
-        self._events += [
-            LeftTube(vehicle=each, off_m=off_m) for each, off_m in self._controller.left
-        ]
-        self._controller.left.clear()
+            if self._records:
+                self._record(decisions)
+        # Bytes are compared in a sixth of the time of numbers, and seldom differ.
+        if controller.idle.tobytes() != self._sessions.idle.tobytes():
+            self._tell_idle()
+        if controller.faults:
+            self._events += [Fault(traceback=said) for said in controller.faults]
+            controller.faults.clear()
+        if left := controller.left:
+            self._events += [LeftTube(vehicle=each, off_m=off_m) for each, off_m in left]
+            left.clear()
         # Last, for a horizon that was sent at this tick stands in place of a heartbeat.
-        self._send_heartbeats(owed, now_ns)
+        if owed:
+            self._send_heartbeats(owed, now_ns)
         self._stopwatch.lap("encode")
-        self.durations.add(self._stopwatch.spent_ns.total() - before_ns)
+        self.durations.add(self._stopwatch.total_ns - before_ns)
 
     def _tell_idle(self) -> None:
         """Tell the operator for which vehicles planning has stopped, and for which it goes on."""
@@ -194,24 +204,22 @@ class Ticker:
 
     def _send_horizons(self, decisions: Decisions, now_ns: int) -> None:
         sent, found = decisions.sent, decisions.found
-        if not len(sent):
-            return
         if self._terms.splines:
             self._send_trajectories(decisions, now_ns)
             return
         # Bytes of one input on all axes, and of what goes with a horizon.
         width = 4 * self._terms.axes
-        feedback, told = found.feedback.data.cast("B"), 0
+        feedback, told = NOTHING, 0
         if self._terms.feedback:
-            told = width * FEEDBACK
-        inputs, begin = in_a_row(found, sent), 0
-        rows, step = decisions.rows[sent], decisions.step[sent]
-        age = step - self._controller.observed_step[rows]
+            feedback, told = found.feedback.data.cast("B"), width * FEEDBACK
+        observed_step = self._controller.observed_step
+        heads, inputs = self._packing.pack(
+            found, sent, decisions.rows, decisions.step, observed_step
+        )
         # The time of sending and not the tick's due time: the vehicle measures the delay by this
         # stamp.
-        columns, server_us = (sent, rows, step, age, found.ahead[sent]), stamp_us(now_ns)
-        # Plain ints: msgpack packs no numpy scalars, and a loop over them takes twice as long.
-        for i, row, k, o, d in zip(*(each.tolist() for each in columns), strict=True):
+        begin, server_us = 0, stamp_us(now_ns)
+        for i, row, k, o, d in heads:
             session, end = self._sessions.at(row), begin + width * (d + self._terms.planned)
             payload = encode_horizon(
                 session.vehicle,

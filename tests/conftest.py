@@ -12,6 +12,8 @@ from typing import Any
 import hypothesis
 import pytest
 
+from skytether.shared.base import kernel
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell's job in the background ignores Ctrl-C, and so would every command that a test starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -25,6 +27,8 @@ UNTIMED: dict[str, Any] = {
 hypothesis.settings.register_profile("same", derandomize=True, **UNTIMED)
 hypothesis.settings.register_profile("fresh", derandomize=False, **UNTIMED)
 hypothesis.settings.load_profile("same")
+# A kernel reads whatever it is handed as the types that it names: here every call is checked.
+kernel.check_types()
 # No flight of a test serves a page, unless the test asks for one.
 os.environ.setdefault("SKYTETHER_PAGE", "none")
 # Tests share the cores among themselves; threads for matrices of a hundred rows wait in loops.

@@ -4,4 +4,5 @@ import skytether.quadrotor.loops
 import skytether.server.endpoint  # noqa: F401 - they are its kernels
 from skytether.shared.base import kernel
 
+kernel.check_types()
 kernel.load()

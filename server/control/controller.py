@@ -10,8 +10,8 @@ for planning is a small part of what a step costs.
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,8 +59,7 @@ def other_schemes(scenario: Scenario) -> set[str]:
     return {f"{_PACKAGE}.{name}" for name in names}
 
 
-@dataclass(frozen=True, slots=True)
-class Decisions:
+class Decisions(NamedTuple):
     """Decisions on n vehicles at a step; valid until the next decisions are made."""
 
     rows: Indices
@@ -93,6 +92,9 @@ class Controller:
         stopwatch: measures the parts; the core has no clock of its own.
         references: see `Desired`.
     """
+
+    owes = False
+    """Whether a vehicle is sent a heartbeat at this tick if nothing else."""
 
     def __init__(
         self,
@@ -143,6 +145,10 @@ class Controller:
         """Step at which each vehicle was sent a horizon last, or -1; shape (room,)."""
         self.owed: Flags = np.zeros(room, dtype=np.bool_)
         """Whether each vehicle is sent a heartbeat at this tick if nothing else; shape (room,)."""
+        self._able = np.zeros(room, dtype=np.bool_)
+        """Scratch: whether each of some vehicles is decided on; shape (room,)."""
+        self._all, self._none = np.arange(block), np.arange(0)
+        """Indices of all vehicles of a block, and of none."""
         self.change_trigger(control)
         self._stopwatch = stopwatch
         self.last_step = np.full(room, -1, dtype=np.int64)
@@ -224,10 +230,16 @@ class Controller:
             self._takes[row] = bool(observation.takes)
         return kept
 
-    def able(self, rows: Indices, step: Indices) -> Flags:
-        """Flags of the vehicles to decide on: the step is new, and `idle` has no reason."""
-        able = np.empty(len(rows), dtype=np.bool_)
-        _able(
+    def owe(self, rows: list[int]) -> None:
+        """Note the vehicles that are sent a heartbeat at this tick if nothing else."""
+        self.owed[:] = False
+        self.owed[rows] = True
+        self.owes = bool(rows)
+
+    def able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
+        """Vehicles to decide on, and their steps: the step is new, and `idle` has no reason."""
+        n, able = len(rows), self._able
+        if n == _able(
             rows,
             step,
             self.last_step,
@@ -237,8 +249,9 @@ class Controller:
             self._uplink_max_ns,
             self.idle,
             able,
-        )
-        return able
+        ):
+            return rows, step
+        return rows[able[:n]], step[able[:n]]
 
     def decide(self, rows: Indices, step: Indices) -> Decisions:
         """Plan for vehicles that are able, and decide which are sent their horizon.
@@ -250,7 +263,6 @@ class Controller:
         Source: algorithms 1, 2.
         """
         n, found, stopwatch = len(rows), self._found, self._stopwatch
-        self.last_step[rows] = step
         self._scheme.foresee(rows, step, found)  # eq. (13)
         stopwatch.lap("estimate")
         self.planner.plan(rows, step, found)  # eq. (14), (15)
@@ -258,9 +270,18 @@ class Controller:
         situation = Situation(rows, figures, found.start[:n], planned, self._known)
         verdict = self._trigger.test(situation)  # eq. (16)
         # A vehicle flies no horizon that was planned before it said that it would.
-        event = verdict.event & self._takes[rows]
-        unsolved = _withhold(
-            rows, step, found.ahead, self.observed_step, self._age_max, figures, self.idle, event
+        event = verdict.event.copy()
+        unsolved, events = _withhold(
+            rows,
+            step,
+            found.ahead,
+            self.observed_step,
+            self._age_max,
+            figures,
+            self._takes,
+            self.last_step,
+            self.idle,
+            event,
         )
         if self.budget:
             # A trigger that compares nothing, as `periodic`, gives no figure to rank its vehicles
@@ -269,16 +290,22 @@ class Controller:
             # A vehicle without a plan to fly on with cannot wait for bytes.
             owed = self.owed[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
             event = self.budget.choose(rows, event, owed, worth, situation.since_sent_s)
-        sent = event.nonzero()[0]
+            events = int(np.count_nonzero(event))
         # After the budget: the committed scheme may replay only what is really sent.
         self._scheme.remember(rows, step, found, event)  # eq. (12)
-        if len(sent):
-            told = rows[sent]
-            self._trigger.sent(told, figures[sent])
-            self._sent_step[told] = step[sent]
-        self._counts["steps"] += n
-        self._counts["events"] += len(sent)
-        self._counts["unsolved"] += unsolved
+        _note_sent(rows, step, event, self._sent_step)
+        if events == n:  # of one vehicle: all or none
+            sent = self._all[:n]
+            self._trigger.sent(rows, figures)
+        elif events:
+            sent = event.nonzero()[0]
+            self._trigger.sent(rows[sent], figures[sent])
+        else:
+            sent = self._none
+        counts = self._counts
+        counts["steps"] += n
+        counts["events"] += events
+        counts["unsolved"] += unsolved
         stopwatch.lap("trigger")
         solve_ns = self.planner.solve_ns
         return Decisions(rows, step, found, figures, planned, verdict, event, sent, solve_ns)
@@ -295,8 +322,9 @@ def _able(
     uplink_max: int,
     idle: I1,
     able: B1,
-) -> None:
-    """Fill in `Controller.able`, and `Controller.idle` for vehicles whose step is new."""
+) -> int:
+    """Fill in `idle` of vehicles whose step is new, and which are `able`; how many those are."""
+    count = 0
     for i in range(len(rows)):
         row, step = rows[i], steps[i]
         able[i] = False
@@ -309,6 +337,8 @@ def _able(
             # Such a horizon would be over, or refused as too late, before it could be flown.
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
+        count += able[i]
+    return count
 
 
 @kernel
@@ -319,16 +349,24 @@ def _withhold(
     observed_step: I1,
     age_max: int,
     figures: Figures,
+    takes: B1,
+    last_step: I1,
     idle: I1,
     event: B1,
-) -> int:
-    """Take back events whose plan is none, with the reason in `idle`; the number of the unsolved.
+) -> tuple[int, int]:
+    """Take back events whose plan is none, with the reason in `idle`; note that k is decided.
 
-    A plan that would begin when its observation has become too old is not flown.
+    A plan that would begin when its observation has become too old is not flown. Neither is one
+    that was made before its vehicle said that it would fly it.
+
+    Returns:
+        number of vehicles whose plan is unsolved, and of events that are left.
     """
-    unsolved = 0
+    unsolved, events = 0, 0
     for i in range(len(rows)):
         row = rows[i]
+        last_step[row] = steps[i]
+        event[i] = event[i] and takes[row]
         if not figures[i].solved:
             unsolved += 1
             idle[row] = UNSOLVED
@@ -336,4 +374,13 @@ def _withhold(
         elif steps[i] + ahead[i] - observed_step[row] > age_max:
             idle[row] = OBSERVATION
             event[i] = False
-    return unsolved
+        events += event[i]
+    return unsolved, events
+
+
+@kernel
+def _note_sent(rows: I1, steps: I1, event: B1, sent_step: I1) -> None:
+    """Note the step at which vehicles are sent a horizon."""
+    for i in range(len(rows)):
+        if event[i]:
+            sent_step[rows[i]] = steps[i]

@@ -119,6 +119,8 @@ class Desired:
         pages = (1, axes, 1, 2) if self._point else (PAGES, rows, len(self._steps), 2)
         self._pages = np.zeros(pages)
         """Desired states in each place [m, m/s]; of a live point its present state alone."""
+        self._at_once = np.zeros(block, dtype=np.int64)
+        """In place of d, where states from k on are wanted; shape (block,)."""
         self._held = np.full(PAGES, EMPTY, dtype=np.int64)
         """Key of the page in each place, or EMPTY; shape (PAGES,)."""
         self._found = Window(
@@ -161,7 +163,7 @@ class Desired:
             rows: the vehicles, no more than a block; shape (n,).
             steps: k of each; shape (n,).
         """
-        pages, place, first = self._find(rows, steps)
+        pages, place, first = self._find(rows, steps, self._at_once)
         n = len(rows)
         states: Array = pages[place[:n], -self._axes :, first[:n]]
         return states
@@ -186,8 +188,8 @@ class Desired:
             ahead: d of each; the n vehicles come first.
         """
         if self._all:
-            return self._find(rows, steps + ahead[: len(rows)])
-        found = self._find(rows, steps)
+            return self._find(rows, steps, ahead)
+        found = self._find(rows, steps, self._at_once)
         window = self._foreseen.states
         _foresee(found, len(rows), ahead, self._outlook, self._dt_s, self._bound_m, window)
         return self._foreseen
@@ -201,17 +203,17 @@ class Desired:
         found: Array = states[place[:n, None], : self._axes, first[:n, None] + stages]
         return found.transpose(0, 2, 1, 3)
 
-    def _find(self, rows: Indices, steps: Indices) -> Window:
-        """Look up desired states from some steps on, and compute the pages that are missing."""
+    def _find(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
+        """Look up desired states from k + d on, and compute the pages that are missing."""
         if self._point:
             return self._found
         held = self._held
-        while (i := _find(held, self._number, rows, steps, self._found)) != FOUND:
+        while (i := _find(held, self._number, rows, steps, ahead, self._found)) != FOUND:
             # Each search of `_place` ends at a free place at the latest: before the last one is
             # taken, all pages go. A block of vehicles needs half of PAGES at most.
             if np.count_nonzero(held == EMPTY) == 1:
                 held[:] = EMPTY
-            number, page = int(self._number[rows[i]]), int(steps[i]) // PAGE
+            number, page = int(self._number[rows[i]]), int(steps[i] + ahead[i]) // PAGE
             sample = self._references(number) if self._references else self._shared
             at = plain(_place)(held, number, page)
             times_s = (page * PAGE + self._steps) * self._dt_s
@@ -241,14 +243,15 @@ def _place(held: I1, number: int, page: int) -> int:
 
 
 @kernel
-def _find(held: I1, numbers: I1, rows: I1, steps: I1, found: Window) -> int:
-    """Fill in where the states of vehicles are; the first whose page is missing, or FOUND."""
+def _find(held: I1, numbers: I1, rows: I1, steps: I1, ahead: I1, found: Window) -> int:
+    """Fill in where states from k + d on are; the first vehicle whose page is missing, or FOUND."""
     for i in range(len(rows)):
-        number, page = numbers[rows[i]], steps[i] // PAGE
+        step = steps[i] + ahead[i]
+        number, page = numbers[rows[i]], step // PAGE
         at = _place(held, number, page)
         if held[at] == EMPTY:
             return i
-        found.place[i], found.first[i] = at, steps[i] - page * PAGE
+        found.place[i], found.first[i] = at, step - page * PAGE
     return FOUND
 
 

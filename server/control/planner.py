@@ -203,6 +203,8 @@ class Planner:
         """Planned states x_p(k+d|k-1) of the last plans [m, m/s]; shape (block, axes, 2)."""
         self.inputs = self._memory.inputs[TRACKER]
         """U of the last plan of each vehicle [m/s]; shape (capacity, axes, H)."""
+        self._batch: Batch | None = None
+        """Batch of the last plans."""
         self.solve_ns = -1
         """Time that planning for the last block took [ns], or -1 where nobody measures it."""
 
@@ -220,33 +222,45 @@ class Planner:
 
         Source: eqs. (14), (15).
         """
-        batch = Batch(
+        window = self._desired.window(rows, step, found.ahead)
+        batch = self._batch
+        if batch is None or batch.desired is not window or batch.found is not found:
+            batch = self._batch = self._batch_of(window, found)
+        solver, undone = self.solvers[LATER], len(rows)
+        # No isinstance: a solver derived from it may solve otherwise, and the compiled pass would
+        # not ask it.
+        if type(solver) is ExactSolver:
+            undone = _plan(batch, rows, step, solver.work)
+        if undone:
+            self._plan_by_moves(batch, rows, step, undone)
+        took_ns = self._stopwatch.lap("plan")
+        self.solve_ns = took_ns if self._stopwatch.runs else -1
+
+    def _batch_of(self, window: Window, found: Foresight) -> Batch:
+        """Batch of these arrays, which are the same ones from step to step."""
+        return Batch(
             mpc=self._mpc,
             terminal_weight=self._terminal_weight,
             compares=self._compares,
             memory=self._memory,
             draft=self._draft,
-            desired=self._desired.window(rows, step, found.ahead),
+            desired=window,
             found=found,
             figures=self.figures,
             room=self._room,
             picked=self._picked,
             settled=self._settled,
         )
+
+    def _plan_by_moves(self, batch: Batch, rows: Indices, step: Indices, undone: int) -> None:
+        """Plan move by move for all vehicles, or for those `undone` that the pass has left."""
         left = np.arange(len(rows))
-        solver = self.solvers[LATER]
-        # No isinstance: a solver derived from it may solve otherwise, and the compiled pass would
-        # not ask it.
-        if type(solver) is ExactSolver:
-            undone = _plan(batch, rows, step, solver.work)
-            left = np.flatnonzero(~self.figures["solved"][: len(rows)]) if undone else left[:0]
-        if len(left):
-            for which in (GENERATOR, TRACKER):
-                _move(batch, rows, step, left, which)
-                self._solve(which, left)
-            _move(batch, rows, step, left, CONCLUDE)
-        took_ns = self._stopwatch.lap("plan")
-        self.solve_ns = took_ns if self._stopwatch.runs else -1
+        if undone < len(rows):
+            left = np.flatnonzero(~self.figures["solved"][: len(rows)])
+        for which in (GENERATOR, TRACKER):
+            _move(batch, rows, step, left, which)
+            self._solve(which, left)
+        _move(batch, rows, step, left, CONCLUDE)
 
     def _solve(self, which: int, left: Indices) -> None:
         """Solve the problems posed in the draft for some vehicles of the block, by index."""

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from skytether.shared.base.kernel import F2, F3, F4, I1, S1, S3, kernel
+from skytether.shared.base.kernel import F2, F3, F4, I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
 
@@ -99,24 +99,77 @@ def foresight(
     )
 
 
-def in_a_row(found: Foresight, sent: Indices) -> memoryview:
-    """Bytes of the horizons of some vehicles of a block, one after the other, as they are sent.
+class Packing:
+    """Packs the horizons that are sent, of one block of vehicles after the other.
 
     Args:
-        sent: which vehicles, by index; their horizons have d + H inputs on each axis; shape (n,).
+        axes: number of axes.
+        most: largest number of inputs of a horizon on each axis.
+        planned: number of these that are planned, H; d more are committed.
     """
-    _, axes, most = found.horizons.shape
-    # One array for all horizons of a block, of which the packets take slices without copying.
-    packed = np.empty(len(sent) * axes * most, dtype=np.float32)
-    _pack(found.horizons, found.ahead, sent, found.held.shape[2], packed)
-    return packed.data.cast("B")
+
+    def __init__(self, axes: int, most: int, planned: int) -> None:
+        self._width, self._planned = axes * most, planned
+        self._heads = np.empty((0, len(HEAD)), dtype=np.int64)
+        self._inputs = np.empty(0, dtype=np.float32)
+        self._told = self._inputs.data.cast("B")
+
+    def pack(
+        self, found: Foresight, sent: Indices, rows: Indices, step: Indices, observed: Indices
+    ) -> tuple[list[list[int]], memoryview]:
+        """Numbers in the columns of HEAD, and bytes of the horizons one after the other.
+
+        The bytes are valid until the next are packed.
+
+        Args:
+            found: has the horizons, of d + H inputs on each axis.
+            sent: which vehicles of the block, by index; shape (n,).
+            rows: the vehicles of the block.
+            step: k of each.
+            observed: step of the newest observation of each vehicle; shape (capacity,).
+        """
+        n = len(sent)
+        if n > len(self._heads):
+            self._heads = np.empty((n, len(HEAD)), dtype=np.int64)
+            self._inputs = np.empty(n * self._width, dtype=np.float32)
+            self._told = self._inputs.data.cast("B")
+        _pack(
+            found.horizons,
+            found.ahead,
+            sent,
+            rows,
+            step,
+            observed,
+            self._planned,
+            self._heads,
+            self._inputs,
+        )
+        return self._heads[:n].tolist(), self._told
+
+
+HEAD = ("index", "row", "step", "age", "ahead")
+"""Columns that `Packing` tells of a horizon: place of its vehicle in the block, and row; step k;
+age of the observation [steps]; delay bound d."""
 
 
 @kernel
-def _pack(horizons: S3, ahead: I1, sent: I1, H: int, packed: S1) -> None:
-    """Fill in `in_a_row` as numbers; shape of `packed`: as many as there can be."""
+def _pack(
+    horizons: S3,
+    ahead: I1,
+    sent: I1,
+    rows: I1,
+    steps: I1,
+    observed: I1,
+    H: int,
+    heads: I2,
+    packed: S1,
+) -> None:
+    """Fill in what `Packing.pack` returns, as numbers; there is room for all there can be."""
     at = 0
-    for i in sent:
+    for n in range(len(sent)):
+        i = sent[n]
+        heads[n, 0], heads[n, 1], heads[n, 2] = i, rows[i], steps[i]
+        heads[n, 3], heads[n, 4] = steps[i] - observed[rows[i]], ahead[i]
         for axis in range(horizons.shape[1]):
             for stage in range(ahead[i] + H):
                 packed[at] = horizons[i, axis, stage]

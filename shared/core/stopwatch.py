@@ -17,6 +17,8 @@ class Stopwatch:
         self._since_ns = 0
         self.spent_ns: Counter[str] = Counter()
         """Sum of the laps of each name so far [ns]."""
+        self.total_ns = 0
+        """Sum of all laps so far [ns]."""
 
     def start(self) -> None:
         """Begin a lap."""
@@ -29,5 +31,6 @@ class Stopwatch:
         now_ns = self._clock_ns()
         took_ns = now_ns - self._since_ns
         self.spent_ns[name] += took_ns
+        self.total_ns += took_ns
         self._since_ns = now_ns
         return took_ns

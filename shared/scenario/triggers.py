@@ -12,6 +12,7 @@ nothing to fly on with, and fire in every policy but `budget` (E18).
 import traceback
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from functools import lru_cache
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -195,12 +196,28 @@ def above(situation: Situation, figure: Array | Compared, threshold: float) -> V
     compared = figure if isinstance(figure, Compared) else Compared.OWN
     values = situation.figures[str(figure)] if isinstance(figure, Compared) else figure
     event = situation.figures["fresh"] | (values > threshold)
-    return Verdict(event, values, np.full(len(values), threshold), compared)
+    return Verdict(event, values, _each(len(values), threshold), compared)
+
+
+@lru_cache(maxsize=256)
+def _each(n: int, number: float) -> Array:
+    """Column with one number for each of n vehicles; read only, made once; shape (n,)."""
+    column = np.full(n, number)
+    column.flags.writeable = False
+    return column
+
+
+@lru_cache(maxsize=256)
+def _all_of(n: int) -> Flags:
+    """Flags that are set for each of n vehicles; read only, made once; shape (n,)."""
+    flags = np.ones(n, dtype=np.bool_)
+    flags.flags.writeable = False
+    return flags
 
 
 def _timed(event: Flags, figures: Figures) -> Verdict:
     """The verdict of a policy that compares no figure."""
-    return Verdict(event, figures["state_gap"], np.zeros(len(event)), Compared.NOTHING)
+    return Verdict(event, figures["state_gap"], _each(len(event), 0.0), Compared.NOTHING)
 
 
 class _Stateless(Trigger):
@@ -229,7 +246,7 @@ class _Stateless(Trigger):
 @trigger
 def always(situation: Situation) -> Verdict:
     """Sends at every step."""
-    return _timed(np.ones(len(situation.rows), dtype=np.bool_), situation.figures)
+    return _timed(_all_of(len(situation.rows)), situation.figures)
 
 
 @trigger
@@ -482,12 +499,12 @@ class Guarded(Trigger):
             )
         except Exception as error:
             self._fail(error)
-            return _timed(np.ones(len(rows), dtype=np.bool_), figures)
+            return _timed(_all_of(len(rows)), figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         """See `Trigger`."""
         try:
-            self._inner.sent(rows, figures)
+            self._inner.sent(rows.copy(), figures.copy())
         except Exception as error:
             self._fail(error)
 

@@ -33,7 +33,28 @@ def double(given: Given) -> None:
 
 values = np.ones(1)
 double(Given(values))
-print(values[0], sum(double.stats.cache_hits.values()))
+print(values[0], sum(double.dispatcher.stats.cache_hits.values()))
+"""
+REFUSING = """
+import sys
+import numpy as np
+from caller import double
+from helper import Given
+from skytether.shared.base import kernel
+
+right = np.ones(1)
+if sys.argv[1:] == ["checked"]:
+    kernel.check_types()
+    double(Given(right))
+for wrong in (np.ones(1, np.float32), np.ones((2, 2)), np.ones(4)[::2], [1.0]):
+    try:
+        double(Given(wrong))
+    except TypeError:
+        continue
+    sys.exit(f"{wrong} is taken")
+for _ in range(2):
+    double(Given(right))
+sys.exit(0 if right[0] in (4.0, 8.0) else f"got {right}")
 """
 
 
@@ -191,3 +212,11 @@ def test_a_server_has_all_kernels_of_its_scheme_in_memory_before_it_flies(scenar
         [sys.executable, "-P", "-c", CALLED, scenario], capture_output=True, text=True, check=True
     )
     assert done.stdout.split() == ["0"]
+
+
+def test_a_kernel_refuses_other_types_than_its_own(tmp_path: Path) -> None:
+    """At its first call, and at each where that is asked for, as in all tests."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "caller.py").write_text(CALLER.split("\nvalues = ", maxsplit=1)[0])
+    assert quiet(tmp_path, REFUSING) == ""
+    assert quiet(tmp_path, REFUSING, "checked") == ""

@@ -77,8 +77,8 @@ class Pace:
 
 HOT = Pace(turn=50, pause_s=0.001)
 """Pace of problems back to back, with everything in the caches."""
-PACED = Pace(turn=1, pause_s=0.005)
-"""Pace of a controller: every problem after a pause, in which caches and clock frequency cool."""
+PACED = Pace(turn=1, pause_s=0.05)
+"""Pace of a controller with the paper's step of 50 ms: in every pause others take the caches."""
 
 
 def interleave(

@@ -44,12 +44,12 @@ class SolversCounts:
     """Size of the benchmark."""
 
     hot: int = 1000
-    paced: int = 500
+    paced: int = 200
     tuning: int = 100
     """Number of ticks with which OSQP is tuned."""
 
 
-FULL, QUICK = SolversCounts(), SolversCounts(hot=100, paced=60, tuning=20)
+FULL, QUICK = SolversCounts(), SolversCounts(hot=100, paced=20, tuning=20)
 
 
 def flights() -> dict[str, Scenario]:

@@ -53,7 +53,7 @@ class TickCounts:
     """How much to measure."""
 
     hot: int = 1000
-    paced: int = 500
+    paced: int = 300
     tuning: int = 60
     fleet: int = 1000
     """Number of vehicles planned for at once."""
@@ -67,7 +67,7 @@ class TickCounts:
 
 
 FULL = TickCounts()
-QUICK = TickCounts(100, 40, 10, 200, 10, 5, 500, 20, (1, 2, 5, 10, 20, 50, 100, 200), 10)
+QUICK = TickCounts(100, 20, 10, 200, 10, 5, 500, 20, (1, 2, 5, 10, 20, 50, 100, 200), 10)
 
 
 def mixes() -> dict[str, Scenario]:
