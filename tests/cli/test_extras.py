@@ -109,7 +109,8 @@ def test_every_command_has_its_needs_told_here() -> None:
 def test_every_package_that_is_imported_is_asked_for() -> None:
     """The requirements name every imported package, and do not rely on another package's."""
     asked = {re.split("[^a-z0-9_-]", one)[0] for one in metadata.requires("skytether") or ()}
-    ours = {"skytether", *(name.replace("-", "_") for name in asked)}
+    imported_as = {"pillow": "PIL"}
+    ours = {"skytether", *(imported_as.get(name, name.replace("-", "_")) for name in asked)}
     imported = set()
     for folder, _, files in os.walk(Path(skytether.__file__).parent, followlinks=True):
         for file in files:

@@ -262,7 +262,7 @@ def test_a_text_says_all_of_a_direction(tmp_path: Any) -> None:
     above.write_text("extends = 'lossy.toml'\nnetwork.uplink = 'constant(0.1)'\n")
     assert reading.load(str(above)).network.uplink.text == "constant(0.1)"
     above.write_text("extends = '5g-urban'\nnetwork.uplink.loss = 0.3\n")
-    with pytest.raises(ConfigError, match="no other keys beside it"):
+    with pytest.raises(ConfigError, match="no other keys of the direction beside it"):
         reading.load(str(above))
     again = reading.check(reading.to_table(reading.load("5g-urban")))
     assert again == reading.load("5g-urban")

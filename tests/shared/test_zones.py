@@ -204,7 +204,7 @@ def test_zones_are_of_missions_alone() -> None:
     """Elsewhere nobody would keep out of them."""
     table = reading.to_table(reading.load("target"))
     table["mission"]["zones"] = BOX
-    with pytest.raises(ConfigError, match=r"mission\.zones: .* on a mission"):
+    with pytest.raises(ConfigError, match=r"mission\.zones: .*expected none without a mission"):
         reading.check(table, "target")
 
 
