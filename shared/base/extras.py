@@ -6,6 +6,10 @@ from contextlib import contextmanager
 from importlib import util
 
 
+MODULES = {"pillow": "PIL"}
+"""Module of each package that is not imported by its own name."""
+
+
 class ExtraMissing(ModuleNotFoundError):
     """Error: what was asked for needs an extra; the message says which, and how to install it."""
 
@@ -45,12 +49,13 @@ def need(extra: str) -> None:
 
 
 def _extras() -> dict[str, list[str]]:
-    """Packages of each extra, each of which is called as its module."""
+    """Modules of each extra, each called as its package is, except for MODULES."""
     from importlib import metadata  # a tenth of what flies; wanted where something is missing
 
     extras: dict[str, list[str]] = {}
     for requirement in metadata.requires("skytether") or ():
         package, _, extra = requirement.partition("; extra == ")
         if extra:
-            extras.setdefault(extra.strip("'\""), []).append(re.split("[^a-z0-9_-]", package)[0])
+            name = re.split("[^a-z0-9_-]", package)[0]
+            extras.setdefault(extra.strip("'\""), []).append(MODULES.get(name, name))
     return extras

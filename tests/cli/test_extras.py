@@ -14,6 +14,7 @@ import pytest
 import skytether
 from skytether.__main__ import COMMANDS
 from skytether.shared.base import extras
+from skytether.shared.base.extras import MODULES
 
 ALL = (
     "server",
@@ -109,8 +110,7 @@ def test_every_command_has_its_needs_told_here() -> None:
 def test_every_package_that_is_imported_is_asked_for() -> None:
     """The requirements name every imported package, and do not rely on another package's."""
     asked = {re.split("[^a-z0-9_-]", one)[0] for one in metadata.requires("skytether") or ()}
-    imported_as = {"pillow": "PIL"}
-    ours = {"skytether", *(imported_as.get(name, name.replace("-", "_")) for name in asked)}
+    ours = {"skytether", *(MODULES.get(name, name.replace("-", "_")) for name in asked)}
     imported = set()
     for folder, _, files in os.walk(Path(skytether.__file__).parent, followlinks=True):
         for file in files:
