@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import util
 
-
 MODULES = {"pillow": "PIL"}
 """Module of each package that is not imported by its own name."""
 

@@ -93,7 +93,9 @@ class Situation(NamedTuple):
             ValueError: the scheme is not "committed", and they are not known.
         """
         if self.known.held is None:
-            raise ValueError("held: expected control.scheme = 'committed', which alone knows it")
+            raise ValueError(
+                "held: expected control.scheme = 'committed', the only scheme that knows it"
+            )
         return self.known.held[: len(self.rows)].copy()
 
     @property

@@ -480,7 +480,7 @@ class Faulty:
 
 
 def make_faulty(fails: set[int]) -> Planner:
-    """A planner of which one problem or both have no answer, while they are in `fails`."""
+    """Planner whose solver fails on the problems that are in `fails` at the time."""
     with solving(lambda posed: Faulty(posed, fails)):
         return make()
 

@@ -235,7 +235,7 @@ def test_what_is_held_aboard_is_known_with_committed_inputs_alone(tmp_path: Path
     """Elsewhere it is a mistake to ask, which is told."""
     plug(tmp_path, "@trigger\ndef look(now):\n    return now.held[:, 0, 0] > 0.0\n")
     (said,) = faults(flown("look", scheme="predictive"))
-    known = "held: expected control.scheme = 'committed', which alone knows it"
+    known = "held: expected control.scheme = 'committed', the only scheme that knows it"
     assert said == f"the trigger look: ValueError: {known}; where it fails, it sends"
 
 

@@ -161,7 +161,7 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
         assert three.said("client").count("the server has restarted") >= 2
         assert summary.steps + summary.deadline_misses == FAULTY_FLIGHT_S * STEPS_PER_S
         assert summary.rmse_xy is not None
-        # However long the engine took: it waited on its path, at worst at the far end.
+        # The engine may take long: the vehicle hovers meanwhile, at worst at the end of its path.
         assert summary.rmse_xy < 2 * HOVER_M
         three.compose("stop")
         assert [three.state(service)["ExitCode"] for service in SERVICES] == [0, 0, 0]

@@ -28,7 +28,7 @@ TERMS = {
 """How each term is written, by its anchor in docs/glossary.md."""
 OPENINGS = {"performance.md", "together.md"}
 """Pages of which only the opening is held to the rule for terms."""
-# What is no prose: it is blanked before a term is looked for, and keeps its length.
+# Code, tables and links: blanked out, at the same length, before terms are looked for.
 NO_PROSE = re.compile(
     r"^```.*?^```"  # code
     r"|^( {4,}|\|).*?$"  # code that is indented; rows of a table
