@@ -114,7 +114,7 @@ class Desired:
         self._dt_s = terms.dt_s
         self._steps = np.arange(PAGE + self._reach + 1)
         self._axes, self._late, shifts = axes, bool(late_s.any()), bool(self._ahead_s.any())
-        # Pages shifted by a dead time hold the states at the steps themselves as well, in more rows.
+        # Pages shifted by a dead time also have rows for the states at the steps themselves.
         rows = 2 * axes if shifts else axes
         pages = (1, axes, 1, 2) if self._point else (PAGES, rows, len(self._steps), 2)
         self._pages = np.zeros(pages)
