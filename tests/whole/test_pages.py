@@ -26,8 +26,6 @@ TERMS = {
     "round-trip": r"round[ -]trips?",
 }
 """How each term is written, by its anchor in docs/glossary.md."""
-OPENINGS = {"performance.md", "together.md"}
-"""Pages of which only the opening is held to the rule for terms."""
 # Code, tables and links: blanked out, at the same length, before terms are looked for.
 NO_PROSE = re.compile(
     r"^```.*?^```"  # code
@@ -67,8 +65,6 @@ def unexplained(text: str) -> dict[str, int]:
 def test_a_term_is_linked_where_it_first_stands(page: str) -> None:
     """To the glossary, or to the page that explains it."""
     text = (DOCS / page).read_text()
-    if page in OPENINGS:
-        text = text.partition("\n## ")[0]
     found = {
         term: text[max(0, at - 40) : at + 40].replace("\n", " ")
         for term, at in unexplained(text).items()
