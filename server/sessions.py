@@ -134,7 +134,7 @@ class Sessions:
         return list(islice(self, count))
 
     def owed(self, now_ns: int) -> list[Session]:
-        """Those that nothing was sent to for as long as their vehicles ask, see `is_owed`."""
+        """Sessions without a packet for as long as their vehicles ask, see `is_owed`."""
         live = self._live.values()
         return [each for each in live if 0 < each.asked_ns <= now_ns - each.sent_ns]
 

@@ -120,7 +120,7 @@ class Desired:
         self._pages = np.zeros(pages)
         """Desired states in each place [m, m/s]; of a live point its present state alone."""
         self._at_once = np.zeros(block, dtype=np.int64)
-        """In place of d, where states from k on are wanted; shape (block,)."""
+        """Zeros in place of d, for states from k on; shape (block,)."""
         self._held = np.full(PAGES, EMPTY, dtype=np.int64)
         """Key of the page in each place, or EMPTY; shape (PAGES,)."""
         self._found = Window(

@@ -145,7 +145,7 @@ def test_ctrl_c_keeps_what_was_done(
     assert main(argv) == 130
     told = capsys.readouterr()
     assert "interrupted with 0 of 1 schemes done" in told.err
-    assert "1 vehicles fly" in told.out
+    assert "1 vehicle flies" in told.out
     monkeypatch.setattr(command.flight, "fly", whole)
     assert main(argv) == 0
     assert "2 vehicles fly" in capsys.readouterr().out

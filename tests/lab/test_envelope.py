@@ -366,10 +366,12 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
     assert verdict.outside_m > 5.0
 
 
-def _able_whatever_the_delay(controller: Controller, rows: Indices, step: Indices) -> Flags:
-    """Vehicles whose step is new."""
+def _able_whatever_the_delay(
+    controller: Controller, rows: Indices, step: Indices
+) -> tuple[Indices, Indices]:
+    """Vehicles whose step is new, and their steps."""
     able: Flags = (step > controller.last_step[rows]) & (controller.observed_step[rows] >= 0)
-    return able
+    return rows[able], step[able]
 
 
 def test_no_point_of_the_demo_flies_away() -> None:

@@ -26,6 +26,7 @@ from skytether.view import plots
 from skytether.view.browser import serve
 from skytether.view.browser.access import Visitor, is_loopback, may_play
 from skytether.view.browser.flight import PageFlight
+from skytether.view.browser.page import stop
 from skytether.view.browser.replay import Player
 from skytether.view.controls import (
     THRESHOLDS,
@@ -277,7 +278,7 @@ def test_a_plot_with_gaps_reaches_a_browser() -> None:
         data = sent.as_serializable_dict([])["updates"]["data"]
         assert data[1] == [1.0, None, 3.0]
     finally:
-        server.stop()
+        stop(server)
 
 
 def test_the_lines_of_a_scene_have_the_gaps_of_what_is_known() -> None:

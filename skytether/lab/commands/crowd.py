@@ -175,7 +175,8 @@ def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
     for scheme, each in flown.items():
         if each.points:
             beyond = f"{each.too_many} do not" if each.too_many else "no more were tried"
-            print(f"{TITLES[scheme]}: {each.flying} vehicles fly, {beyond}")
+            fly = "vehicle flies" if each.flying == 1 else "vehicles fly"
+            print(f"{TITLES[scheme]}: {each.flying} {fly}, {beyond}")
     print(f"{options.out}: crowd.csv, crowd.png")
 
 

@@ -26,9 +26,25 @@ MOVES_TO_A_DRAWING = 5
 """Number of marker updates per redraw of lines, plots and words."""
 
 
+STOPPED_S = 30.0
+"""Time after which a server of viser that does not end is left alone [s]."""
+
+
 def _silence() -> contextlib.redirect_stdout[io.StringIO]:
     """Keep viser's prints off standard output; it prints even when told not to."""
     return contextlib.redirect_stdout(io.StringIO())
+
+
+def stop(server: viser.ViserServer) -> None:
+    """Stop a server of viser, and wait until its thread has printed its last line.
+
+    viser itself waits for a second, and would print when something else has the standard output.
+    """
+    thread = server._websock_server._server_thread
+    with _silence():
+        server.stop()
+        if thread:
+            thread.join(STOPPED_S)
 
 
 class Page:
@@ -81,8 +97,7 @@ class Page:
         """Close the page."""
         self._closed.set()
         self._thread.join()
-        with _silence():
-            self._server.stop()
+        stop(self._server)
 
     def _work(self) -> None:
         moves = 0
