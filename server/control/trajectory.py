@@ -70,6 +70,8 @@ CHANCES = 3
 """Number of delay bounds ahead at whose ends trajectories are compared."""
 SURE = 1e-3
 """Probability below which what is left of the cases is not looked at."""
+RUNS_OUT = 1e-2
+"""Largest probability that all trajectories are lost that are to follow one that ends."""
 TINY = 1e-9
 """Smallest K_p, for weights that ask for none [1/s]."""
 
@@ -431,9 +433,9 @@ def _appraise(
         flown, newly = _listen(settings, memory, bound, clock, row)
         lost += newly
         known, d, observed = memory.vehicles[row], bound.steps[row], memory.observed[row]
-        newest, ends = flown, -1
+        newest, ends, held = flown, -1, np.inf
         if flown >= 0:
-            ends = memory.sent[row, flown % ROOM].ends
+            held = ends = memory.sent[row, flown % ROOM].ends
         oldest = max(known.first, known.sent - ROOM, flown + 1)
         for number in range(oldest, known.sent):
             sent = memory.sent[row, number % ROOM]
@@ -469,6 +471,9 @@ def _appraise(
         plan.cost_gap, plan.deviation_m = 0.0, 0.0
         if not plan.fresh:
             plan.cost_gap, plan.deviation_m = _gap(settings, memory, intended[i], row, newest, k, d)
+        # What is held ends soon, and all that was sent since may be lost: the vehicle would brake.
+        soon = held <= k + CHANCES * d <= observed + settings.age_max
+        plan.fresh |= soon and share > RUNS_OUT
     return lost, unsolved
 
 

@@ -699,6 +699,18 @@ def test_a_packet_that_has_become_too_old_is_replaced(
     assert (rmse_m(flown, flight) < 0.5) == renewed
 
 
+def test_before_a_trajectory_ends_as_many_are_sent_as_make_the_next_one_sure() -> None:
+    """At 30 % loss and one every 2 s; by the clock alone, 19 of 20 such flights brake."""
+    slow = {
+        "control.trigger": "expected_gap(1000) | silence(2)",
+        "network.uplink.loss": 0.3,
+        "reference.agility": 0.02,
+        "reference.speed_mps": 0.3,
+    }
+    flights = skytether.fly_batch("target", range(1, 7), duration=60.0, **slow)
+    assert sum("brake" in flight.summary.modes for flight in flights) <= 1
+
+
 def test_only_with_feedback() -> None:
     """Nothing else would lead the vehicle along the trajectory."""
     flown = reading.to_table(scenario())
