@@ -600,7 +600,7 @@ class Scenario(Section, frozen=True):
             yield VEHICLES[flies]
 
     def _shape(self) -> str:
-        """Shape as a term; of a plug-in, its beginning and a digest of it and what it gives."""
+        """Shape as both ends compare it: its name, or for a plug-in its text and a digest."""
         shape = policies.shape(self.reference.shape, REFERENCES)
         if REFERENCES[shape.name].is_ours:
             return shape.name

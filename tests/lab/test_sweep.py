@@ -355,7 +355,7 @@ def test_a_trajectory_edited_between_two_sweeps_is_refused(tmp_path: Path) -> No
 def test_a_task_whose_trajectory_was_edited_since_the_sweep_began_is_not_flown(
     tmp_path: Path,
 ) -> None:
-    """Nor is it kept; once the file is what it was, the sweep goes on."""
+    """Its result is not kept either. With the file restored, the sweep goes on."""
     path = tmp_path / "path.csv"
     plan = Sweep("mine", along(path), [], CHUNK + 1)
     first, second = plan.tasks()

@@ -408,7 +408,7 @@ compiled_pass = skytether.server.control.planner._plan
 
 
 def leaving(batch: Batch, rows: Indices, steps: Indices, work: Workspace) -> int:
-    """The compiled pass, but every third vehicle is left as if its active set had wandered."""
+    """Plan as the compiled pass does, but leave every third vehicle unsolved, with its memory."""
     left, memory = rows[::3], batch.memory
     before = memory.inputs[:, left], memory.states[left], memory.step[left]
     compiled_pass(batch, rows, steps, work)

@@ -139,7 +139,7 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
         assert three.addresses("server") != before
 
         with three.fault("the server crashes, and Docker restarts it"):
-            # Everything of its user's but this shell; the init process follows.
+            # Kills all processes of its user except this shell; then the init process ends as well.
             three.inside("server", "sh", "-c", "kill -9 -1")
             until("the restart", lambda: three.inspect("server")["RestartCount"] == 1)
 
