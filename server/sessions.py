@@ -135,8 +135,7 @@ class Sessions:
 
     def owed(self, now_ns: int) -> list[Session]:
         """Sessions without a packet for as long as their vehicles ask, see `is_owed`."""
-        live = self._live.values()
-        return [each for each in live if 0 < each.asked_ns <= now_ns - each.sent_ns]
+        return [each for each in self._live.values() if each.is_owed(now_ns)]
 
     def at(self, row: int) -> Session:
         """The session in a row."""

@@ -535,7 +535,8 @@ def _column(values: Any, kind: type[np.generic], n: int) -> NDArray[Any]:
     if column.shape != (n,) or not np.can_cast(column.dtype, kind):
         got = f"{column.dtype.name} of shape {column.shape}"
         raise ValueError(f"got {got}, expected {np.dtype(kind).name} of shape ({n},)")
-    return column
+    # As kernels read it, which do not look at types once they are called: float64, side by side.
+    return np.ascontiguousarray(column, dtype=kind)
 
 
 def make_trigger(

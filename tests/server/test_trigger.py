@@ -22,6 +22,7 @@ from skytether.shared.scenario.triggers import (
     Situation,
     Trigger,
     Verdict,
+    _column,
     make_trigger,
 )
 
@@ -552,3 +553,12 @@ def test_batch_is_judged_as_its_singles(tree: Any, seed: int) -> None:
                 assert one[0] == all_[i]
             if alone.event[0]:
                 single.sent(ROW, figures[i : i + 1])
+
+
+def test_columns_of_a_plugin_reach_kernels_as_kernels_read_them() -> None:
+    """Numbers of another kind, or not side by side, are copied; kernels do not check them."""
+    for values in (np.arange(3), np.arange(6.0)[::2], np.ones(3, dtype=np.float32), [1, 2, 3]):
+        column = _column(values, np.float64, 3)
+        assert (column.dtype, column.flags.c_contiguous) == (np.dtype(np.float64), True)
+        np.testing.assert_array_equal(column, values)
+    assert _column(np.ones(6, dtype=np.bool_)[::2], np.bool_, 3).flags.c_contiguous
