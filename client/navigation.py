@@ -82,7 +82,7 @@ class Navigation:
         """Whether what was measured since the last step is what no vehicle can have come to."""
         self._nothing = [math.nan] * axes
         self.measured = [(math.nan, math.nan)] * axes
-        """What was measured and is had since the last step, position [m] and velocity [m/s] of each
+        """Measurements that came since the last step, position [m] and velocity [m/s] of each
         axis; NaN where nothing is."""
         self.estimate = self.measured
         """State now, position [m] and velocity [m/s] of each axis."""

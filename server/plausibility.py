@@ -125,7 +125,7 @@ ANEW, BELIEVED, CLOCK, HORIZON, JUMP = map(int, Belief)
 
 @part
 def _against(said: HeardNumbers, row: int, which: int, H: int, dt: float, noise_m: float) -> int:
-    """What speaks against the new observation after another; BELIEVED where nothing does."""
+    """Reason against the new observation after another; BELIEVED where nothing does."""
     before, new = said.numbers[which, row], said.numbers[NEW, row]
     verdict = BELIEVED
     if new.in_force > new.since + H or new.since > new.step:

@@ -22,7 +22,7 @@ class AirStep(NamedTuple):
     push: list[float]
     """Push w + τ a on each axis, which acts like an input [m/s]."""
     shoves: list[tuple[float, float]]
-    """What white acceleration adds to position [m] and velocity [m/s] of each axis; empty without
+    """White acceleration's part of position [m] and velocity [m/s] of each axis; empty without
     any."""
 
 

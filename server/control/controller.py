@@ -323,7 +323,7 @@ def _able(
     idle: I1,
     able: B1,
 ) -> int:
-    """Fill in `idle` of vehicles whose step is new, and which are `able`; how many those are."""
+    """Fill in `able`, and `idle` of vehicles whose step is new; returns how many are able."""
     count = 0
     for i in range(len(rows)):
         row, step = rows[i], steps[i]

@@ -60,10 +60,10 @@ class Foresight(NamedTuple):
     disturbance: F2
     """Disturbance ŵ, an input that nobody gave [m/s]; shape (block, axes)."""
     horizons: S3
-    """What may be sent, from k on: d committed inputs, then H planned ones [m/s]; shape
+    """Inputs that may be sent, from k on: d committed inputs, then H planned ones [m/s]; shape
     (block, axes, most + H)."""
     feedback: S3
-    """What goes with a horizon, see `wire.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
+    """Feedback columns of a horizon, see `wire.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
     told: Splines
     """Trajectories that are sent, with the scheme "trajectory"."""
 

@@ -124,7 +124,7 @@ KERNELS: list[Any] = []
 
 
 def missing(without: Collection[str] = ()) -> list[Callable[[], None]]:
-    """What compiles each kernel that has no machine code yet, neither in memory nor on disk.
+    """Functions that compile the kernels without machine code in memory or on disk.
 
     Args:
         without: names of the modules whose kernels are not needed.
@@ -252,7 +252,7 @@ class Reaching:
     """Makes one of numba's cache locators mind everything that a kernel reaches."""
 
     def get_source_stamp(self) -> str:
-        """What must be as it was for machine code on disk to be used."""
+        """Stamp that must be unchanged for machine code on disk to be used."""
         return self.stamp
 
     def get_disambiguator(self) -> str:

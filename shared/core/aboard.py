@@ -118,7 +118,7 @@ class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle is not flown, for its autopilot has not come into the air with it."""
 
     doing: str
-    """What it has not come to do."""
+    """Stage of the take-off that it has not reached."""
     why: str
 
     def __str__(self) -> str:

@@ -339,7 +339,7 @@ DOES = {
     "manual": "is flown by somebody else, or by nobody",
     "fault": "stands still, and must be checked before it flies again",
 }
-"""What a vehicle does in each mode, as far as it is told: along a plan it coasts in silence."""
+"""Words for each mode, as far as the server is told: along a plan it coasts in silence."""
 
 
 class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):

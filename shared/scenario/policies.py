@@ -130,7 +130,7 @@ def _policy(text: str, table: PluginTable, name: str, arguments: list[ast.expr])
 
 
 def _number(node: ast.expr) -> Any:
-    """What an argument is, if it is a constant; a number may have a minus before it."""
+    """Value of an argument that is a constant; a number may have a minus before it."""
     match node:
         case ast.Constant(value):
             return value

@@ -245,7 +245,7 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
 
 
 def _strange(table: object, section: Any, at: str = "") -> str | None:
-    """What to say of the first key of a table that its section does not have, if there is one."""
+    """Message about the first key of a table that is unknown; None if all are known."""
     if not (isinstance(table, Mapping) and hasattr(section, "__struct_fields__")):
         return None
     kinds = typing.get_type_hints(section)

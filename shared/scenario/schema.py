@@ -201,7 +201,7 @@ class VehicleConfig(Section, frozen=True):
     """The UAV, as far as it is simulated, and its failsafe without fresh horizons."""
 
     kind: OfVehicle[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "simulated"
-    """What flies, see `skytether vehicles`."""
+    """Vehicle that flies, see `skytether vehicles`."""
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
     """Line to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
     serial:PATH:BAUD."""

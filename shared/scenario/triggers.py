@@ -27,7 +27,7 @@ from skytether.shared.scenario.schema import ControlConfig
 trigger = TRIGGERS
 """Decorator of a policy: a function of a `Situation` and its numbers, or a class like `Trigger`."""
 Figures = NDArray[np.void]
-"""What plans are worth, a record for each vehicle, see `server.control.planner.FIGURES`; shape
+"""Figures of plans, a record for each vehicle, see `server.control.planner.FIGURES`; shape
 (n,)."""
 
 
@@ -68,13 +68,13 @@ class Situation(NamedTuple):
     rows: Indices
     """Numbers of the vehicles' places in what a policy remembers; shape (n,)."""
     figures: Figures
-    """What their plans are worth, a record each; docs/triggers.md has the fields; shape (n,)."""
+    """Figures of their plans, a record each; docs/triggers.md has the fields; shape (n,)."""
     estimate: Array
     """Estimate x̂(k+d): position and velocity where planning starts [m, m/s]; shape (n, axes, 2)."""
     planned: Array
     """State x_p there according to the plan before [m, m/s]; shape (n, axes, 2)."""
     known: KnownArrays
-    """What the rest is cut from once it is asked for."""
+    """Arrays of all vehicles, from which other fields are cut when they are read."""
 
     @property
     def plan(self) -> Array:
@@ -153,10 +153,10 @@ class Verdict(NamedTuple):
     event: Flags
     """Whether it fires; shape (n,)."""
     figure: Array
-    """What the leftmost policy that compares a figure compares; V(k) of eq. (16) where none does;
+    """Figure of the leftmost policy that compares one; V(k) of eq. (16) where none does;
     shape (n,)."""
     threshold: Array
-    """What it compares that with; 0 where nothing is compared; shape (n,)."""
+    """Threshold of that figure; 0 where nothing is compared; shape (n,)."""
     compared: Compared = Compared.OWN
     """Name of the figure that is compared with the threshold."""
 

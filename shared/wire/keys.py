@@ -57,7 +57,7 @@ class Keyring:
     """Keys of some vehicles."""
 
     name: str
-    """What the user calls the file that they are from."""
+    """Name by which the user knows the file that the keys are from."""
     keys: Mapping[tuple[int, int], VehicleKey] = field(repr=False)
     """Keys by vehicle and number."""
 

@@ -200,7 +200,7 @@ class Horizon(NamedTuple):
     inputs: NDArray[np.float32]
     """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
-    """What feedback aboard takes, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
+    """Parameters of the feedback aboard, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
     (axes, 0) where the inputs are to be flown as they are."""
     number: int = 0
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""

@@ -103,7 +103,7 @@ class Shell:
                 self._add(line)
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """Where every datagram is received: making room for the longest costs more than to copy."""
+        """Buffer of every datagram: making room for the longest costs more than to copy."""
         self.address = from_kernel(bound.getsockname())
         """Address of socket 0."""
 
@@ -297,7 +297,7 @@ def run(
 
 
 def _fault(context: dict[str, Any]) -> Fault:
-    """What the loop has caught, as an event."""
+    """Exception that the loop has caught, as an event."""
     error = context.get("exception")
     trace = traceback.format_exception(error) if error else [context["message"]]
     return Fault(traceback="".join(trace))

@@ -1,4 +1,4 @@
-"""What each extra takes: disk and time to install; and what a vehicle takes that flies.
+"""Footprint of each extra: disk and time to install; and what a vehicle takes that flies.
 
 Each extra is installed into an environment of its own by uv, from its cache and at the versions of
 requirements-dev.lock, and compiled to bytecode afterwards, as pip leaves it; disk is what all of

@@ -55,7 +55,7 @@ class MissionsOptions:
 
 
 class FlownMission(NamedTuple):
-    """What came of a mission."""
+    """Result of a mission."""
 
     seed: int
     vehicles: int
@@ -118,7 +118,7 @@ def _zones(rng: np.random.Generator, count: int, half_m: float) -> Iterator[str]
 def _places(
     rng: np.random.Generator, vehicles: int, half_m: float, kept: Zones, apart_m: float
 ) -> tuple[Array, Array]:
-    """Where vehicles begin and where they go [m]; two of shape (vehicles, 2)."""
+    """Starts and goals of the vehicles [m]; two of shape (vehicles, 2)."""
     room_m = 0.75 * apart_m  # from zones: past a vehicle at its goal there is a way
     routes, found = Routes(kept, room_m), list[Array]()
     while len(found) < 2:

@@ -1,4 +1,4 @@
-"""What it costs to keep vehicles apart: a motion's QP beside other solvers, and whole ticks.
+"""Cost of keeping vehicles apart: a motion's QP beside other solvers, and whole ticks.
 
     python -m skytether.lab.benchmarks.motions
 

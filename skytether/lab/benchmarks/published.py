@@ -90,7 +90,7 @@ class PublishedOptions:
 
 
 class TaskFlight(NamedTuple):
-    """What came of a flight."""
+    """Result of a flight."""
 
     least_m: float
     """Smallest distance between two vehicles, heights stretched [m]."""
@@ -101,7 +101,7 @@ class TaskFlight(NamedTuple):
 
 
 def places(task: Task, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Where vehicles begin, and where they go [m]; two of shape (vehicles, 3)."""
+    """Starts and goals of the vehicles [m]; two of shape (vehicles, 3)."""
     if task.circle_m:
         angle = 2.0 * np.pi * (np.arange(task.vehicles) / task.vehicles) + np.pi / 4.0
         on = task.circle_m * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)

@@ -1,4 +1,4 @@
-"""What a whole tick costs: of one vehicle, of fleets, and of more and more vehicles."""
+"""Cost of a whole tick: of one vehicle, of fleets, and of more and more vehicles."""
 
 import gc
 import time

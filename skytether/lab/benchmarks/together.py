@@ -56,7 +56,7 @@ PLANNERS: dict[str, Callable[[list[Motion]], list[Motion]]] = {
     "the newest alone": lambda motions: motions[-1:],
     "nothing": lambda _: [],
 }
-"""What of the motions of others a planner keeps apart from."""
+"""Motions of others that each planner keeps apart from."""
 ARRIVED_M = 0.3
 """Distance from its goal at which a vehicle has arrived [m]."""
 
@@ -81,7 +81,7 @@ class TogetherOptions:
 
 
 class Swap(NamedTuple):
-    """What came of a flight."""
+    """Result of a flight."""
 
     least_m: float
     """Smallest distance between two vehicles [m]."""

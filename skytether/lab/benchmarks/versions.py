@@ -29,7 +29,7 @@ from skytether.shared.base import files
 
 ROOT = Path(__file__).parents[3]
 WORKERS = ("skytether/lab/benchmarks/versions_worker.py", "benchmarks/versions_worker.py")
-"""Where a checkout has its worker, of today and until 0.1.0, by its own names for everything."""
+"""Paths of a checkout's worker, of today and until 0.1.0, by its own names for everything."""
 RUN = """
 import importlib, runpy, sys
 worker, harness, pause_s = sys.argv[1:]
